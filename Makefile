@@ -1,0 +1,39 @@
+# make demo | test | test-all | check | view
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test test-all check view format clean
+
+demo: $(STAMP)
+	$(BIN)/morphgen compose arm=ur5 ee=plane --out robots
+	$(BIN)/morphgen check robots/ur5-plane --strict
+	$(BIN)/morphgen conform robots/ur5-plane
+	@echo "The robot is in robots/ur5-plane; its picture is robots/ur5-plane/preview.png"
+
+test: $(STAMP)
+	$(BIN)/pytest -m "not slow" -n auto
+
+test-all: $(STAMP)
+	$(BIN)/pytest -n auto
+
+check: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+view: demo
+	$(BIN)/morphgen view robots/ur5-plane
+
+format: $(STAMP)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,dev]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info

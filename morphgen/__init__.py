@@ -1,0 +1,1 @@
+"""morphgen: procedural robot morphologies with embedded tasks."""

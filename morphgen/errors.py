@@ -1,0 +1,50 @@
+"""Every error that morphgen raises on purpose, and the hint that lists valid choices."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class MorphgenError(Exception):
+    """Root of the errors a user can cause; its text is one line fit for a terminal."""
+
+
+class RobotError(MorphgenError):
+    """A robot's structure contradicts itself."""
+
+
+class FormatError(MorphgenError):
+    """A file cannot be read or written as what it claims to be."""
+
+
+class MeshError(FormatError):
+    """A mesh file is missing, unreadable, empty or not finite."""
+
+
+class PartError(MorphgenError):
+    """A part, its manifest or one of its parameters is unknown or wrong."""
+
+
+class CompositionError(MorphgenError):
+    """Parts cannot be joined as asked."""
+
+
+class MissingDependencyError(MorphgenError):
+    """An optional package that the command needs is not installed."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Return a hint for an unknown name: the closest valid one and the whole list.
+
+    Args:
+        name: What the user wrote.
+        valid: Every name that would have been accepted.
+
+    Returns:
+        Text to append to an error, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
+    """
+    choices = sorted(valid)
+    close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
+    guess = f"; did you mean {close[0]!r}?" if close else ";"
+    return f"{guess} valid: {', '.join(choices) if choices else '(none)'}"

@@ -1,0 +1,1 @@
+"""``Robot`` and what follows from it alone: the ground floor."""

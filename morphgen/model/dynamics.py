@@ -1,0 +1,92 @@
+"""Joint-space inertia, and the position-control gains that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from morphgen.model.kinematics import forward_kinematics, mimic_map
+from morphgen.model.robot import Robot
+
+Array = NDArray[np.float64]
+
+BANDWIDTH = 30.0
+"""Natural frequency of the position control that the gains give, rad/s."""
+MIN_INERTIA = 1e-5
+"""Joint-space inertia below which a joint is controlled as if it had this much."""
+
+
+@dataclass(frozen=True)
+class Actuation:
+    """Position control of one independent joint."""
+
+    joint: str
+    stiffness: float
+    """N m/rad or N/m."""
+    damping: float
+    """N m s/rad or N s/m."""
+    effort: float | None
+    """Largest torque or force, N m or N; None where the source names none."""
+    velocity: float | None
+    """Largest speed, rad/s or m/s; None where the source names none."""
+
+
+def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
+    """Joint-space inertia at one configuration, by body Jacobians: sum of J^T I J.
+
+    Args:
+        robot: The body, its root held in the world.
+        q: Independent joint positions, shape (dof,), rad or m.
+
+    Returns:
+        Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
+    """
+    T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
+    jacobian = np.zeros((len(robot.links), 6, len(robot.movable)))
+    column = {k: i for i, k in enumerate(robot.movable)}
+    for k, joint in enumerate(robot.joints):
+        jacobian[k + 1] = jacobian[robot.parents[k + 1]]
+        if joint.is_movable:
+            axis = T_root_link[k + 1, :3, :3] @ np.array(joint.unit_axis)
+            origin = T_root_link[k + 1, :3, 3]
+            if joint.kind == "prismatic":
+                jacobian[k + 1, :3, column[k]] = axis
+            else:
+                jacobian[k + 1, :3, column[k]] = -np.cross(axis, origin)
+                jacobian[k + 1, 3:, column[k]] = axis
+    M = np.zeros((len(robot.movable),) * 2)
+    for i, link in enumerate(robot.links):
+        if link.inertial is None or link.inertial.mass == 0:
+            continue
+        R = T_root_link[i, :3, :3]
+        com = T_root_link[i, :3, 3] + R @ np.array(link.inertial.com)
+        angular = jacobian[i, 3:]
+        linear = jacobian[i, :3] + np.cross(angular, com, axis=0)
+        M += link.inertial.mass * linear.T @ linear
+        M += angular.T @ (R @ link.inertial.matrix @ R.T) @ angular
+    matrix, _ = mimic_map(robot)
+    return np.asarray(matrix.T @ M @ matrix)
+
+
+def actuation(robot: Robot) -> tuple[Actuation, ...]:
+    """Gains of every independent joint from the body's inertia at home.
+
+    Stiffness is omega^2 I and damping 2 omega I (critical), with omega = ``BANDWIDTH`` and I
+    the joint's diagonal entry of the joint-space inertia at home.
+    """
+    inertia = np.maximum(np.diag(mass_matrix(robot, robot.home)), MIN_INERTIA)
+    gains = []
+    for k, value in zip(robot.independent, inertia.tolist(), strict=True):
+        joint = robot.joints[k]
+        gains.append(
+            Actuation(
+                joint.name,
+                stiffness=BANDWIDTH**2 * value,
+                damping=2 * BANDWIDTH * value,
+                effort=joint.effort,
+                velocity=joint.velocity,
+            )
+        )
+    return tuple(gains)

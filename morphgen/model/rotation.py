@@ -1,0 +1,115 @@
+"""Rotations: quaternions (w, x, y, z) with w >= 0, matrices, and URDF's roll-pitch-yaw."""
+
+from __future__ import annotations
+
+import math
+
+Vec3 = tuple[float, float, float]
+Quat = tuple[float, float, float, float]
+
+IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
+_GIMBAL = 1e-9
+
+
+def normalized(q: Quat) -> Quat:
+    """Scale to unit length and choose the sign with w >= 0 (first non-zero entry positive).
+
+    Raises:
+        ValueError: If the quaternion is zero or not finite.
+    """
+    w, x, y, z = q
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if not math.isfinite(norm) or norm < 1e-12:
+        raise ValueError(f"{q} is no rotation quaternion")
+    if abs(w) < 1e-15 * norm:
+        w = 0.0
+    lead = next(value for value in (w, x, y, z) if abs(value) > 1e-15 * norm)
+    if lead < 0:
+        norm = -norm
+    return (w / norm + 0.0, x / norm + 0.0, y / norm + 0.0, z / norm + 0.0)
+
+
+def multiply(a: Quat, b: Quat) -> Quat:
+    """Hamilton product: the rotation b followed by the rotation a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return normalized(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        )
+    )
+
+
+def conjugate(q: Quat) -> Quat:
+    """The inverse rotation."""
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def rotate(q: Quat, v: Vec3) -> Vec3:
+    """Rotate a vector by a unit quaternion."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+def to_matrix(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
+    """Rotation matrix of a unit quaternion, as rows."""
+    w, x, y, z = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def from_matrix(rows: tuple[Vec3, Vec3, Vec3]) -> Quat:
+    """Quaternion of a rotation matrix (Shepperd's method: the largest pivot is used)."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    trace = a + e + i
+    pivots = (trace, a, e, i)
+    largest = pivots.index(max(pivots))
+    if largest == 0:
+        return normalized((1 + trace, h - f, c - g, d - b))
+    if largest == 1:
+        return normalized((h - f, 1 + a - e - i, b + d, c + g))
+    if largest == 2:
+        return normalized((c - g, b + d, 1 + e - a - i, f + h))
+    return normalized((d - b, c + g, f + h, 1 + i - a - e))
+
+
+def from_rpy(rpy: Vec3) -> Quat:
+    """Quaternion of URDF's fixed-axis roll, pitch, yaw: Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, cp, cy = (math.cos(angle / 2) for angle in rpy)
+    sr, sp, sy = (math.sin(angle / 2) for angle in rpy)
+    return normalized(
+        (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+    )
+
+
+def to_rpy(q: Quat) -> Vec3:
+    """Roll, pitch, yaw of a unit quaternion; at the gimbal lock yaw is zero."""
+    (a, b, _), (d, e, _), (g, h, i) = to_matrix(q)
+    cos_pitch = math.hypot(a, d)
+    pitch = math.atan2(-g, cos_pitch)
+    if cos_pitch > _GIMBAL:
+        return (math.atan2(h, i), pitch, math.atan2(d, a))
+    return (math.copysign(1.0, -g) * math.atan2(b, e), pitch, 0.0)
+
+
+def from_axis_angle(axis: Vec3, angle: float) -> Quat:
+    """Quaternion of a turn by ``angle`` (rad) about a unit axis."""
+    s = math.sin(angle / 2)
+    return normalized((math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s))

@@ -1,0 +1,84 @@
+"""Forward kinematics: hand-made figures, batches, mimic joints and reach."""
+
+import math
+
+import numpy as np
+import pytest
+from robots import arm
+
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import (
+    bounds,
+    forward_kinematics,
+    frame_pose,
+    movable_positions,
+    random_configurations,
+    reach,
+)
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+
+
+def planar(lengths=(0.5, 0.3)):
+    links = tuple(Link(f"link{i}") for i in range(len(lengths) + 1))
+    joints = tuple(
+        Joint(
+            f"joint{i}",
+            "revolute",
+            f"link{i}",
+            f"link{i + 1}",
+            Pose((lengths[i - 1] if i else 0.0, 0.0, 0.0)),
+            (0.0, 0.0, 1.0),
+            (-math.pi, math.pi),
+        )
+        for i in range(len(lengths))
+    )
+    tool = Frame("tool", links[-1].name, Pose((lengths[-1], 0.0, 0.0)))
+    return Robot("planar", links, joints, (tool,), home=(0.0,) * len(lengths))
+
+
+def test_planar_arm_is_where_trigonometry_says():
+    q = np.array([0.3, -1.1])
+    x = 0.5 * math.cos(0.3) + 0.3 * math.cos(0.3 - 1.1)
+    y = 0.5 * math.sin(0.3) + 0.3 * math.sin(0.3 - 1.1)
+    np.testing.assert_allclose(frame_pose(planar(), q)[:3, 3], [x, y, 0.0], atol=1e-14)
+
+
+def test_batch_is_the_stack_of_its_rows():
+    robot = arm()
+    q = random_configurations(robot, 12, np.random.default_rng(3)).reshape(3, 4, robot.dof)
+    batch = forward_kinematics(robot, q)
+    assert batch.shape == (3, 4, len(robot.links), 4, 4)
+    np.testing.assert_array_equal(batch[2, 1], forward_kinematics(robot, q[2, 1]))
+
+
+def test_mimic_joints_follow_through_chains():
+    hinge = {"axis": (0.0, 0.0, 1.0), "limits": (-1.0, 1.0)}
+    robot = Robot(
+        "chain",
+        tuple(Link(name) for name in "abcd"),
+        (
+            Joint("one", "revolute", "a", "b", **hinge),
+            Joint("two", "revolute", "b", "c", **hinge, mimic=Mimic("one", 2.0, 0.1)),
+            Joint("three", "revolute", "c", "d", **hinge, mimic=Mimic("two", -1.0, 0.5)),
+        ),
+        home=(0.0,),
+    )
+    assert robot.dof == 1
+    np.testing.assert_allclose(movable_positions(robot, [0.2]), [0.2, 0.5, 0.0], atol=1e-15)
+
+
+def test_q_of_wrong_length_is_refused_with_both_shapes():
+    with pytest.raises(ValueError, match=r"\(3,\).*\(\.\.\., 2\)"):
+        forward_kinematics(planar(), np.zeros(3))
+
+
+def test_reach_of_a_planar_arm_is_its_length():
+    assert reach(planar((0.5, 0.3, 0.2))) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_random_configurations_stay_in_bounds():
+    robot = arm()
+    q = random_configurations(robot, 1000, np.random.default_rng(0))
+    limits = bounds(robot)
+    assert (q >= limits[:, 0]).all()
+    assert (q <= limits[:, 1]).all()

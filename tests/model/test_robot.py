@@ -1,0 +1,58 @@
+"""A ``Robot`` that contradicts itself cannot be made."""
+
+from dataclasses import replace
+
+import pytest
+from robots import arm
+
+from morphgen.errors import RobotError
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.model.tree import renamed, subtree
+
+
+def test_two_links_of_one_name():
+    with pytest.raises(RobotError, match="two links are named 'a'"):
+        Robot("r", (Link("a"), Link("a")), (Joint("j", "fixed", "a", "a"),))
+
+
+def test_links_out_of_topological_order():
+    joints = (Joint("j", "fixed", "c", "b"), Joint("k", "fixed", "a", "c"))
+    with pytest.raises(RobotError, match="topological order"):
+        Robot("r", (Link("a"), Link("b"), Link("c")), joints)
+
+
+def test_home_of_wrong_length():
+    with pytest.raises(RobotError, match="home has 1 values for 4 joints"):
+        replace(arm(), home=(0.0,))
+
+
+def test_frame_on_no_link_names_the_nearest():
+    with pytest.raises(RobotError, match="did you mean 'upper'"):
+        replace(arm(), frames=(Frame("tool", "uper"),))
+
+
+def test_mimic_of_a_missing_joint_and_mimic_loops():
+    links = (Link("a"), Link("b"))
+    with pytest.raises(RobotError, match="mimics 'nobody'"):
+        Robot("r", links, (Joint("j", "revolute", "a", "b", mimic=Mimic("nobody")),))
+    with pytest.raises(RobotError, match="j -> j"):
+        Robot("r", links, (Joint("j", "revolute", "a", "b", mimic=Mimic("j")),))
+
+
+def test_subtree_keeps_home_frames_and_mimics():
+    part = subtree(arm(), "lower")
+    assert [link.name for link in part.links] == ["lower", "slider", "left", "right"]
+    assert part.home == (0.01, 0.02)
+    assert part.frame("tool").link == "slider"
+
+
+def test_subtree_that_loses_a_mimic_leader_is_refused():
+    with pytest.raises(RobotError, match="mimics 'left'"):
+        subtree(arm(), "lower", without=["left"])
+
+
+def test_renaming_carries_every_reference():
+    robot = renamed(arm(), {"slider": "s"}, {"left": "l"})
+    assert robot.frame("tool").link == "s"
+    assert robot.joints[-1].mimic == Mimic("l", -1.0, 0.0)
+    assert robot.joints[-1].parent == "s"

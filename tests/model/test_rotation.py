@@ -1,0 +1,57 @@
+"""Rotations agree with SciPy and survive the trip through roll-pitch-yaw."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from morphgen.model import rotation
+
+ANGLES = st.floats(-math.pi, math.pi, allow_nan=False)
+RPY = st.tuples(ANGLES, st.floats(-math.pi / 2, math.pi / 2), ANGLES)
+
+
+@given(RPY)
+def test_rpy_is_urdfs_fixed_axis_convention(rpy):
+    ours = np.array(rotation.to_matrix(rotation.from_rpy(rpy)))
+    np.testing.assert_allclose(ours, Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-12)
+
+
+@given(RPY)
+def test_rpy_survives_the_quaternion_even_near_the_gimbal_lock(rpy):
+    q = rotation.from_rpy(rpy)
+    back = rotation.from_rpy(rotation.to_rpy(q))
+    np.testing.assert_allclose(rotation.to_matrix(back), rotation.to_matrix(q), atol=1e-8)
+
+
+@pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
+@pytest.mark.parametrize("roll", [0.0, 0.7, -2.0])
+@pytest.mark.parametrize("yaw", [0.0, 1.1, -3.0])
+def test_rpy_at_the_gimbal_lock_is_the_same_rotation(roll, pitch, yaw):
+    q = rotation.from_rpy((roll, pitch, yaw))
+    back = rotation.from_rpy(rotation.to_rpy(q))
+    np.testing.assert_allclose(rotation.to_matrix(back), rotation.to_matrix(q), atol=1e-12)
+
+
+@given(RPY, RPY)
+def test_product_is_the_product_of_matrices(a, b):
+    qa, qb = rotation.from_rpy(a), rotation.from_rpy(b)
+    product = np.array(rotation.to_matrix(rotation.multiply(qa, qb)))
+    expected = np.array(rotation.to_matrix(qa)) @ np.array(rotation.to_matrix(qb))
+    np.testing.assert_allclose(product, expected, atol=1e-12)
+
+
+@given(RPY)
+def test_matrix_gives_back_the_quaternion_with_positive_w(rpy):
+    q = rotation.from_rpy(rpy)
+    assert q[0] >= 0
+    back = rotation.from_matrix(rotation.to_matrix(q))
+    assert min(np.abs(np.subtract(back, q)).max(), np.abs(np.add(back, q)).max()) < 1e-7
+
+
+def test_zero_is_no_rotation():
+    with pytest.raises(ValueError, match="no rotation"):
+        rotation.normalized((0.0, 0.0, 0.0, 0.0))

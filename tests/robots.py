@@ -1,0 +1,48 @@
+"""Small robots that tests build in code."""
+
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape
+from morphgen.model.inertia import with_inertia
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+
+
+def rod(name: str, length: float = 0.3) -> Link:
+    """A rod along z from its link's origin, of the density of water."""
+    shape = Shape(Cylinder(0.02, length - 0.06), Pose((0.0, 0.0, length / 2)), (0.8, 0.4, 0.1, 1.0))
+    return with_inertia(Link(name, visuals=(shape,), collisions=(shape,)), 1000.0)
+
+
+def arm() -> Robot:
+    """Base, two hinges, a slide and a mimicking finger pair."""
+    block = Shape(Box((0.1, 0.1, 0.04)))
+    base = with_inertia(Link("base", visuals=(block,), collisions=(block,)), 2000.0)
+    links = (
+        base,
+        rod("upper"),
+        rod("lower"),
+        rod("slider", 0.2),
+        rod("left", 0.1),
+        rod("right", 0.1),
+    )
+    up = Pose((0.0, 0.0, 0.3))
+    limits = {"limits": (-2.0, 2.0), "effort": 50.0, "velocity": 2.0}
+    slide = {"limits": (0.0, 0.04), "effort": 20.0, "velocity": 0.5}
+    joints = (
+        Joint("shoulder", "revolute", "base", "upper", Pose((0.0, 0.0, 0.05)), (0, 1, 0), **limits),
+        Joint("elbow", "revolute", "upper", "lower", up, (1, 0, 0), **limits),
+        Joint("extend", "prismatic", "lower", "slider", up, (0, 0, 1), **slide),
+        Joint("left", "prismatic", "slider", "left", Pose((0.0, 0.05, 0.2)), (0, 1, 0), **slide),
+        Joint(
+            "right",
+            "prismatic",
+            "slider",
+            "right",
+            Pose((0.0, -0.05, 0.2)),
+            (0, 1, 0),
+            limits=(-0.04, 0.0),
+            effort=20.0,
+            velocity=0.5,
+            mimic=Mimic("left", -1.0, 0.0),
+        ),
+    )
+    tool = Frame("tool", "slider", Pose.from_xyz_rpy((0.0, 0.0, 0.28), (0.0, 0.3, 0.0)))
+    return Robot("arm", links, joints, (tool,), home=(0.4, 0.5, 0.01, 0.02))
