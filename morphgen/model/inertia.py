@@ -147,7 +147,7 @@ def _corners(shape: Shape) -> Array:
         case Capsule(radius, length):
             low = np.array([-radius, -radius, -length / 2 - radius])
         case Mesh():
-            corners = np.asarray(hull(shape.geometry).vertices)
+            corners = np.asarray(load_mesh(shape.geometry).vertices)
             T = shape.T_link_shape.matrix
             return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
     corners = np.array(list(itertools.product(*zip(low, -low, strict=True))))

@@ -17,17 +17,18 @@ trimesh applies neither; it applies the scene graph's transforms, and so does th
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 
 import collada
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import QhullError
 from trimesh.visual import TextureVisuals
 
 from morphgen.errors import MeshError
@@ -41,6 +42,7 @@ _UNREADABLE = (
     AssertionError,
     AttributeError,
     LookupError,
+    NameError,
     OSError,
     RuntimeError,
     SyntaxError,
@@ -51,6 +53,15 @@ _UNREADABLE = (
     trimesh.exchange.stl.HeaderError,
 )
 """What the readers raise on a file that is not what its suffix says."""
+
+_Triangles: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""Vertices (n, 3) and faces (m, 3)."""
+
+MAX_STL_FACES = 200_000
+"""Triangles of the largest STL that MuJoCo reads."""
+
+# Without a handler of its own, trimesh's warnings about a file would reach the terminal.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True)
@@ -108,10 +119,10 @@ def _hull(
     path: str, stamp: tuple[int, int], scale: tuple[float, ...], part: int | None
 ) -> trimesh.Trimesh:
     vertices = _scaled(path, stamp, scale, part).vertices
-    try:
-        result: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
-    except (QhullError, ValueError) as error:
-        raise MeshError(f"{path}: is flat, so it has no convex hull") from error
+    spread = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
+    if len(vertices) < 4 or spread[2] < 1e-7 * spread[0]:
+        raise MeshError(f"{path}: is flat, so it has no convex hull")
+    result: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
     return result
 
 
@@ -126,10 +137,8 @@ def _scaled(
         if not 0 <= part < len(groups):
             raise MeshError(f"{path}: no part {part}; valid: 0 to {len(groups) - 1}")
         groups = (groups[part],)
-    offsets = np.cumsum([0, *(len(group.vertices) for group in groups)])
-    vertices = np.concatenate([group.vertices for group in groups]) * scale
-    faces = np.concatenate([g.faces + start for g, start in zip(groups, offsets, strict=False)])
-    vertices, faces = _cleaned(vertices, faces[:, ::-1] if math.prod(scale) < 0 else faces)
+    vertices, faces = _concatenated([(group.vertices, group.faces) for group in groups])
+    vertices, faces = _cleaned(vertices * scale, faces[:, ::-1] if math.prod(scale) < 0 else faces)
     if not len(faces):
         raise MeshError(f"{path}: no triangle has an area at scale {scale}")
     return trimesh.Trimesh(vertices, faces, process=False)
@@ -138,26 +147,12 @@ def _scaled(
 @lru_cache(maxsize=128)
 def _groups(path: str, stamp: tuple[int, int]) -> tuple[_Group, ...]:
     """The file's triangles by colour, in metres."""
-    pieces: dict[Rgba | None, list[tuple[NDArray[np.float64], NDArray[np.int64]]]] = {}
-    scene = _scene(Path(path))
-    for node in scene.graph.nodes_geometry:
-        T_scene_node, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
-            continue
-        vertices = trimesh.transform_points(geometry.vertices, T_scene_node) * _unit(geometry)
-        mirrored = np.linalg.det(T_scene_node[:3, :3]) < 0
-        faces = geometry.faces[:, ::-1] if mirrored else geometry.faces
-        if not np.isfinite(vertices[faces]).all():
-            raise MeshError(f"{path}: has a vertex that is not finite")
-        pieces.setdefault(_colour(geometry), []).append((vertices, np.asarray(faces)))
+    pieces: dict[Rgba | None, list[_Triangles]] = {}
+    for rgba, triangles in _read(Path(path)):
+        pieces.setdefault(rgba, []).append(triangles)
     groups = []
     for rgba, parts in pieces.items():
-        offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-        vertices, faces = _cleaned(
-            np.concatenate([vertices for vertices, _ in parts]),
-            np.concatenate([f + start for (_, f), start in zip(parts, offsets, strict=False)]),
-        )
+        vertices, faces = _cleaned(*_concatenated(parts))
         if len(faces):
             groups.append(_Group(MeshPart(rgba, len(faces)), vertices, faces))
     if not groups:
@@ -165,16 +160,34 @@ def _groups(path: str, stamp: tuple[int, int]) -> tuple[_Group, ...]:
     return tuple(groups)
 
 
-def _scene(path: Path) -> trimesh.Scene:
+def _read(path: Path) -> list[tuple[Rgba | None, _Triangles]]:
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"{path}: cannot read {path.suffix!r} meshes; valid: {', '.join(SUFFIXES)}")
     try:
-        return trimesh.load_scene(path, process=False)
+        scene = trimesh.load_scene(path, process=False)
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        return [
+            (_colour(geometry), _in_scene(geometry, T_scene_node))
+            for T_scene_node, name in placed
+            if isinstance(geometry := scene.geometry[name], trimesh.Trimesh)
+        ]
     except _UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise MeshError(
-            f"{path}: not a readable {path.suffix[1:].lower()} mesh: {reason}"
-        ) from error
+        raise MeshError(f"{path}: not a readable {path.suffix[1:]} mesh: {reason}") from error
+
+
+def _in_scene(geometry: trimesh.Trimesh, T_scene_node: NDArray[np.float64]) -> _Triangles:
+    """A geometry's vertices in the scene, metres, and faces that point outwards there."""
+    faces = np.asarray(geometry.faces)
+    if geometry.vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise ValueError(f"vertices are {geometry.vertices.shape}, faces {faces.shape}")
+    if faces.size and faces.min() < 0:
+        raise ValueError(f"vertex index {faces.min()}")
+    vertices = trimesh.transform_points(geometry.vertices, T_scene_node) * _unit(geometry)
+    if not np.isfinite(vertices[faces]).all():
+        raise ValueError("a vertex is not finite")
+    mirrored = np.linalg.det(T_scene_node[:3, :3]) < 0
+    return vertices, faces[:, ::-1] if mirrored else faces
 
 
 def _unit(geometry: trimesh.Trimesh) -> float:
@@ -194,16 +207,23 @@ def _colour(geometry: trimesh.Trimesh) -> Rgba | None:
         if visual.uv is None or image is None:
             rgba = material.main_color
         else:
-            rgba = np.mean(material.to_color(visual.uv), axis=0)
+            colours = material.to_color(visual.uv)  # type: ignore[no-untyped-call]
+            rgba = np.mean(colours, axis=0)
     else:
         rgba = np.mean(visual.vertex_colors, axis=0)
     red, green, blue, alpha = (round(float(channel)) / 255 for channel in rgba)
     return (red, green, blue, alpha)
 
 
-def _cleaned(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _concatenated(parts: list[_Triangles]) -> _Triangles:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
+    return (
+        np.concatenate([vertices for vertices, _ in parts]),
+        np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=True)]),
+    )
+
+
+def _cleaned(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> _Triangles:
     """Merge coincident vertices; drop unused ones and triangles without area."""
     merged = trimesh.Trimesh(vertices, faces, process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)

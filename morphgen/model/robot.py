@@ -19,6 +19,11 @@ JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "continuous", "prismatic", "fixed")
 Pair = tuple[str, str]
 
+DEFAULT_EFFORT = 100.0
+"""What a joint without a largest effort is given where a file must name one, N m or N."""
+DEFAULT_VELOCITY = 1.0
+"""What a joint without a largest velocity is given where a file must name one, rad/s or m/s."""
+
 
 @dataclass(frozen=True)
 class Inertial:

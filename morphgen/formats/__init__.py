@@ -1,0 +1,1 @@
+"""Robots in and out: URDF, xacro, MJCF, meshes, the bundle and its picture."""

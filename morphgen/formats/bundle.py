@@ -1,0 +1,182 @@
+"""The bundle: a robot as a folder that loads anywhere."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import trimesh
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.stl import export_stl
+
+from morphgen.errors import FormatError
+from morphgen.formats.card import apply_card, card_of, card_text
+from morphgen.formats.mjcf import mjcf_text
+from morphgen.formats.picture import render
+from morphgen.formats.urdf import read_urdf, with_frames
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.model.findings import Finding
+from morphgen.model.geometry import Mesh, Shape
+from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts
+from morphgen.model.robot import Link, Robot
+
+URDF = "robot.urdf"
+MJCF = "robot.xml"
+CARD = "card.json"
+PICTURE = "preview.png"
+MESHES = "meshes"
+
+
+def write_bundle(
+    robot: Robot, folder: Path, findings: Iterable[Finding] = (), *, picture: bool = True
+) -> Path:
+    """Write a robot's bundle to a temporary folder and move it into place.
+
+    Args:
+        robot: The body.
+        folder: The bundle; a bundle that is there is replaced.
+        findings: What the checks say, for the card.
+        picture: Whether to draw ``preview.png``.
+
+    Returns:
+        ``folder``.
+
+    Raises:
+        FormatError: If the folder cannot be written, or is there and no bundle.
+        MissingDependencyError: If a picture is wanted and nothing can draw it.
+    """
+    if folder.exists() and not (folder / CARD).is_file():
+        raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
+    robot = split_colours(robot)
+    with _replacing(folder) as partial:
+        files = _write_meshes(robot, partial / MESHES)
+        (partial / URDF).write_text(urdf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
+        (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
+        hashes = {
+            path.relative_to(partial).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(partial.rglob("*"))
+            if path.is_file()
+        }
+        card = card_of(robot, findings, hashes, {"morphgen": version("morphgen")})
+        (partial / CARD).write_text(card_text(card), encoding="utf-8")
+        if picture:
+            render(robot, partial / URDF, partial / MJCF).save(partial / PICTURE)
+    return folder
+
+
+def read_bundle(folder: Path) -> Robot:
+    """Read a bundle back.
+
+    Raises:
+        FormatError: If it is no bundle, or its files do not agree.
+    """
+    card_path = folder / CARD
+    if not card_path.is_file():
+        raise FormatError(f"{folder} is no bundle: it has no {CARD}")
+    try:
+        card = json.loads(card_path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FormatError(f"{card_path}: no valid JSON: {error}") from error
+    robot = read_urdf(folder / URDF)
+    return apply_card(with_frames(robot, tuple(card.get("frames", ()))), card)
+
+
+def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
+    """Read a bundle's folder, a URDF or a xacro.
+
+    Raises:
+        FormatError: If it is none of them, or broken.
+    """
+    if path.is_dir():
+        return read_bundle(path)
+    if path.name == URDF and (path.parent / CARD).is_file():
+        return read_bundle(path.parent)
+    return read_urdf(path, args)
+
+
+def split_colours(robot: Robot) -> Robot:
+    """One visual per colour for every visual mesh that has several colours of its own.
+
+    A colour of a single triangle is left out: MuJoCo reads no mesh of three vertices.
+    """
+    return replace(robot, links=tuple(_split_link(link) for link in robot.links))
+
+
+def _split_link(link: Link) -> Link:
+    visuals = tuple(piece for shape in link.visuals for piece in _split_shape(shape))
+    return link if visuals == link.visuals else replace(link, visuals=visuals)
+
+
+def _split_shape(shape: Shape) -> tuple[Shape, ...]:
+    mesh = shape.geometry
+    if not isinstance(mesh, Mesh) or mesh.part is not None:
+        return (shape,)
+    parts = mesh_parts(mesh.path)
+    if len(parts) < 2:
+        rgba = shape.rgba or (parts[0].rgba if parts else None)
+        return (replace(shape, rgba=rgba),)
+    return tuple(
+        replace(shape, geometry=replace(mesh, part=i), rgba=part.rgba or shape.rgba)
+        for i, part in enumerate(parts)
+        if part.faces > 1
+    )
+
+
+def _write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
+    """Write every mesh once, in metres; return its path in the bundle."""
+    files: dict[Mesh, str] = {}
+    for link in robot.links:
+        for shape in (*link.visuals, *link.collisions):
+            mesh = shape.geometry
+            if not isinstance(mesh, Mesh) or mesh in files:
+                continue
+            folder.mkdir(exist_ok=True)
+            data, suffix = _mesh_bytes(load_mesh(mesh))
+            digest = hashlib.sha256(data).hexdigest()[:8]
+            name = f"{_safe(mesh.path.stem)}-{digest}.{suffix}"
+            (folder / name).write_bytes(data)
+            files[mesh] = f"{MESHES}/{name}"
+    return files
+
+
+def _mesh_bytes(mesh: trimesh.Trimesh) -> tuple[bytes, str]:
+    """Binary STL, which every loader reads; OBJ beyond the size of STL that MuJoCo reads."""
+    if len(mesh.faces) <= MAX_STL_FACES:
+        return export_stl(mesh), "stl"
+    return export_obj(mesh, include_normals=False, header=None).encode(), "obj"
+
+
+def _safe(stem: str) -> str:
+    base = stem.rsplit("-", 1)[0] if len(stem.rsplit("-", 1)[-1]) == 8 else stem
+    return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in base)
+
+
+@contextmanager
+def _replacing(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside ``folder`` that takes its place if the block succeeds."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise FormatError(f"cannot write to {folder.parent}: {error.strerror}") from error
+    try:
+        partial.chmod(0o755)
+        yield partial
+        if folder.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+            folder.rename(old / folder.name)
+            partial.rename(folder)
+            shutil.rmtree(old)
+        else:
+            partial.rename(folder)
+    except OSError as error:
+        raise FormatError(f"cannot write {folder}: {error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

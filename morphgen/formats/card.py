@@ -1,0 +1,98 @@
+"""The card: everything about a robot that is not geometry, as plain data."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+from morphgen.errors import FormatError
+from morphgen.formats.urdf_text import number
+from morphgen.model.dynamics import actuation
+from morphgen.model.findings import Finding
+from morphgen.model.kinematics import reach
+from morphgen.model.robot import Robot
+
+CARD_FORMAT = 1
+
+
+def card_of(
+    robot: Robot,
+    findings: Iterable[Finding],
+    hashes: Mapping[str, str],
+    versions: Mapping[str, str],
+) -> dict[str, object]:
+    """Describe a robot.
+
+    Args:
+        robot: The body.
+        findings: What the checks say of it.
+        hashes: SHA-256 of its files, by name.
+        versions: Versions of what made it.
+
+    Returns:
+        Data for ``card.json``; it holds no time and no path, so the same robot gives the same
+        bytes anywhere.
+    """
+    has_tool = any(frame.name == "tool" for frame in robot.frames)
+    joints = [robot.joints[k] for k in robot.independent]
+    return {
+        "format": CARD_FORMAT,
+        "name": robot.name,
+        "links": len(robot.links),
+        "movable": len(robot.movable),
+        "dof": robot.dof,
+        "mass": _rounded(robot.mass),
+        "reach": _rounded(reach(robot)) if has_tool and robot.dof else None,
+        "home": {joint.name: _rounded(q) for joint, q in zip(joints, robot.home, strict=True)},
+        "frames": {
+            frame.name: {
+                "link": frame.link,
+                "position": [_rounded(v) for v in frame.T_link_frame.position],
+                "quaternion": [_rounded(v) for v in frame.T_link_frame.quaternion],
+            }
+            for frame in robot.frames
+        },
+        "ignore_pairs": [list(pair) for pair in robot.ignore_pairs],
+        "actuation": {
+            gains.joint: {
+                key: _rounded(value) for key, value in asdict(gains).items() if key != "joint"
+            }
+            for gains in actuation(robot)
+        },
+        **robot.provenance,
+        "findings": [finding.as_dict() for finding in findings],
+        "hashes": dict(sorted(hashes.items())),
+        "versions": dict(versions),
+    }
+
+
+def card_text(card: Mapping[str, object]) -> str:
+    """A card as JSON text."""
+    return json.dumps(card, indent=2, ensure_ascii=False) + "\n"
+
+
+def apply_card(robot: Robot, card: Mapping[str, Any]) -> Robot:
+    """Give a robot read from a bundle's URDF what only the card knows.
+
+    Raises:
+        FormatError: If the card is of another format or lacks a key.
+    """
+    if card.get("format") != CARD_FORMAT:
+        raise FormatError(f"card format {card.get('format')!r}; this version reads {CARD_FORMAT}")
+    keys = ("derivation", "source", "repairs", "parts")
+    try:
+        home = card["home"]
+        return replace(
+            robot,
+            home=tuple(float(home[robot.joints[k].name]) for k in robot.independent),
+            ignore_pairs=tuple((str(a), str(b)) for a, b in card["ignore_pairs"]),
+            provenance={key: card[key] for key in keys if key in card},
+        )
+    except KeyError as error:
+        raise FormatError(f"the card has no {error}") from error
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else float(number(value))

@@ -1,0 +1,231 @@
+"""``Robot`` to MuJoCo: MJCF text, and an ``MjSpec`` compiled from the same text."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from lxml import etree
+
+from morphgen.errors import FormatError
+from morphgen.formats.mjcf_elements import (
+    Meshes,
+    MeshFile,
+    geom_attributes,
+    join,
+    joint_attributes,
+    pose_attributes,
+)
+from morphgen.formats.mujoco_urdf import BOUND_INERTIA, BOUND_MASS
+from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, Actuation, actuation
+from morphgen.model.kinematics import mimic_map, movable_positions
+from morphgen.model.robot import Joint, Link, Robot
+
+TIMESTEP = 0.005
+"""Physics step of the written model, seconds."""
+VISUAL_GROUP, COLLISION_GROUP = 2, 3
+"""Geom groups; MuJoCo's viewers show groups 0 to 2."""
+_SITE_GROUP = 4
+
+
+def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
+    """Write a robot as MJCF; the same robot gives the same bytes.
+
+    Every link is a body of its name, the root welded to the world (a root named ``world``, a name
+    that MuJoCo keeps for itself, is the world body). Visual shapes are in group 2 and touch
+    nothing, collision shapes in group 3. Every independent joint has a position actuator of its
+    name, with the gains of ``morphgen.model.dynamics.actuation``; mimic joints are equality
+    constraints, ignored pairs ``<exclude>``, frames sites; ``home`` is a keyframe.
+
+    Numbers are written here with 12 significant digits. ``MjSpec.to_xml``, with its 6 digits,
+    moves a tool by micrometres and inertias by parts per million; so nothing goes through it.
+
+    A massless link on a moving joint is refused by MuJoCo; the ``<compiler>`` bounds it at
+    1e-12 kg and 1e-14 kg m^2, far below any real part. A joint that moves less inertia than
+    ``MIN_INERTIA`` gets that much armature, the inertia that its gains assume. An effort of zero
+    means, as in most URDFs that have it, that nobody filled it in: the actuator has no limit.
+
+    Args:
+        robot: The body.
+        mesh_file: File to write for a mesh, relative to the MJCF, such as ``meshes/hand.stl``.
+            The file must hold the mesh as the shape uses it: its part alone, scale applied.
+            MuJoCo reads STL of at most 200,000 faces and OBJ of any size.
+
+    Raises:
+        FormatError: If MJCF cannot express the robot: a link named ``world`` that is not a root
+            without mass, or limits without any room between them.
+        MeshError: If a collision mesh cannot be read.
+    """
+    meshes = Meshes(mesh_file)
+    root = _document(robot, meshes)
+    etree.indent(root)
+    return etree.tostring(root, encoding="unicode") + "\n"
+
+
+def to_spec(robot: Robot, mesh_file: MeshFile | None = None) -> mujoco.MjSpec:
+    """Build an editable MuJoCo model, equal to what ``mjcf_text`` writes.
+
+    Args:
+        robot: The body.
+        mesh_file: As for ``mjcf_text``; None puts the triangles themselves into the model, for
+            collision those of the convex hull.
+
+    Raises:
+        FormatError: As ``mjcf_text``.
+        MeshError: If a mesh cannot be read.
+    """
+    meshes = Meshes(mesh_file)
+    spec = mujoco.MjSpec.from_string(etree.tostring(_document(robot, meshes), encoding="unicode"))
+    meshes.add_to(spec)
+    return spec
+
+
+def _document(robot: Robot, meshes: Meshes) -> etree._Element:
+    root = etree.Element("mujoco", model=robot.name)
+    etree.SubElement(
+        root,
+        "compiler",
+        angle="radian",
+        inertiafromgeom="false",
+        boundmass=f"{BOUND_MASS:g}",
+        boundinertia=f"{BOUND_INERTIA:g}",
+    )
+    etree.SubElement(root, "option", timestep=f"{TIMESTEP:g}", integrator="implicitfast")
+    default = etree.SubElement(root, "default")
+    visual = etree.SubElement(default, "default", {"class": "visual"})
+    etree.SubElement(visual, "geom", group=str(VISUAL_GROUP), contype="0", conaffinity="0")
+    collision = etree.SubElement(default, "default", {"class": "collision"})
+    etree.SubElement(collision, "geom", group=str(COLLISION_GROUP))
+    asset = etree.SubElement(root, "asset")
+    world = etree.SubElement(root, "worldbody")
+    gains = actuation(robot)
+    _write_bodies(world, robot, meshes, gains)
+    meshes.write(asset)
+    _write_constraints(root, robot)
+    _write_actuators(root, robot, gains)
+    _write_home(root, robot, world)
+    for section in ("asset", "contact", "equality", "actuator"):
+        element = root.find(section)
+        if element is not None and len(element) == 0:
+            root.remove(element)
+    return root
+
+
+def _write_bodies(
+    world: etree._Element, robot: Robot, meshes: Meshes, gains: tuple[Actuation, ...]
+) -> None:
+    sites: dict[str, list[dict[str, str]]] = {}
+    for frame in robot.frames:
+        attributes = {"name": frame.name, "group": str(_SITE_GROUP)}
+        sites.setdefault(frame.link, []).append(attributes | pose_attributes(frame.T_link_frame))
+    light = {gain.joint for gain in gains if gain.stiffness <= BANDWIDTH**2 * MIN_INERTIA}
+    bodies: list[etree._Element] = []
+    for i, link in enumerate(robot.links):
+        if link.name == "world":
+            if i > 0 or (link.inertial is not None and link.inertial.mass > 0):
+                raise FormatError(
+                    f"robot {robot.name!r}: link 'world' is not a root without mass; MuJoCo keeps "
+                    "that name for the world, rename the link"
+                )
+            body = world
+        else:
+            joint = robot.joints[i - 1] if i else None
+            body = etree.SubElement(
+                bodies[robot.parents[i]] if i else world,
+                "body",
+                {"name": link.name} | (pose_attributes(joint.T_parent_joint) if joint else {}),
+            )
+            _write_inertial(body, link)
+            if joint is not None and joint.is_movable:
+                _write_joint(body, joint, armature=MIN_INERTIA if joint.name in light else 0.0)
+        for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+            for shape in shapes:
+                attributes = geom_attributes(shape, meshes, collision=kind == "collision")
+                if shape.rgba is not None:
+                    attributes["rgba"] = join(shape.rgba)
+                etree.SubElement(body, "geom", {"class": kind} | attributes)
+        for site in sites.get(link.name, ()):
+            etree.SubElement(body, "site", site)
+        bodies.append(body)
+
+
+def _write_inertial(body: etree._Element, link: Link) -> None:
+    if link.inertial is None or link.inertial.mass == 0:
+        return
+    xx, xy, xz, yy, yz, zz = link.inertial.inertia
+    mass = join([link.inertial.mass], zero=0)
+    inertial = etree.SubElement(body, "inertial", pos=join(link.inertial.com), mass=mass)
+    off_diagonal = join([xy, xz, yz], zero=1e-18)
+    diagonal = join([xx, yy, zz], zero=1e-18)
+    if off_diagonal == "0 0 0":
+        inertial.set("diaginertia", diagonal)
+    else:
+        inertial.set("fullinertia", f"{diagonal} {off_diagonal}")
+
+
+def _write_joint(body: etree._Element, joint: Joint, armature: float) -> None:
+    element = etree.SubElement(body, "joint", joint_attributes(joint))
+    limits = _limits(joint)
+    if limits is not None:
+        element.set("range", limits)
+    if armature:
+        element.set("armature", join([armature]))
+    if joint.damping:
+        element.set("damping", join([joint.damping]))
+    if joint.friction:
+        element.set("frictionloss", join([joint.friction]))
+
+
+def _write_constraints(root: etree._Element, robot: Robot) -> None:
+    contact = etree.SubElement(root, "contact")
+    for a, b in robot.ignore_pairs:
+        etree.SubElement(contact, "exclude", body1=a, body2=b)
+    equality = etree.SubElement(root, "equality")
+    matrix, offset = mimic_map(robot)
+    for row, k in enumerate(robot.movable):
+        joint = robot.joints[k]
+        if joint.mimic is None:
+            continue
+        element = etree.SubElement(equality, "joint", name=f"{joint.name}_mimic", joint1=joint.name)
+        for column in np.flatnonzero(matrix[row]).tolist():
+            element.set("joint2", robot.joints[robot.independent[column]].name)
+        element.set("polycoef", join([offset[row], matrix[row].sum(), 0, 0, 0]))
+
+
+def _write_actuators(root: etree._Element, robot: Robot, gains: tuple[Actuation, ...]) -> None:
+    section = etree.SubElement(root, "actuator")
+    for gain in gains:
+        element = etree.SubElement(
+            section,
+            "position",
+            name=gain.joint,
+            joint=gain.joint,
+            kp=f"{gain.stiffness:.6g}",
+            kv=f"{gain.damping:.6g}",
+        )
+        limits = _limits(robot.joints[robot.joint_index[gain.joint]])
+        if limits is not None:
+            element.set("ctrlrange", limits)
+        if gain.effort:
+            element.set("forcerange", join([-gain.effort, gain.effort]))
+
+
+def _write_home(root: etree._Element, robot: Robot, world: etree._Element) -> None:
+    values = movable_positions(robot, robot.home).tolist()
+    positions = {robot.joints[k].name: q for k, q in zip(robot.movable, values, strict=True)}
+    key = etree.SubElement(etree.SubElement(root, "keyframe"), "key", name="home")
+    if positions:
+        key.set("qpos", join(positions[joint.get("name", "")] for joint in world.iter("joint")))
+    if robot.home:
+        key.set("ctrl", join(robot.home))
+
+
+def _limits(joint: Joint) -> str | None:
+    if joint.limits is None or joint.kind == "continuous":
+        return None
+    lower, upper = joint.limits
+    if lower >= upper:
+        raise FormatError(
+            f"joint {joint.name!r}: limits ({lower:g}, {upper:g}) leave no room to move; MJCF "
+            "needs lower < upper, or make the joint fixed"
+        )
+    return join(joint.limits)

@@ -1,0 +1,207 @@
+"""A picture of a robot, drawn without display or GPU."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from morphgen.errors import MissingDependencyError
+from morphgen.model.inertia import bounding_box
+from morphgen.model.kinematics import forward_kinematics, movable_positions
+from morphgen.model.robot import Robot
+
+SIZE = (640, 480)
+_OVERSAMPLING = 2
+_FOV = 35.0
+_YAW, _PITCH = 50.0, -20.0
+_MARGIN = 0.92
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera looking at a point from a distance."""
+
+    target: tuple[float, float, float]
+    distance: float
+    """Metres."""
+
+
+class GlContext(Protocol):
+    """What MuJoCo's OpenGL contexts have in common."""
+
+    def make_current(self) -> None:
+        """Draw here from now on."""
+
+    def free(self) -> None:
+        """Give the context back."""
+
+
+def render(
+    robot: Robot,
+    urdf: Path,
+    mjcf: Path,
+    q: ArrayLike | None = None,
+    size: tuple[int, int] = SIZE,
+) -> Image.Image:
+    """Draw a robot as its files show it.
+
+    PyBullet's software renderer where PyBullet is installed, MuJoCo's otherwise.
+
+    Args:
+        robot: The body that the files hold.
+        urdf: Its URDF.
+        mjcf: Its MJCF.
+        q: Configuration, shape (dof,); home by default.
+        size: Width and height, pixels.
+
+    Raises:
+        MissingDependencyError: If neither renderer works here.
+    """
+    configuration = np.asarray(robot.home if q is None else q, dtype=np.float64)
+    view = _framing(robot, configuration, size[0] / size[1])
+    if find_spec("pybullet") is not None:
+        return _render_pybullet(robot, urdf, configuration, view, size)
+    return _render_mujoco(robot, mjcf, configuration, view, size)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what C code prints to the process's standard streams from the terminal."""
+    saved = [os.dup(fd) for fd in (1, 2)]
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for fd in (1, 2):
+            os.dup2(sink, fd)
+        yield
+    finally:
+        for fd, original in zip((1, 2), saved, strict=True):
+            os.dup2(original, fd)
+            os.close(original)
+        os.close(sink)
+
+
+def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
+    """The closest view that holds the robot and its foot, both centred."""
+    T_root_link = forward_kinematics(robot, q)
+    points = [np.zeros((1, 3))]
+    for T, link in zip(T_root_link, robot.links, strict=True):
+        if link.visuals or link.collisions:
+            low, high = bounding_box(link.visuals or link.collisions)
+            corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+            points.append(corners @ T[:3, :3].T + T[:3, 3])
+    axes = Rotation.from_euler("ZX", [_YAW, _PITCH], degrees=True).as_matrix()
+    across, ahead, up = (np.concatenate(points) @ axes).T
+    middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
+    tangent = _MARGIN * math.tan(math.radians(_FOV / 2))
+    needed = np.maximum(
+        np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
+    )
+    distance = max(float((needed - (ahead - middle[1])).max()), 0.05)
+    x, y, z = (axes @ middle).tolist()
+    return View((x, y, z), distance)
+
+
+def _render_pybullet(
+    robot: Robot, urdf: Path, q: NDArray[np.float64], view: View, size: tuple[int, int]
+) -> Image.Image:
+    with quiet():
+        import pybullet
+
+        client = pybullet.connect(pybullet.DIRECT)
+        try:
+            flags = pybullet.URDF_USE_MATERIAL_COLORS_FROM_MTL
+            body = pybullet.loadURDF(
+                str(urdf), useFixedBase=True, flags=flags, physicsClientId=client
+            )
+            index = {
+                pybullet.getJointInfo(body, i, physicsClientId=client)[1].decode(): i
+                for i in range(pybullet.getNumJoints(body, physicsClientId=client))
+            }
+            for k, position in zip(robot.movable, movable_positions(robot, q), strict=True):
+                pybullet.resetJointState(
+                    body, index[robot.joints[k].name], float(position), physicsClientId=client
+                )
+            width, height = (_OVERSAMPLING * side for side in size)
+            near, far = 0.02 * view.distance, 4 * view.distance
+            image = pybullet.getCameraImage(
+                width,
+                height,
+                pybullet.computeViewMatrixFromYawPitchRoll(
+                    view.target, view.distance, _YAW, _PITCH, 0, 2
+                ),
+                pybullet.computeProjectionMatrixFOV(_FOV, width / height, near, far),
+                lightDirection=(1.0, -0.6, 1.6),
+                shadow=0,
+                renderer=pybullet.ER_TINY_RENDERER,
+                physicsClientId=client,
+            )[2]
+        finally:
+            pybullet.disconnect(client)
+    pixels = np.asarray(image, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+    return Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
+
+
+def _render_mujoco(
+    robot: Robot, mjcf: Path, q: NDArray[np.float64], view: View, size: tuple[int, int]
+) -> Image.Image:
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    data = mujoco.MjData(model)
+    for k, position in zip(robot.movable, movable_positions(robot, q), strict=True):
+        data.qpos[model.joint(robot.joints[k].name).qposadr[0]] = position
+    mujoco.mj_forward(model, data)
+    model.vis.global_.fovy = _FOV
+    model.vis.global_.offwidth, model.vis.global_.offheight = size
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.7
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = view.target
+    camera.distance, camera.azimuth, camera.elevation = view.distance, 90 + _YAW, _PITCH
+    options = mujoco.MjvOption()
+    options.geomgroup[3] = 0
+    context = _gl_context(*size)
+    try:
+        context.make_current()
+        scene = mujoco.MjvScene(model, maxgeom=10_000)
+        gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, gpu)
+        mujoco.mjv_updateScene(
+            model, data, options, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene
+        )
+        pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        depth = np.empty((size[1], size[0]), dtype=np.float32)
+        mujoco.mjr_render(mujoco.MjrRect(0, 0, *size), scene, gpu)
+        mujoco.mjr_readPixels(pixels, depth, mujoco.MjrRect(0, 0, *size), gpu)
+        gpu.free()
+    finally:
+        context.free()
+    pixels[depth >= 1.0] = 255
+    return Image.fromarray(pixels[::-1])
+
+
+def _gl_context(width: int, height: int) -> GlContext:
+    """An offscreen OpenGL context of MuJoCo's, by EGL or OSMesa."""
+    reasons = []
+    for backend in ("egl", "osmesa"):
+        try:
+            context: GlContext = import_module(f"mujoco.{backend}").GLContext(width, height)
+        except (ImportError, AttributeError, RuntimeError, OSError) as error:
+            reasons.append(f"{backend}: {error}")
+        else:
+            return context
+    raise MissingDependencyError(
+        "no picture can be drawn: PyBullet is not installed (pip install pybullet; it has wheels "
+        "up to Python 3.11) and MuJoCo finds no offscreen OpenGL: " + "; ".join(reasons)
+    )

@@ -1,0 +1,252 @@
+"""Find the files that a robot description names, without ROS."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.metadata
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+from morphgen.errors import FormatError
+
+REQUIREMENTS = {"rtb-data": "rtb-data==1.1.0", "example-robot-data": "example-robot-data"}
+"""What to install for each pip distribution that robots are read from."""
+
+_DATA_ROOTS = {
+    "rtb-data": ("rtbdata/xacro", "rtbdata"),
+    "example-robot-data": ("cmeel.prefix/share", "cmeel.prefix/share/example-robot-data/robots"),
+}
+_PACKAGE_SUFFIX = re.compile(r"_(description|support)$")
+_PACKAGE_NAME = re.compile(r"[A-Za-z][\w-]*$")
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?://)?")
+_NAME_TAG = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
+
+
+@dataclass(frozen=True)
+class PackageFinder:
+    """Where ROS packages may lie, besides around the file that names them."""
+
+    roots: tuple[Path, ...] = ()
+    """Folders that hold package folders, in the order of search."""
+    packages: tuple[tuple[str, Path], ...] = ()
+    """Packages whose folder is known: (name, folder)."""
+
+    def find(self, package: str, *files: Path) -> Path:
+        """Return the folder of a package.
+
+        The first of these that exists: a folder given for that name; around each of ``files``, from
+        the file upwards, a folder that is the package (by its ``package.xml`` or its own name) or
+        that holds it as a direct child; under each root, a folder of that name or, up to two
+        levels down, one whose ``package.xml`` says so. Descriptions are often copied into a folder
+        named without ROS's suffix, so a package ``x_description`` or ``x_support`` that is nowhere
+        is then sought as a folder ``x``. Names are case-sensitive and the root of the file system
+        holds no packages.
+
+        Raises:
+            FormatError: The name is not a package name, or no folder was found.
+        """
+        place = f"{files[0]}: " if files else ""
+        if not _PACKAGE_NAME.match(package):
+            raise FormatError(f"{place}{package!r} is no package name (letters, digits, _ and -)")
+        for name, folder in self.packages:
+            if name == package:
+                return _absolute(folder)
+        stems = [package, _PACKAGE_SUFFIX.sub("", package)]
+        for name in dict.fromkeys(stems):
+            for candidate in self._candidates(name, files):
+                return candidate
+        around = f"in or beside the folders above {files[0]}, " if files else ""
+        roots = ", ".join(map(str, self.roots)) or "(none)"
+        raise FormatError(
+            f"{place}package {package!r} not found: looked {around}in the roots {roots};"
+            " give the folder that holds it as another root"
+        )
+
+    def _candidates(self, name: str, files: Iterable[Path]) -> Iterator[Path]:
+        for file in files:
+            for folder in _ancestors(file):
+                if folder.name == name or _declared_name(folder) == name:
+                    yield folder
+                if (folder / name).is_dir():
+                    yield folder / name
+        for root in self.roots:
+            if root.name == name or _declared_name(root) == name:
+                yield root
+            if (root / name).is_dir():
+                yield root / name
+            for manifest in sorted([*root.glob("*/package.xml"), *root.glob("*/*/package.xml")]):
+                if _declared_name(manifest.parent) == name:
+                    yield manifest.parent
+
+
+def default_finder(
+    roots: Iterable[Path] = (), packages: Mapping[str, Path] | None = None
+) -> PackageFinder:
+    """Return a finder for the given roots, then ROS's environment, then the pip data packages.
+
+    Args:
+        roots: Folders that hold packages, searched first.
+        packages: Folders of packages by name.
+
+    Returns:
+        A finder that has read ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` once, now.
+    """
+    shares = (prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH"))
+    found = map(_absolute, (*roots, *_path_list("ROS_PACKAGE_PATH"), *shares, *_data_roots()))
+    named = sorted((name, _absolute(folder)) for name, folder in (packages or {}).items())
+    return PackageFinder(tuple(dict.fromkeys(found)), tuple(named))
+
+
+def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
+    """Return the file that a URI inside a robot description means.
+
+    Understood are ``package://`` and ``model://`` (looked up by the finder), ``file://``, absolute
+    and relative paths (from the description's folder). A name is tried as written, then with its
+    ``%`` escapes decoded; backslashes count as slashes; letter case matters.
+
+    A description may name files of ROS packages and of its own tree, nothing else. Its tree is the
+    nearest folder above it with a ``package.xml``, else the nearest named ``*_description`` or
+    ``*_support``, else the folder above its own (so that ``urdf/robot.urdf`` reaches
+    ``meshes/``). A relative path that climbs out is refused, also when the file exists: on another
+    machine it would mean another file. So is an absolute path that lies neither in the tree nor in
+    one of the finder's folders nor in any ROS package; name its folder as a root to allow it.
+
+    Args:
+        uri: As written in the description.
+        base_file: The description's own path.
+        finder: Where packages may lie.
+
+    Raises:
+        FormatError: The URI is malformed, leaves its tree, or names no file.
+    """
+    base = _absolute(base_file)
+    text = uri.strip().replace("\\", "/")
+    match = _SCHEME.match(text)
+    scheme, rest = (match[1], text[match.end() :]) if match else ("", text)
+    if scheme not in ("package", "model", "file", "") or not rest:
+        raise FormatError(
+            f"{base}: cannot read {uri!r}; valid: package://, model://, file:// or a path"
+        )
+    if scheme in ("package", "model"):
+        package, _, rest = rest.lstrip("/").partition("/")
+        folder = boundary = finder.find(package, base)
+    else:
+        folder, boundary = base.parent, _tree(base)
+    missing = []
+    for name in dict.fromkeys([rest, unquote(rest)]):
+        absolute = scheme in ("file", "") and Path(name).is_absolute()
+        path = Path(os.path.normpath(name if absolute else folder / name.lstrip("/")))
+        if not path.is_relative_to(boundary) and not (absolute and _may_name(path, finder)):
+            raise FormatError(
+                f"{base}: {uri!r} leaves {boundary}, the folder of its description;"
+                " move the file inside or refer to it by package://"
+            )
+        if path.is_file():
+            return path
+        missing.append(path)
+    raise FormatError(f"{base}: {uri!r} names no file: looked for {_listed(missing)}")
+
+
+def distribution_file(package: str, relative: str) -> Path:
+    """Return a file of an installed pip distribution.
+
+    Args:
+        package: Distribution name, such as ``rtb-data``.
+        relative: Path below the distribution's install root, with forward slashes.
+
+    Raises:
+        FormatError: The distribution is not installed, or has no such file.
+    """
+    requirement = REQUIREMENTS.get(package, package)
+    inside = PurePosixPath(relative)
+    if inside.is_absolute() or ".." in inside.parts:
+        raise FormatError(f"{relative!r} is not a path below the install root of {package!r}")
+    try:
+        distribution = importlib.metadata.distribution(package)
+    except (importlib.metadata.PackageNotFoundError, ValueError) as error:
+        raise FormatError(
+            f"{relative!r} is part of {package!r}, not installed: pip install {requirement}"
+        ) from error
+    path = _absolute(distribution.locate_file(relative))
+    if not path.is_file():
+        raise FormatError(
+            f"{package} {distribution.version} has no file {_listed([path])};"
+            f" try pip install {requirement}"
+        )
+    return path
+
+
+def _tree(base: Path) -> Path:
+    """The folder that a description's relative paths must stay in."""
+    ancestors = _ancestors(base)
+    declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
+    named = [folder for folder in ancestors if _has_suffix(folder)]
+    return (declared + named + ancestors[1:2] + [base.parent])[0]
+
+
+def _may_name(path: Path, finder: PackageFinder) -> bool:
+    """Whether an absolute path lies in one of the finder's folders or in some ROS package."""
+    known = {*finder.roots, *(folder for _, folder in finder.packages)}
+    return any(
+        folder in known or _has_suffix(folder) or (folder / "package.xml").is_file()
+        for folder in path.parents
+    )
+
+
+def _has_suffix(folder: Path) -> bool:
+    return _PACKAGE_SUFFIX.search(folder.name) is not None
+
+
+def _ancestors(file: Path) -> list[Path]:
+    """Folders above a file, nearest first, without the root of the file system."""
+    return [folder for folder in _absolute(file).parents if folder != folder.parent]
+
+
+def _absolute(path: object) -> Path:
+    return Path(os.path.normpath(Path(str(path)).absolute()))
+
+
+def _path_list(variable: str) -> list[Path]:
+    return [Path(entry) for entry in os.environ.get(variable, "").split(os.pathsep) if entry]
+
+
+def _declared_name(folder: Path) -> str | None:
+    """The name in a folder's ``package.xml``, if it has one."""
+    manifest = folder / "package.xml"
+    if not manifest.is_file():
+        return None
+    return _read_name(manifest, manifest.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1024)
+def _read_name(manifest: Path, mtime_ns: int) -> str | None:
+    match = _NAME_TAG.search(manifest.read_bytes())
+    return match[1].decode(errors="replace") if match else None
+
+
+@lru_cache(maxsize=1)
+def _data_roots() -> tuple[Path, ...]:
+    """Folders with packages in those pip data packages that are installed."""
+    roots = []
+    for name, folders in _DATA_ROOTS.items():
+        try:
+            distribution = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        roots += [_absolute(distribution.locate_file(folder)) for folder in folders]
+    return tuple(roots)
+
+
+def _listed(paths: list[Path]) -> str:
+    """Missing paths, with the name in the same folder that comes closest to the last."""
+    text = " and ".join(map(str, paths))
+    folder, name = paths[-1].parent, paths[-1].name
+    names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    same = [other for other in names if other.lower() == name.lower()]
+    close = same or difflib.get_close_matches(name, names, n=1, cutoff=0.7)
+    return f"{text}; did you mean {close[0]!r}?" if close else text

@@ -1,0 +1,211 @@
+"""Faults in the structure of a URDF, found on its XML, with line numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from lxml import etree
+
+from morphgen.errors import nearest
+from morphgen.formats.structure_values import Place, content_findings, place_of
+from morphgen.model.findings import Finding
+from morphgen.model.robot import JOINT_KINDS
+
+_REPLACEMENT = {
+    "floating": "fix the body to the world, or use three prismatic and three revolute joints",
+    "planar": "use two prismatic joints and a revolute one",
+}
+
+
+def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]:
+    """What keeps a URDF from being a kinematic tree with readable numbers.
+
+    Args:
+        root: The document's root element; ``sourceline`` of its elements is reported.
+        origin: What to call the document, usually its path.
+
+    Returns:
+        Findings in the order found; with none of severity ``error``, the document converts.
+    """
+    if root.tag != "robot":
+        return (_wrong_root(root, origin),)
+    findings = _robot_findings(root, origin)
+    unexpanded = _first_xacro(root)
+    if unexpanded is None:
+        return tuple(findings)
+    # A forgotten call only adds what no loader reads; with faults around it, it explains them.
+    broken = any(finding.severity == "error" for finding in findings)
+    left = place_of(root, origin).finding(
+        unexpanded,
+        "xacro-unexpanded",
+        f"<xacro:{etree.QName(unexpanded).localname}> is left in the document",
+        "give the file the suffix .xacro, or expand it first",
+        severity="error" if broken else "warning",
+    )
+    return (left,) if broken else (left, *findings)
+
+
+def _robot_findings(root: etree._Element, origin: str) -> list[Finding]:
+    links, joints = root.findall("link"), root.findall("joint")
+    findings = list(content_findings(root, place_of(root, origin)))
+    if not links:
+        findings.append(
+            place_of(root, origin).finding(
+                root, "link-missing", "<robot> has no <link>", "add at least one link"
+            )
+        )
+    findings += _duplicates(links, origin)
+    findings += _duplicates(joints, origin)
+    findings += _tree(links, joints, origin)
+    findings += _kinds(joints, origin)
+    findings += _mimics(joints, origin)
+    for element in [*links, *joints, *root.findall("material")]:
+        findings += content_findings(element, place_of(element, origin))
+    return findings
+
+
+def _wrong_root(root: etree._Element, origin: str) -> Finding:
+    name = etree.QName(root)
+    fix = "give a URDF or xacro, whose root element is <robot>"
+    if name.localname == "robot":
+        fix = f"remove the default namespace {name.namespace!r}"
+    why = f"the root element is <{name.localname}>, not <robot>"
+    return Place(origin, f"<{name.localname}>").finding(root, "root-not-robot", why, fix)
+
+
+def _first_xacro(root: etree._Element) -> etree._Element | None:
+    for element in root.iter("{*}*"):
+        namespace = etree.QName(element).namespace
+        if namespace is not None and "xacro" in namespace:
+            return element
+    return None
+
+
+def _duplicates(elements: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
+    first: dict[str, etree._Element] = {}
+    for element in elements:
+        name = element.get("name")
+        if name in first:
+            yield place_of(element, origin).finding(
+                element,
+                f"{element.tag}-duplicate",
+                f"the name is taken by the {element.tag} on line {first[name].sourceline}",
+                "rename one of them",
+            )
+        elif name:
+            first[name] = element
+
+
+def _ends(joint: etree._Element) -> tuple[str | None, str | None]:
+    parent, child = joint.find("parent"), joint.find("child")
+    return (
+        None if parent is None else parent.get("link"),
+        None if child is None else child.get("link"),
+    )
+
+
+def _tree(
+    links: Sequence[etree._Element], joints: Sequence[etree._Element], origin: str
+) -> Iterator[Finding]:
+    by_name = {name: link for link in links if (name := link.get("name"))}
+    parent_of: dict[str, str] = {}
+    above: dict[str, etree._Element] = {}
+    for joint in joints:
+        place = place_of(joint, origin)
+        parent, child = _ends(joint)
+        for role, name in (("parent", parent), ("child", child)):
+            if name and name not in by_name:
+                yield place.finding(
+                    joint,
+                    "joint-link-unknown",
+                    f"its {role} {name!r} is no link",
+                    f"name a link{nearest(name, by_name)}",
+                )
+        if not child or child not in by_name:
+            continue
+        if child in above:
+            yield place.finding(
+                joint,
+                "link-two-parents",
+                f"link {child!r} already hangs on joint {above[child].get('name')!r} "
+                f"(line {above[child].sourceline})",
+                "remove one joint: a robot is a tree, loops are not supported",
+            )
+            continue
+        above[child] = joint
+        if parent in by_name:
+            parent_of[child] = parent
+    for cycle in _cycles(parent_of):
+        yield place_of(above[cycle[0]], origin).finding(
+            above[cycle[0]],
+            "cycle",
+            "links hang on each other: " + " -> ".join([*cycle, cycle[0]]),
+            "remove one of the joints",
+        )
+    roots = [name for name in by_name if name not in above]
+    for name in roots[1:]:
+        yield place_of(by_name[name], origin).finding(
+            by_name[name],
+            "disconnected",
+            f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root",
+            "attach it by a fixed joint, or remove it",
+        )
+
+
+def _cycles(above: dict[str, str]) -> Iterator[list[str]]:
+    """Cycles of a map from each name to the one above it, each once, in order of going down."""
+    done: set[str] = set()
+    for start in above:
+        path: list[str] = []
+        name: str | None = start
+        while name is not None and name not in done:
+            done.add(name)
+            path.append(name)
+            name = above.get(name)
+        if name in path:
+            yield list(reversed(path[path.index(name) :]))
+
+
+def _kinds(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
+    for joint in joints:
+        kind = joint.get("type")
+        if kind in _REPLACEMENT:
+            yield place_of(joint, origin).finding(
+                joint,
+                "joint-type-unsupported",
+                f"joints of type {kind!r} are not supported",
+                _REPLACEMENT[kind],
+            )
+        elif kind and kind not in JOINT_KINDS:
+            yield place_of(joint, origin).finding(
+                joint,
+                "joint-type-unknown",
+                f"{kind!r} is no joint type",
+                f"use one{nearest(kind, JOINT_KINDS)}",
+            )
+
+
+def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
+    by_name = {name: joint for joint in joints if (name := joint.get("name"))}
+    leader_of: dict[str, str] = {}
+    for name, joint in by_name.items():
+        mimic = joint.find("mimic")
+        leader = None if mimic is None else mimic.get("joint")
+        if mimic is None or not leader:
+            continue
+        if leader in by_name:
+            leader_of[name] = leader
+        else:
+            yield place_of(joint, origin).finding(
+                mimic,
+                "mimic-unknown",
+                f"it mimics {leader!r}, which is no joint",
+                f"name a joint{nearest(leader, by_name)}",
+            )
+    for cycle in _cycles(leader_of):
+        yield place_of(by_name[cycle[0]], origin).finding(
+            by_name[cycle[0]],
+            "mimic-cycle",
+            "joints mimic each other: " + " -> ".join([*cycle, cycle[0]]),
+            "let one of them move by itself",
+        )

@@ -1,0 +1,253 @@
+"""What a URDF's elements must contain: children, attributes, numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from lxml import etree
+
+from morphgen.model.findings import Finding, Severity
+
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """An attribute that holds numbers."""
+
+    attribute: str
+    counts: tuple[int, ...] = (1,)
+    """How many numbers it may hold."""
+    required: bool = False
+    positive: bool = False
+    nonzero: bool = False
+    commas_read: bool = False
+    """Whether commas between the numbers are understood all the same."""
+
+
+CHILDREN = {
+    "link": ("inertial", "visual", "collision"),
+    "inertial": ("origin", "mass", "inertia"),
+    "visual": ("origin", "geometry", "material"),
+    "collision": ("origin", "geometry"),
+    "geometry": ("box", "cylinder", "sphere", "mesh"),
+    "material": ("color",),
+    "joint": (
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "limit",
+        "mimic",
+        "dynamics",
+        "calibration",
+        "safety_controller",
+    ),
+}
+"""The elements that are read, by the element around them."""
+
+_REPEATABLE = ("visual", "collision")
+_REQUIRED_CHILDREN = {
+    "inertial": ("mass", "inertia"),
+    "visual": ("geometry",),
+    "collision": ("geometry",),
+    "joint": ("parent", "child"),
+}
+_REQUIRED_TEXT = {
+    "robot": ("name",),
+    "link": ("name",),
+    "joint": ("name", "type"),
+    "parent": ("link",),
+    "child": ("link",),
+    "mimic": ("joint",),
+    "mesh": ("filename",),
+}
+_NUMBERS = {
+    "origin": (Numbers("xyz", (3,)), Numbers("rpy", (3,))),
+    "axis": (Numbers("xyz", (3,)),),
+    "limit": tuple(Numbers(name) for name in ("lower", "upper", "effort", "velocity")),
+    "mimic": (Numbers("multiplier"), Numbers("offset")),
+    "dynamics": (Numbers("damping"), Numbers("friction")),
+    "calibration": (Numbers("rising"), Numbers("falling")),
+    "safety_controller": tuple(
+        Numbers(name)
+        for name in ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity")
+    ),
+    "mass": (Numbers("value", required=True),),
+    "inertia": tuple(
+        Numbers(name, required=True) for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    ),
+    "box": (Numbers("size", (3,), required=True, positive=True, commas_read=True),),
+    "sphere": (Numbers("radius", required=True, positive=True),),
+    "cylinder": (
+        Numbers("radius", required=True, positive=True),
+        Numbers("length", required=True, positive=True),
+    ),
+    "mesh": (Numbers("scale", (1, 3), nonzero=True, commas_read=True),),
+    "color": (Numbers("rgba", (4,)),),
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """The link, joint or robot that an element belongs to."""
+
+    origin: str
+    """Name of the file."""
+    owner: str
+    """Such as ``link 'base'``."""
+
+    def finding(
+        self,
+        element: etree._Element,
+        code: str,
+        why: str,
+        fix: str,
+        severity: Severity = "error",
+    ) -> Finding:
+        """A finding at the element's line."""
+        return Finding(code, severity, f"{self.origin}:{element.sourceline} {self.owner}", why, fix)
+
+
+def place_of(element: etree._Element, origin: str) -> Place:
+    """The place named after a link, joint or other element at the top level."""
+    name = element.get("name")
+    return Place(origin, f"{element.tag} {name!r}" if name else f"{element.tag} without a name")
+
+
+def content_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+    """Look at an element and everything read inside it.
+
+    Args:
+        element: A ``<link>``, ``<joint>``, ``<material>`` or ``<robot>`` (its attributes only).
+        place: The place to name in findings.
+    """
+    tag = element.tag
+    for name in _REQUIRED_TEXT.get(tag, ()):
+        if not element.get(name, "").strip():
+            yield place.finding(
+                element,
+                "attribute-missing",
+                f"<{tag}> has no {name}",
+                f'write <{tag} {name}="...">',
+            )
+    for numbers in _NUMBERS.get(tag, ()):
+        yield from _number_findings(element, numbers, place)
+    for name in _REQUIRED_CHILDREN.get(tag, ()):
+        if element.find(name) is None:
+            yield place.finding(
+                element,
+                "element-missing",
+                f"<{tag}> has no <{name}>",
+                f"add <{name}> or drop <{tag}>",
+            )
+    if tag == "geometry":
+        yield from _geometry_findings(element, place)
+    for name in CHILDREN.get(tag, ()):
+        children = element.findall(name)
+        if len(children) > 1 and name not in _REPEATABLE:
+            yield place.finding(
+                children[1],
+                "element-repeated",
+                f"<{tag}> has {len(children)} <{name}>; the first one counts",
+                "keep one",
+                severity="warning",
+            )
+        for child in children:
+            yield from content_findings(child, place)
+
+
+def _geometry_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+    kinds = CHILDREN["geometry"]
+    shapes = [child for child in element if isinstance(child.tag, str)]
+    if not shapes:
+        yield place.finding(
+            element, "geometry-missing", "<geometry> is empty", f"put one of {_tags(kinds)} into it"
+        )
+        return
+    for shape in shapes:
+        if shape.tag in kinds:
+            continue
+        fix = f"use one of {_tags(kinds)}"
+        if shape.tag == "capsule":
+            fix = "write a cylinder with a sphere at either end: URDF has no capsule"
+        yield place.finding(
+            shape, "geometry-unknown", f"<{shape.tag}> is no geometry that URDF knows", fix
+        )
+    if len(shapes) > 1:
+        yield place.finding(
+            shapes[1],
+            "element-repeated",
+            f"<geometry> holds {len(shapes)} shapes; the first one counts",
+            "give each its own <visual> or <collision>",
+            severity="warning",
+        )
+
+
+def _number_findings(element: etree._Element, numbers: Numbers, place: Place) -> Iterator[Finding]:
+    name = numbers.attribute
+    text = element.get(name)
+    if text is None:
+        if numbers.required:
+            yield place.finding(
+                element,
+                "attribute-missing",
+                f"<{element.tag}> has no {name}",
+                f'write <{element.tag} {name}="...">',
+            )
+        return
+    shown = f'<{element.tag} {name}="{text}">'
+    counts = " or ".join(str(count) for count in numbers.counts)
+    vector = max(numbers.counts) > 1
+    words = text.replace(",", " ").split() if vector else text.split()
+    wrong = [word for word in words if not _is_number(word)]
+    if wrong:
+        yield place.finding(
+            element,
+            "number-malformed",
+            f"{shown}: {wrong[0]!r} is no finite decimal number",
+            "write decimal numbers with a point, separated by spaces",
+        )
+        return
+    if len(words) not in numbers.counts:
+        yield place.finding(
+            element,
+            "number-count",
+            f"{shown} holds {len(words)} numbers",
+            f"write {counts}",
+        )
+        return
+    if "," in text:
+        yield place.finding(
+            element,
+            "number-commas",
+            f"{shown} separates numbers by commas, which MuJoCo refuses",
+            "separate them by spaces",
+            severity="warning" if numbers.commas_read else "error",
+        )
+    values = [float(word) for word in words]
+    if numbers.positive and min(values) <= 0:
+        yield place.finding(
+            element,
+            "size-not-positive",
+            f"{shown} is not positive",
+            "write lengths above 0, in metres",
+        )
+    if numbers.nonzero and 0.0 in values:
+        yield place.finding(
+            element,
+            "mesh-scale-invalid",
+            f"{shown} flattens the mesh",
+            "write factors other than 0",
+        )
+
+
+def _is_number(word: str) -> bool:
+    return _DECIMAL.fullmatch(word) is not None and math.isfinite(float(word))
+
+
+def _tags(names: tuple[str, ...]) -> str:
+    return ", ".join(f"<{name}>" for name in names)

@@ -1,0 +1,143 @@
+"""``Robot`` to URDF text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from lxml import etree
+
+from morphgen.errors import FormatError
+from morphgen.formats.mujoco_urdf import MUJOCO_COMPILER_ATTRIBUTES
+from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
+from morphgen.model.robot import (
+    DEFAULT_EFFORT,
+    DEFAULT_VELOCITY,
+    Inertial,
+    Joint,
+    Link,
+    Robot,
+)
+
+MeshUri = Callable[[Mesh], str]
+
+
+def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
+    """Write a robot as URDF; the same robot gives the same bytes.
+
+    Frames become massless links of their own name on fixed joints. Links without mass get an
+    explicit zero ``<inertial>``, because PyBullet reads a missing one as 1 kg. A ``<mujoco>``
+    element tells MuJoCo to keep names, masses and mesh paths. Capsules, which URDF lacks,
+    become a cylinder and two spheres. A hinge without limits becomes ``continuous``, and a missing
+    effort or velocity the default: with half a ``<limit>`` Pinocchio refuses the file and PyBullet
+    reads zeros.
+
+    Args:
+        robot: The body.
+        mesh_uri: File name to write for a mesh.
+    """
+    root = etree.Element("robot", name=robot.name)
+    etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", MUJOCO_COMPILER_ATTRIBUTES)
+    for link in robot.links:
+        _write_link(root, link, mesh_uri)
+    for frame in robot.frames:
+        _write_link(root, Link(frame.name), mesh_uri)
+    for joint in robot.joints:
+        _write_joint(root, joint)
+    for frame in robot.frames:
+        T = frame.T_link_frame
+        _write_joint(root, Joint(f"{frame.name}_joint", "fixed", frame.link, frame.name, T))
+    etree.indent(root)
+    return etree.tostring(root, encoding="unicode", xml_declaration=False) + "\n"
+
+
+def number(value: float) -> str:
+    """A number with 12 significant digits; what is smaller than 1e-12 is zero."""
+    return "0" if abs(value) < 1e-12 else f"{value:.12g}"
+
+
+def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
+    element = etree.SubElement(root, "link", name=link.name)
+    body = link.inertial or Inertial(0.0)
+    inertial = etree.SubElement(element, "inertial")
+    _write_origin(inertial, Pose(body.com))
+    etree.SubElement(inertial, "mass", value=number(body.mass))
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    values = {name: _inertia_number(v) for name, v in zip(names, body.inertia, strict=True)}
+    etree.SubElement(inertial, "inertia", values)
+    for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+        for i, shape in enumerate(piece for whole in shapes for piece in _urdf_pieces(whole)):
+            holder = etree.SubElement(element, kind, name=f"{link.name}_{kind}_{i}")
+            _write_origin(holder, shape.T_link_shape)
+            _write_geometry(etree.SubElement(holder, "geometry"), shape.geometry, mesh_uri)
+            if shape.rgba is not None and kind == "visual":
+                colour = " ".join(number(value) for value in shape.rgba)
+                material = etree.SubElement(holder, "material", name=f"{link.name}_material_{i}")
+                etree.SubElement(material, "color", rgba=colour)
+
+
+def _urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
+    """A capsule as a cylinder and two spheres; any other shape as itself."""
+    if not isinstance(shape.geometry, Capsule):
+        return (shape,)
+    radius, length = shape.geometry.radius, shape.geometry.length
+    T = shape.T_link_shape
+    return (
+        Shape(Cylinder(radius, length), T, shape.rgba),
+        Shape(Sphere(radius), T @ Pose((0.0, 0.0, length / 2)), shape.rgba),
+        Shape(Sphere(radius), T @ Pose((0.0, 0.0, -length / 2)), shape.rgba),
+    )
+
+
+def _inertia_number(value: float) -> str:
+    """Inertias of finger-sized bodies are far below ``number``'s zero."""
+    return f"{value:.12g}" if abs(value) > 1e-18 else "0"
+
+
+def _write_origin(element: etree._Element, pose: Pose) -> None:
+    xyz = " ".join(number(value) for value in pose.position)
+    rpy = " ".join(number(value) for value in pose.rpy)
+    if (xyz, rpy) != ("0 0 0", "0 0 0"):
+        etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
+
+
+def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshUri) -> None:
+    match geometry:
+        case Box(size):
+            etree.SubElement(element, "box", size=" ".join(number(value) for value in size))
+        case Sphere(radius):
+            etree.SubElement(element, "sphere", radius=number(radius))
+        case Cylinder(radius, length):
+            etree.SubElement(element, "cylinder", radius=number(radius), length=number(length))
+        case Mesh():
+            etree.SubElement(element, "mesh", filename=mesh_uri(geometry))
+        case Capsule():
+            raise FormatError("a capsule has no URDF element; it is written as its pieces")
+
+
+def _write_joint(root: etree._Element, joint: Joint) -> None:
+    kind = "continuous" if joint.kind == "revolute" and joint.limits is None else joint.kind
+    element = etree.SubElement(root, "joint", name=joint.name, type=kind)
+    _write_origin(element, joint.T_parent_joint)
+    etree.SubElement(element, "parent", link=joint.parent)
+    etree.SubElement(element, "child", link=joint.child)
+    if not joint.is_movable:
+        return
+    etree.SubElement(element, "axis", xyz=" ".join(number(value) for value in joint.unit_axis))
+    effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
+    velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
+    limit = {"effort": number(effort), "velocity": number(velocity)}
+    if kind != "continuous":
+        lower, upper = joint.bounds
+        limit = {"lower": number(lower), "upper": number(upper)} | limit
+    etree.SubElement(element, "limit", limit)
+    if joint.damping or joint.friction:
+        values = {"damping": number(joint.damping), "friction": number(joint.friction)}
+        etree.SubElement(element, "dynamics", values)
+    if joint.mimic is not None:
+        etree.SubElement(
+            element,
+            "mimic",
+            joint=joint.mimic.joint,
+            multiplier=number(joint.mimic.multiplier),
+            offset=number(joint.mimic.offset),
+        )

@@ -1,0 +1,124 @@
+"""The bundle: complete or absent, the same bytes each time, and it reads back."""
+
+import json
+import stat
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from robots import arm
+
+from morphgen.errors import FormatError
+from morphgen.formats import bundle
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.model.geometry import Mesh, Shape
+from morphgen.model.robot import Link, Robot
+
+
+def files(folder):
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()
+    }
+
+
+def test_it_holds_urdf_mjcf_card_and_picture(tmp_path):
+    folder = write_bundle(arm(), tmp_path / "arm")
+    assert set(files(folder)) == {"robot.urdf", "robot.xml", "card.json", "preview.png"}
+    assert (tmp_path / "arm").stat().st_mode & stat.S_IROTH
+
+
+def test_it_reads_back(tmp_path):
+    robot = arm()
+    back = read_bundle(write_bundle(robot, tmp_path / "arm", picture=False))
+    assert back.home == robot.home
+    assert [frame.name for frame in back.frames] == ["tool"]
+    assert len(back.links) == len(robot.links)
+    assert back.mass == pytest.approx(robot.mass)
+
+
+def test_writing_twice_gives_the_same_bytes(tmp_path):
+    first = files(write_bundle(arm(), tmp_path / "a" / "arm"))
+    second = files(write_bundle(arm(), tmp_path / "b" / "arm"))
+    assert first == second
+
+
+def test_reading_and_writing_again_gives_the_same_urdf(tmp_path):
+    first = write_bundle(arm(), tmp_path / "a", picture=False)
+    second = write_bundle(read_bundle(first), tmp_path / "b", picture=False)
+    assert files(first)["robot.urdf"] == files(second)["robot.urdf"]
+
+
+def test_the_picture_shows_something(tmp_path):
+    picture = Image.open(write_bundle(arm(), tmp_path / "arm") / "preview.png")
+    pixels = np.asarray(picture.convert("L"))
+    assert picture.size == (640, 480)
+    drawn = (np.abs(pixels.astype(int) - int(pixels[0, 0])) > 10).mean()
+    assert 0.01 < drawn < 0.6
+
+
+def test_meshes_are_written_once_in_metres(tmp_path):
+    source = tmp_path / "cube.stl"
+    trimesh.creation.box(extents=(100, 100, 100)).export(source)
+    mesh = Mesh(source, (0.001, 0.001, 0.001))
+    link = Link("a", visuals=(Shape(mesh),), collisions=(Shape(mesh),))
+    folder = write_bundle(Robot("r", (link,)), tmp_path / "r", picture=False)
+    (written,) = (folder / "meshes").iterdir()
+    assert trimesh.load_mesh(written).extents == pytest.approx([0.1, 0.1, 0.1])
+    again = write_bundle(read_bundle(folder), tmp_path / "r2", picture=False)
+    assert [p.name for p in (again / "meshes").iterdir()] == [written.name]
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bundle, "mjcf_text", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_bundle(arm(), tmp_path / "out" / "arm")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_an_interrupted_replacement_leaves_the_old_one(tmp_path, monkeypatch):
+    before = files(write_bundle(arm(), tmp_path / "arm", picture=False))
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bundle, "mjcf_text", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_bundle(arm(), tmp_path / "arm")
+    assert files(tmp_path / "arm") == before
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+
+
+def test_a_folder_that_is_no_bundle_is_not_replaced(tmp_path):
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.txt").write_text("years of work")
+    with pytest.raises(FormatError, match="no bundle"):
+        write_bundle(arm(), tmp_path / "precious")
+    assert (tmp_path / "precious" / "thesis.txt").exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FormatError, match="cannot write to"):
+        write_bundle(arm(), tmp_path / "file" / "arm")
+
+
+@pytest.mark.parametrize(("content", "message"), [("{", "no valid JSON"), ('{"format": 99}', "99")])
+def test_a_broken_card_is_refused(tmp_path, content, message):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    (folder / "card.json").write_text(content)
+    with pytest.raises(FormatError, match=message):
+        read_bundle(folder)
+
+
+def test_the_card_says_what_the_robot_is(tmp_path):
+    card = json.loads(
+        (write_bundle(arm(), tmp_path / "arm", picture=False) / "card.json").read_text()
+    )
+    assert card["dof"] == 4
+    assert card["movable"] == 5
+    assert set(card["hashes"]) == {"robot.urdf", "robot.xml"}
+    assert set(card["actuation"]) == {"shoulder", "elbow", "extend", "left"}

@@ -1,0 +1,323 @@
+"""MJCF: the same robot as ours, to the digits that matter, and whatever MuJoCo is fussy about."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from robots import arm, rod
+
+from morphgen.errors import FormatError
+from morphgen.formats.mjcf import mjcf_text, to_spec
+from morphgen.formats.mjcf_elements import FLAT_THICKNESS
+from morphgen.model.dynamics import MIN_INERTIA, actuation
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.kinematics import (
+    frame_pose,
+    movable_positions,
+    random_configurations,
+)
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
+
+
+def no_file(mesh):
+    raise AssertionError(f"{mesh} was written")
+
+
+def text(robot):
+    return mjcf_text(robot, no_file)
+
+
+def compiled(robot):
+    return mujoco.MjModel.from_xml_string(text(robot))
+
+
+def place(model, robot, q):
+    data = mujoco.MjData(model)
+    for k, value in zip(robot.movable, movable_positions(robot, q), strict=True):
+        data.joint(robot.joints[k].name).qpos[0] = value
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def single(shape, **kwargs):
+    return Robot("one", (Link("body", Inertial(1.0, inertia=(1, 0, 0, 1, 0, 1)), **kwargs),))
+
+
+def hinged(link, joint=None):
+    """A link on a hinge on a massless root."""
+    joint = joint or Joint("hinge", "revolute", "root", link.name, limits=(-1.0, 1.0))
+    return Robot("hinged", (Link("root"), link), (joint,), home=(0.0,))
+
+
+def test_tool_pose_agrees_to_a_micrometre():
+    robot = arm()
+    model = compiled(robot)
+    for q in random_configurations(robot, 20, np.random.default_rng(0)):
+        site = place(model, robot, q).site("tool")
+        T = frame_pose(robot, q)
+        assert site.xpos == pytest.approx(T[:3, 3], abs=1e-9)
+        assert site.xmat.reshape(3, 3) == pytest.approx(T[:3, :3], abs=1e-9)
+
+
+def test_inertias_keep_their_digits():
+    matrix = np.array([[3.123456789e-8, 4e-9, -5e-9], [4e-9, 2.9e-8, 6e-9], [-5e-9, 6e-9, 3e-8]])
+    link = Link("bead", Inertial.from_matrix(0.0123456789, (0.1, 0.2, 1 / 3), matrix))
+    model = compiled(hinged(link))
+    body = model.body("bead")
+    R = np.empty(9)
+    mujoco.mju_quat2Mat(R, body.iquat)
+    R = R.reshape(3, 3)
+    assert body.mass[0] == pytest.approx(0.0123456789, rel=1e-9)
+    assert body.ipos == pytest.approx((0.1, 0.2, 1 / 3), abs=1e-9)
+    assert R @ np.diag(body.inertia) @ R.T == pytest.approx(matrix, abs=1e-6 * 3e-8)
+
+
+def test_every_link_is_a_body_and_the_mass_is_ours():
+    robot = arm()
+    model = compiled(robot)
+    assert [model.body(i).name for i in range(1, model.nbody)] == [x.name for x in robot.links]
+    assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-9)
+
+
+def test_the_spec_is_the_text():
+    robot = arm()
+    assert to_spec(robot).to_xml() == mujoco.MjSpec.from_string(text(robot)).to_xml()
+
+
+def test_the_same_robot_gives_the_same_text():
+    assert text(arm()) == text(arm())
+    assert "e-17" not in text(arm())
+
+
+def test_primitives_have_their_sizes_and_groups():
+    shapes = (
+        Shape(Box((0.1, 0.2, 0.3)), Pose((1.0, 2.0, 3.0))),
+        Shape(Sphere(0.1)),
+        Shape(Cylinder(0.1, 0.4)),
+        Shape(Capsule(0.1, 0.4), rgba=(0.1, 0.2, 0.3, 0.5)),
+    )
+    model = compiled(single("body", visuals=shapes, collisions=shapes))
+    kinds = [mujoco.mjtGeom(kind).name[7:].lower() for kind in model.geom_type]
+    assert kinds == ["box", "sphere", "cylinder", "capsule"] * 2
+    assert model.geom_size[:4].tolist() == [
+        [0.05, 0.1, 0.15],
+        [0.1, 0, 0],
+        [0.1, 0.2, 0],
+        [0.1, 0.2, 0],
+    ]
+    assert model.geom_pos[0].tolist() == [1.0, 2.0, 3.0]
+    assert model.geom_rgba[3] == pytest.approx((0.1, 0.2, 0.3, 0.5))
+    assert model.geom_group.tolist() == [2] * 4 + [3] * 4
+    assert model.geom_contype.tolist() == [0] * 4 + [1] * 4
+    assert model.geom_conaffinity.tolist() == [0] * 4 + [1] * 4
+
+
+def test_joints_keep_their_properties():
+    joint = Joint(
+        "slide", "prismatic", "root", "rod", axis=(0, 3, 4), limits=(-0.1, 0.3), damping=2.0,
+        friction=0.5, effort=7.0,
+    )  # fmt: skip
+    model = compiled(hinged(rod("rod"), joint))
+    slide = model.joint("slide")
+    assert slide.type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+    assert slide.axis == pytest.approx((0, 0.6, 0.8))
+    assert slide.range.tolist() == [-0.1, 0.3]
+    assert model.jnt_limited.tolist() == [1]
+    assert model.dof_damping.ravel()[0] == 2.0
+    assert model.dof_frictionloss[0] == 0.5
+
+
+def test_continuous_and_unlimited_joints_have_no_range():
+    for kind, limits in (("continuous", (-1.0, 1.0)), ("revolute", None)):
+        joint = Joint("free", kind, "root", "rod", limits=limits)
+        model = compiled(hinged(rod("rod"), joint))
+        assert model.jnt_limited.tolist() == [0]
+        assert model.actuator_ctrllimited.tolist() == [0]
+        assert model.actuator_forcelimited.tolist() == [0]
+
+
+def test_actuators_have_the_gains_of_the_body():
+    robot = arm()
+    model = compiled(robot)
+    assert model.nu == robot.dof
+    for i, gain in enumerate(actuation(robot)):
+        actuator = model.actuator(i)
+        joint = robot.joints[robot.joint_index[gain.joint]]
+        assert actuator.name == gain.joint
+        assert model.joint(actuator.trnid[0]).name == gain.joint
+        assert actuator.gainprm[0] == pytest.approx(gain.stiffness, rel=1e-5)
+        assert actuator.biasprm[1:3] == pytest.approx((-gain.stiffness, -gain.damping), rel=1e-5)
+        assert actuator.forcerange == pytest.approx((-joint.effort, joint.effort))
+        assert actuator.ctrlrange == pytest.approx(joint.limits)
+
+
+def test_home_is_a_keyframe_with_its_mimics_and_holds():
+    robot = arm()
+    model = compiled(robot)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    assert data.ctrl == pytest.approx(robot.home)
+    for k, q in zip(robot.movable, movable_positions(robot, robot.home), strict=True):
+        assert data.joint(robot.joints[k].name).qpos[0] == pytest.approx(q)
+    model.opt.gravity[:] = 0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    assert data.ctrl == pytest.approx([data.joint(robot.joints[k].name).qpos[0] for k in
+                                       robot.independent], abs=1e-3)  # fmt: skip
+
+
+def test_branches_keep_the_keyframe_in_mujocos_order():
+    links = tuple(rod(name) for name in ("root", "left", "right", "left_tip", "right_tip"))
+    joints = tuple(
+        Joint(child, "revolute", parent, child, Pose((x, 0, 0.3)), (0, 1, 0), (-2.0, 2.0))
+        for parent, child, x in (
+            ("root", "left", -0.2),
+            ("root", "right", 0.2),
+            ("left", "left_tip", 0.0),
+            ("right", "right_tip", 0.0),
+        )
+    )
+    robot = Robot("tree", links, joints, home=(0.1, 0.2, 0.3, 0.4))
+    model = compiled(robot)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    assert [data.joint(j.name).qpos[0] for j in joints] == pytest.approx(robot.home)
+    assert [data.actuator(j.name).ctrl[0] for j in joints] == pytest.approx(robot.home)
+
+
+def test_mimic_joints_follow_through_a_chain():
+    links = tuple(rod(name) for name in "abcd")
+    limits = {"limits": (-2.0, 2.0)}
+    joints = (
+        Joint("lead", "revolute", "a", "b", **limits),
+        Joint("follow", "revolute", "b", "c", mimic=Mimic("lead", -0.5, 0.2), **limits),
+        Joint("last", "revolute", "c", "d", mimic=Mimic("follow", 2.0, 0.1), **limits),
+    )
+    model = compiled(Robot("chain", links, joints, home=(0.4,)))
+    assert model.neq == 2
+    assert {model.joint(i).name for i in model.eq_obj2id.tolist()} == {"lead"}
+    assert model.eq_data[:, :3] == pytest.approx(np.array([[0.2, -0.5, 0], [0.5, -1.0, 0]]))
+
+
+def test_ignored_pairs_are_excluded():
+    robot = replace(arm(), ignore_pairs=(("base", "upper"), ("left", "right")))
+    assert compiled(robot).nexclude == 2
+
+
+def test_massless_moving_links_are_legal_and_weigh_nothing():
+    links = (Link("root"), Link("x"), Link("y"), rod("tip"), Link("leaf"))
+    joints = (
+        Joint("x", "prismatic", "root", "x", axis=(1, 0, 0), limits=(-1.0, 1.0)),
+        Joint("y", "prismatic", "x", "y", axis=(0, 1, 0), limits=(-1.0, 1.0)),
+        Joint("tip", "revolute", "y", "tip", axis=(0, 1, 0), limits=(-1.0, 1.0)),
+        Joint("leaf", "revolute", "tip", "leaf", axis=(0, 1, 0), limits=(-1.0, 1.0)),
+    )
+    robot = Robot("gantry", links, joints, home=(0.0,) * 4)
+    model = compiled(robot)
+    assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-9)
+    assert model.dof_armature.tolist() == [0, 0, 0, MIN_INERTIA]
+    data = mujoco.MjData(model)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    assert np.isfinite(data.qpos).all()
+    assert data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
+
+
+def test_a_body_of_one_link_compiles():
+    assert compiled(single("body", collisions=(Shape(Sphere(0.1)),))).nkey == 1
+
+
+def test_frames_are_sites_also_on_the_root():
+    robot = Robot("r", (Link("root"),), frames=(Frame("tool", "root", Pose((1, 2, 3))),))
+    assert compiled(robot).site("tool").pos.tolist() == [1, 2, 3]
+
+
+def test_a_root_named_world_is_the_world():
+    robot = hinged(rod("rod"))
+    joint = replace(robot.joints[0], parent="world")
+    robot = replace(robot, links=(Link("world"), robot.links[1]), joints=(joint,))
+    assert compiled(robot).nbody == 2
+    heavy = Link("world", Inertial(1.0))
+    with pytest.raises(FormatError, match="rename"):
+        text(replace(robot, links=(heavy, robot.links[1])))
+
+
+@pytest.mark.parametrize("limits", [(0.0, 0.0), (1.0, -1.0)])
+def test_limits_without_room_are_refused(limits):
+    with pytest.raises(FormatError, match=r"'hinge'.*fixed"):
+        text(hinged(rod("rod"), Joint("hinge", "revolute", "root", "rod", limits=limits)))
+
+
+def meshed(path, *, collision, scale=(1.0, 1.0, 1.0)):
+    shape = (Shape(Mesh(path, scale)),)
+    shapes = {"collisions": shape} if collision else {"visuals": shape}
+    return single("body", **shapes)
+
+
+def export(mesh, path):
+    mesh.export(path)
+    return path
+
+
+@pytest.fixture
+def flat(tmp_path):
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    return export(square, tmp_path / "flat.stl")
+
+
+@pytest.mark.parametrize("collision", [True, False])
+def test_meshes_without_files_are_in_the_model(tmp_path, collision):
+    path = export(trimesh.creation.box((1, 2, 3)), tmp_path / "cube.stl")
+    model = to_spec(meshed(path, collision=collision, scale=(0.1, 0.1, -0.1))).compile()
+    extents = sorted(np.ptp(model.mesh_vert, axis=0))
+    assert extents == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
+
+
+def test_a_file_is_named_once(tmp_path):
+    path = export(trimesh.creation.box(), tmp_path / "cube.stl")
+    shape = Shape(Mesh(path))
+    robot = single("body", visuals=(shape, shape), collisions=(shape,))
+    written = mjcf_text(robot, lambda mesh: f"meshes/{Path(mesh.path).name}")
+    assert re.findall(r'<mesh [^>]*file="([^"]*)"', written) == ["meshes/cube.stl"]
+    assert written.count('mesh="cube"') == 3
+
+
+def test_meshes_of_one_stem_have_names_of_their_own(tmp_path):
+    shapes = []
+    for k in (1, 2):
+        (tmp_path / str(k)).mkdir()
+        path = export(trimesh.creation.box((k, k, k)), tmp_path / str(k) / "cube.stl")
+        shapes.append(Shape(Mesh(path)))
+    assert to_spec(single("body", visuals=tuple(shapes))).compile().nmesh == 2
+
+
+def test_flat_visual_meshes_compile(flat):
+    assert to_spec(meshed(flat, collision=False)).compile().nmeshface == 2
+    written = mjcf_text(meshed(flat, collision=False), lambda mesh: str(mesh.path))
+    assert mujoco.MjModel.from_xml_string(written).nmeshface == 2
+
+
+def test_flat_collision_meshes_get_a_thickness(flat):
+    robot = meshed(flat, collision=True)
+    written = mujoco.MjModel.from_xml_string(mjcf_text(robot, no_file))
+    for model in (written, to_spec(robot).compile()):
+        assert min(np.ptp(model.mesh_vert, axis=0)) == pytest.approx(FLAT_THICKNESS, rel=1e-3)
+
+
+def test_a_single_triangle_can_be_seen(tmp_path):
+    path = tmp_path / "triangle.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
+    assert to_spec(meshed(path, collision=False)).compile().nmesh == 1
+
+
+@pytest.mark.slow
+def test_a_mesh_of_more_faces_than_an_stl_may_have(tmp_path):
+    sphere = trimesh.creation.icosphere(subdivisions=7)
+    assert len(sphere.faces) > 200_000
+    path = export(sphere, tmp_path / "sphere.stl")
+    assert to_spec(meshed(path, collision=False)).compile().nmeshface == len(sphere.faces)

@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from morphgen.errors import FormatError
+from morphgen.formats.resolve import (
+    PackageFinder,
+    default_finder,
+    distribution_file,
+    resolve_uri,
+)
+
+NOWHERE = PackageFinder()
+
+
+def touch(path: Path, text: str = "") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def failure(uri: str, base: Path, finder: PackageFinder = NOWHERE) -> str:
+    with pytest.raises(FormatError) as caught:
+        resolve_uri(uri, base, finder)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    return touch(tmp_path / "ws" / "arm_description" / "urdf" / "arm.urdf")
+
+
+def test_a_package_is_found_above_the_file_by_its_folders_name(urdf: Path) -> None:
+    mesh = touch(urdf.parent.parent / "meshes" / "a.stl")
+    assert resolve_uri("package://arm_description/meshes/a.stl", urdf, NOWHERE) == mesh
+    assert resolve_uri("package:///arm_description/meshes/a.stl", urdf, NOWHERE) == mesh
+    assert resolve_uri("model://arm_description/meshes/a.stl", urdf, NOWHERE) == mesh
+
+
+def test_a_package_is_found_by_the_name_in_its_package_xml(urdf: Path) -> None:
+    touch(urdf.parent.parent / "package.xml", "<package><name>other_name</name></package>")
+    mesh = touch(urdf.parent.parent / "a.stl")
+    assert resolve_uri("package://other_name/a.stl", urdf, NOWHERE) == mesh
+
+
+def test_a_package_is_found_beside_an_ancestor_of_the_file(urdf: Path) -> None:
+    mesh = touch(urdf.parents[2] / "hand_description" / "a.stl")
+    assert resolve_uri("package://hand_description/a.stl", urdf, NOWHERE) == mesh
+
+
+def test_a_package_is_found_in_a_root_also_two_levels_down(tmp_path: Path, urdf: Path) -> None:
+    finder = PackageFinder((tmp_path / "root",))
+    direct = touch(tmp_path / "root" / "one" / "a.stl")
+    assert resolve_uri("package://one/a.stl", urdf, finder) == direct
+    deep = touch(tmp_path / "root" / "repository" / "src" / "a.stl")
+    touch(deep.parent / "package.xml", "<package format='3'>\n <name> two </name></package>")
+    assert resolve_uri("package://two/a.stl", urdf, finder) == deep
+
+
+def test_a_package_copied_into_a_folder_without_the_ros_suffix_is_found(tmp_path: Path) -> None:
+    urdf = touch(tmp_path / "kuka_kr6" / "urdf" / "kr6.urdf")
+    mesh = touch(tmp_path / "kuka_kr6" / "meshes" / "a.stl")
+    assert resolve_uri("package://kuka_kr6_support/meshes/a.stl", urdf, NOWHERE) == mesh
+
+
+def test_a_folder_given_for_a_package_wins(tmp_path: Path, urdf: Path) -> None:
+    touch(urdf.parent.parent / "a.stl")
+    mine = touch(tmp_path / "mine" / "a.stl")
+    finder = default_finder(packages={"arm_description": tmp_path / "mine"})
+    assert resolve_uri("package://arm_description/a.stl", urdf, finder) == mine
+
+
+def test_a_package_that_is_nowhere_says_where_it_was_looked_for(tmp_path: Path, urdf: Path) -> None:
+    message = failure("package://lost/a.stl", urdf, PackageFinder((tmp_path / "root",)))
+    assert "'lost'" in message
+    assert str(urdf) in message
+    assert str(tmp_path / "root") in message
+
+
+@pytest.mark.parametrize("package", [".ssh", "..", "a b", "%2e%2e"])
+def test_what_is_no_package_name_is_refused(package: str, urdf: Path) -> None:
+    assert "no package name" in failure(f"package://{package}/id", urdf)
+
+
+def test_the_root_of_the_file_system_holds_no_packages(urdf: Path) -> None:
+    assert "not found" in failure("package://etc/hostname", urdf)
+
+
+def test_letter_case_matters_and_the_near_miss_is_named(urdf: Path) -> None:
+    touch(urdf.parent / "Base.STL")
+    message = failure("base.stl", urdf)
+    assert str(urdf.parent / "base.stl") in message
+    assert "'Base.STL'" in message
+
+
+def test_relative_paths_start_at_the_descriptions_folder(
+    urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = touch(urdf.parent / "a.stl")
+    beside = touch(urdf.parent.parent / "meshes" / "b.stl")
+    touch(tmp_path / "elsewhere" / "a.stl")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert resolve_uri("a.stl", urdf, NOWHERE) == here
+    assert resolve_uri("file://a.stl", urdf, NOWHERE) == here
+    assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
+
+
+def test_escapes_and_backslashes_are_understood(urdf: Path) -> None:
+    spaced = touch(urdf.parent / "my mesh.stl")
+    literal = touch(urdf.parent / "100%20.stl")
+    assert resolve_uri("my%20mesh.stl", urdf, NOWHERE) == spaced
+    assert resolve_uri("100%20.stl", urdf, NOWHERE) == literal
+    assert resolve_uri(r"..\urdf\my mesh.stl", urdf, NOWHERE) == spaced
+
+
+@pytest.mark.parametrize("uri", ["../../secret.stl", "%2e%2e/%2e%2e/secret.stl"])
+def test_a_relative_path_may_not_climb_out_of_its_package(uri: str, urdf: Path) -> None:
+    touch(urdf.parents[2] / "secret.stl")
+    assert "leaves" in failure(uri, urdf)
+
+
+def test_a_package_uri_may_not_climb_out_of_the_package(urdf: Path) -> None:
+    touch(urdf.parents[2] / "secret.stl")
+    assert "leaves" in failure("package://arm_description/../secret.stl", urdf)
+
+
+def test_without_a_package_a_path_may_climb_one_folder(tmp_path: Path) -> None:
+    urdf = touch(tmp_path / "robot" / "urdf" / "robot.urdf")
+    mesh = touch(tmp_path / "robot" / "meshes" / "a.stl")
+    touch(tmp_path / "a.stl")
+    assert resolve_uri("../meshes/a.stl", urdf, NOWHERE) == mesh
+    assert "leaves" in failure("../../a.stl", urdf)
+
+
+def test_absolute_paths_reach_the_own_tree_packages_and_roots_only(
+    tmp_path: Path, urdf: Path
+) -> None:
+    own = touch(urdf.parent.parent / "meshes" / "a.stl")
+    packaged = touch(tmp_path / "opt" / "hand_description" / "a.stl")
+    private = touch(tmp_path / "private" / "a.stl")
+    assert resolve_uri(str(own), urdf, NOWHERE) == own
+    assert resolve_uri(own.as_uri(), urdf, NOWHERE) == own
+    assert resolve_uri(packaged.as_uri(), urdf, NOWHERE) == packaged
+    assert "leaves" in failure(private.as_uri(), urdf)
+    assert resolve_uri(str(private), urdf, PackageFinder((private.parent,))) == private
+
+
+@pytest.mark.parametrize("uri", ["", " ", "http://host/a.stl", "package://", "C:/a.stl"])
+def test_what_is_no_reference_to_a_file_is_refused(uri: str, urdf: Path) -> None:
+    assert repr(uri) in failure(uri, urdf)
+
+
+def test_a_folder_is_not_a_file(urdf: Path) -> None:
+    assert "no file" in failure("../urdf", urdf)
+
+
+def test_ros_environment_is_searched_after_given_roots(
+    tmp_path: Path, urdf: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    classic = touch(tmp_path / "classic" / "one" / "a.stl")
+    ament = touch(tmp_path / "prefix" / "share" / "two" / "a.stl")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "classic"))
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "prefix"))
+    assert resolve_uri("package://one/a.stl", urdf, default_finder()) == classic
+    assert resolve_uri("package://two/a.stl", urdf, default_finder()) == ament
+    mine = touch(tmp_path / "mine" / "one" / "a.stl")
+    assert resolve_uri("package://one/a.stl", urdf, default_finder([tmp_path / "mine"])) == mine
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "package://ur_description/meshes/ur5/collision/base.stl",
+        "package://example-robot-data/robots/z1_description/meshes/visual/z1_Link00.dae",
+        "package://z1_description/meshes/visual/z1_Link00.dae",
+    ],
+)
+def test_the_data_packages_are_found_from_anywhere(uri: str, urdf: Path) -> None:
+    assert resolve_uri(uri, urdf, default_finder()).is_file()
+
+
+def test_a_distributions_file_is_found_and_a_missing_one_is_explained() -> None:
+    path = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
+    assert path.is_absolute()
+    assert path.is_file()
+    with pytest.raises(FormatError, match=r"did you mean 'ur5_robot.urdf.xacro'"):
+        distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robott.urdf.xacro")
+
+
+def test_a_missing_distribution_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.path", [])
+    with pytest.raises(FormatError, match=r"pip install rtb-data==1\.1\.0"):
+        distribution_file("rtb-data", "rtbdata/x.urdf")
+
+
+@pytest.mark.parametrize("relative", ["../x", "/etc/hostname", "rtbdata/../../x"])
+def test_a_distributions_file_lies_below_its_install_root(relative: str) -> None:
+    with pytest.raises(FormatError, match="not a path below"):
+        distribution_file("rtb-data", relative)

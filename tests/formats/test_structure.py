@@ -1,0 +1,207 @@
+"""Faults in a URDF's structure are named with their line; what is left converts."""
+
+import io
+
+import pytest
+import yourdfpy
+from lxml import etree
+
+from morphgen.formats.structure import structure_findings
+from morphgen.formats.xml import parse_xml
+from morphgen.model.findings import Finding
+
+SOUND = """<robot name="r">
+<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+<link name="a"/>
+<link name="b">
+<inertial><origin xyz="0 0 0.1"/><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+<visual><origin rpy="0 0 1"/><geometry><box size="1 1 1"/></geometry></visual>
+<visual><geometry><mesh filename="m.stl" scale="-1 1 1"/></geometry></visual>
+<collision><geometry><cylinder radius="1" length="2"/></geometry></collision>
+<collision><geometry><sphere radius="1"/></geometry></collision>
+</link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/>
+<axis xyz="0 0 1"/><limit lower="-1" upper="1e0" effort="1" velocity=".5"/>
+<dynamics damping="0.1"/></joint>
+<link name="c"/>
+<joint name="k" type="continuous"><parent link="b"/><child link="c"/>
+<mimic joint="j" multiplier="-1." offset="+0.1"/></joint>
+</robot>
+"""
+
+# code, what of SOUND is replaced, by what, line of the finding
+FAULTS = [
+    ("root-not-robot", ("robot", "sdf"), 1),
+    ("root-not-robot", ('<robot name="r"', '<robot name="r" xmlns="http://x.org"'), 1),
+    ("link-missing", None, 1),
+    ("attribute-missing", (' name="r"', ""), 1),
+    ("attribute-missing", ('<link name="a"/>', '<link name="a"/><link/>'), 3),
+    ("attribute-missing", (' type="revolute"', ""), 12),
+    ("attribute-missing", ('<mass value="1"/>', "<mass/>"), 5),
+    ("attribute-missing", ('izz="1"', ""), 6),
+    ("attribute-missing", (' size="1 1 1"', ""), 7),
+    ("attribute-missing", (' length="2"', ""), 9),
+    ("attribute-missing", (' filename="m.stl"', ""), 8),
+    ("attribute-missing", ('<parent link="a"/>', "<parent/>"), 12),
+    ("attribute-missing", ('joint="j" ', ""), 17),
+    ("element-missing", ('<parent link="a"/>', ""), 12),
+    ("element-missing", ('<child link="b"/>', ""), 12),
+    ("element-missing", ('<mass value="1"/>', ""), 5),
+    ("element-missing", ('<geometry><box size="1 1 1"/></geometry>', ""), 7),
+    ("geometry-missing", ('<box size="1 1 1"/>', ""), 7),
+    ("geometry-unknown", ('<sphere radius="1"/>', '<capsule radius="1" length="1"/>'), 10),
+    ("geometry-unknown", ("sphere", "ball"), 10),
+    ("number-malformed", ('rpy="0 0 1"', 'rpy="0 0 nan"'), 7),
+    ("number-malformed", ('xyz="0 0 1"', 'xyz="0 0 up"'), 13),
+    ("number-malformed", ('upper="1e0"', 'upper="inf"'), 13),
+    ("number-malformed", ('upper="1e0"', 'upper="1e999"'), 13),
+    ("number-malformed", ('effort="1"', 'effort="1_0"'), 13),
+    ("number-malformed", ('velocity=".5"', 'velocity="0,5"'), 13),
+    ("number-malformed", ('damping="0.1"', 'damping="${d}"'), 14),
+    ("number-malformed", ('multiplier="-1."', 'multiplier="--1"'), 17),
+    ("number-malformed", ('<mass value="1"', '<mass value="1kg"'), 5),
+    ("number-count", ('xyz="0 0 0.1"', 'xyz="0 0.1"'), 5),
+    ("number-count", ('size="1 1 1"', 'size=""'), 7),
+    ("number-count", ('scale="-1 1 1"', 'scale="1 1"'), 8),
+    ("number-count", ('effort="1"', 'effort=""'), 13),
+    ("number-count", ('"0.5 0.5 0.5 1"', '"0.5 0.5 0.5"'), 2),
+    ("number-commas", ('xyz="0 0 0.1"', 'xyz="0,0,0.1"'), 5),
+    ("size-not-positive", ('size="1 1 1"', 'size="1 0 1"'), 7),
+    ("size-not-positive", ('<sphere radius="1"', '<sphere radius="-1"'), 10),
+    ("mesh-scale-invalid", ('scale="-1 1 1"', 'scale="0"'), 8),
+    ("link-duplicate", ('<link name="c"/>', '<link name="c"/><link name="a"/>'), 15),
+    ("joint-duplicate", ('joint name="k"', 'joint name="j"'), 16),
+    ("joint-link-unknown", ('<parent link="a"/>', '<parent link="z"/>'), 12),
+    ("joint-link-unknown", ('<child link="c"/>', '<child link="z"/>'), 16),
+    ("link-two-parents", ('<child link="c"/>', '<child link="b"/>'), 16),
+    ("cycle", ('<parent link="a"/>', '<parent link="c"/>'), 16),
+    ("cycle", ('<parent link="b"/>', '<parent link="c"/>'), 16),
+    ("disconnected", ('<link name="c"/>', '<link name="c"/>\n<link name="d"/>'), 16),
+    ("mimic-unknown", ('mimic joint="j"', 'mimic joint="z"'), 17),
+    ("mimic-cycle", ('mimic joint="j"', 'mimic joint="k"'), 16),
+    ("joint-type-unsupported", ('type="revolute"', 'type="floating"'), 12),
+    ("joint-type-unsupported", ('type="continuous"', 'type="planar"'), 16),
+    ("joint-type-unknown", ('type="revolute"', 'type="hinge"'), 12),
+]
+
+SUSPICIOUS = [
+    ("number-commas", ('size="1 1 1"', 'size="1, 1, 1"')),
+    ("number-commas", ('scale="-1 1 1"', 'scale="1,1,1"')),
+    ("element-repeated", ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><axis xyz="1 0 0"/>')),
+    ("element-repeated", ('<box size="1 1 1"/>', '<box size="1 1 1"/><sphere radius="1"/>')),
+    (
+        "xacro-unexpanded",
+        (
+            '<robot name="r">',
+            '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>',
+        ),
+    ),
+]
+
+
+def findings(text: str) -> tuple[Finding, ...]:
+    return structure_findings(parse_xml(text.encode(), "r.urdf"), "r.urdf")
+
+
+def load(text: str) -> yourdfpy.URDF:
+    data = io.BytesIO(etree.tostring(parse_xml(text.encode(), "r.urdf")))
+    return yourdfpy.URDF.load(data, load_meshes=False)
+
+
+def changed(change: tuple[str, str] | None) -> str:
+    if change is None:
+        return '<robot name="r"/>'
+    assert change[0] in SOUND
+    return SOUND.replace(*change) if change[0] == "robot" else SOUND.replace(*change, 1)
+
+
+def test_a_sound_document_has_no_findings_and_loads():
+    assert findings(SOUND) == ()
+    assert load(SOUND).robot.name == "r"
+
+
+@pytest.mark.parametrize(("code", "change", "line"), FAULTS)
+def test_a_fault_is_found_at_its_line(code, change, line):
+    found = [finding for finding in findings(changed(change)) if finding.code == code]
+    assert found, findings(changed(change))
+    assert found[0].severity == "error"
+    assert found[0].where.startswith(f"r.urdf:{line} ")
+    assert found[0].fix
+    assert "\n" not in found[0].why + found[0].fix
+
+
+@pytest.mark.parametrize(("code", "change"), SUSPICIOUS)
+def test_what_can_still_be_read_is_a_warning_and_loads(code, change):
+    assert [(f.code, f.severity) for f in findings(changed(change))] == [(code, "warning")]
+    load(changed(change))
+
+
+def test_the_owner_is_named():
+    (finding,) = findings(SOUND.replace('<sphere radius="1"/>', '<sphere radius="0"/>'))
+    assert finding.where == "r.urdf:10 link 'b'"
+
+
+def test_a_near_miss_is_suggested():
+    (finding, *_) = findings(SOUND.replace("revolute", "revolut"))
+    assert "did you mean 'revolute'" in finding.fix
+
+
+def test_an_unexpanded_xacro_explains_the_faults_around_it():
+    text = SOUND.replace(
+        '<robot name="r">',
+        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>',
+    ).replace('damping="0.1"', 'damping="${d}"')
+    (finding,) = findings(text)
+    assert (finding.code, finding.severity) == ("xacro-unexpanded", "error")
+
+
+def test_every_cycle_is_named_once():
+    links = "".join(f'<link name="{name}"/>' for name in "abcdef")
+    pairs = [("b", "c"), ("c", "b"), ("d", "e"), ("e", "f"), ("f", "d")]
+    joints = "".join(
+        f'<joint name="{p}{c}" type="fixed"><parent link="{p}"/><child link="{c}"/></joint>'
+        for p, c in pairs
+    )
+    found = findings(f'<robot name="r">{links}{joints}</robot>')
+    cycles = [finding.why for finding in found if finding.code == "cycle"]
+    assert [why.partition(": ")[2] for why in cycles] == ["b -> c -> b", "f -> d -> e -> f"]
+
+
+def test_foreign_elements_are_left_alone():
+    foreign = (
+        '<gazebo reference="b"><origin xyz="x"/><box/></gazebo>'
+        '<transmission name="t"><joint/></transmission>'
+    )
+    assert findings(SOUND.replace('<link name="a"/>', f'<link name="a"/>{foreign}')) == ()
+
+
+def mutations() -> list[str]:
+    """The sound document, each attribute dropped, emptied or spoilt, each element dropped."""
+    texts = []
+    total = len(list(etree.fromstring(SOUND).iter()))
+    for i in range(total):
+        names = list(list(etree.fromstring(SOUND).iter())[i].attrib)
+        for name in names:
+            for value in (None, "", "x", "nan", "1,2,3", "1 2", "-1", "0"):
+                root = etree.fromstring(SOUND)
+                element = list(root.iter())[i]
+                if value is None:
+                    del element.attrib[name]
+                else:
+                    element.set(name, value)
+                texts.append(etree.tostring(root).decode())
+        if i:
+            root = etree.fromstring(SOUND)
+            element = list(root.iter())[i]
+            element.getparent().remove(element)
+            texts.append(etree.tostring(root).decode())
+    return texts
+
+
+def test_whatever_passes_is_parsed_without_a_crash():
+    texts = mutations()
+    passed = [t for t in texts if not any(f.severity == "error" for f in findings(t))]
+    assert 0 < len(passed) < len(texts)
+    for text in passed:
+        load(text)

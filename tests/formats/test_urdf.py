@@ -1,0 +1,136 @@
+"""URDF in and out: the same robot comes back, and faults are named by line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robots import arm
+
+from morphgen.errors import FormatError
+from morphgen.formats.urdf import UnsoundError, read_urdf, with_frames
+from morphgen.formats.urdf_text import number, urdf_text
+from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
+from morphgen.model.kinematics import frame_pose, random_configurations
+from morphgen.model.robot import Joint, Link, Robot
+
+
+def no_mesh(mesh):
+    raise AssertionError(f"no mesh expected: {mesh}")
+
+
+def written(robot: Robot, folder: Path) -> Path:
+    path = folder / "robot.urdf"
+    path.write_text(urdf_text(robot, no_mesh))
+    return path
+
+
+def test_a_robot_survives_the_trip(tmp_path):
+    robot = arm()
+    back = with_frames(read_urdf(written(robot, tmp_path)), ["tool"])
+    assert [link.name for link in back.links] == [link.name for link in robot.links]
+    assert [joint.name for joint in back.joints] == [joint.name for joint in robot.joints]
+    assert back.joints[-1].mimic == robot.joints[-1].mimic
+    assert back.joints[0].limits == robot.joints[0].limits
+    assert back.joints[0].effort == robot.joints[0].effort
+    assert back.mass == pytest.approx(robot.mass, rel=1e-11)
+    q = random_configurations(robot, 50, np.random.default_rng(0))
+    np.testing.assert_allclose(frame_pose(back, q), frame_pose(robot, q), atol=1e-11)
+
+
+def test_text_of_the_text_is_the_text(tmp_path):
+    first = written(arm(), tmp_path)
+    again = urdf_text(with_frames(read_urdf(first), ["tool"]), no_mesh)
+    assert again == first.read_text()
+
+
+def test_links_come_root_first_whatever_their_order(tmp_path):
+    path = tmp_path / "shuffled.urdf"
+    path.write_text(
+        '<robot name="r"><link name="c"/><link name="a"/><link name="b"/>'
+        '<joint name="j2" type="fixed"><parent link="b"/><child link="c"/></joint>'
+        '<joint name="j1" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'
+    )
+    assert [link.name for link in read_urdf(path).links] == ["a", "b", "c"]
+
+
+def test_missing_limits_are_not_read_as_zero(tmp_path):
+    path = tmp_path / "free.urdf"
+    path.write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute">'
+        '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    joint = read_urdf(path).joints[0]
+    assert joint.limits is None
+    assert joint.effort is None
+
+
+def test_home_is_in_the_middle_of_a_range_without_zero(tmp_path):
+    joint = Joint("j", "prismatic", "a", "b", limits=(0.2, 0.8), effort=1.0, velocity=1.0)
+    robot = Robot("r", (Link("a"), Link("b")), (joint,), home=(0.3,))
+    assert read_urdf(written(robot, tmp_path)).home == (0.5,)
+
+
+def test_a_turned_inertial_frame_is_turned_into_link_axes(tmp_path):
+    path = tmp_path / "turned.urdf"
+    path.write_text(
+        '<robot name="r"><link name="a"><inertial><origin rpy="0 0 1.5707963267948966"/>'
+        '<mass value="1"/><inertia ixx="1" iyy="2" izz="3" ixy="0" ixz="0" iyz="0"/></inertial>'
+        "</link></robot>"
+    )
+    inertial = read_urdf(path).root.inertial
+    assert inertial is not None
+    np.testing.assert_allclose(np.diag(inertial.matrix), [2, 1, 3], atol=1e-12)
+
+
+def test_a_capsule_is_written_as_cylinder_and_spheres(tmp_path):
+    T = Pose.from_xyz_rpy((0.1, 0, 0), (1.0, 0, 0))
+    link = Link("a", collisions=(Shape(Capsule(0.05, 0.2), T),))
+    shapes = read_urdf(written(Robot("r", (link,)), tmp_path)).root.collisions
+    assert [type(shape.geometry) for shape in shapes] == [Cylinder, Sphere, Sphere]
+    ends = [np.array(shape.T_link_shape.position) for shape in shapes[1:]]
+    assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(0.2)
+    np.testing.assert_allclose((ends[0] + ends[1]) / 2, T.position, atol=1e-12)
+
+
+def test_links_without_mass_say_so_for_pybullet(tmp_path):
+    text = urdf_text(Robot("r", (Link("a"),)), no_mesh)
+    assert '<mass value="0"/>' in text
+
+
+def test_broken_structure_is_named_by_line(tmp_path):
+    path = tmp_path / "two.urdf"
+    path.write_text('<robot name="r">\n<link name="a"/>\n<link name="a"/>\n</robot>')
+    with pytest.raises(UnsoundError, match=r"two\.urdf:3"):
+        read_urdf(path)
+
+
+def test_a_missing_mesh_is_named(tmp_path):
+    path = tmp_path / "bare.urdf"
+    path.write_text(
+        '<robot name="r"><link name="a"><visual><geometry><mesh filename="gone.stl"/></geometry>'
+        "</visual></link></robot>"
+    )
+    with pytest.raises(UnsoundError, match=r"gone\.stl") as caught:
+        read_urdf(path)
+    assert caught.value.findings[0].code == "mesh-unresolved"
+
+
+def test_a_missing_file_and_arguments_for_no_xacro(tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        read_urdf(tmp_path / "none.urdf")
+    with pytest.raises(FormatError, match="no xacro"):
+        read_urdf(written(arm(), tmp_path), {"a": "1"})
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.1 + 0.2, "0.3"),
+        (-0.0, "0"),
+        (1e-13, "0"),
+        (1.0, "1"),
+        (-1.5707963267948966, "-1.57079632679"),
+    ],
+)
+def test_numbers_have_twelve_digits_and_no_negative_zero(value, text):
+    assert number(value) == text

@@ -1,0 +1,284 @@
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+from xml.dom import minidom
+
+import pytest
+
+from morphgen.errors import FormatError
+from morphgen.formats.resolve import PackageFinder, default_finder, distribution_file
+from morphgen.formats.xacro import evaluate, expand, expand_text
+from morphgen.formats.xml import parse_xml
+
+NOWHERE = PackageFinder()
+HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+
+
+def robot(body: str) -> str:
+    return f"{HEAD}{body}</robot>"
+
+
+def expanded(body: str, origin: Path, **args: str) -> list[dict[str, str]]:
+    """Attributes of the links of a document."""
+    root = parse_xml(expand_text(robot(body), args, origin, NOWHERE), "out")
+    return [dict(link.attrib) for link in root.findall("link")]
+
+
+def failure(body: str, origin: Path, **args: str) -> str:
+    with pytest.raises(FormatError) as caught:
+        expand_text(robot(body), args, origin, NOWHERE)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(origin.parent) in message
+    return message
+
+
+@pytest.fixture
+def origin(tmp_path: Path) -> Path:
+    return tmp_path / "part.xacro"
+
+
+def test_arguments_have_defaults_that_a_caller_can_replace(origin: Path) -> None:
+    body = '<xacro:arg name="n" default="3"/><link name="l$(arg n)"/>'
+    assert expanded(body, origin) == [{"name": "l3"}]
+    assert expanded(body, origin, n="7") == [{"name": "l7"}]
+
+
+def test_macros_properties_conditions_and_python_work(origin: Path) -> None:
+    body = """
+      <xacro:property name="n" value="2"/>
+      <xacro:macro name="chain" params="i">
+        <link name="l${i}" x="${'%.3f' % (pi * i)}"/>
+        <xacro:if value="${i &lt; n}"><xacro:chain i="${i + 1}"/></xacro:if>
+      </xacro:macro>
+      <xacro:chain i="0"/>"""
+    names = [link["name"] for link in expanded(body, origin)]
+    assert names == ["l0", "l1", "l2"]
+
+
+def test_an_argument_declared_nowhere_is_refused_with_the_nearest(origin: Path) -> None:
+    body = '<xacro:arg name="length" default="1"/><link name="l"/>'
+    message = failure(body, origin, lenght="2")
+    assert "'lenght'" in message
+    assert "did you mean 'length'" in message
+
+
+def test_an_argument_declared_in_a_branch_not_taken_is_known(origin: Path) -> None:
+    body = '<xacro:if value="false"><xacro:arg name="a" default="1"/></xacro:if><link name="l"/>'
+    assert expanded(body, origin, a="2") == [{"name": "l"}]
+
+
+def test_an_argument_without_default_must_be_given(origin: Path) -> None:
+    body = '<link name="$(arg prefix)link"/>'
+    assert "'prefix'" in failure(body, origin)
+    assert expanded(body, origin, prefix="left_") == [{"name": "left_link"}]
+
+
+def test_the_callers_arguments_are_not_changed(origin: Path) -> None:
+    args: dict[str, str] = {}
+    expand_text(robot('<xacro:arg name="n" default="3"/>'), args, origin, NOWHERE)
+    assert args == {}
+
+
+def test_nothing_of_one_call_is_left_for_the_next(origin: Path) -> None:
+    expanded('<xacro:property name="p" value="1"/><xacro:arg name="a" default="1"/>', origin)
+    assert "'p'" in failure('<link name="${p}"/>', origin)
+    failure('<link name="${python.update(q=1)}${1/0}"/>', origin)
+    assert "'q'" in failure('<link name="${python.q}"/>', origin)
+
+
+def test_includes_are_relative_to_the_file_that_includes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "top.xacro").write_text(robot('<xacro:include filename="sub/a.xacro"/>'))
+    (tmp_path / "sub" / "a.xacro").write_text(robot('<xacro:include filename="b.xacro"/>'))
+    (tmp_path / "sub" / "b.xacro").write_text(robot('<link name="$(dirname)"/>'))
+    monkeypatch.chdir("/")
+    root = parse_xml(expand(tmp_path / "top.xacro", {}, NOWHERE), "out")
+    assert [link.get("name") for link in root] == [str(tmp_path / "sub")]
+
+
+def test_find_looks_around_the_file_and_in_roots(tmp_path: Path, origin: Path) -> None:
+    (tmp_path / "near_description").mkdir()
+    (tmp_path / "far" / "far_description").mkdir(parents=True)
+    finder = PackageFinder((tmp_path / "far",))
+    text = robot('<link name="$(find near_description)"/><link name="$(find far_description)"/>')
+    root = parse_xml(expand_text(text, {}, origin, finder), "out")
+    assert [link.get("name") for link in root] == [
+        str(tmp_path / "near_description"),
+        str(tmp_path / "far" / "far_description"),
+    ]
+    assert "'lost'" in failure('<link name="$(find lost)"/>', origin)
+
+
+def test_a_missing_include_names_both_files(origin: Path) -> None:
+    message = failure('<xacro:include filename="lost.xacro"/>', origin)
+    assert str(origin) in message
+    assert "lost.xacro" in message
+
+
+def test_an_optional_include_may_be_missing(origin: Path) -> None:
+    body = '<xacro:include filename="lost.xacro" optional="true"/><link name="l"/>'
+    assert expanded(body, origin) == [{"name": "l"}]
+
+
+def test_broken_xml_in_an_include_is_reported_with_its_line(tmp_path: Path, origin: Path) -> None:
+    (tmp_path / "broken.xacro").write_text("<robot>\n\n<link></robot>")
+    message = failure('<xacro:include filename="broken.xacro"/>', origin)
+    assert message.startswith(f"{tmp_path / 'broken.xacro'}:3:")
+
+
+def test_a_doctype_in_an_include_is_refused(tmp_path: Path, origin: Path) -> None:
+    (tmp_path / "bomb.xacro").write_text('<!DOCTYPE r [<!ENTITY a "b">]><r>&a;</r>')
+    assert "DOCTYPE" in failure('<xacro:include filename="bomb.xacro"/>', origin)
+
+
+def test_a_file_that_includes_itself_is_an_error(origin: Path) -> None:
+    body = '<xacro:include filename="part.xacro"/>'
+    origin.write_text(robot(body))
+    assert "without end" in failure(body, origin)
+
+
+def test_a_macro_that_calls_itself_without_end_is_an_error(origin: Path) -> None:
+    body = '<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>'
+    assert "without end" in failure(body, origin)
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ('<link name="${1/0}"/>', "division by zero"),
+        ('<link name="${nope}"/>', "'nope'"),
+        ('<link name="${1 +}"/>', "syntax"),
+        ("<xacro:nope/>", "nope"),
+        ("<xacro:property/>", "name"),
+        ('<xacro:if value="maybe"/>', "maybe"),
+        ('<xacro:macro name="m" params="a"/><xacro:m/>', "a"),
+        ('<xacro:macro name="m" params=" "/><xacro:m/>', "m"),
+        ('<link name="$(env HOME)"/>', "xacro:arg"),
+        ('<link name="$(cwd)"/>', "xacro:arg"),
+        ('<link name="$(nope x)"/>', "valid: arg"),
+        ("<link name=\"${load_yaml('lost.yaml')}\"/>", "lost.yaml"),
+    ],
+)
+def test_faults_are_one_line_that_names_the_file(body: str, reason: str, origin: Path) -> None:
+    assert reason in failure(body, origin)
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "().__class__",
+        "[x.__class__ for x in [()]]",
+        "(lambda: ().__class__.__bases__)()",
+        "__import__('os')",
+        "open('/etc/hostname')",
+        "(i for i in ()).gi_frame",
+    ],
+)
+def test_expressions_do_not_reach_pythons_internals(expression: str, origin: Path) -> None:
+    failure(f'<link name="${{{expression}}}"/>', origin)
+    failure(f'<link name="$(eval {expression.replace(")", "")})"/>', origin)
+
+
+def test_the_environment_plays_no_part(origin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EXTRA", "surprise")
+    assert expanded('<link name="$(optenv EXTRA usual)"/>', origin) == [{"name": "usual"}]
+
+
+def test_yaml_can_be_loaded_with_units(tmp_path: Path, origin: Path) -> None:
+    (tmp_path / "p.yaml").write_text("arm: {reach: !millimeters 500}\n")
+    body = "<link name=\"${xacro.load_yaml('p.yaml').arm.reach}\"/>"
+    assert expanded(body, origin) == [{"name": "0.5"}]
+
+
+def test_warnings_stay_off_the_terminal(origin: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    body = '<xacro:property name="pi" value="3"/><xacro:property name="a" value="1" odd="2"/>'
+    expanded(body, origin)
+    failure(body + "<xacro:nope/>", origin)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_text_and_attributes_survive_with_their_special_characters(origin: Path) -> None:
+    text = robot('<!-- gone --><link name="a&lt;&quot;b\'&amp;é"/><gazebo>1 &lt; 2</gazebo>')
+    root = parse_xml(expand_text(text, {}, origin, NOWHERE), "out")
+    assert root[0].get("name") == "a<\"b'&é"
+    assert root[1].text == "1 < 2"
+
+
+def test_the_packages_changes_to_minidom_reach_nobody(origin: Path) -> None:
+    expanded('<link name="l"/>', origin)
+    text = '<a z="1" b="2"> <c/> </a>'
+    assert minidom.parseString(text).documentElement.toxml() == text  # type: ignore[union-attr]
+
+
+def test_threads_do_not_disturb_one_another(tmp_path: Path) -> None:
+    results: dict[int, list[list[dict[str, str]]]] = {}
+
+    def work(k: int) -> None:
+        body = '<xacro:arg name="n" default="0"/><link name="$(arg n)${sin(0)}"/>'
+        results[k] = [expanded(body, tmp_path / f"{k}.xacro", n=str(k)) for _ in range(30)]
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert results == {k: [[{"name": f"{k}0.0"}]] * 30 for k in range(4)}
+
+
+@pytest.mark.parametrize(
+    ("file", "links"),
+    [
+        ("ur_description/urdf/ur5_robot.urdf.xacro", 11),
+        ("franka_description/robots/panda_arm_hand.urdf.xacro", 12),
+        ("kinova_description/urdf/j2s7s300_standalone.xacro", 17),
+        ("kortex_description/robots/gen3_robotiq_2f_85.xacro", 24),
+        ("interbotix_descriptions/urdf/wx250s.urdf.xacro", 14),
+        ("kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.xacro", 10),
+    ],
+)
+def test_the_data_packages_robots_expand(file: str, links: int) -> None:
+    path = distribution_file("rtb-data", f"rtbdata/xacro/{file}")
+    data = expand(path, {}, default_finder())
+    assert len(parse_xml(data, file).findall("link")) == links
+    assert data == expand(path, {}, default_finder())
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("0.5", 0.5),
+        ("${length / 2}", 0.15),
+        ("${2 * sin(pi / 6) + max(length, 1)}", 2.0),
+        ("-${length}", -0.3),
+        ("${radians(90)}", math.pi / 2),
+        ("${e}", 9.0),
+    ],
+)
+def test_an_expression_is_a_number(expression: str, value: float) -> None:
+    assert evaluate(expression, {"length": 0.3, "e": 9.0}) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("expression", "reason"),
+    [
+        ("${lenght}", "did you mean 'length'"),
+        ("${1 / 0}", "division by zero"),
+        ("${1e400}", "not a finite number"),
+        ("${True}", "not a finite number"),
+        ("long", "not a finite number"),
+        ("", "not a finite number"),
+        ("$(arg length)", "no meaning"),
+        ("${().__class__}", "__class__"),
+    ],
+)
+def test_what_is_no_number_is_refused(expression: str, reason: str) -> None:
+    with pytest.raises(FormatError) as caught:
+        evaluate(expression, {"length": 0.3})
+    assert reason in str(caught.value)
+    assert repr(expression) in str(caught.value)
+    assert "\n" not in str(caught.value)

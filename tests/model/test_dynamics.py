@@ -1,0 +1,100 @@
+"""Joint-space inertia against MuJoCo's, and gains that settle without overshoot."""
+
+import mujoco
+import numpy as np
+import pytest
+from robots import arm
+
+from morphgen.formats.mjcf import to_spec
+from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, actuation, mass_matrix
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import mimic_map, movable_positions
+from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
+
+
+def random_robot(rng):
+    """A tree of hinges, slides, fixed and mimic joints in no particular order."""
+    links = [Link("l0", random_inertial(rng))]
+    joints = []
+    for i in range(1, 9):
+        kind = rng.choice(["revolute", "prismatic", "continuous", "fixed"], p=[0.4, 0.3, 0.1, 0.2])
+        leaders = [j.name for j in joints if j.is_independent]
+        follows = kind != "fixed" and bool(leaders) and rng.random() < 0.3
+        mimic = Mimic(rng.choice(leaders), rng.normal(), rng.normal()) if follows else None
+        T = Pose.from_xyz_rpy(tuple(rng.normal(size=3)), tuple(rng.normal(size=3)))
+        links.append(Link(f"l{i}", random_inertial(rng)))
+        parent = f"l{rng.integers(i)}"
+        axis = tuple(rng.normal(size=3))
+        joints.append(Joint(f"j{i}", str(kind), parent, f"l{i}", T, axis, mimic=mimic))
+    dof = sum(joint.is_independent for joint in joints)
+    return Robot("random", tuple(links), tuple(joints), home=(0.0,) * dof)
+
+
+def random_inertial(rng):
+    points = rng.normal(size=(10, 3))
+    second = points.T @ points
+    inertia = np.trace(second) * np.eye(3) - second
+    x, y, z = rng.normal(size=3)
+    return Inertial.from_matrix(rng.uniform(0.1, 3), (x, y, z), inertia * rng.uniform(1e-4, 1))
+
+
+def mujoco_mass_matrix(robot, q):
+    model = to_spec(robot).compile()
+    data = mujoco.MjData(model)
+    addresses = []
+    for k, value in zip(robot.movable, movable_positions(robot, q), strict=True):
+        joint = model.joint(robot.joints[k].name)
+        data.qpos[joint.qposadr[0]] = value
+        addresses.append(joint.dofadr[0])
+    mujoco.mj_forward(model, data)
+    full = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    full -= np.diag(model.dof_armature)
+    matrix, _ = mimic_map(robot)
+    return matrix.T @ full[np.ix_(addresses, addresses)] @ matrix
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_mass_matrix_is_mujocos(seed):
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng)
+    q = rng.normal(size=robot.dof)
+    expected = mujoco_mass_matrix(robot, q)
+    assert mass_matrix(robot, q) == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
+
+
+def test_mass_matrix_of_a_robot_without_joints_is_empty():
+    assert mass_matrix(Robot("block", (Link("block", Inertial(1.0)),)), ()).shape == (0, 0)
+
+
+def test_gains_are_critically_damped():
+    robot = arm()
+    inertia = np.diag(mass_matrix(robot, robot.home))
+    gains = actuation(robot)
+    assert [gain.joint for gain in gains] == ["shoulder", "elbow", "extend", "left"]
+    for gain, value in zip(gains, inertia, strict=True):
+        assert gain.stiffness == pytest.approx(BANDWIDTH**2 * value)
+        ratio = gain.damping / (2 * np.sqrt(gain.stiffness * value))
+        assert ratio == pytest.approx(1.0)
+
+
+def test_gains_take_a_smallest_inertia():
+    joint = Joint("spin", "revolute", "root", "leaf")
+    (gain,) = actuation(Robot("light", (Link("root"), Link("leaf")), (joint,), home=(0.0,)))
+    assert gain.stiffness == pytest.approx(BANDWIDTH**2 * MIN_INERTIA)
+
+
+def test_a_single_joint_settles_without_overshoot():
+    inertial = Inertial(2.0, (0.0, 0.0, 0.3), (0.02, 0.0, 0.0, 0.02, 0.0, 0.01))
+    joint = Joint("swing", "revolute", "root", "bar", axis=(0, 1, 0), limits=(-2.0, 2.0))
+    robot = Robot("pendulum", (Link("root"), Link("bar", inertial)), (joint,), home=(0.0,))
+    model = to_spec(robot).compile()
+    model.opt.gravity[:] = 0
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 1.0
+    trace = []
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+        trace.append(data.qpos[0])
+    assert max(trace) <= 1.0 + 1e-3
+    assert trace[-1] == pytest.approx(1.0, abs=1e-3)

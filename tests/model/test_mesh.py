@@ -1,0 +1,236 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from morphgen.errors import MeshError
+from morphgen.model.geometry import Mesh
+from morphgen.model.mesh import MeshPart, hull, load_mesh, mesh_parts
+
+DAE = """<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+  <asset><unit meter="{unit}"/><up_axis>{up}</up_axis></asset>
+  <library_effects>
+    <effect id="red-fx"><profile_COMMON><technique sid="c"><lambert>
+      <diffuse><color>1 0 0 1</color></diffuse></lambert></technique></profile_COMMON></effect>
+    <effect id="blue-fx"><profile_COMMON><technique sid="c"><lambert>
+      <diffuse><color>0 0 1 1</color></diffuse></lambert></technique></profile_COMMON></effect>
+  </library_effects>
+  <library_materials>
+    <material id="red"><instance_effect url="#red-fx"/></material>
+    <material id="blue"><instance_effect url="#blue-fx"/></material>
+  </library_materials>
+  <library_geometries><geometry id="g"><mesh>
+    <source id="p"><float_array id="pa" count="12">0 0 0 1 0 0 0 2 0 0 0 3</float_array>
+      <technique_common><accessor source="#pa" count="4" stride="3">
+        <param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+      </accessor></technique_common></source>
+    <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+    <triangles count="1" material="m1"><input semantic="VERTEX" source="#v" offset="0"/>
+      <p>0 2 1</p></triangles>
+    <triangles count="3" material="m2"><input semantic="VERTEX" source="#v" offset="0"/>
+      <p>0 1 3 1 2 3 0 3 2</p></triangles>
+  </mesh></geometry></library_geometries>
+  <library_visual_scenes><visual_scene id="s"><node><translate>{shift}</translate>
+    <instance_geometry url="#g"><bind_material><technique_common>
+      <instance_material symbol="m1" target="#red"/>
+      <instance_material symbol="m2" target="#blue"/>
+    </technique_common></bind_material></instance_geometry></node></visual_scene>
+  </library_visual_scenes>
+  <scene><instance_visual_scene url="#s"/></scene>
+</COLLADA>
+"""
+RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
+
+
+def dae(path: Path, unit: str = "1", up: str = "Z_UP", shift: str = "0 0 0") -> Path:
+    path.write_text(DAE.format(unit=unit, up=up, shift=shift))
+    return path
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Path:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((0.2, 0.4, 0.6)).export(path)
+    return path
+
+
+@pytest.fixture
+def data() -> Path:
+    import importlib.metadata
+
+    return Path(str(importlib.metadata.distribution("rtb-data").locate_file("rtbdata/xacro")))
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ascii.stl", "STL", "obj", "ply", "glb", "dae"])
+def test_a_box_is_the_same_box_in_every_format(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"box.{suffix}"
+    box = trimesh.creation.box((0.2, 0.4, 0.6))
+    path.write_bytes(_exported(box, suffix))
+    mesh = load_mesh(Mesh(path))
+    np.testing.assert_allclose(mesh.extents, (0.2, 0.4, 0.6), atol=1e-7)
+    assert len(mesh.faces) == 12
+    assert len(mesh.vertices) == 8
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(0.048)
+
+
+def _exported(mesh: trimesh.Trimesh, suffix: str) -> bytes:
+    kind = "stl_ascii" if suffix == "ascii.stl" else suffix.lower()
+    data = mesh.export(file_type=kind)
+    return data.encode() if isinstance(data, str) else bytes(data)
+
+
+def test_the_scale_is_applied_and_a_mirror_keeps_the_volume_positive(box: Path) -> None:
+    mesh = load_mesh(Mesh(box, (2.0, 1.0, -1.0)))
+    np.testing.assert_allclose(mesh.extents, (0.4, 0.4, 0.6), atol=1e-7)
+    assert mesh.volume == pytest.approx(0.096)
+
+
+def test_a_mesh_is_read_once_until_its_file_changes(box: Path) -> None:
+    first = load_mesh(Mesh(box))
+    assert load_mesh(Mesh(box)) is first
+    trimesh.creation.box((1, 1, 1)).export(box)
+    os.utime(box, ns=(1, 1))
+    np.testing.assert_allclose(load_mesh(Mesh(box)).extents, (1, 1, 1))
+
+
+def test_relative_paths_follow_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, size in (("a", 1.0), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        trimesh.creation.box((size,) * 3).export(tmp_path / name / "m.stl")
+        os.utime(tmp_path / name / "m.stl", ns=(1, 1))
+        monkeypatch.chdir(tmp_path / name)
+        assert load_mesh(Mesh(Path("m.stl"))).extents[0] == pytest.approx(size)
+
+
+def test_collada_units_are_applied_once(tmp_path: Path) -> None:
+    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", unit="0.001")))
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [0.001, 0.002, 0.003]], atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
+def test_colladas_up_axis_turns_nothing(up: str, tmp_path: Path) -> None:
+    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", up=up)))
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [1, 2, 3]])
+
+
+def test_the_scene_graph_is_applied_in_the_files_units(tmp_path: Path) -> None:
+    mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", unit="0.1", shift="10 0 0")))
+    np.testing.assert_allclose(mesh.bounds, [[1, 0, 0], [1.1, 0.2, 0.3]], atol=1e-12)
+
+
+def test_a_file_splits_into_one_part_a_colour(tmp_path: Path) -> None:
+    path = dae(tmp_path / "m.dae")
+    assert mesh_parts(path) == (MeshPart(RED, 1), MeshPart(BLUE, 3))
+    red, blue, whole = (load_mesh(Mesh(path, part=part)) for part in (0, 1, None))
+    assert (len(red.faces), len(blue.faces), len(whole.faces)) == (1, 3, 4)
+    assert whole.is_watertight
+    assert red.area + blue.area == pytest.approx(whole.area)
+
+
+def test_obj_materials_are_parts_and_a_file_without_colour_has_none(
+    tmp_path: Path, box: Path
+) -> None:
+    (tmp_path / "m.mtl").write_text("newmtl r\nKd 1 0 0\nnewmtl b\nKd 0 0 1\nnewmtl r2\nKd 1 0 0\n")
+    (tmp_path / "m.obj").write_text(
+        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+        "usemtl r\nf 1 3 2\nusemtl b\nf 1 2 4\nf 2 3 4\nusemtl r2\nf 1 4 3\n"
+    )
+    parts = mesh_parts(tmp_path / "m.obj")
+    assert {part.rgba: part.faces for part in parts} == {RED: 2, BLUE: 2}
+    assert mesh_parts(box) == (MeshPart(None, 12),)
+
+
+def test_a_part_that_is_not_there_is_refused(box: Path) -> None:
+    with pytest.raises(MeshError, match="no part 1; valid: 0 to 0"):
+        load_mesh(Mesh(box, part=1))
+
+
+def test_triangles_without_area_are_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "m.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\nf 1 1 2\n")
+    assert load_mesh(Mesh(path)).faces.shape == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("empty.stl", b"", "empty.stl"),
+        ("none.stl", b"solid x\nendsolid x\n", "none.stl"),
+        ("junk.stl", b"\x00\xff" * 300, "no triangle"),
+        ("junk.dae", b"<COLLADA", "not a readable dae"),
+        ("junk.glb", b"glTF\x02\x00", "not a readable glb"),
+        ("junk.ply", b"ply\n", "ply"),
+        ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle"),
+        ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "not finite"),
+        ("inf.obj", b"v 1e999 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "not finite"),
+        ("a.step", b"x", "valid: .dae"),
+    ],
+)
+def test_what_is_no_mesh_is_refused_by_name(
+    name: str, content: bytes, reason: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    for read in (lambda: load_mesh(Mesh(path)), lambda: mesh_parts(path)):
+        with pytest.raises(MeshError) as caught:
+            read()
+        assert str(path) in str(caught.value)
+        assert reason in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"lost\.stl: no such file"):
+        load_mesh(Mesh(tmp_path / "lost.stl"))
+
+
+@pytest.mark.parametrize("scale", [(0.0, 1.0, 1.0), (np.nan, 1.0, 1.0), (np.inf, 1.0, 1.0)])
+def test_a_scale_that_destroys_the_mesh_is_refused(
+    scale: tuple[float, float, float], box: Path
+) -> None:
+    with pytest.raises(MeshError, match="scale"):
+        load_mesh(Mesh(box, scale))
+
+
+def test_a_hull_encloses_its_mesh_and_is_computed_once(tmp_path: Path) -> None:
+    path = tmp_path / "ring.stl"
+    trimesh.creation.annulus(0.1, 0.2, 0.3).export(path)
+    shape = hull(Mesh(path))
+    assert hull(Mesh(path)) is shape
+    assert shape.is_convex
+    assert shape.is_watertight
+    np.testing.assert_allclose(shape.bounds, load_mesh(Mesh(path)).bounds)
+    assert shape.volume > load_mesh(Mesh(path)).volume
+
+
+def test_a_flat_mesh_has_no_hull(tmp_path: Path) -> None:
+    path = tmp_path / "flat.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
+    with pytest.raises(MeshError, match="flat"):
+        hull(Mesh(path))
+
+
+@pytest.mark.parametrize("part", ["arm_mico", "hand_2finger", "wrist_spherical_2"])
+def test_kinovas_y_up_visuals_are_where_their_stls_are(part: str, data: Path) -> None:
+    meshes = data / "kinova_description" / "meshes"
+    assert "Y_UP" in (meshes / f"{part}.dae").read_text()
+    np.testing.assert_allclose(
+        load_mesh(Mesh(meshes / f"{part}.dae")).bounds,
+        load_mesh(Mesh(meshes / f"{part}.STL")).bounds,
+        atol=1e-3,
+    )
+
+
+def test_the_kr210_visual_in_inches_has_the_size_of_its_collision(data: Path) -> None:
+    meshes = data / "kuka_description" / "kuka_kr210" / "meshes" / "kr210l150"
+    visual = load_mesh(Mesh(meshes / "visual" / "link_2.dae"))
+    collision = load_mesh(Mesh(meshes / "collision" / "link_2.stl"))
+    np.testing.assert_allclose(sorted(visual.extents), sorted(collision.extents), atol=1e-3)
