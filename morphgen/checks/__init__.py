@@ -1,0 +1,81 @@
+"""Findings about a robot, each with a code, a severity and the fix; and the safe repairs.
+
+``error`` means that a simulator refuses the robot or simulates something else than it says,
+``warning`` that something is suspicious, ``info`` names a trap that a bundle already avoids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from morphgen.checks.frames import check_tool
+from morphgen.checks.home import check_self_collision
+from morphgen.checks.inertia import check_inertia, check_masses
+from morphgen.checks.joints import check_axes, check_drive, check_home, check_limits
+from morphgen.checks.loaders import (
+    check_capsules,
+    check_mesh_scales,
+    check_mimic_loaders,
+    check_root,
+)
+from morphgen.checks.mimic import check_mimic, check_mimic_range
+from morphgen.checks.names import check_frame_names, check_names, check_reserved
+from morphgen.checks.repairs import repaired
+from morphgen.checks.shapes import check_shapes, check_units
+from morphgen.model.findings import Finding
+from morphgen.model.robot import Robot
+
+Check = Callable[[Robot], Iterator[Finding]]
+
+CHECKS: tuple[Check, ...] = (
+    check_masses,
+    check_inertia,
+    check_axes,
+    check_limits,
+    check_drive,
+    check_home,
+    check_mimic,
+    check_mimic_range,
+    check_shapes,
+    check_units,
+    check_names,
+    check_reserved,
+    check_frame_names,
+    check_self_collision,
+    check_mimic_loaders,
+    check_capsules,
+    check_mesh_scales,
+    check_root,
+)
+
+_RANK = {"error": 0, "warning": 1, "info": 2}
+
+__all__ = ["CHECKS", "Check", "check", "fix"]
+
+
+def check(robot: Robot, *, tool_required: bool = True) -> tuple[Finding, ...]:
+    """Run every check.
+
+    Args:
+        robot: The body.
+        tool_required: Whether a missing or motionless tool is a finding; not so for a part.
+
+    Returns:
+        Findings by severity, code and place; the same robot gives the same ones.
+    """
+    checks = (*CHECKS, check_tool) if tool_required else CHECKS
+    findings = {finding for run in checks for finding in run(robot)}
+    return tuple(sorted(findings, key=lambda f: (_RANK[f.severity], f.code, f.where, f.why)))
+
+
+def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
+    """Repair what can be repaired safely.
+
+    Args:
+        robot: The body.
+
+    Returns:
+        The repaired body and the findings that are gone.
+    """
+    gone = tuple(f for f in check(robot, tool_required=False) if f.fixable)
+    return (repaired(robot) if gone else robot), gone

@@ -1,0 +1,140 @@
+"""Conformance: do all loaders read a bundle as the same robot?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.checks.readers import LOADERS, Loader, Reading
+from morphgen.errors import FormatError
+from morphgen.formats.bundle import read_bundle
+from morphgen.formats.mujoco_urdf import BOUND_MASS
+from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
+from morphgen.model.robot import Frame, Robot
+
+Array = NDArray[np.float64]
+
+POSITION_TOLERANCE = 1e-5
+"""Largest distance of a loader's tool from ours, metres."""
+ROTATION_TOLERANCE = 1e-5
+"""Largest angle of a loader's tool to ours, rad."""
+MASS_TOLERANCE = 1e-6
+"""Largest difference of a loader's total mass from ours, relative to ours.
+
+MuJoCo may add ``BOUND_MASS`` a link.
+"""
+
+
+@dataclass(frozen=True)
+class ConformanceRow:
+    """What one loader makes of a bundle."""
+
+    loader: str
+    passed: bool | None
+    """Whether it agrees; None if the loader is not installed."""
+    joints: bool | None = None
+    """Whether it has the same movable joints, by name."""
+    mass: float | None = None
+    """Total mass, kg."""
+    position_error: float | None = None
+    """Largest distance of the frame from ours over the configurations, metres."""
+    rotation_error: float | None = None
+    """Largest angle of the frame to ours over the configurations, rad."""
+    message: str = ""
+    """What is wrong, or that the loader is not installed."""
+
+
+@dataclass(frozen=True)
+class ConformanceReport:
+    """What every loader makes of a bundle."""
+
+    robot: str
+    frame: str
+    """The frame or link whose pose was compared."""
+    samples: int
+    seed: int
+    passed: bool
+    """Whether every installed loader agrees."""
+    rows: tuple[ConformanceRow, ...]
+
+
+def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
+    """Load a bundle in every loader and compare joints, total mass and tool pose.
+
+    The loaders are yourdfpy, PyBullet, MuJoCo (the URDF), MuJoCo (the MJCF) and Pinocchio; ours is
+    ``morphgen.model.kinematics``. Mimic joints are set like any other, except in yourdfpy, which
+    moves them itself. A robot without a frame ``tool`` is compared at its last link.
+
+    Args:
+        bundle_dir: The bundle.
+        samples: Random configurations within the joint limits.
+        seed: Their seed.
+
+    Raises:
+        FormatError: If ``bundle_dir`` is no bundle.
+    """
+    return compare(read_bundle(bundle_dir), bundle_dir, samples, seed)
+
+
+def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
+    """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``."""
+    frame = next((frame for frame in robot.frames if frame.name == "tool"), None)
+    if frame is None:
+        frame = Frame(robot.links[-1].name, robot.links[-1].name)
+        robot = replace(robot, frames=(frame,))
+    q = random_configurations(robot, samples, np.random.default_rng(seed))
+    rows = tuple(_row(robot, folder, loader, frame.name, q) for loader in LOADERS)
+    passed = all(row.passed is not False for row in rows)
+    return ConformanceReport(robot.name, frame.name, samples, seed, passed, rows)
+
+
+def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> ConformanceRow:
+    if find_spec(loader.module) is None:
+        return ConformanceRow(loader.name, None, message="not installed")
+    names = [robot.joints[k].name for k in robot.movable]
+    positions = dict(zip(names, movable_positions(robot, q).T, strict=True))
+    try:
+        reading = loader.read(folder, frame, positions, len(q))
+    except FormatError as error:
+        return ConformanceRow(loader.name, False, message=str(error))
+    return _judged(robot, loader.name, frame, q, reading)
+
+
+def _judged(robot: Robot, loader: str, frame: str, q: Array, reading: Reading) -> ConformanceRow:
+    expected = frame_pose(robot, q, frame)
+    offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
+    position_error = float(np.linalg.norm(offset, axis=1).max(initial=0.0))
+    rotation_error = _angle(reading.T_root_frame[:, :3, :3], expected[:, :3, :3])
+    ours = {robot.joints[k].name for k in robot.movable}
+    theirs = set(reading.joints)
+    faults = []
+    if missing := sorted(ours - theirs):
+        faults.append(f"lacks joints {', '.join(missing)}")
+    if surplus := sorted(theirs - ours):
+        faults.append(f"has joints {', '.join(surplus)} that we have not")
+    slack = MASS_TOLERANCE * robot.mass + BOUND_MASS * (len(robot.links) + len(robot.frames))
+    if abs(reading.mass - robot.mass) > slack:
+        faults.append(f"weighs {reading.mass:.9g} kg, not {robot.mass:.9g} kg")
+    if position_error > POSITION_TOLERANCE:
+        faults.append(f"{frame} is {position_error:.3g} m off")
+    if rotation_error > ROTATION_TOLERANCE:
+        faults.append(f"{frame} is {rotation_error:.3g} rad off")
+    return ConformanceRow(
+        loader,
+        passed=not faults,
+        joints=ours == theirs,
+        mass=reading.mass,
+        position_error=position_error,
+        rotation_error=rotation_error,
+        message="; ".join(faults),
+    )
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Largest angle between rotations of two stacks (n, 3, 3), rad, exact for small angles."""
+    chord = np.linalg.norm(a - b, axis=(1, 2)) / np.sqrt(8.0)
+    return float(2 * np.arcsin(np.clip(chord, 0.0, 1.0)).max(initial=0.0))

@@ -1,0 +1,195 @@
+"""Mass properties: missing, impossible, or far from what the geometry suggests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from morphgen.checks.rigid import RigidGroup, rigid_groups
+from morphgen.checks.solids import body_shapes, solid_of
+from morphgen.model.findings import Finding
+from morphgen.model.inertia import bounding_box
+from morphgen.model.robot import Inertial, Link, Robot
+
+DEFAULT_DENSITY = 1000.0
+"""Density of a link whose source gives no mass, kg/m^3."""
+GYRATION_FACTOR = 5.0
+"""Radii of gyration may differ from those of the solid geometry by this factor."""
+COM_MARGIN = 0.5
+"""How far the centre of mass may lie outside the bounding box, as a fraction of half its size."""
+DENSITY_RANGE = (20.0, 25_000.0)
+"""Plausible mean densities, kg/m^3: from foam to tungsten."""
+TRIANGLE_MARGIN = 1e-12
+"""Relative margin of the triangle inequality; MuJoCo refuses what rounding pushes over it."""
+
+
+def check_masses(robot: Robot) -> Iterator[Finding]:
+    """Find moving bodies without mass, and links whose mass is impossible."""
+    for group in rigid_groups(robot):
+        if not group.is_root:
+            yield from _group_findings(group)
+    for link in robot.links:
+        if link.inertial is not None and not is_mass_valid(link.inertial):
+            yield Finding(
+                "mass-invalid",
+                "error",
+                f"link {link.name}",
+                f"mass {link.inertial.mass:g} kg with its centre at {link.inertial.com}",
+                f"write a finite mass of at least 0; the repair takes the solid geometry's at "
+                f"{DEFAULT_DENSITY:g} kg/m^3",
+                fixable=solid_of(link) is not None,
+            )
+        if is_inertia_without_mass(link):
+            yield Finding(
+                "inertia-without-mass",
+                "warning",
+                f"link {link.name}",
+                "it has a rotational inertia but no mass",
+                "give it a mass, or set its inertia to zero as the repair does",
+                fixable=True,
+            )
+
+
+def check_inertia(robot: Robot) -> Iterator[Finding]:
+    """Compare the mass properties of every link with physics and with its geometry."""
+    for link in robot.links:
+        body = link.inertial
+        if body is None or not is_mass_valid(body) or body.mass == 0:
+            continue
+        solid = solid_of(link)
+        fault = inertia_fault(body)
+        if fault is not None:
+            yield Finding(
+                "inertia-not-physical",
+                "error",
+                f"link {link.name}",
+                f"{fault}; MuJoCo refuses it, PyBullet takes zero",
+                "correct the inertia; the repair takes the solid geometry's at the same mass",
+                fixable=solid is not None,
+            )
+        if solid is not None:
+            if fault is None:
+                yield from _gyration_findings(link, body, solid)
+            yield from _placement_findings(link, body, solid)
+
+
+def is_mass_valid(body: Inertial) -> bool:
+    """Whether mass and centre of mass are finite, and the mass not negative."""
+    return math.isfinite(body.mass) and body.mass >= 0 and all(math.isfinite(x) for x in body.com)
+
+
+def is_inertia_without_mass(link: Link) -> bool:
+    """Whether a bare frame turns heavily: inertia without mass."""
+    return link.is_empty and link.inertial is not None and any(link.inertial.inertia)
+
+
+def lacks_mass(link: Link) -> bool:
+    """Whether a link has geometry but no mass."""
+    return not link.is_empty and (link.inertial is None or link.inertial.mass == 0)
+
+
+def inertia_fault(body: Inertial) -> str | None:
+    """Why no rigid body of positive mass has this inertia; None if one can.
+
+    The principal moments must be positive, and none as large as the sum of the others: that is
+    reached only by a body without any thickness.
+    """
+    if not np.isfinite(body.matrix).all():
+        return f"inertia {body.inertia} is not finite"
+    low, middle, high = np.linalg.eigvalsh(body.matrix).tolist()
+    moments = f"principal moments {low:.4g}, {middle:.4g}, {high:.4g} kg m^2"
+    if low <= 0:
+        return f"{moments} are not all positive"
+    if low + middle <= high * (1 + TRIANGLE_MARGIN):
+        return f"{moments}: the largest is no less than the sum of the others"
+    return None
+
+
+def _group_findings(group: RigidGroup) -> Iterator[Finding]:
+    missing = [link for link in group.links if lacks_mass(link)]
+    for link in missing:
+        if group.mass > 0:
+            why = "it has geometry but no mass (PyBullet takes 1 kg where <inertial> is missing)"
+        else:
+            why = (
+                "it moves, has geometry and no mass: MuJoCo refuses that, PyBullet takes 1 kg "
+                "where <inertial> is missing and cannot move it where the mass is zero"
+            )
+        yield Finding(
+            "inertia-missing",
+            "warning" if group.mass > 0 else "error",
+            f"link {link.name}",
+            why,
+            f"give it mass and inertia; the repair takes those of its solid geometry at "
+            f"{DEFAULT_DENSITY:g} kg/m^3",
+            fixable=solid_of(link) is not None,
+        )
+    if group.mass > 0 or any(not link.is_empty for link in group.links):
+        return
+    where = f"link {group.links[0].name}"
+    if group.mass_beyond > 0:
+        why = "it moves and has no mass: MuJoCo refuses that without boundmass, which a bundle sets"
+        yield Finding("massless-between", "info", where, why, "give it a small mass")
+    else:
+        why = "it moves, and neither it nor anything beyond it has mass: simulators cannot move it"
+        yield Finding(
+            "massless-body",
+            "error",
+            where,
+            why,
+            "give it geometry and mass, or make its joint fixed",
+        )
+
+
+def _gyration_findings(link: Link, body: Inertial, solid: Inertial) -> Iterator[Finding]:
+    radii, expected = gyration_radii(body), gyration_radii(solid)
+    ratio = radii / expected
+    if ratio.max() <= GYRATION_FACTOR and ratio.min() >= 1 / GYRATION_FACTOR:
+        return
+    yield Finding(
+        "inertia-implausible",
+        "warning",
+        f"link {link.name}",
+        f"radii of gyration {_millimetres(radii)} mm; its solid geometry has "
+        f"{_millimetres(expected)} mm",
+        "compute the inertia from the geometry, or check its unit",
+    )
+
+
+def _placement_findings(link: Link, body: Inertial, solid: Inertial) -> Iterator[Finding]:
+    low, high = bounding_box(body_shapes(link))
+    margin = COM_MARGIN * (high - low) / 2
+    if np.any(body.com < low - margin) or np.any(body.com > high + margin):
+        x, y, z = body.com
+        yield Finding(
+            "com-outside",
+            "warning",
+            f"link {link.name}",
+            f"its centre of mass ({x:.4g}, {y:.4g}, {z:.4g}) m lies outside its geometry "
+            f"({_corner(low)} to {_corner(high)} m)",
+            "check the origin of <inertial>",
+        )
+    density = body.mass / solid.mass
+    if not DENSITY_RANGE[0] <= density <= DENSITY_RANGE[1]:
+        yield Finding(
+            "density-implausible",
+            "warning",
+            f"link {link.name}",
+            f"{body.mass:.4g} kg in {solid.mass * 1e6:.4g} cm^3 are {density:.4g} kg/m^3",
+            f"check mass and geometry; {DENSITY_RANGE[0]:g} to {DENSITY_RANGE[1]:g} is plausible",
+        )
+
+
+def gyration_radii(body: Inertial) -> np.ndarray:
+    """Principal radii of gyration about the centre of mass, ascending, shape (3,), metres."""
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(body.matrix) / body.mass))
+
+
+def _millimetres(values: np.ndarray) -> str:
+    return ", ".join(f"{1000 * value:.3g}" for value in values.tolist())
+
+
+def _corner(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in point.tolist()) + ")"

@@ -1,0 +1,186 @@
+"""Joints: axes, limits, effort, velocity and the home position."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from morphgen.model.findings import Finding
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Joint, Robot
+
+AXIS_TOLERANCE = 1e-3
+"""How far an axis may be from unit length, as rounding in a file makes it."""
+REVOLUTE_SPAN = 4 * 2 * math.pi
+"""Widest plausible range of a revolute joint, rad; more is likely to be degrees."""
+PRISMATIC_SPAN = 10.0
+"""Widest plausible range of a prismatic joint, m; more is likely to be millimetres."""
+
+
+def check_axes(robot: Robot) -> Iterator[Finding]:
+    """Find axes that are zero or not of unit length."""
+    for joint in _movable(robot):
+        length = math.hypot(*joint.axis)
+        if not is_axis_valid(joint):
+            yield Finding(
+                "axis-invalid",
+                "error",
+                f"joint {joint.name}",
+                f"its axis {joint.axis} has no direction",
+                "write a unit vector",
+            )
+        elif not is_axis_unit(joint):
+            prismatic = joint.kind == "prismatic"
+            yield Finding(
+                "axis-not-unit",
+                "error" if prismatic else "warning",
+                f"joint {joint.name}",
+                f"its axis {joint.axis} is {length:.4g} long"
+                + ("; PyBullet moves it that many times as far" if prismatic else ""),
+                "scale the axis to unit length, as the repair does",
+                fixable=True,
+            )
+
+
+def check_limits(robot: Robot) -> Iterator[Finding]:
+    """Find limits that are missing, contradictory or implausible."""
+    for joint in _movable(robot):
+        where = f"joint {joint.name}"
+        if joint.kind == "continuous":
+            if joint.limits is not None:
+                yield Finding(
+                    "limits-on-continuous",
+                    "warning",
+                    where,
+                    f"it is continuous but has limits {joint.limits}, which PyBullet reports "
+                    "and MuJoCo drops",
+                    "make it revolute if the limits are real; the repair drops them",
+                    fixable=True,
+                )
+            continue
+        if joint.limits is None or not all(map(math.isfinite, joint.limits)):
+            yield Finding(
+                "limits-missing",
+                "error",
+                where,
+                f"it is {joint.kind} with limits {joint.limits}: PyBullet refuses the file, "
+                "MuJoCo lets it move without end",
+                "write limits" + (", or make it continuous" if joint.kind == "revolute" else ""),
+            )
+            continue
+        lower, upper = sorted(joint.limits)
+        span, unit = upper - lower, "m" if joint.kind == "prismatic" else "rad"
+        widest = PRISMATIC_SPAN if joint.kind == "prismatic" else REVOLUTE_SPAN
+        if has_inverted_limits(joint):
+            yield Finding(
+                "limits-inverted",
+                "error",
+                where,
+                f"lower {upper:g} is above upper {lower:g}: MuJoCo drops or refuses such limits",
+                "swap the limits, as the repair does",
+                fixable=True,
+            )
+        if span == 0:
+            yield Finding(
+                "limits-empty",
+                "error",
+                where,
+                f"both limits are {lower:g}: MuJoCo drops or refuses that, PyBullet locks it",
+                "write the real limits, or make the joint fixed",
+            )
+        if span > widest:
+            yield Finding(
+                "limits-wide",
+                "warning",
+                where,
+                f"its limits span {span:g} {unit}, more than {widest:.4g} {unit}",
+                f"check the unit of the limits ({unit})",
+            )
+
+
+def check_drive(robot: Robot) -> Iterator[Finding]:
+    """Find joints without usable effort or velocity, and negative damping or friction."""
+    for joint in _movable(robot):
+        where = f"joint {joint.name}"
+        linear = joint.kind == "prismatic"
+        if joint.is_independent and not is_positive(joint.effort):
+            yield Finding(
+                "effort-missing",
+                "warning",
+                where,
+                f"its effort is {joint.effort}: PyBullet has no force to move it, MuJoCo no limit",
+                f"write its largest effort; the repair takes {DEFAULT_EFFORT:g} "
+                + ("N" if linear else "N m"),
+                fixable=True,
+            )
+        if joint.is_independent and not is_positive(joint.velocity):
+            yield Finding(
+                "velocity-missing",
+                "warning",
+                where,
+                f"its velocity is {joint.velocity}",
+                f"write its largest velocity; the repair takes {DEFAULT_VELOCITY:g} "
+                + ("m/s" if linear else "rad/s"),
+                fixable=True,
+            )
+        for name, value in (("damping", joint.damping), ("friction", joint.friction)):
+            if not value >= 0 or math.isinf(value):
+                yield Finding(
+                    f"{name}-invalid",
+                    "warning",
+                    where,
+                    f"its {name} is {value}",
+                    "write a finite number of at least 0",
+                )
+
+
+def check_home(robot: Robot) -> Iterator[Finding]:
+    """Find home positions outside the limits."""
+    for k, position in zip(robot.independent, robot.home, strict=True):
+        joint = robot.joints[k]
+        lower, upper = reachable(joint)
+        if not (math.isfinite(position) and lower <= position <= upper):
+            yield Finding(
+                "home-outside-limits",
+                "error",
+                f"joint {joint.name}",
+                f"home is {position:g}, its limits are {lower:g} to {upper:g}",
+                "move home between the limits, as the repair does",
+                fixable=True,
+            )
+
+
+def is_axis_valid(joint: Joint) -> bool:
+    """Whether the axis has a direction."""
+    length = math.hypot(*joint.axis)
+    return math.isfinite(length) and length >= 1e-9
+
+
+def is_axis_unit(joint: Joint) -> bool:
+    """Whether the axis is of unit length, up to rounding in a file."""
+    return abs(math.hypot(*joint.axis) - 1) <= AXIS_TOLERANCE
+
+
+def has_inverted_limits(joint: Joint) -> bool:
+    """Whether the lower limit is above the upper one."""
+    return (
+        joint.kind in ("revolute", "prismatic")
+        and joint.limits is not None
+        and all(map(math.isfinite, joint.limits))
+        and joint.limits[0] > joint.limits[1]
+    )
+
+
+def reachable(joint: Joint) -> tuple[float, float]:
+    """Lowest and highest position that the limits allow, in whatever order they are written."""
+    if joint.limits is None or joint.kind == "continuous" or any(map(math.isnan, joint.limits)):
+        return (-math.inf, math.inf)
+    return (min(joint.limits), max(joint.limits))
+
+
+def is_positive(value: float | None) -> bool:
+    """Whether a value is given, finite and above zero."""
+    return value is not None and math.isfinite(value) and value > 0
+
+
+def _movable(robot: Robot) -> Iterator[Joint]:
+    return (robot.joints[k] for k in robot.movable)

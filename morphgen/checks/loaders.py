@@ -1,0 +1,75 @@
+"""Traps of single loaders that a bundle already avoids: worth knowing, no fault."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from morphgen.checks.rigid import rigid_groups
+from morphgen.checks.solids import is_scale_valid
+from morphgen.model.findings import Finding
+from morphgen.model.geometry import Capsule, Mesh
+from morphgen.model.robot import Robot
+
+
+def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:
+    """Tell which joints a URDF loader may leave without their leader."""
+    followers = [robot.joints[k].name for k in robot.movable if robot.joints[k].mimic is not None]
+    if followers:
+        yield Finding(
+            "mimic-ignored-by-loaders",
+            "info",
+            f"robot {robot.name}",
+            f"PyBullet, older MuJoCo and (unless asked) Pinocchio ignore <mimic> of "
+            f"{', '.join(followers)}",
+            "load robot.xml, where it is an equality, or drive the followers yourself",
+        )
+
+
+def check_capsules(robot: Robot) -> Iterator[Finding]:
+    """Tell which links have capsules."""
+    for link in robot.links:
+        shapes = (*link.visuals, *link.collisions)
+        if any(isinstance(shape.geometry, Capsule) for shape in shapes):
+            yield Finding(
+                "capsule-in-urdf",
+                "info",
+                f"link {link.name}",
+                "URDF has no capsule: robot.urdf holds a cylinder and two spheres instead",
+                "load robot.xml, which has the capsule itself",
+            )
+
+
+def check_mesh_scales(robot: Robot) -> Iterator[Finding]:
+    """Tell which meshes are mirrored or stretched by their scale."""
+    for link in robot.links:
+        shapes = (*link.visuals, *link.collisions)
+        meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
+        for mesh in dict.fromkeys(meshes):
+            if not is_scale_valid(mesh):
+                continue
+            if mesh.scale[0] * mesh.scale[1] * mesh.scale[2] < 0:
+                code, why = "mesh-mirrored", "mirrors it; some loaders turn it inside out"
+            elif min(mesh.scale) < max(mesh.scale):
+                code, why = "mesh-stretched", "stretches it; some loaders use one factor only"
+            else:
+                continue
+            yield Finding(
+                code,
+                "info",
+                f"link {link.name}",
+                f"{mesh.path.name}: scale {mesh.scale} {why}",
+                "nothing to do in a bundle, whose meshes have the scale applied",
+            )
+
+
+def check_root(robot: Robot) -> Iterator[Finding]:
+    """Tell whether the root has geometry but weighs nothing."""
+    base = rigid_groups(robot)[0]
+    if base.mass == 0 and any(not link.is_empty for link in base.links):
+        yield Finding(
+            "massless-root",
+            "info",
+            f"link {robot.root.name}",
+            "the base has geometry but no mass: PyBullet never lets a massless base move",
+            "give it a mass if the base should ever move freely",
+        )

@@ -1,0 +1,170 @@
+"""Other libraries' readings of a bundle: joints, mass, and where they put a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.errors import FormatError
+from morphgen.formats.picture import quiet
+from morphgen.model.geometry import Pose
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a loader understood."""
+
+    joints: tuple[str, ...]
+    """Names of the movable joints."""
+    mass: float
+    """Total mass, kg."""
+    T_root_frame: Array
+    """Pose of the frame at every configuration, shape (n, 4, 4)."""
+
+
+Read = Callable[[Path, str, Mapping[str, Array], int], Reading]
+"""Reads the bundle (folder, frame, position of every movable joint, shape (n,), and n)."""
+
+
+@dataclass(frozen=True)
+class Loader:
+    """A library that reads one file of a bundle."""
+
+    name: str
+    module: str
+    """The library's import name."""
+    read: Read
+    """Raises ``FormatError`` if the library refuses the file or lacks the frame."""
+
+
+def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the URDF in yourdfpy, which moves mimic joints itself."""
+    import yourdfpy
+
+    urdf = yourdfpy.URDF.load(str(folder / "robot.urdf"), load_meshes=False)
+    if frame not in urdf.link_map:
+        raise FormatError(f"no link {frame!r}")
+    poses = np.empty((n, 4, 4))
+    driven = [name for name in urdf.actuated_joint_names if name in q]
+    for i in range(n):
+        urdf.update_cfg({name: float(q[name][i]) for name in driven})
+        poses[i] = urdf.get_transform(frame)
+    links, joints = urdf.robot.links, urdf.robot.joints
+    mass = sum(link.inertial.mass for link in links if link.inertial is not None)
+    return Reading(tuple(j.name for j in joints if j.type != "fixed"), float(mass), poses)
+
+
+def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the URDF in PyBullet, floating, because a fixed base reports no mass."""
+    with quiet():
+        import pybullet
+
+        client = pybullet.connect(pybullet.DIRECT)
+        try:
+            body = pybullet.loadURDF(str(folder / "robot.urdf"), physicsClientId=client)
+            indices = range(pybullet.getNumJoints(body, physicsClientId=client))
+            infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in indices]
+            movable = {
+                info[1].decode(): i
+                for i, info in zip(indices, infos, strict=True)
+                if info[2] != pybullet.JOINT_FIXED
+            }
+            links = {info[12].decode(): i for i, info in zip(indices, infos, strict=True)}
+            mass = sum(
+                pybullet.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in (-1, *indices)
+            )
+            if frame not in links:
+                raise FormatError(f"no link {frame!r}")
+            poses = np.tile(np.eye(4), (n, 1, 1))
+            for i in range(n):
+                for name, index in movable.items():
+                    if name in q:
+                        pybullet.resetJointState(
+                            body, index, float(q[name][i]), physicsClientId=client
+                        )
+                position, (x, y, z, w) = pybullet.getLinkState(
+                    body, links[frame], computeForwardKinematics=1, physicsClientId=client
+                )[4:6]
+                poses[i, :3, 3] = position
+                poses[i, :3, :3] = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
+        except pybullet.error as error:
+            raise FormatError(f"PyBullet: {error}") from error
+        finally:
+            pybullet.disconnect(client)
+    return Reading(tuple(movable), float(mass), poses)
+
+
+def read_mujoco_urdf(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the URDF in MuJoCo."""
+    return _read_mujoco(folder / "robot.urdf", frame, q, n)
+
+
+def read_mujoco_mjcf(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the MJCF in MuJoCo."""
+    return _read_mujoco(folder / "robot.xml", frame, q, n)
+
+
+def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read the URDF in Pinocchio, mimic joints as joints of their own."""
+    import pinocchio
+
+    with quiet():
+        try:
+            model = pinocchio.buildModelFromUrdf(str(folder / "robot.urdf"))
+        except (ValueError, RuntimeError) as error:
+            raise FormatError("Pinocchio: " + " ".join(str(error).split())) from error
+    kind = pinocchio.FrameType.BODY
+    if not model.existFrame(frame, kind):
+        raise FormatError(f"no link {frame!r}")
+    index, data = model.getFrameId(frame, kind), model.createData()
+    names = tuple(model.names)[1:]
+    column = {name: model.idx_vs[k + 1] for k, name in enumerate(names)}
+    poses = np.empty((n, 4, 4))
+    for i in range(n):
+        v = np.zeros(model.nv)
+        for name in names:
+            if name in q:
+                v[column[name]] = q[name][i]
+        configuration = pinocchio.integrate(model, pinocchio.neutral(model), v)
+        pinocchio.framesForwardKinematics(model, data, configuration)
+        poses[i] = data.oMf[index].homogeneous
+    return Reading(names, float(sum(body.mass for body in model.inertias)), poses)
+
+
+LOADERS = (
+    Loader("yourdfpy", "yourdfpy", read_yourdfpy),
+    Loader("pybullet", "pybullet", read_pybullet),
+    Loader("mujoco (urdf)", "mujoco", read_mujoco_urdf),
+    Loader("mujoco (mjcf)", "mujoco", read_mujoco_mjcf),
+    Loader("pinocchio", "pinocchio", read_pinocchio),
+)
+
+
+def _read_mujoco(path: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    import mujoco
+
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise FormatError("MuJoCo: " + " ".join(str(error).split())) from error
+    data = mujoco.MjData(model)
+    sites = {model.site(i).name: i for i in range(model.nsite)}
+    bodies = {model.body(i).name: i for i in range(model.nbody)}
+    if frame not in sites and frame not in bodies:
+        raise FormatError(f"no site or body {frame!r}")
+    address = {model.joint(i).name: model.jnt_qposadr[i] for i in range(model.njnt)}
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    for i in range(n):
+        for name in address.keys() & q.keys():
+            data.qpos[address[name]] = q[name][i]
+        mujoco.mj_kinematics(model, data)
+        placed = data.site(sites[frame]) if frame in sites else data.body(bodies[frame])
+        poses[i, :3, 3] = placed.xpos
+        poses[i, :3, :3] = placed.xmat.reshape(3, 3)
+    return Reading(tuple(address), float(model.body_mass.sum()), poses)

@@ -1,0 +1,95 @@
+"""Repairs that are safe to make without asking."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from morphgen.checks.inertia import (
+    DEFAULT_DENSITY,
+    inertia_fault,
+    is_inertia_without_mass,
+    is_mass_valid,
+    lacks_mass,
+)
+from morphgen.checks.joints import (
+    has_inverted_limits,
+    is_axis_unit,
+    is_axis_valid,
+    is_positive,
+    reachable,
+)
+from morphgen.checks.names import named, safe_names
+from morphgen.checks.rigid import rigid_groups
+from morphgen.checks.solids import solid_of
+from morphgen.model.inertia import with_inertia
+from morphgen.model.robot import (
+    DEFAULT_EFFORT,
+    DEFAULT_VELOCITY,
+    Inertial,
+    Joint,
+    Link,
+    Robot,
+)
+from morphgen.model.tree import renamed
+
+
+def repaired(robot: Robot) -> Robot:
+    """A copy without the findings that say they are fixable; what is sound stays as it is."""
+    moving = {link.name for g in rigid_groups(robot) if not g.is_root for link in g.links}
+    joints = tuple(_joint(joint) for joint in robot.joints)
+    home = tuple(
+        _nearest_reachable(joints[k], position)
+        for k, position in zip(robot.independent, robot.home, strict=True)
+    )
+    links = tuple(_link(link, moves=link.name in moving) for link in robot.links)
+    return _renamed(replace(robot, links=links, joints=joints, home=home))
+
+
+def _link(link: Link, *, moves: bool) -> Link:
+    body = link.inertial
+    if is_inertia_without_mass(link):
+        return replace(link, inertial=Inertial(0.0))
+    wrong = body is not None and not is_mass_valid(body)
+    if wrong or (moves and lacks_mass(link)):
+        return with_inertia(link, DEFAULT_DENSITY) if solid_of(link) is not None else link
+    if body is None or body.mass == 0 or inertia_fault(body) is None:
+        return link
+    solid = solid_of(link)
+    if solid is None:
+        return link
+    scale = body.mass / solid.mass
+    return replace(link, inertial=Inertial.from_matrix(body.mass, body.com, scale * solid.matrix))
+
+
+def _joint(joint: Joint) -> Joint:
+    if not joint.is_movable:
+        return joint
+    if is_axis_valid(joint) and not is_axis_unit(joint):
+        joint = replace(joint, axis=joint.unit_axis)
+    if joint.kind == "continuous" and joint.limits is not None:
+        joint = replace(joint, limits=None)
+    if has_inverted_limits(joint):
+        joint = replace(joint, limits=reachable(joint))
+    if joint.is_independent and not is_positive(joint.effort):
+        joint = replace(joint, effort=DEFAULT_EFFORT)
+    if joint.is_independent and not is_positive(joint.velocity):
+        joint = replace(joint, velocity=DEFAULT_VELOCITY)
+    return joint
+
+
+def _nearest_reachable(joint: Joint, position: float) -> float:
+    lower, upper = reachable(joint)
+    return min(max(position if math.isfinite(position) else 0.0, lower), upper)
+
+
+def _renamed(robot: Robot) -> Robot:
+    names = named(robot)
+    reserved = {"world"} if robot.link_index.get("world", 0) > 0 else ()
+    frame = safe_names(names["frame"])
+    safe = renamed(robot, safe_names(names["link"], reserved), safe_names(names["joint"]))
+    return replace(
+        safe,
+        name=safe_names(names["robot"])[robot.name],
+        frames=tuple(replace(part, name=frame[part.name]) for part in safe.frames),
+    )

@@ -1,0 +1,169 @@
+"""Robots with one fault each, by the code of the finding that names it."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from robots import arm
+
+from morphgen.model.geometry import Box, Capsule, Geometry, Mesh, Shape
+from morphgen.model.inertia import inertial_of, with_inertia
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
+from morphgen.model.tree import renamed
+
+FLAT_INERTIA = (1e-3, 0.0, 0.0, 1e-3, 0.0, 2.5e-3)
+
+
+def sound() -> Robot:
+    """A robot that every check passes in silence: the arm, its right finger moving by itself."""
+    return with_joint(arm(), "right", mimic=None)
+
+
+def with_joint(robot: Robot, name: str, **changes: object) -> Robot:
+    """The robot, one joint changed; one that begins to move by itself is at 0 at home."""
+    home = {robot.joints[k].name: q for k, q in zip(robot.independent, robot.home, strict=True)}
+    joints = tuple(replace(j, **changes) if j.name == name else j for j in robot.joints)
+    moving = (j for j in joints if j.is_independent)
+    return replace(robot, joints=joints, home=tuple(home.get(j.name, 0.0) for j in moving))
+
+
+def with_link(robot: Robot, name: str, **changes: object) -> Robot:
+    """The robot, one link changed."""
+    return robot.with_links([replace(robot.link(name), **changes)])
+
+
+def with_body(name: str, **changes: object) -> Robot:
+    """The sound robot, the mass properties of one link changed."""
+    body = sound().link(name).inertial
+    assert body is not None
+    return with_link(sound(), name, inertial=replace(body, **changes))
+
+
+def with_shape(geometry: Geometry, *, visual: bool = True) -> Robot:
+    """The sound robot, its slider's collision (and visual) shape changed."""
+    shapes = (Shape(geometry),)
+    changes = {"collisions": shapes} | ({"visuals": shapes} if visual else {})
+    return with_link(sound(), "slider", **changes)
+
+
+def with_end(link: Link, joint: Joint) -> Robot:
+    """The sound robot with one more link."""
+    robot = sound()
+    home = (*robot.home, *([0.0] if joint.is_independent else []))
+    return replace(robot, links=(*robot.links, link), joints=(*robot.joints, joint), home=home)
+
+
+def hinge(child: str, **changes: object) -> Joint:
+    """A joint at the end of the slider."""
+    joint = Joint(child, "revolute", "slider", child, limits=(-1.0, 1.0), effort=1.0, velocity=1.0)
+    return replace(joint, **changes)
+
+
+def _home(position: float) -> Robot:
+    return replace(sound(), home=(position, *sound().home[1:]))
+
+
+def _weightless_between() -> Robot:
+    tip = Link("tip", Inertial(0.1, inertia=(1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4)))
+    robot = with_end(Link("cross"), hinge("cross"))
+    joint = replace(hinge("tip", axis=(0.0, 1.0, 0.0)), parent="cross")
+    return replace(
+        robot, links=(*robot.links, tip), joints=(*robot.joints, joint), home=(*robot.home, 0.0)
+    )
+
+
+def _colliding() -> Robot:
+    """The lower rod's shape is laid into the base, two joints away."""
+    block = (Shape(Box((2.0, 2.0, 2.0))),)
+    return with_link(sound(), "lower", collisions=block)
+
+
+ROBOTS: dict[str, Callable[[], Robot]] = {
+    "inertia-missing": lambda: with_link(sound(), "lower", inertial=None),
+    "massless-body": lambda: with_end(Link("stub"), hinge("stub")),
+    "massless-between": _weightless_between,
+    "massless-root": lambda: with_link(sound(), "base", inertial=None),
+    "mass-invalid": lambda: with_body("lower", mass=-1.0),
+    "inertia-without-mass": lambda: with_end(
+        Link("pad", Inertial(0.0, inertia=(1.0, 0.0, 0.0, 1.0, 0.0, 1.0))),
+        Joint("pad", "fixed", "slider", "pad"),
+    ),
+    "inertia-not-physical": lambda: with_body("lower", inertia=FLAT_INERTIA),
+    "inertia-implausible": lambda: with_body("lower", inertia=(1.0, 0.0, 0.0, 1.0, 0.0, 1.0)),
+    "com-outside": lambda: with_body("lower", com=(0.0, 0.0, 0.6)),
+    "density-implausible": lambda: with_body("lower", mass=100.0),
+    "axis-invalid": lambda: with_joint(sound(), "elbow", axis=(0.0, 0.0, 0.0)),
+    "axis-not-unit": lambda: with_joint(sound(), "extend", axis=(0.0, 0.0, 2.0)),
+    "limits-missing": lambda: with_joint(sound(), "elbow", limits=None),
+    "limits-inverted": lambda: with_joint(sound(), "elbow", limits=(1.0, -1.0)),
+    "limits-empty": lambda: with_joint(sound(), "elbow", limits=(0.5, 0.5)),
+    "limits-on-continuous": lambda: with_joint(sound(), "elbow", kind="continuous"),
+    "limits-wide": lambda: with_joint(sound(), "elbow", limits=(-180.0, 180.0)),
+    "effort-missing": lambda: with_joint(sound(), "elbow", effort=0.0),
+    "velocity-missing": lambda: with_joint(sound(), "elbow", velocity=None),
+    "damping-invalid": lambda: with_joint(sound(), "elbow", damping=-1.0),
+    "friction-invalid": lambda: with_joint(sound(), "elbow", friction=math.nan),
+    "home-outside-limits": lambda: _home(3.0),
+    "mimic-on-fixed": lambda: with_end(
+        Link("pad"), Joint("pad", "fixed", "slider", "pad", mimic=Mimic("elbow"))
+    ),
+    "mimic-leader-fixed": lambda: with_joint(arm(), "left", kind="fixed"),
+    "mimic-invalid": lambda: with_joint(arm(), "right", mimic=Mimic("left", math.inf)),
+    "mimic-still": lambda: with_joint(arm(), "right", mimic=Mimic("left", 0.0)),
+    "mimic-range": lambda: with_joint(arm(), "right", mimic=Mimic("left", -2.0)),
+    "mimic-ignored-by-loaders": arm,
+    "size-not-positive": lambda: with_shape(Box((0.1, 0.1, 0.0))),
+    "extent-implausible": lambda: with_shape(Box((20.0, 20.0, 20.0))),
+    "visual-collision-scale": lambda: with_shape(Box((1.4e-4, 1.4e-4, 1.4e-4)), visual=False),
+    "capsule-in-urdf": lambda: with_shape(Capsule(0.02, 0.1)),
+    "name-characters": lambda: replace(renamed(sound(), {"right": "right/pad 1"}), name="an arm"),
+    "name-reserved": lambda: renamed(sound(), {"right": "world"}),
+    "frame-name-taken": lambda: replace(sound(), frames=(*sound().frames, Frame("base", "base"))),
+    "self-collision": _colliding,
+    "tool-missing": lambda: replace(sound(), frames=()),
+    "tool-still": lambda: replace(sound(), frames=(Frame("tool", "base"),)),
+}
+
+
+def _ball(path: Path, subdivisions: int = 2) -> Path:
+    trimesh.creation.icosphere(subdivisions, radius=0.05).export(path)
+    return path
+
+
+def _triangle(path: Path) -> Path:
+    corners = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.1, 0.0]])
+    trimesh.Trimesh(corners, [[0, 1, 2]], process=False).export(path)
+    return path
+
+
+def _mesh(path: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Robot:
+    """The sound robot with a mesh on its slider, and mass to match where it can be measured."""
+    robot = with_shape(Mesh(path, scale))
+    if path.is_file() and path.stem == "ball" and all(map(math.isfinite, scale)) and all(scale):
+        return robot.with_links([with_inertia(robot.link("slider"), 1000.0)])
+    shape = Shape(Box((0.1, 0.1, 0.1)))
+    return with_link(robot, "slider", inertial=inertial_of([shape], 1000.0))
+
+
+def _text(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+MESHES: dict[str, Callable[[Path], Robot]] = {
+    "mesh-unresolved": lambda folder: _mesh(folder / "nowhere.stl"),
+    "mesh-unreadable": lambda folder: _mesh(_text(folder / "empty.obj", "v 0 0 0\n")),
+    "mesh-flat": lambda folder: _mesh(_triangle(folder / "triangle.stl")),
+    "mesh-huge": lambda folder: _mesh(_ball(folder / "ball.stl", subdivisions=4)),
+    "mesh-scale-invalid": lambda folder: _mesh(_ball(folder / "ball.stl"), (1.0, 0.0, 1.0)),
+    "mesh-mirrored": lambda folder: _mesh(_ball(folder / "ball.stl"), (1.0, -1.0, 1.0)),
+    "mesh-stretched": lambda folder: _mesh(_ball(folder / "ball.stl"), (1.0, 1.0, 2.0)),
+}
+
+
+def sound_mesh(folder: Path) -> Robot:
+    """The sound robot with a sound mesh."""
+    return _mesh(_ball(folder / "ball.stl"))

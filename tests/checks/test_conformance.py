@@ -1,0 +1,159 @@
+"""Conformance: all loaders agree on what we write, and the check notices when one does not."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+
+import pytest
+from robots import arm, rod
+
+from morphgen.checks import conformance as module
+from morphgen.checks.conformance import compare, conformance
+from morphgen.errors import FormatError
+from morphgen.formats.bundle import write_bundle
+from morphgen.model.geometry import Capsule, Pose, Shape
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+
+LOADERS = ["yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio"]
+
+
+def massless_tree():
+    """Massless root, massless moving links, a fixed massless one, every kind of joint."""
+    strength = {"effort": 10.0, "velocity": 1.0}
+    links = (
+        Link("root"),
+        Link("x"),
+        Link("turn", collisions=(Shape(Capsule(0.02, 0.1)),)),
+        rod("heavy"),
+        Link("bracket"),
+        rod("slider", 0.1),
+        rod("follower", 0.2),
+    )
+    joints = (
+        Joint("x", "prismatic", "root", "x", axis=(0.6, 0.8, 0), limits=(-0.5, 0.5), **strength),
+        Joint("turn", "continuous", "x", "turn", Pose.from_xyz_rpy((0, 0, 0.1), (0.3, 0.4, 0.5))),
+        Joint("swing", "revolute", "turn", "heavy", axis=(0, 1, 0), limits=(-1.0, 2.0), **strength),
+        Joint("fix", "fixed", "heavy", "bracket", Pose.from_xyz_rpy((0.1, 0, 0.3), (1.5, 0, 3))),
+        Joint(
+            "push", "prismatic", "bracket", "slider", axis=(0, 0, -1), limits=(0.0, 0.1), **strength
+        ),
+        Joint(
+            "follow",
+            "revolute",
+            "slider",
+            "follower",
+            limits=(-3.0, 3.0),
+            mimic=Mimic("swing", -0.5, 0.2),
+            **strength,
+        ),
+    )
+    tool = Frame("tool", "follower", Pose.from_xyz_rpy((0.01, 0.02, 0.2), (0.1, 0.2, 0.3)))
+    return Robot("massless", links, joints, (tool,), home=(0.0, 0.1, 0.2, 0.05))
+
+
+def bundle(robot, tmp_path):
+    return write_bundle(robot, tmp_path / "bundle", picture=False)
+
+
+@pytest.mark.parametrize("make", [arm, massless_tree])
+def test_all_loaders_agree(make, tmp_path):
+    report = conformance(bundle(make(), tmp_path), samples=20)
+    assert [row.loader for row in report.rows] == LOADERS
+    assert report.passed
+    assert report.frame == "tool"
+    for row in report.rows:
+        if row.loader == "pybullet" and find_spec("pybullet") is None:
+            continue
+        assert row.passed, row
+        assert row.joints
+        assert row.message == ""
+        assert row.mass == pytest.approx(make().mass, rel=1e-6)
+        assert row.position_error < 1e-5
+        assert row.rotation_error < 1e-5
+
+
+def test_a_robot_without_tool_is_compared_at_its_last_link(tmp_path):
+    report = conformance(bundle(replace(arm(), frames=()), tmp_path), samples=3)
+    assert report.passed
+    assert report.frame == "right"
+
+
+def rows_of(robot, folder):
+    report = compare(robot, folder, samples=5)
+    assert not report.passed
+    return {row.loader: row for row in report.rows if row.passed is not None}
+
+
+def test_a_moved_joint_is_noticed_by_its_distance(tmp_path):
+    robot = arm()
+    folder = bundle(robot, tmp_path)
+    T = robot.joints[0].T_parent_joint
+    moved = replace(robot.joints[0], T_parent_joint=Pose((0.0, 2e-5, 0.0)) @ T)
+    for row in rows_of(replace(robot, joints=(moved, *robot.joints[1:])), folder).values():
+        assert not row.passed
+        assert row.position_error == pytest.approx(2e-5, rel=1e-2)
+        assert row.message == "tool is 2e-05 m off"
+
+
+def test_a_turned_tool_is_noticed_by_its_angle(tmp_path):
+    robot = arm()
+    folder = bundle(robot, tmp_path)
+    (tool,) = robot.frames
+    turned = replace(tool, T_link_frame=tool.T_link_frame @ Pose.from_xyz_rpy(rpy=(0, 0, 3e-5)))
+    for row in rows_of(replace(robot, frames=(turned,)), folder).values():
+        assert not row.passed
+        assert row.rotation_error == pytest.approx(3e-5, rel=5e-2)
+
+
+def test_a_wrong_mass_is_noticed(tmp_path):
+    robot = arm()
+    folder = bundle(robot, tmp_path)
+    base = replace(robot.root, inertial=replace(robot.root.inertial, mass=1.0))
+    for row in rows_of(robot.with_links([base]), folder).values():
+        assert "weighs" in row.message
+
+
+def test_a_renamed_joint_is_noticed(tmp_path):
+    robot = arm()
+    folder = bundle(robot, tmp_path)
+    joints = (replace(robot.joints[0], name="hip"), *robot.joints[1:])
+    for row in rows_of(replace(robot, joints=joints), folder).values():
+        assert row.joints is False
+        assert "lacks joints hip; has joints shoulder" in row.message
+
+
+def test_a_missing_tool_is_noticed(tmp_path):
+    robot = arm()
+    folder = bundle(replace(robot, frames=()), tmp_path)
+    for row in rows_of(robot, folder).values():
+        assert not row.passed
+        assert "'tool'" in row.message
+
+
+def test_files_that_a_loader_refuses_are_its_rows_fault(tmp_path):
+    robot = arm()
+    folder = bundle(robot, tmp_path)
+    (folder / "robot.xml").write_text("<mujoco><nonsense/></mujoco>")
+    rows = rows_of(robot, folder)
+    assert rows["mujoco (mjcf)"].message.startswith("MuJoCo: ")
+    assert [name for name, row in rows.items() if not row.passed] == ["mujoco (mjcf)"]
+
+
+def test_a_loader_that_is_not_installed_is_said_so(tmp_path, monkeypatch):
+    real = find_spec
+    monkeypatch.setattr(
+        module, "find_spec", lambda name: None if name == "pinocchio" else real(name)
+    )
+    report = conformance(bundle(arm(), tmp_path), samples=2)
+    row = report.rows[-1]
+    assert (row.loader, row.passed, row.message) == ("pinocchio", None, "not installed")
+    assert report.passed
+
+
+def test_a_folder_that_is_no_bundle_is_refused(tmp_path):
+    with pytest.raises(FormatError, match="no bundle"):
+        conformance(tmp_path)
+
+
+def test_a_robot_that_does_not_move(tmp_path):
+    robot = Robot("block", (rod("block"),), frames=(Frame("tool", "block", Pose((0, 0, 0.3))),))
+    assert conformance(bundle(robot, tmp_path), samples=2).passed

@@ -1,0 +1,117 @@
+"""Each fault is named by its code; a sound robot is left alone."""
+
+from dataclasses import replace
+
+import mujoco
+import pytest
+from broken import MESHES, ROBOTS, hinge, sound, sound_mesh, with_body, with_end, with_joint
+from robots import arm
+
+from morphgen.checks import check, shapes
+from morphgen.model.findings import Finding
+from morphgen.model.robot import Inertial, Link, Mimic, Robot
+from morphgen.model.tree import renamed
+
+
+def found(robot: Robot, code: str) -> Finding:
+    """The first finding of that code."""
+    return next(finding for finding in check(robot) if finding.code == code)
+
+
+def test_a_sound_robot_is_clean(tmp_path):
+    assert check(sound()) == ()
+    assert check(sound_mesh(tmp_path)) == ()
+
+
+def test_a_gripper_that_mimics_is_only_told_about_loaders():
+    assert [finding.severity for finding in check(arm())] == ["info"]
+
+
+@pytest.mark.parametrize("code", ROBOTS)
+def test_a_fault_is_found(code):
+    assert code in {finding.code for finding in check(ROBOTS[code]())}
+
+
+@pytest.mark.parametrize("code", MESHES)
+def test_a_fault_of_a_mesh_is_found(code, tmp_path, monkeypatch):
+    monkeypatch.setattr(shapes, "MAX_STL_FACES", 1000)
+    assert code in {finding.code for finding in check(MESHES[code](tmp_path))}
+
+
+@pytest.mark.parametrize("code", ROBOTS)
+def test_findings_are_sorted_and_repeatable(code):
+    findings = check(ROBOTS[code]())
+    rank = ["error", "warning", "info"]
+    assert list(findings) == sorted(
+        findings, key=lambda f: (rank.index(f.severity), f.code, f.where)
+    )
+    assert findings == check(ROBOTS[code]())
+    assert all(f.why and f.fix and "\n" not in f.why + f.fix for f in findings)
+
+
+def test_the_tool_is_asked_for_only_where_it_is_required():
+    assert check(replace(sound(), frames=()), tool_required=False) == ()
+
+
+def test_a_bare_frame_needs_no_mass():
+    pad = replace(hinge("pad"), kind="fixed", limits=None)
+    assert check(with_end(Link("pad"), pad)) == ()
+    assert check(with_end(Link("pad", Inertial(0.0)), pad)) == ()
+
+
+def test_a_massless_link_beside_a_heavy_one_is_suspicious_and_alone_refused():
+    shape = sound().link("right").collisions
+    moving = with_end(Link("pad", collisions=shape), hinge("pad"))
+    fixed = with_end(
+        Link("pad", collisions=shape), replace(hinge("pad"), kind="fixed", limits=None)
+    )
+    assert found(moving, "inertia-missing").severity == "error"
+    assert found(fixed, "inertia-missing").severity == "warning"
+
+
+def test_the_triangle_inequality_is_drawn_where_mujoco_draws_it():
+    for low, code in ((1.0001e-3, None), (0.9999e-3, "inertia-not-physical")):
+        body = (low, 0.0, 0.0, low, 0.0, 2e-3)
+        codes = {finding.code for finding in check(with_body("lower", inertia=body))}
+        assert (code in codes) is (code is not None)
+        moments = " ".join(str(body[i]) for i in (0, 3, 5))
+        xml = (
+            "<mujoco><worldbody><body><joint/>"
+            f'<inertial pos="0 0 0" mass="1" diaginertia="{moments}"/>'
+            "</body></worldbody></mujoco>"
+        )
+        if code is None:
+            mujoco.MjModel.from_xml_string(xml)
+        else:
+            with pytest.raises(ValueError, match="A \\+ B >= C"):
+                mujoco.MjModel.from_xml_string(xml)
+
+
+def test_a_long_axis_matters_more_for_a_slide_than_for_a_hinge():
+    for joint, severity in (("extend", "error"), ("elbow", "warning")):
+        robot = with_joint(sound(), joint, axis=(0.0, 0.0, 1.5))
+        assert found(robot, "axis-not-unit").severity == severity
+
+
+def test_an_axis_rounded_in_a_file_is_a_unit_axis():
+    robot = with_joint(sound(), "elbow", axis=(0.7071, 0.7071, 0.0))
+    assert "axis-not-unit" not in {finding.code for finding in check(robot)}
+
+
+def test_a_follower_is_judged_by_its_whole_chain():
+    robot = with_joint(arm(), "right", mimic=Mimic("left", -0.5))
+    assert {finding.severity for finding in check(robot)} == {"info"}
+    free = with_joint(robot, "left", kind="continuous", limits=None)
+    assert "from -inf to inf" in found(free, "mimic-range").why
+
+
+def test_a_root_may_be_called_world():
+    assert check(renamed(sound(), {"base": "world"})) == ()
+
+
+def test_overlap_of_an_ignored_pair_is_no_finding():
+    robot = ROBOTS["self-collision"]()
+    pairs = [finding.where for finding in check(robot) if finding.code == "self-collision"]
+    ignored = tuple(tuple(pair.removeprefix("links ").split(", ")) for pair in pairs)
+    assert ignored
+    assert "self-collision" not in {f.code for f in check(replace(robot, ignore_pairs=ignored))}

@@ -1,0 +1,132 @@
+"""``fix`` removes what it says is fixable, nothing else, and leaves sound robots alone."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from broken import FLAT_INERTIA, MESHES, ROBOTS, sound, with_body, with_joint, with_link
+from robots import arm
+
+from morphgen.checks import check, fix, shapes
+from morphgen.checks.inertia import DEFAULT_DENSITY
+from morphgen.checks.names import safe_names
+from morphgen.model.inertia import inertial_of
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Robot
+from morphgen.model.tree import renamed
+
+
+def keys(robot: Robot) -> set[tuple[str, str]]:
+    """Code and place of every finding."""
+    return {(finding.code, finding.where) for finding in check(robot)}
+
+
+def assert_fixable_means_fixed(robot: Robot) -> None:
+    """Whatever is fixable is gone, whatever is not is still there, and nothing is new."""
+    findings = check(robot)
+    repaired, gone = fix(robot)
+    fixable = {finding for finding in findings if finding.fixable}
+    assert set(gone) == fixable
+    assert keys(repaired) == keys(robot) - {(finding.code, finding.where) for finding in fixable}
+    assert fix(repaired)[1] == ()
+
+
+@pytest.mark.parametrize("code", [code for code in ROBOTS if not code.startswith("name-")])
+def test_fixable_means_fixed(code):
+    assert_fixable_means_fixed(ROBOTS[code]())
+
+
+@pytest.mark.parametrize("code", MESHES)
+def test_fixable_means_fixed_with_meshes(code, tmp_path, monkeypatch):
+    monkeypatch.setattr(shapes, "MAX_STL_FACES", 1000)
+    assert_fixable_means_fixed(MESHES[code](tmp_path))
+
+
+def test_a_sound_robot_stays_itself():
+    robot = sound()
+    assert fix(robot) == (robot, ())
+
+
+def test_missing_mass_is_that_of_the_solid_geometry():
+    robot, _ = fix(with_link(sound(), "lower", inertial=None))
+    shapes = sound().link("lower").collisions
+    assert robot.link("lower").inertial == inertial_of(shapes, DEFAULT_DENSITY)
+
+
+def test_an_impossible_inertia_keeps_its_mass_and_its_centre():
+    broken = with_body("lower", inertia=FLAT_INERTIA, com=(0.0, 0.0, 0.1))
+    before, after = broken.link("lower").inertial, fix(broken)[0].link("lower").inertial
+    assert (after.mass, after.com) == (before.mass, before.com)
+    solid = inertial_of(broken.link("lower").collisions, 1.0)
+    assert after.inertia == pytest.approx([before.mass / solid.mass * v for v in solid.inertia])
+
+
+def test_joints_are_repaired_together_with_home():
+    broken = with_joint(
+        sound(), "shoulder", axis=(0, 3, 4), limits=(0.2, -0.2), effort=None, velocity=-1.0
+    )
+    robot, gone = fix(broken)
+    joint = robot.joints[0]
+    assert joint.axis == pytest.approx((0.0, 0.6, 0.8))
+    assert joint.limits == (-0.2, 0.2)
+    assert (joint.effort, joint.velocity) == (DEFAULT_EFFORT, DEFAULT_VELOCITY)
+    assert robot.home[0] == 0.2
+    assert {finding.code for finding in gone} == {
+        "axis-not-unit",
+        "effort-missing",
+        "home-outside-limits",
+        "limits-inverted",
+        "velocity-missing",
+    }
+
+
+def test_home_that_is_no_number_becomes_the_reachable_position_nearest_zero():
+    broken = replace(
+        with_joint(sound(), "shoulder", limits=(0.3, 1.0)), home=(math.nan, 0, 0, 0, 0)
+    )
+    assert fix(broken)[0].home[0] == 0.3
+
+
+def test_names_are_changed_everywhere():
+    broken = renamed(arm(), {"left": "left pad"}, {"left": "left/1"})
+    robot, gone = fix(replace(broken, ignore_pairs=(("left pad", "right"),)))
+    assert {finding.code for finding in gone} == {"name-characters"}
+    assert "left_pad" in robot.link_index
+    assert robot.joints[3].child == "left_pad"
+    assert robot.joints[4].mimic.joint == robot.joints[3].name == "left_1"
+    assert robot.ignore_pairs == (("left_pad", "right"),)
+
+
+@pytest.mark.parametrize("code", ["name-characters", "name-reserved"])
+def test_repaired_names_are_sound(code):
+    robot, gone = fix(ROBOTS[code]())
+    assert code in {finding.code for finding in gone}
+    assert check(robot) == ()
+
+
+def test_new_names_are_unique_and_safe_ones_stay():
+    assert safe_names(["a b", "a_b", "a/b", ""]) == {
+        "a b": "a_b_2",
+        "a_b": "a_b",
+        "a/b": "a_b_3",
+        "": "_",
+    }
+    assert safe_names(["world", "a"], reserved={"world"}) == {"world": "world_2", "a": "a"}
+
+
+def test_faults_that_meet_in_one_robot_are_repaired_together():
+    broken = with_joint(with_body("lower", mass=math.nan), "extend", axis=(0, 0, 9), effort=None)
+    broken = with_link(broken, "upper", inertial=None)
+    broken = renamed(broken, {"right": "world", "left": "left pad"}, {"elbow": "an elbow"})
+    repaired, gone = fix(broken)
+    assert len(gone) == 7
+    assert check(repaired) == ()
+
+
+def test_a_link_without_solid_geometry_keeps_its_fault():
+    body = sound().link("lower").inertial
+    broken = with_link(
+        sound(), "lower", inertial=replace(body, mass=-1.0), collisions=(), visuals=()
+    )
+    finding = next(finding for finding in check(broken) if finding.code == "mass-invalid")
+    assert not finding.fixable
+    assert fix(broken)[1] == ()

@@ -1,0 +1,210 @@
+"""Self-collision: what penetrates, and what does so by design."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import trimesh
+from robots import arm
+
+from morphgen.checks.self_collision import (
+    PENETRATION,
+    SelfCollision,
+    attached_pairs,
+    ignore_pairs,
+    self_collisions,
+)
+from morphgen.errors import RobotError
+from morphgen.model.geometry import Box, Mesh, Pose, Shape, Sphere
+from morphgen.model.kinematics import forward_kinematics, random_configurations
+from morphgen.model.robot import Joint, Link, Robot
+
+BALL = (Shape(Sphere(0.05)),)
+
+
+def ball(name):
+    return Link(name, collisions=BALL)
+
+
+def slides(*offsets):
+    """Balls on slides along x on an empty root, starting at the given offsets."""
+    joints = tuple(
+        Joint(f"x{i}", "prismatic", "root", f"ball{i}", Pose((x, 0, 0)), limits=(-1.0, 1.0))
+        for i, x in enumerate(offsets)
+    )
+    balls = (ball(f"ball{i}") for i in range(len(offsets)))
+    return Robot("slides", (Link("root"), *balls), joints, home=(0.0,) * len(offsets))
+
+
+def chain(*links, kind="revolute"):
+    """Links on joints one after the other, 0.3 m apart."""
+    joints = tuple(
+        Joint(f"to_{child.name}", kind, parent.name, child.name, Pose((0, 0, 0.3)), (0, 1, 0))
+        for parent, child in pairwise(links)
+    )
+    home = (0.0,) * sum(joint.is_independent for joint in joints)
+    return Robot("chain", links, joints, home=home)
+
+
+def test_depths_are_those_of_spheres():
+    robot = slides(0.0, 0.3)
+    found = self_collisions(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
+    assert found[0] == {}
+    assert found[1] == {("ball0", "ball1"): pytest.approx(0.02, abs=1e-6)}
+    assert found[2] == {("ball0", "ball1"): pytest.approx(0.05, abs=1e-6)}
+
+
+def test_faces_that_meet_do_not_collide():
+    block = (Shape(Box((0.1, 0.1, 0.1))),)
+    robot = slides(0.0, 0.1)
+    robot = replace(
+        robot, links=(robot.root, *(replace(x, collisions=block) for x in robot.links[1:]))
+    )
+    clear, deep = self_collisions(robot, [[0.0, -PENETRATION / 2], [0.0, -2 * PENETRATION]])
+    assert clear == {}
+    assert set(deep) == {("ball0", "ball1")}
+
+
+def test_ignored_pairs_are_not_reported():
+    robot = replace(slides(0.0, 0.01, 0.02), ignore_pairs=(("ball0", "ball1"),))
+    (found,) = self_collisions(robot, [robot.home])
+    assert set(found) == {("ball0", "ball2"), ("ball1", "ball2")}
+
+
+def test_spheres_agree_with_the_distance_of_their_centres():
+    links = tuple(ball(f"b{i}") for i in range(6))
+    robot = chain(*links)
+    robot = replace(
+        robot, joints=tuple(replace(j, axis=(i % 2, 1, 0.5)) for i, j in enumerate(robot.joints))
+    )
+    robot = replace(
+        robot, links=tuple(Link(x.name, collisions=(Shape(Sphere(0.12)),)) for x in links)
+    )
+    q = random_configurations(robot, 100, np.random.default_rng(3))
+    T = forward_kinematics(robot, q)
+    for found, centres in zip(self_collisions(robot, q), T[..., :3, 3], strict=True):
+        distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+        expected = {
+            (f"b{i}", f"b{j}")
+            for i in range(6)
+            for j in range(i + 1, 6)
+            if distance[i, j] < 0.24 - PENETRATION
+        }
+        assert set(found) == expected
+
+
+def test_the_roots_links_are_tested_like_any_other():
+    """MuJoCo by itself never tests what is welded to the world against its children."""
+    robot = chain(ball("a"), replace(ball("b"), collisions=(Shape(Sphere(0.3)),)))
+    (found,) = self_collisions(robot, [robot.home])
+    assert set(found) == {("a", "b")}
+
+
+def test_mimic_joints_follow():
+    robot = replace(arm(), ignore_pairs=ignore_pairs(arm()))
+    q = np.array(robot.home)
+    q[3] = 0.04
+    assert self_collisions(robot, [q]) == [{}]
+
+
+def test_a_mesh_counts_as_its_convex_hull(tmp_path):
+    ring = trimesh.creation.annulus(r_min=0.4, r_max=0.5, height=0.1)
+    ring.export(tmp_path / "ring.stl")
+    mesh = Link("ring", collisions=(Shape(Mesh(tmp_path / "ring.stl")),))
+    robot = chain(mesh, ball("inside"))
+    robot = replace(robot, joints=(replace(robot.joints[0], T_parent_joint=Pose((0.0, 0.1, 0.0))),))
+    (found,) = self_collisions(robot, [robot.home])
+    assert set(found) == {("inside", "ring")}
+
+
+def test_neighbours_are_attached():
+    robot = chain(ball("a"), ball("b"), ball("c"))
+    assert attached_pairs(robot) == (("a", "b"), ("b", "c"))
+
+
+def test_links_without_shapes_do_not_part_neighbours():
+    robot = chain(ball("a"), Link("x"), Link("y"), ball("b"), ball("c"))
+    assert attached_pairs(robot) == (("a", "b"), ("b", "c"))
+
+
+def test_links_on_fixed_joints_are_one_body():
+    links = (ball("a"), ball("b"), ball("c"), ball("d"))
+    robot = chain(*links)
+    fixed = replace(robot.joints[1], kind="fixed")
+    robot = replace(robot, joints=(robot.joints[0], fixed, robot.joints[2]), home=(0.0, 0.0))
+    assert attached_pairs(robot) == (("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d"))
+
+
+def test_siblings_on_an_empty_root_are_not_attached():
+    assert attached_pairs(slides(0.0, 0.3)) == ()
+
+
+def test_touching_at_home_is_ignored():
+    robot = slides(0.0, 0.05, 0.5)
+    pairs = ignore_pairs(robot)
+    assert pairs == (("ball0", "ball1"),)
+    assert self_collisions(replace(robot, ignore_pairs=pairs), [robot.home]) == [{}]
+
+
+def test_never_separating_pairs_are_ignored():
+    """Home is one of the few places where the fin is out of the wall's way."""
+    wall = Link("wall", collisions=(Shape(Box((0.02, 2.0, 2.0)), Pose((0.3, 0.0, 0.0))),))
+    fin = Link("fin", collisions=(Shape(Sphere(0.1), Pose((0.0, 0.0, 0.1))),))
+    for reach, expected in ((10.0, False), (0.08, True)):
+        push = Joint(
+            "push", "prismatic", "wall", "hand", axis=(1, 0, 0), limits=(0.24, 0.24 + reach)
+        )
+        turn = Joint("turn", "continuous", "hand", "fin", axis=(0, 0, 1))
+        robot = Robot("r", (wall, ball("hand"), fin), (push, turn), home=(0.0, 0.0))
+        assert (("fin", "wall") in ignore_pairs(robot)) == expected
+        assert ("fin", "wall") not in self_collisions(robot, [robot.home])[0]
+
+
+def test_the_result_depends_on_nothing_but_the_robot():
+    assert ignore_pairs(arm()) == ignore_pairs(arm())
+
+
+def test_only_pairs_across_parts_are_tested():
+    robot = arm()
+    part = {"base": 0, "upper": 0, "lower": 0}
+    whole = ignore_pairs(robot)
+    inside = [pair for pair in whole if part.get(pair[0]) == part.get(pair[1])]
+    asked = []
+
+    def across(a, b):
+        asked.append((a, b))
+        return part.get(a) != part.get(b)
+
+    assert ignore_pairs(robot, known=inside, check=across) == whole
+    assert not set(asked) & set(whole)
+
+
+def test_known_pairs_are_kept_whatever_their_order():
+    robot = slides(0.0, 0.5)
+    assert ignore_pairs(robot, known=[("ball1", "ball0")]) == (("ball0", "ball1"),)
+
+
+def test_a_known_pair_of_no_link_is_an_error():
+    with pytest.raises(RobotError, match="no link 'ball9'"):
+        ignore_pairs(slides(0.0, 0.5), known=[("ball0", "ball9")])
+
+
+def test_a_root_named_world_and_a_locked_joint_are_no_matter():
+    robot = slides(0.0, 0.05)
+    joints = tuple(replace(j, parent="world", limits=(0.0, 0.0)) for j in robot.joints)
+    robot = replace(robot, links=(Link("world"), *robot.links[1:]), joints=joints)
+    assert ignore_pairs(robot) == (("ball0", "ball1"),)
+
+
+def test_configurations_of_another_shape_are_refused():
+    tester = SelfCollision(slides(0.0, 0.3))
+    for q in ([0.0, 0.0], [[0.0]]):
+        with pytest.raises(ValueError, match="q has shape"):
+            tester.penetrations(q)
+
+
+def test_a_heap_of_overlapping_links_fits_into_memory():
+    robot = slides(*[0.0] * 40)
+    (found,) = self_collisions(robot, [robot.home])
+    assert len(found) == 40 * 39 // 2
