@@ -1,0 +1,66 @@
+"""The front door: parses arguments and calls one function a command; nobody imports it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+
+from morphgen.cli import (
+    check,
+    compose,
+    conform,
+    describe,
+    import_robot,
+    list_parts,
+    view,
+)
+from morphgen.errors import MorphgenError
+
+COMMANDS = (compose, list_parts, describe, check, import_robot, conform, view)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of every command; each sets ``run``, which returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="morphgen", description="Author robot morphologies and put them to work."
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    commands = parser.add_subparsers(metavar="COMMAND", dest="command")
+    for module in COMMANDS:
+        module.add_parser(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Returns:
+        0 for success, 1 for findings or failed checks, 2 for bad input, 130 when interrupted.
+    """
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.version:
+        from importlib.metadata import version
+
+        print(f"morphgen {version('morphgen')}")
+        return 0
+    if args.command is None:
+        parser.print_help()
+        return 2
+    try:
+        return int(args.run(args))
+    except MorphgenError as error:
+        message = " ".join(str(error).split())
+        if getattr(args, "json", False):
+            print(json.dumps({"error": type(error).__name__, "message": message}))
+        print(f"morphgen: {message}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("morphgen: interrupted; nothing half-written is left", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1

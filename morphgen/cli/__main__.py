@@ -1,0 +1,7 @@
+"""``python -m morphgen.cli``."""
+
+import sys
+
+from morphgen.cli import main
+
+sys.exit(main())

@@ -1,0 +1,78 @@
+"""``morphgen check``: findings about robots."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli.options import Subparsers, add_json
+
+if TYPE_CHECKING:
+    from morphgen.model.findings import Finding
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "check",
+        help="say what is wrong with robots, and how to mend it",
+        description="Say what is wrong with robots. Exit code 1 if there is an error "
+        "(with --strict: or a warning).",
+    )
+    parser.add_argument("robots", nargs="+", type=Path, help="bundles' folders, URDFs or xacros")
+    parser.add_argument("--strict", action="store_true", help="warnings fail, too")
+    parser.add_argument(
+        "--fix",
+        metavar="DIR",
+        type=Path,
+        help="write bundles with the safe repairs applied to this folder",
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check every robot; print findings."""
+    failing = ("error", "warning") if args.strict else ("error",)
+    report: dict[str, list[dict[str, object]]] = {}
+    failed = False
+    for path in args.robots:
+        findings = _checked(path, args.fix)
+        report[str(path)] = [finding.as_dict() for finding in findings]
+        failed |= any(finding.severity in failing for finding in findings)
+        if not args.json:
+            _print(path, findings)
+    if args.json:
+        print(json.dumps(report, indent=2))
+    return int(failed)
+
+
+def _checked(path: Path, fix_into: Path | None) -> tuple[Finding, ...]:
+    from morphgen.checks import check, fix
+    from morphgen.formats.bundle import CARD, read_robot, write_bundle
+    from morphgen.formats.urdf import UnsoundError
+
+    try:
+        robot = read_robot(path)
+    except UnsoundError as error:
+        return error.findings
+    is_bundle = (path / CARD).is_file() or (path.parent / CARD).is_file()
+    if fix_into is not None:
+        robot, repaired = fix(robot)
+        for finding in repaired:
+            print(f"{path}: repaired {finding.code} at {finding.where}: {finding.fix}")
+        write_bundle(robot, fix_into / robot.name, check(robot, tool_required=is_bundle))
+    return check(robot, tool_required=is_bundle)
+
+
+def _print(path: Path, findings: tuple[Finding, ...]) -> None:
+    counts = {
+        severity: sum(finding.severity == severity for finding in findings)
+        for severity in ("error", "warning", "info")
+    }
+    print(f"{path}: " + ", ".join(f"{n} {severity}" for severity, n in counts.items()))
+    for finding in findings:
+        print(f"  {finding.severity} {finding.code} at {finding.where}: {finding.why}")
+        print(f"    fix: {finding.fix}{' (check --fix does it)' if finding.fixable else ''}")

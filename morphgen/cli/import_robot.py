@@ -1,0 +1,53 @@
+"""``morphgen import``: any URDF or xacro to a bundle."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from morphgen.cli.options import Subparsers, add_json, add_out
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "import",
+        help="turn any URDF or xacro into a bundle",
+        description="Turn any URDF or xacro into a bundle, with meshes baked to metres and z up.",
+    )
+    parser.add_argument("file", type=Path, help="a URDF, or a xacro by its suffix")
+    parser.add_argument("--root", help="link where the robot begins (default: the file's root)")
+    parser.add_argument("--tool", help="link whose frame is the tool")
+    parser.add_argument(
+        "--arg",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="a xacro argument; may be repeated",
+    )
+    parser.add_argument(
+        "--as-is",
+        action="store_true",
+        help="do not make the safe repairs (see morphgen check), without which some loaders "
+        "refuse the robot",
+    )
+    add_out(parser)
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import, check, write and say where."""
+    from morphgen.cli.written import write_and_report
+    from morphgen.errors import FormatError
+    from morphgen.grammar.imported import import_robot
+
+    pairs = [entry.partition("=") for entry in args.arg]
+    for name, equals, value in pairs:
+        if not name or not equals:
+            raise FormatError(f"--arg {name}{equals}{value}: expected NAME=VALUE")
+    arguments = {name: value for name, _, value in pairs}
+    robot = import_robot(
+        args.file, arguments, root=args.root, tool=args.tool, name=args.name, repair=not args.as_is
+    )
+    return write_and_report(robot, args)

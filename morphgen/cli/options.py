@@ -1,0 +1,47 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from morphgen.grammar.library import Library
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def add_library(parser: argparse.ArgumentParser) -> None:
+    """Let the user name folders of own parts."""
+    parser.add_argument(
+        "--library",
+        metavar="DIR",
+        type=Path,
+        action="append",
+        default=[],
+        help="a folder of your own parts (also: MORPHGEN_LIBRARY); may be repeated",
+    )
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Let the user ask for JSON."""
+    parser.add_argument("--json", action="store_true", help="print JSON for machines")
+
+
+def add_out(parser: argparse.ArgumentParser) -> None:
+    """Let the user choose where bundles go, and their name."""
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("robots"), help="default: robots/"
+    )
+    parser.add_argument(
+        "--name", help="the robot's name and its folder's (default: from its parts)"
+    )
+    parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
+
+
+def library_of(args: argparse.Namespace) -> Library:
+    """The library that the arguments ask for."""
+    from morphgen.grammar.library import default_library
+
+    return default_library(args.library)

@@ -1,0 +1,68 @@
+"""Import: any URDF or xacro to a robot with a tool, a home and its ignore list."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from morphgen.checks import fix
+from morphgen.checks.self_collision import ignore_pairs
+from morphgen.errors import FormatError, nearest
+from morphgen.formats.urdf import read_urdf
+from morphgen.model.robot import Frame, Robot
+from morphgen.model.tree import renamed, subtree
+
+
+def import_robot(
+    path: Path,
+    args: Mapping[str, str] | None = None,
+    *,
+    root: str | None = None,
+    tool: str | None = None,
+    name: str | None = None,
+    repair: bool = True,
+) -> Robot:
+    """Read a robot description and complete it.
+
+    Args:
+        path: A URDF, or a xacro by its suffix.
+        args: xacro arguments.
+        root: Link where the robot begins; by default the file's root.
+        tool: Link whose frame becomes the frame ``tool``; by default there is none.
+        name: Name of the robot; by default the file's own.
+        repair: Whether to make the safe repairs of ``morphgen.checks.fix``, without which some
+            loaders refuse the robot; each is named in the provenance.
+
+    Raises:
+        FormatError: If the file cannot be read, or has no such link.
+    """
+    robot = read_urdf(path, args)
+    for option, link in (("root", root), ("tool", tool)):
+        if link is not None and link not in robot.link_index:
+            raise FormatError(
+                f"{path}: no link {link!r} for {option}{nearest(link, robot.link_index)}"
+            )
+    if root is not None:
+        robot = subtree(robot, root)
+    if tool is not None and tool not in robot.link_index:
+        raise FormatError(f"{path}: tool {tool!r} is not below root {root!r}")
+    if tool is not None:
+        robot = _without_name_clash(robot)
+        link = "tool_link" if tool == "tool" else tool
+        robot = replace(robot, frames=(Frame("tool", link),))
+    robot = replace(robot, name=name or robot.name, provenance={"source": path.name})
+    if repair:
+        robot, repaired = fix(robot)
+        repairs = [f"{finding.where}: {finding.why}" for finding in repaired]
+        robot = replace(robot, provenance={**robot.provenance, "repairs": repairs})
+    return replace(robot, ignore_pairs=ignore_pairs(robot))
+
+
+def _without_name_clash(robot: Robot) -> Robot:
+    """A link ``tool`` becomes ``tool_link``: a bundle's URDF has a link for the frame itself."""
+    return renamed(
+        robot,
+        {"tool": "tool_link"} if "tool" in robot.link_index else {},
+        {"tool_joint": "tool_link_joint"} if "tool_joint" in robot.joint_index else {},
+    )

@@ -1,0 +1,211 @@
+"""Parts: fragments of a kinematic tree with a root, a mount and named ports."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+from morphgen.errors import FormatError, MorphgenError, PartError, RobotError, nearest
+from morphgen.formats.resolve import PackageFinder, distribution_file
+from morphgen.formats.urdf import read_urdf, robot_from_xml
+from morphgen.formats.urdf_text import number
+from morphgen.formats.xacro import evaluate, expand
+from morphgen.grammar.manifest import Manifest, Number, PackageSource, Placement
+from morphgen.grammar.parameters import resolve_values
+from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
+from morphgen.model.inertia import inertial_of_mass, with_inertia
+from morphgen.model.robot import Frame, Link, Robot
+from morphgen.model.tree import subtree
+
+_EXPRESSION = re.compile(r"\$\{(.*)\}")
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part with its parameters filled in."""
+
+    manifest: Manifest
+    values: Mapping[str, float]
+    body: Robot
+    """Its links and joints, names as in the source; rooted at the manifest's root."""
+    T_root_mount: Pose
+    """The frame that is put onto the parent's port."""
+    ports: Mapping[str, Frame]
+    tool: Frame | None
+
+
+def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> Part:
+    """Build a part; the same manifest and values give the same object.
+
+    Args:
+        manifest: What the part is.
+        values: Its parameters, SI units; defaults fill the rest.
+
+    Raises:
+        PartError: If a parameter is unknown or out of range, or the manifest names a link or
+            joint that its source does not have.
+        FormatError: If the source cannot be read.
+    """
+    complete = resolve_values(values or {}, manifest.parameters, manifest.name)
+    return _load(manifest.path, _Frozen(manifest, complete))
+
+
+class _Frozen:
+    """A manifest and values as a key of the cache."""
+
+    def __init__(self, manifest: Manifest, values: Mapping[str, float]) -> None:
+        self.manifest, self.values = manifest, values
+        self.key = (manifest.path, tuple(values.items()))
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Frozen) and self.key == other.key
+
+
+@lru_cache(maxsize=256)
+def _load(path: Path, frozen: _Frozen) -> Part:
+    manifest, values = frozen.manifest, frozen.values
+    try:
+        body = subtree(_read_source(manifest, values), manifest.root, manifest.without)
+    except RobotError as error:
+        raise PartError(f"{manifest.path}: {error}") from error
+    body = _with_bodies(_with_motion(body, manifest, values), manifest)
+    ports = {
+        name: Frame(name, placement.link, _pose(placement, body, manifest, values))
+        for name, placement in manifest.ports.items()
+    }
+    tool = None
+    if manifest.tool is not None:
+        tool = Frame("tool", manifest.tool.link, _pose(manifest.tool, body, manifest, values))
+    return Part(manifest, values, body, _mount(body, manifest, values), ports, tool)
+
+
+def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:
+    try:
+        if isinstance(manifest.source, PackageSource):
+            file = distribution_file(manifest.source.package, manifest.source.file)
+            return read_urdf(file, manifest.source.args)
+        arguments = {name: number(value) for name, value in values.items()}
+        finder = PackageFinder()
+        data = expand(manifest.source, arguments, finder)
+        return robot_from_xml(data, manifest.source, finder)
+    except FormatError as error:
+        raise PartError(f"part {manifest.name!r}: {error}") from error
+
+
+def _with_motion(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Robot:
+    """The body with the manifest's home, efforts and velocities."""
+    for key, entries in (
+        ("home", manifest.home),
+        ("effort", manifest.effort),
+        ("velocity", manifest.velocity),
+    ):
+        for name in entries:
+            if name not in body.joint_index:
+                raise PartError(
+                    f"{manifest.path}: {key}: no joint {name!r}{nearest(name, body.joint_index)}"
+                )
+    independent = [body.joints[k].name for k in body.independent]
+    for name in manifest.home:
+        if name not in independent:
+            raise PartError(f"{manifest.path}: home: {name!r} does not move by itself")
+    home = {name: _evaluated(entry, manifest, values) for name, entry in manifest.home.items()}
+    return replace(
+        body,
+        joints=tuple(
+            replace(
+                joint,
+                effort=manifest.effort.get(joint.name, joint.effort),
+                velocity=manifest.velocity.get(joint.name, joint.velocity),
+            )
+            for joint in body.joints
+        ),
+        home=tuple(home.get(name, rest) for name, rest in zip(independent, body.home, strict=True)),
+    )
+
+
+def _with_bodies(body: Robot, manifest: Manifest) -> Robot:
+    """The body with the manifest's shapes and masses."""
+    for key, names in (
+        ("mass", manifest.mass),
+        ("drop", manifest.drop),
+        ("collision_from_visual", manifest.collision_from_visual),
+    ):
+        for name in names:
+            if name not in body.link_index:
+                raise PartError(
+                    f"{manifest.path}: {key}: no link {name!r}{nearest(name, body.link_index)}"
+                )
+    return replace(body, links=tuple(_with_body(link, manifest) for link in body.links))
+
+
+def _with_body(link: Link, manifest: Manifest) -> Link:
+    if link.name in manifest.drop:
+        dropped = manifest.drop[link.name]
+        link = replace(
+            link, visuals=_kept(link.visuals, dropped), collisions=_kept(link.collisions, dropped)
+        )
+    if link.name in manifest.collision_from_visual:
+        link = replace(link, collisions=tuple(replace(shape, rgba=None) for shape in link.visuals))
+    if link.name in manifest.mass:
+        mass = manifest.mass[link.name]
+        return replace(link, inertial=inertial_of_mass(link, mass) if mass else None)
+    if manifest.density is not None and link.inertial is None:
+        return with_inertia(link, manifest.density)
+    return link
+
+
+def _kept(shapes: tuple[Shape, ...], dropped: tuple[str, ...]) -> tuple[Shape, ...]:
+    return tuple(
+        shape
+        for shape in shapes
+        if not (isinstance(shape.geometry, Mesh) and shape.geometry.path.name in dropped)
+    )
+
+
+def _mount(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Pose:
+    if manifest.mount is None:
+        return IDENTITY
+    T_link_mount = _pose(manifest.mount, body, manifest, values)
+    T_root_link = IDENTITY
+    link = manifest.mount.link
+    while link != manifest.root:
+        joint = body.joints[body.link_index[link] - 1]
+        if joint.is_movable:
+            raise PartError(
+                f"{manifest.path}: mount is on {manifest.mount.link!r}, which moves "
+                f"({joint.name!r}) against the root {manifest.root!r}"
+            )
+        T_root_link = joint.T_parent_joint @ T_root_link
+        link = joint.parent
+    return T_root_link @ T_link_mount
+
+
+def _pose(
+    placement: Placement, body: Robot, manifest: Manifest, values: Mapping[str, float]
+) -> Pose:
+    if placement.link not in body.link_index:
+        raise PartError(
+            f"{manifest.path}: no link {placement.link!r} in the part"
+            + nearest(placement.link, body.link_index)
+        )
+    x, y, z = (_evaluated(entry, manifest, values) for entry in placement.xyz)
+    roll, pitch, yaw = (_evaluated(entry, manifest, values) for entry in placement.rpy)
+    return Pose.from_xyz_rpy((x, y, z), (roll, pitch, yaw))
+
+
+def _evaluated(entry: Number, manifest: Manifest, values: Mapping[str, float]) -> float:
+    if not isinstance(entry, str):
+        return entry
+    match = _EXPRESSION.fullmatch(entry.strip())
+    if match is None:
+        raise PartError(f"{manifest.path}: {entry!r} is neither a number nor ${{...}}")
+    try:
+        return evaluate(entry, values)
+    except MorphgenError as error:
+        raise PartError(f"{manifest.path}: {entry}: {error}") from error

@@ -1,0 +1,177 @@
+"""Requests: ``arm=ur5 ee=plane left.ee.size=0.1`` to a derivation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from morphgen.errors import CompositionError, nearest
+from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import KINDS, Kind, Manifest
+from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
+
+MAIN_PORTS: Mapping[Kind, str] = {"base": "top", "arm": "flange"}
+"""Where the next part goes when no port is named."""
+
+
+@dataclass
+class _Slot:
+    """A part asked for at one place: ``base``, ``arm``, ``left.ee`` ..."""
+
+    kind: Kind
+    port: str
+    """The limb, such as ``left``; empty for the main one."""
+    part: str = ""
+    values: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        return f"{self.port}.{self.kind}" if self.port else self.kind
+
+
+def parse_request(words: Sequence[str], library: Library) -> Derivation:
+    """Read ``key=value`` words into a derivation.
+
+    ``base``, ``arm`` and ``ee`` choose parts (the base is ``fixed`` unless named). A limb on a
+    named port is written before them: ``left.arm=ur5``. Anything else is a parameter of a part:
+    ``ee.size=80mm``, ``left.ee.mount_yaw=45deg``.
+
+    Args:
+        words: The words, in any order.
+        library: Where the parts are.
+
+    Raises:
+        CompositionError: If a word is malformed or given twice, a parameter belongs to no part,
+            a port does not exist, or nothing stands on the base.
+        PartError: If a part or parameter is unknown, or a value is wrong.
+    """
+    slots = _slots(words)
+    base = slots.pop("base", _Slot("base", "", "fixed"))
+    if not slots:
+        raise CompositionError(
+            "nothing to compose: name at least an arm or an ee, such as arm=ur5 ee=plane"
+        )
+    manifests = {key: library.manifest(slot.part, slot.kind) for key, slot in slots.items()}
+    children = _limbs(slots, manifests, library)
+    base_manifest = library.manifest(base.part, "base")
+    for port, child in children:
+        _require_port(base_manifest, port, child.label)
+    return _node(base, base_manifest, tuple(children))
+
+
+def default_name(derivation: Derivation, library: Library) -> str:
+    """A name for a robot: its parts, and a short hash if a parameter is not at its default."""
+    words = []
+    changed = False
+    for node in derivation.walk():
+        defaults = {p.name: p.default for p in library.manifest(node.part).parameters.values()}
+        changed |= dict(node.parameters) != defaults
+        if node.part in ("fixed", "none"):
+            continue
+        limb = node.label.removesuffix("_arm").removesuffix("arm")
+        words.append(f"{limb}-{node.part}" if limb and node.label.endswith("arm") else node.part)
+    if changed:
+        words.append(derivation.digest[:6])
+    return "-".join(words)
+
+
+def _slots(words: Sequence[str]) -> dict[str, _Slot]:
+    slots: dict[str, _Slot] = {}
+    values: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not key or not value:
+            raise CompositionError(f"{word!r} is not of the form key=value, such as arm=ur5")
+        *port, last = key.split(".")
+        if last not in KINDS:
+            if key in values:
+                raise CompositionError(f"{key} is given twice")
+            values[key] = value
+            continue
+        if len(port) > 1 or (port and last == "base"):
+            raise CompositionError(
+                f"{key}: a part is named base, arm, ee, PORT.arm or PORT.ee, such as left.arm"
+            )
+        if key in slots:
+            raise CompositionError(f"{key} is given twice: {slots[key].part} and {value}")
+        slots[key] = _Slot(last, port[0] if port else "", value)
+    if any(key != "base" for key in slots):
+        slots.setdefault("base", _Slot("base", "", "fixed"))
+    for key, value in values.items():
+        owner, _, name = key.rpartition(".")
+        if owner not in slots:
+            raise CompositionError(
+                f"{key}={value}: no part is chosen for {owner or key!r}{nearest(owner, slots)}"
+            )
+        slots[owner].values[name] = value
+    return slots
+
+
+def _limbs(
+    slots: Mapping[str, _Slot], manifests: Mapping[str, Manifest], library: Library
+) -> list[tuple[str, Derivation]]:
+    """(port of the base, what stands there), arms with their end-effectors."""
+    limbs: list[tuple[str, Derivation]] = []
+    used: set[str] = set()
+    for key, slot in slots.items():
+        if slot.kind != "arm":
+            continue
+        arm = manifests[key]
+        held: list[tuple[str, Derivation]] = []
+        for port in arm.ports:
+            ee_key = _ee_key(slot, port, arm)
+            if ee_key in slots:
+                used.add(ee_key)
+                held.append((port, _node(slots[ee_key], manifests[ee_key])))
+            else:
+                limb, _, _ = ee_key.rpartition(".")
+                none = _Slot("ee", limb, "none")
+                held.append((port, _node(none, library.manifest("none", "ee"))))
+        limbs.append((slot.port or MAIN_PORTS["base"], _node(slot, arm, tuple(held))))
+    for key, slot in slots.items():
+        if slot.kind == "ee" and key not in used:
+            arm_key = f"{slot.port}.arm" if slot.port and slot.port in _ports(slots) else "arm"
+            if arm_key in slots:
+                _require_port(manifests[arm_key], slot.port or MAIN_PORTS["arm"], key)
+            limbs.append((slot.port or MAIN_PORTS["base"], _node(slot, manifests[key])))
+    return limbs
+
+
+def _ports(slots: Mapping[str, _Slot]) -> set[str]:
+    return {slot.port for slot in slots.values() if slot.kind == "arm"}
+
+
+def _ee_key(arm_slot: _Slot, port: str, arm: Manifest) -> str:
+    """The key that names the end-effector on an arm's port."""
+    if port == MAIN_PORTS["arm"]:
+        return f"{arm_slot.port}.ee" if arm_slot.port else "ee"
+    return f"{port}.ee"
+
+
+def _node(
+    slot: _Slot, manifest: Manifest, children: tuple[tuple[str, Derivation], ...] = ()
+) -> Derivation:
+    parameters = dict(manifest.parameters)
+    if slot.kind != "base":
+        parameters[MOUNT_YAW.name] = MOUNT_YAW
+    values = {}
+    for name, text in slot.values.items():
+        if name not in parameters:
+            raise CompositionError(
+                f"{slot.key}.{name}: {manifest.name!r} has no parameter {name!r}"
+                + nearest(name, parameters)
+            )
+        values[name] = parse_value(text, parameters[name], f"{slot.key}.{name}")
+    complete = resolve_values(values, parameters, manifest.name)
+    if complete.get(MOUNT_YAW.name) == 0.0:
+        del complete[MOUNT_YAW.name]
+    label = slot.key.replace(".", "_")
+    return Derivation(label, manifest.name, tuple(complete.items()), children)
+
+
+def _require_port(manifest: Manifest, port: str, wanted: str) -> None:
+    if port not in manifest.ports:
+        raise CompositionError(
+            f"{wanted}: {manifest.name!r} has no port {port!r}{nearest(port, manifest.ports)}"
+        )

@@ -1,0 +1,1 @@
+"""Procedural parts: a xacro beside its YAML, by kind."""

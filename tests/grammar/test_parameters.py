@@ -1,0 +1,49 @@
+"""Values have units and ranges, and an error says which."""
+
+import math
+
+import pytest
+
+from morphgen.errors import PartError
+from morphgen.grammar.parameters import MOUNT_YAW, Parameter, parse_value, resolve_values
+
+SIZE = Parameter("size", 0.1, 0.05, 0.5, "m")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("0.1", 0.1), ("80mm", 0.08), ("12 cm", 0.12), ("1e-1m", 0.1)]
+)
+def test_lengths(text, value):
+    assert parse_value(text, SIZE, "ee.size") == pytest.approx(value)
+
+
+def test_degrees_become_radians():
+    assert parse_value("45deg", MOUNT_YAW, "ee.mount_yaw") == pytest.approx(math.pi / 4)
+
+
+@pytest.mark.parametrize("text", ["45deg", "1kg", "3 furlongs"])
+def test_unit_of_another_kind_is_refused_with_the_right_ones(text):
+    with pytest.raises(PartError, match=r"ee\.size=.*wrong unit.*units: m/cm/mm"):
+        parse_value(text, SIZE, "ee.size")
+
+
+@pytest.mark.parametrize("text", ["big", "", "1.2.3", "nan", "inf", "0x10"])
+def test_what_is_no_number_is_refused(text):
+    with pytest.raises(PartError, match="not a number"):
+        parse_value(text, SIZE, "ee.size")
+
+
+@pytest.mark.parametrize("text", ["0.6", "10mm", "-0.1"])
+def test_out_of_range_names_the_range(text):
+    with pytest.raises(PartError, match=r"out of range; expected 0\.05 to 0\.5 m"):
+        parse_value(text, SIZE, "ee.size")
+
+
+def test_unknown_parameter_names_the_nearest():
+    with pytest.raises(PartError, match="no parameter 'sise'; did you mean 'size'"):
+        resolve_values({"sise": 0.1}, {"size": SIZE}, "plane")
+
+
+def test_default_outside_its_range_is_a_fault_of_the_manifest():
+    with pytest.raises(PartError, match="default 2 is outside"):
+        Parameter("size", 2.0, 0.0, 1.0, "m")

@@ -1,0 +1,1 @@
+"""The page on which robots are looked at."""
