@@ -6,7 +6,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import cast
 
 from morphgen.checks.frames import check_tool
 from morphgen.checks.home import check_self_collision
@@ -64,8 +66,17 @@ def check(robot: Robot, *, tool_required: bool = True) -> tuple[Finding, ...]:
         Findings by severity, code and place; the same robot gives the same ones.
     """
     checks = (*CHECKS, check_tool) if tool_required else CHECKS
-    findings = {finding for run in checks for finding in run(robot)}
+    findings = {_judged(finding, robot) for run in checks for finding in run(robot)}
     return tuple(sorted(findings, key=lambda f: (_RANK[f.severity], f.code, f.where, f.why)))
+
+
+def _judged(finding: Finding, robot: Robot) -> Finding:
+    """The finding as information, with the reason, if the robot's parts say it is as it should be."""
+    accepted = cast(Mapping[str, Mapping[str, str]], robot.provenance.get("accepted", {}))
+    reason = accepted.get(finding.where.partition(" ")[2], {}).get(finding.code)
+    if reason is None:
+        return finding
+    return replace(finding, severity="info", why=f"{finding.why}; accepted: {reason}")
 
 
 def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:

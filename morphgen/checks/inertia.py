@@ -111,7 +111,10 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
     missing = [link for link in group.links if lacks_mass(link)]
     for link in missing:
         if group.mass > 0:
-            why = "it has geometry but no mass (PyBullet takes 1 kg where <inertial> is missing)"
+            why = (
+                "it has geometry but no mass, on a body that has (PyBullet takes 1 kg where "
+                "<inertial> is missing; a bundle writes zero)"
+            )
         else:
             why = (
                 "it moves, has geometry and no mass: MuJoCo refuses that, PyBullet takes 1 kg "
@@ -119,7 +122,7 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
             )
         yield Finding(
             "inertia-missing",
-            "warning" if group.mass > 0 else "error",
+            "info" if group.mass > 0 else "error",
             f"link {link.name}",
             why,
             f"give it mass and inertia; the repair takes those of its solid geometry at "

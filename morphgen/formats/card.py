@@ -81,7 +81,7 @@ def apply_card(robot: Robot, card: Mapping[str, Any]) -> Robot:
     """
     if card.get("format") != CARD_FORMAT:
         raise FormatError(f"card format {card.get('format')!r}; this version reads {CARD_FORMAT}")
-    keys = ("derivation", "source", "repairs", "parts")
+    keys = ("derivation", "source", "repairs", "parts", "accepted")
     try:
         home = card["home"]
         return replace(

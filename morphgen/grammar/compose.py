@@ -87,7 +87,15 @@ def join(derivation: Derivation, library: Library, name: str) -> Robot:
         tuple(joints),
         _tool_frames(tools),
         tuple(home),
-        provenance={"derivation": str(derivation), "parts": _provenance(placed.values())},
+        provenance={
+            "derivation": str(derivation),
+            "parts": _provenance(placed.values()),
+            "accepted": {
+                here.scoped(name): dict(whys)
+                for here in placed.values()
+                for name, whys in here.part.manifest.accepted.items()
+            },
+        },
     )
 
 

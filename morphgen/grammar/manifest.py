@@ -18,9 +18,19 @@ Number = float | str
 """A number, or an expression over the part's parameters such as ``${size / 2}``."""
 
 _REQUIRED = {"name", "kind", "summary", "root", "licence"}
-_COMMON = _REQUIRED | {"without", "mount", "ports", "tool", "home", "effort", "velocity"}
-_REAL = _COMMON | {"source", "citation", "notes", "mass", "drop", "collision_from_visual"}
-_TEMPLATE = _COMMON | {"file", "density", "parameters", "reference", "notes"}
+_COMMON = _REQUIRED | {
+    "accepted",
+    "effort",
+    "home",
+    "mount",
+    "notes",
+    "ports",
+    "tool",
+    "velocity",
+    "without",
+}
+_REAL = _COMMON | {"source", "citation", "mass", "drop", "collision_from_visual"}
+_TEMPLATE = _COMMON | {"file", "density", "parameters", "reference"}
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,8 @@ class Manifest:
     """Names of mesh files, by link, whose shapes are left out."""
     collision_from_visual: tuple[str, ...] = ()
     """Links whose visual shapes replace their collision shapes."""
+    accepted: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """Findings that are as they should be: by link or joint and code, why."""
     density: float | None = None
     """Of links without inertial, kg/m^3."""
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
@@ -117,6 +129,10 @@ def read_manifest(path: Path) -> Manifest:
         mass=_numbers(data, "mass", path),
         drop={link: tuple(names) for link, names in _mapping(data.get("drop"), "drop").items()},
         collision_from_visual=tuple(data.get("collision_from_visual", ())),
+        accepted={
+            name: {code: str(why) for code, why in _mapping(whys, f"{path}: accepted").items()}
+            for name, whys in _mapping(data.get("accepted"), f"{path}: accepted").items()
+        },
         density=_float(data["density"], f"{path}: density") if "density" in data else None,
         parameters={name: _parameter(name, entry, path) for name, entry in parameters.items()},
         citation=str(data.get("citation", data.get("reference", ""))).strip(),

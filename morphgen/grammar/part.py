@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
+from morphgen.checks.names import safe_names
 from morphgen.errors import FormatError, MorphgenError, PartError, RobotError, nearest
 from morphgen.formats.resolve import PackageFinder, distribution_file
 from morphgen.formats.urdf import read_urdf, robot_from_xml
@@ -18,7 +19,7 @@ from morphgen.grammar.parameters import resolve_values
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
 from morphgen.model.inertia import inertial_of_mass, with_inertia
 from morphgen.model.robot import Frame, Link, Robot
-from morphgen.model.tree import subtree
+from morphgen.model.tree import renamed, subtree
 
 _EXPRESSION = re.compile(r"\$\{(.*)\}")
 
@@ -30,7 +31,8 @@ class Part:
     manifest: Manifest
     values: Mapping[str, float]
     body: Robot
-    """Its links and joints, names as in the source; rooted at the manifest's root."""
+    """Its links and joints, rooted at the manifest's root; names as in the source, but for
+    characters that loaders dislike."""
     T_root_mount: Pose
     """The frame that is put onto the parent's port."""
     ports: Mapping[str, Frame]
@@ -75,6 +77,7 @@ def _load(path: Path, frozen: _Frozen) -> Part:
     except RobotError as error:
         raise PartError(f"{manifest.path}: {error}") from error
     body = _with_bodies(_with_motion(body, manifest, values), manifest)
+    T_root_mount = _mount(body, manifest, values)
     ports = {
         name: Frame(name, placement.link, _pose(placement, body, manifest, values))
         for name, placement in manifest.ports.items()
@@ -82,7 +85,15 @@ def _load(path: Path, frozen: _Frozen) -> Part:
     tool = None
     if manifest.tool is not None:
         tool = Frame("tool", manifest.tool.link, _pose(manifest.tool, body, manifest, values))
-    return Part(manifest, values, body, _mount(body, manifest, values), ports, tool)
+    links = safe_names(link.name for link in body.links)
+    return Part(
+        manifest,
+        values,
+        renamed(body, links, safe_names(joint.name for joint in body.joints)),
+        T_root_mount,
+        {name: replace(port, link=links[port.link]) for name, port in ports.items()},
+        tool and replace(tool, link=links[tool.link]),
+    )
 
 
 def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:
@@ -99,7 +110,7 @@ def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:
 
 
 def _with_motion(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Robot:
-    """The body with the manifest's home, efforts and velocities."""
+    """The body with the manifest's home, efforts and velocities; continuous joints unlimited."""
     for key, entries in (
         ("home", manifest.home),
         ("effort", manifest.effort),
@@ -122,6 +133,7 @@ def _with_motion(body: Robot, manifest: Manifest, values: Mapping[str, float]) -
                 joint,
                 effort=manifest.effort.get(joint.name, joint.effort),
                 velocity=manifest.velocity.get(joint.name, joint.velocity),
+                limits=None if joint.kind == "continuous" else joint.limits,
             )
             for joint in body.joints
         ),
