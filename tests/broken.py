@@ -81,10 +81,19 @@ def _colliding() -> Robot:
     return with_link(sound(), "lower", collisions=block)
 
 
+def _with_pads(n: int) -> Robot:
+    robot = sound()
+    for i in range(n):
+        pad = Joint(f"pad{i}", "fixed", robot.links[-1].name, f"pad{i}")
+        robot = replace(robot, links=(*robot.links, Link(f"pad{i}")), joints=(*robot.joints, pad))
+    return robot
+
+
 ROBOTS: dict[str, Callable[[], Robot]] = {
     "inertia-missing": lambda: with_link(sound(), "lower", inertial=None),
     "massless-body": lambda: with_end(Link("stub"), hinge("stub")),
     "massless-between": _weightless_between,
+    "links-too-many": lambda: _with_pads(130),
     "massless-root": lambda: with_link(sound(), "base", inertial=None),
     "mass-invalid": lambda: with_body("lower", mass=-1.0),
     "inertia-without-mass": lambda: with_end(

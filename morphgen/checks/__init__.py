@@ -16,6 +16,7 @@ from morphgen.checks.inertia import check_inertia, check_masses
 from morphgen.checks.joints import check_axes, check_drive, check_home, check_limits
 from morphgen.checks.loaders import (
     check_capsules,
+    check_link_count,
     check_mesh_scales,
     check_mimic_loaders,
     check_root,
@@ -47,6 +48,7 @@ CHECKS: tuple[Check, ...] = (
     check_mimic_loaders,
     check_capsules,
     check_mesh_scales,
+    check_link_count,
     check_root,
 )
 
@@ -71,7 +73,7 @@ def check(robot: Robot, *, tool_required: bool = True) -> tuple[Finding, ...]:
 
 
 def _judged(finding: Finding, robot: Robot) -> Finding:
-    """The finding as information, with the reason, if the robot's parts say it is as it should be."""
+    """The finding, turned to information where a part says why it is as it should be."""
     accepted = cast(Mapping[str, Mapping[str, str]], robot.provenance.get("accepted", {}))
     reason = accepted.get(finding.where.partition(" ")[2], {}).get(finding.code)
     if reason is None:

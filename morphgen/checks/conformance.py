@@ -22,6 +22,8 @@ POSITION_TOLERANCE = 1e-5
 """Largest distance of a loader's tool from ours, metres."""
 ROTATION_TOLERANCE = 1e-5
 """Largest angle of a loader's tool to ours, rad."""
+LARGEST_POSITION = 10.0
+"""Joints without sensible limits are compared up to here, rad or m: PyBullet counts in floats."""
 MASS_TOLERANCE = 1e-6
 """Largest difference of a loader's total mass from ours, relative to ours.
 
@@ -87,6 +89,7 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
         robot = replace(robot, frames=(frame,))
     q = random_configurations(robot, samples, np.random.default_rng(seed))
+    q = np.clip(q, -LARGEST_POSITION, LARGEST_POSITION)
     rows = tuple(_row(robot, folder, loader, frame.name, q) for loader in LOADERS)
     passed = all(row.passed is not False for row in rows)
     return ConformanceReport(robot.name, frame.name, samples, seed, passed, rows)

@@ -66,8 +66,9 @@ def check_inertia(robot: Robot) -> Iterator[Finding]:
                 "error",
                 f"link {link.name}",
                 f"{fault}; MuJoCo refuses it, PyBullet takes zero",
-                "correct the inertia; the repair takes the solid geometry's at the same mass",
-                fixable=solid is not None,
+                "correct the inertia; the repair takes, at the same mass, the solid geometry's or, "
+                f"without any, that of a ball of {DEFAULT_DENSITY:g} kg/m^3",
+                fixable=True,
             )
         if solid is not None:
             if fault is None:

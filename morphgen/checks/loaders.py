@@ -10,6 +10,9 @@ from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Mesh
 from morphgen.model.robot import Robot
 
+PYBULLET_LINKS = 127
+"""Links below the root that PyBullet 3.2.7 holds; of more it answers nothing."""
+
 
 def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:
     """Tell which joints a URDF loader may leave without their leader."""
@@ -60,6 +63,19 @@ def check_mesh_scales(robot: Robot) -> Iterator[Finding]:
                 f"{mesh.path.name}: scale {mesh.scale} {why}",
                 "nothing to do in a bundle, whose meshes have the scale applied",
             )
+
+
+def check_link_count(robot: Robot) -> Iterator[Finding]:
+    """Tell whether the robot has more links than PyBullet holds."""
+    links = len(robot.links) + len(robot.frames)
+    if links - 1 > PYBULLET_LINKS:
+        yield Finding(
+            "links-too-many",
+            "error",
+            f"robot {robot.name}",
+            f"{links - 1} links below the root; PyBullet holds {PYBULLET_LINKS}",
+            "leave out bare frames, or import a part of it with --root",
+        )
 
 
 def check_root(robot: Robot) -> Iterator[Finding]:

@@ -76,9 +76,12 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
                 if info[2] != pybullet.JOINT_FIXED
             }
             links = {info[12].decode(): i for i, info in zip(indices, infos, strict=True)}
+            base = pybullet.getBodyInfo(body, physicsClientId=client)[0].decode()
             mass = sum(
                 pybullet.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in (-1, *indices)
             )
+            if frame == base:
+                return Reading(tuple(movable), float(mass), np.tile(np.eye(4), (n, 1, 1)))
             if frame not in links:
                 raise FormatError(f"no link {frame!r}")
             poses = np.tile(np.eye(4), (n, 1, 1))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from morphgen.checks.inertia import (
     DEFAULT_DENSITY,
     inertia_fault,
@@ -57,9 +59,15 @@ def _link(link: Link, *, moves: bool) -> Link:
         return link
     solid = solid_of(link)
     if solid is None:
-        return link
+        return replace(link, inertial=_ball(body))
     scale = body.mass / solid.mass
     return replace(link, inertial=Inertial.from_matrix(body.mass, body.com, scale * solid.matrix))
+
+
+def _ball(body: Inertial) -> Inertial:
+    """The body as a ball of the same mass, its density the default."""
+    radius = (3 * body.mass / (4 * math.pi * DEFAULT_DENSITY)) ** (1 / 3)
+    return Inertial.from_matrix(body.mass, body.com, 0.4 * body.mass * radius**2 * np.eye(3))
 
 
 def _joint(joint: Joint) -> Joint:

@@ -53,14 +53,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return int(args.run(args))
     except MorphgenError as error:
-        message = " ".join(str(error).split())
-        if getattr(args, "json", False):
-            print(json.dumps({"error": type(error).__name__, "message": message}))
-        print(f"morphgen: {message}", file=sys.stderr)
-        return 2
+        return _refused(error, str(error), args)
     except KeyboardInterrupt:
         print("morphgen: interrupted; nothing half-written is left", file=sys.stderr)
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        return _refused(error, f"{error.filename}: {error.strerror}", args)
+
+
+def _refused(error: Exception, text: str, args: argparse.Namespace) -> int:
+    """Say in one line why the input was refused; return the exit code."""
+    message = " ".join(text.split())
+    if getattr(args, "json", False):
+        print(json.dumps({"error": type(error).__name__, "message": message}))
+    print(f"morphgen: {message}", file=sys.stderr)
+    return 2

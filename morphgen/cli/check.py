@@ -36,38 +36,44 @@ def add_parser(commands: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check every robot; print findings."""
     failing = ("error", "warning") if args.strict else ("error",)
-    report: dict[str, list[dict[str, object]]] = {}
+    report: dict[str, dict[str, list[dict[str, object]]]] = {}
     failed = False
     for path in args.robots:
-        findings = _checked(path, args.fix)
-        report[str(path)] = [finding.as_dict() for finding in findings]
+        findings, repaired = _checked(path, args.fix)
+        report[str(path)] = {
+            "findings": [finding.as_dict() for finding in findings],
+            "repaired": [finding.as_dict() for finding in repaired],
+        }
         failed |= any(finding.severity in failing for finding in findings)
         if not args.json:
-            _print(path, findings)
+            _print(path, findings, repaired)
     if args.json:
         print(json.dumps(report, indent=2))
     return int(failed)
 
 
-def _checked(path: Path, fix_into: Path | None) -> tuple[Finding, ...]:
+def _checked(path: Path, fix_into: Path | None) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+    """What is wrong with a robot, and what was before its repair into a folder, if any."""
     from morphgen.checks import check, fix
-    from morphgen.formats.bundle import CARD, read_robot, write_bundle
+    from morphgen.formats.bundle import CARD, bundle_folder, read_robot, write_bundle
     from morphgen.formats.urdf import UnsoundError
 
     try:
         robot = read_robot(path)
     except UnsoundError as error:
-        return error.findings
+        return error.findings, ()
     is_bundle = (path / CARD).is_file() or (path.parent / CARD).is_file()
-    if fix_into is not None:
-        robot, repaired = fix(robot)
-        for finding in repaired:
-            print(f"{path}: repaired {finding.code} at {finding.where}: {finding.fix}")
-        write_bundle(robot, fix_into / robot.name, check(robot, tool_required=is_bundle))
-    return check(robot, tool_required=is_bundle)
+    if fix_into is None:
+        return check(robot, tool_required=is_bundle), ()
+    robot, repaired = fix(robot)
+    findings = check(robot, tool_required=is_bundle)
+    write_bundle(robot, bundle_folder(fix_into, robot.name), findings)
+    return findings, repaired
 
 
-def _print(path: Path, findings: tuple[Finding, ...]) -> None:
+def _print(path: Path, findings: tuple[Finding, ...], repaired: tuple[Finding, ...]) -> None:
+    for finding in repaired:
+        print(f"{path}: repaired {finding.code} at {finding.where}: {finding.fix}")
     counts = {
         severity: sum(finding.severity == severity for finding in findings)
         for severity in ("error", "warning", "info")

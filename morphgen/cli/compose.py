@@ -36,5 +36,6 @@ def run(args: argparse.Namespace) -> int:
 
     library = library_of(args)
     derivation = parse_request(args.words, library)
-    robot = compose(derivation, library, args.name or default_name(derivation, library))
+    name = default_name(derivation, library) if args.name is None else args.name
+    robot = compose(derivation, library, name)
     return write_and_report(robot, args)

@@ -30,7 +30,12 @@ def run(args: argparse.Namespace) -> int:
     from tabulate import tabulate
 
     from morphgen.checks.conformance import conformance
+    from morphgen.errors import MorphgenError
 
+    if args.samples < 1:
+        raise MorphgenError(f"--samples {args.samples}: expected 1 or more")
+    if args.seed < 0:
+        raise MorphgenError(f"--seed {args.seed}: expected 0 or more")
     reports = [conformance(path, args.samples, args.seed) for path in args.bundles]
     if args.json:
         print(json.dumps([asdict(report) for report in reports], indent=2, default=str))

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 
 from morphgen.checks import check
-from morphgen.errors import FormatError
-from morphgen.formats.bundle import CARD, write_bundle
+from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
 from morphgen.model.robot import Robot
-
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def write_and_report(robot: Robot, args: argparse.Namespace) -> int:
     """Write ``args.out / robot.name``, print a summary and return the exit code."""
-    if not _NAME.fullmatch(robot.name):
-        raise FormatError(
-            f"name {robot.name!r}: use letters, digits, '-', '_' and '.', a letter or digit first"
-        )
+    folder = bundle_folder(args.out, robot.name)
     findings = check(robot)
-    folder = write_bundle(robot, args.out / robot.name, findings, picture=not args.no_picture)
+    write_bundle(robot, folder, findings, picture=not args.no_picture)
     if args.json:
         card = json.loads((folder / CARD).read_text(encoding="utf-8"))
         print(json.dumps({"folder": str(folder), "card": card}))

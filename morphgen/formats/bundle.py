@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -17,7 +18,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
-from morphgen.formats.card import apply_card, card_of, card_text
+from morphgen.formats.card import apply_card, card_frames, card_of, card_text
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
 from morphgen.formats.urdf import read_urdf, with_frames
@@ -32,6 +33,22 @@ MJCF = "robot.xml"
 CARD = "card.json"
 PICTURE = "preview.png"
 MESHES = "meshes"
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+
+
+def bundle_folder(parent: Path, name: str) -> Path:
+    """The folder of a robot's bundle: the name below ``parent``.
+
+    Raises:
+        FormatError: If the name would make another folder of it, or an odd one.
+    """
+    if not _NAME.fullmatch(name):
+        raise FormatError(
+            f"name {name!r}: use letters, digits, '-', '_' and '.', a letter or digit first, "
+            "at most 200"
+        )
+    return parent / name
 
 
 def write_bundle(
@@ -84,8 +101,8 @@ def read_bundle(folder: Path) -> Robot:
         card = json.loads(card_path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise FormatError(f"{card_path}: no valid JSON: {error}") from error
-    robot = read_urdf(folder / URDF)
-    return apply_card(with_frames(robot, tuple(card.get("frames", ()))), card)
+    frames = card_frames(card, str(card_path))
+    return apply_card(with_frames(read_urdf(folder / URDF), frames), card, str(card_path))
 
 
 def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
@@ -170,13 +187,25 @@ def _replacing(folder: Path) -> Iterator[Path]:
         partial.chmod(0o755)
         yield partial
         if folder.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            folder.rename(old / folder.name)
-            partial.rename(folder)
-            shutil.rmtree(old)
+            _swap(folder, partial)
         else:
             partial.rename(folder)
     except OSError as error:
         raise FormatError(f"cannot write {folder}: {error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _swap(folder: Path, partial: Path) -> None:
+    """Put ``partial`` in the place of ``folder``, which stays if that fails."""
+    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    old = aside / folder.name
+    try:
+        folder.rename(old)
+        partial.rename(folder)
+    except BaseException:
+        if not folder.exists():
+            old.rename(folder)
+        shutil.rmtree(aside)
+        raise
+    shutil.rmtree(aside)

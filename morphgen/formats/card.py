@@ -73,14 +73,39 @@ def card_text(card: Mapping[str, object]) -> str:
     return json.dumps(card, indent=2, ensure_ascii=False) + "\n"
 
 
-def apply_card(robot: Robot, card: Mapping[str, Any]) -> Robot:
-    """Give a robot read from a bundle's URDF what only the card knows.
+def card_frames(card: object, origin: str) -> tuple[str, ...]:
+    """Names of a card's frames.
+
+    Args:
+        card: What was read.
+        origin: What to call the card in errors, usually its path.
 
     Raises:
-        FormatError: If the card is of another format or lacks a key.
+        FormatError: If it is no card, or of another format.
     """
-    if card.get("format") != CARD_FORMAT:
-        raise FormatError(f"card format {card.get('format')!r}; this version reads {CARD_FORMAT}")
+    if not isinstance(card, dict) or "format" not in card:
+        raise FormatError(f"{origin}: no card: expected an object with the key 'format'")
+    if card["format"] != CARD_FORMAT:
+        raise FormatError(
+            f"{origin}: card format {card['format']!r}; this version reads {CARD_FORMAT}"
+        )
+    frames = card.get("frames", {})
+    if not isinstance(frames, dict):
+        raise FormatError(f"{origin}: frames: expected an object, not {frames!r}")
+    return tuple(frames)
+
+
+def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
+    """Give a robot read from a bundle's URDF what only the card knows.
+
+    Args:
+        robot: The robot, with the card's frames.
+        card: The card.
+        origin: What to call the card in errors, usually its path.
+
+    Raises:
+        FormatError: If the card lacks a key, or a value is of the wrong type.
+    """
     keys = ("derivation", "source", "repairs", "parts", "accepted")
     try:
         home = card["home"]
@@ -91,7 +116,9 @@ def apply_card(robot: Robot, card: Mapping[str, Any]) -> Robot:
             provenance={key: card[key] for key in keys if key in card},
         )
     except KeyError as error:
-        raise FormatError(f"the card has no {error}") from error
+        raise FormatError(f"{origin}: has no {error}") from error
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"{origin}: home or ignore_pairs: {error}") from error
 
 
 def _rounded(value: float | None) -> float | None:

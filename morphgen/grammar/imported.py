@@ -51,7 +51,9 @@ def import_robot(
         robot = _without_name_clash(robot)
         link = "tool_link" if tool == "tool" else tool
         robot = replace(robot, frames=(Frame("tool", link),))
-    robot = replace(robot, name=name or robot.name, provenance={"source": path.name})
+    robot = replace(
+        robot, name=robot.name if name is None else name, provenance={"source": path.name}
+    )
     if repair:
         robot, repaired = fix(robot)
         repairs = [f"{finding.where}: {finding.why}" for finding in repaired]

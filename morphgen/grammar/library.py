@@ -33,7 +33,7 @@ class Library:
             if not folder.is_dir():
                 raise PartError(f"library folder {folder} does not exist")
             for path in sorted(folder.rglob("*.yaml")):
-                if path.stem in found:
+                if found.get(path.stem, path) != path:
                     raise PartError(f"part {path.stem!r} is in {found[path.stem]} and in {path}")
                 found[path.stem] = path
         return dict(sorted(found.items()))
@@ -73,8 +73,9 @@ def default_library(extra: Iterable[Path] = ()) -> Library:
     """The package's parts, those of ``MORPHGEN_LIBRARY``, and those of ``extra`` folders."""
     environment = os.environ.get(ENVIRONMENT, "")
     users = [Path(entry) for entry in environment.split(os.pathsep) if entry]
+    given = (folder.absolute() for folder in (*users, *extra))
     own = [Path(str(files(package))) for package in ("morphgen.templates", "morphgen.robots_real")]
-    return _library((*own, *users, *extra))
+    return _library(tuple(dict.fromkeys((*own, *given))))
 
 
 @lru_cache(maxsize=8)

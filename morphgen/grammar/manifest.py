@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,8 +96,8 @@ def read_manifest(path: Path) -> Manifest:
     """Read a part's YAML.
 
     Raises:
-        PartError: If it is no YAML, lacks a key, has an unknown one, or a value of wrong type;
-            the message names the file and the key.
+        PartError: If it is no YAML, lacks a key, has an unknown or a repeated one, or a value of
+            wrong type; the message names the file and the key.
     """
     data = _mapping(load_yaml(path), str(path))
     allowed = _REAL if "source" in data else _TEMPLATE
@@ -119,7 +120,7 @@ def read_manifest(path: Path) -> Manifest:
         source=_source(data, path),
         root=str(data["root"]),
         licence=str(data["licence"]),
-        without=tuple(str(name) for name in data.get("without", ())),
+        without=_names(data.get("without"), f"{path}: without"),
         mount=_placement(data["mount"], f"{path}: mount") if "mount" in data else None,
         ports={name: _placement(port, f"{path}: ports.{name}") for name, port in ports.items()},
         tool=_placement(data["tool"], f"{path}: tool") if "tool" in data else None,
@@ -127,13 +128,20 @@ def read_manifest(path: Path) -> Manifest:
         effort=_numbers(data, "effort", path),
         velocity=_numbers(data, "velocity", path),
         mass=_numbers(data, "mass", path),
-        drop={link: tuple(names) for link, names in _mapping(data.get("drop"), "drop").items()},
-        collision_from_visual=tuple(data.get("collision_from_visual", ())),
+        drop={
+            link: _names(names, f"{path}: drop.{link}")
+            for link, names in _mapping(data.get("drop"), f"{path}: drop").items()
+        },
+        collision_from_visual=_names(
+            data.get("collision_from_visual"), f"{path}: collision_from_visual"
+        ),
         accepted={
-            name: {code: str(why) for code, why in _mapping(whys, f"{path}: accepted").items()}
+            name: {
+                code: str(why) for code, why in _mapping(whys, f"{path}: accepted.{name}").items()
+            }
             for name, whys in _mapping(data.get("accepted"), f"{path}: accepted").items()
         },
-        density=_float(data["density"], f"{path}: density") if "density" in data else None,
+        density=_positive(data["density"], f"{path}: density") if "density" in data else None,
         parameters={name: _parameter(name, entry, path) for name, entry in parameters.items()},
         citation=str(data.get("citation", data.get("reference", ""))).strip(),
         notes=str(data.get("notes", "")).strip(),
@@ -152,11 +160,25 @@ def load_yaml(path: Path) -> object:
         mark = error.problem_mark
         place = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
         raise PartError(f"{path}{place}: no valid YAML: {error.problem}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise PartError(f"{path}: cannot be read: {error}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise PartError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from error
+    except OSError as error:
+        raise PartError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Safe, and a key may be given once only."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is given twice", key.start_mark
+                )
+            seen.add(key.value)
+        found: dict[Any, Any] = super().construct_mapping(node, deep)
+        return found
 
 
 def _source(data: Mapping[str, Any], path: Path) -> PackageSource | Path:
@@ -236,7 +258,24 @@ def _home(data: Mapping[str, Any], path: Path) -> dict[str, Number]:
 def _float(value: object, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise PartError(f"{where}: {value!r} is not a number")
+    if not math.isfinite(value):
+        raise PartError(f"{where}: {value} is not finite")
     return float(value)
+
+
+def _positive(value: object, where: str) -> float:
+    number = _float(value, where)
+    if number <= 0:
+        raise PartError(f"{where}: {number:g} is not positive")
+    return number
+
+
+def _names(data: object, where: str) -> tuple[str, ...]:
+    if data is None:
+        return ()
+    if not isinstance(data, list) or not all(isinstance(name, str) for name in data):
+        raise PartError(f"{where}: expected a list of names, not {data!r}")
+    return tuple(data)
 
 
 def _mapping(data: object, where: str) -> Mapping[str, Any]:
@@ -244,4 +283,7 @@ def _mapping(data: object, where: str) -> Mapping[str, Any]:
         return {}
     if not isinstance(data, dict):
         raise PartError(f"{where}: expected keys and values, not {data!r}")
+    for key in data:
+        if not isinstance(key, str):
+            raise PartError(f"{where}: key {key!r} is not text; quote it")
     return data

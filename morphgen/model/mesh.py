@@ -207,7 +207,7 @@ def _colour(geometry: trimesh.Trimesh) -> Rgba | None:
         if visual.uv is None or image is None:
             rgba = material.main_color
         else:
-            colours = material.to_color(visual.uv)  # type: ignore[no-untyped-call]
+            colours = material.to_color(visual.uv)
             rgba = np.mean(colours, axis=0)
     else:
         rgba = np.mean(visual.vertex_colors, axis=0)
