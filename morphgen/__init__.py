@@ -1,7 +1,7 @@
 """morphgen: procedural robot morphologies with embedded tasks.
 
-``compose``, ``read``, ``write``, ``check`` and ``fix`` are loaded when first used, so that
-``import morphgen`` costs nothing.
+``compose``, ``sample``, ``read``, ``write``, ``check`` and ``fix`` are loaded when first used, so
+that ``import morphgen`` costs nothing.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from morphgen.api import check, compose, fix, read, write
+    from morphgen.api import check, compose, fix, read, sample, write
 
-__all__ = ["check", "compose", "fix", "read", "write"]
+__all__ = ["check", "compose", "fix", "read", "sample", "write"]
 
 
 def __getattr__(name: str) -> object:

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from os import PathLike
 from pathlib import Path
 
 from morphgen.checks import check, fix
 from morphgen.formats.bundle import read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
+from morphgen.grammar.conditions import require_condition
 from morphgen.grammar.library import default_library
-from morphgen.grammar.request import default_name, parse_request
+from morphgen.grammar.model import find_grammar, load_grammar
+from morphgen.grammar.request import parse_words
+from morphgen.grammar.sampling import sample as draw_samples
+from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
-__all__ = ["check", "compose", "fix", "read", "write"]
+__all__ = ["check", "compose", "fix", "read", "sample", "write"]
 
 
 def compose(request: str, *, name: str | None = None, library: Iterable[Path] = ()) -> Robot:
     """Join parts into a robot.
 
     Args:
-        request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``.
+        request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``, or a grammar and
+            what is pinned in it, such as ``chain beads=5``.
         name: The robot's name; by default from its parts.
         library: Folders of your own parts.
 
@@ -29,8 +34,38 @@ def compose(request: str, *, name: str | None = None, library: Iterable[Path] = 
             says what does.
     """
     parts = default_library(library)
-    derivation = parse_request(request.split(), parts)
-    return compose_derivation(derivation, parts, name or default_name(derivation, parts))
+    derivation, own = parse_words(request.split(), parts)
+    return compose_derivation(derivation, parts, name or own)
+
+
+def sample(
+    grammar: str | PathLike[str],
+    n: int,
+    *,
+    seed: int = 0,
+    where: str | None = None,
+    library: Iterable[Path] = (),
+) -> Iterator[Robot]:
+    """Draw robots from a grammar, one when asked for.
+
+    Args:
+        grammar: Name of a grammar that comes with morphgen or lies in ``library``, or a path.
+        n: How many.
+        seed: Seed; robot i does not depend on n.
+        where: A condition such as ``reach > 0.4 and dof >= 5``.
+        library: Folders of your own parts and grammars.
+
+    Raises:
+        GrammarError: If the grammar or condition is malformed.
+        SamplingError: If the conditions can hardly be met.
+    """
+    folders = tuple(library)
+    found = load_grammar(find_grammar(str(grammar), folders), folders)
+    conditions = [parse_condition(where)] if where else []
+    for condition in conditions:
+        require_condition(condition)
+    parts = default_library(folders)
+    return (drawn.robot for drawn in draw_samples(found, parts, n, seed=seed, where=conditions))
 
 
 def read(path: str | PathLike[str]) -> Robot:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_LISTED = 24
+
 
 class MorphgenError(Exception):
     """Root of the errors a user can cause; its text is one line fit for a terminal."""
@@ -26,6 +28,10 @@ class PartError(MorphgenError):
     """A part, its manifest or one of its parameters is unknown or wrong."""
 
 
+class GrammarError(MorphgenError):
+    """A grammar, a condition or a derivation is malformed or means nothing."""
+
+
 class CompositionError(MorphgenError):
     """Parts cannot be joined as asked."""
 
@@ -35,7 +41,7 @@ class MissingDependencyError(MorphgenError):
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Return a hint for an unknown name: the closest valid one and the whole list.
+    """Return a hint for an unknown name: the closest valid one and the list, if not too long.
 
     Args:
         name: What the user wrote.
@@ -47,4 +53,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     choices = sorted(valid)
     close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
-    return f"{guess} valid: {', '.join(choices) if choices else '(none)'}"
+    if len(choices) > _LISTED:
+        listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))
+        return f"{guess} nearest of {len(choices)}: {', '.join(listed)}"
+    return f"{guess} valid: {', '.join(choices) or '(none)'}"

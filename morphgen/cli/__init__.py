@@ -12,14 +12,28 @@ from morphgen.cli import (
     check,
     compose,
     conform,
+    derive,
     describe,
+    grammar,
     import_robot,
     list_parts,
+    sample,
     view,
 )
 from morphgen.errors import MorphgenError
 
-COMMANDS = (compose, list_parts, describe, check, import_robot, conform, view)
+COMMANDS = (
+    compose,
+    sample,
+    list_parts,
+    describe,
+    check,
+    conform,
+    import_robot,
+    grammar,
+    derive,
+    view,
+)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -40,8 +54,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 for success, 1 for findings or failed checks, 2 for bad input, 130 when interrupted.
     """
+    try:
+        try:
+            return _run(argv)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _run(argv: Sequence[str] | None) -> int:
     parser = build_parser()
-    args = parser.parse_args(argv)
+    args, words = parser.parse_known_args(argv)
+    if any(word.startswith("-") for word in words) or not (words == [] or hasattr(args, "words")):
+        parser.error(f"unrecognized arguments: {' '.join(words)}")
+    if words:
+        args.words += words
     if args.version:
         from importlib.metadata import version
 
@@ -58,8 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("morphgen: interrupted; nothing half-written is left", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        raise
     except OSError as error:
         return _refused(error, f"{error.filename}: {error.strerror}", args)
 

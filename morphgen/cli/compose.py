@@ -12,13 +12,15 @@ def add_parser(commands: Subparsers) -> None:
     parser = commands.add_parser(
         "compose",
         help="join a base, arms and end-effectors into a robot",
-        description="Join a base, arms and end-effectors into a robot and write its bundle.",
+        description="Join a base, arms and end-effectors into a robot and write its bundle. A "
+        "grammar named first (see: morphgen grammar list) is followed instead: its first "
+        "alternatives and typical values, but for what is pinned.",
         epilog="example: morphgen compose arm=ur5 ee=plane ee.size=80mm --out robots/",
     )
     parser.add_argument(
         "words",
         nargs="+",
-        metavar="KEY=VALUE",
+        metavar="[GRAMMAR] KEY=VALUE",
         help="arm=ur5, ee=plane, ee.size=0.1, left.arm=panda, ee.mount_yaw=45deg ...",
     )
     parser.add_argument("--geometry", choices=["mesh"], default="mesh", help="shapes of real parts")
@@ -32,10 +34,9 @@ def run(args: argparse.Namespace) -> int:
     """Compose, check, write and say where."""
     from morphgen.cli.written import write_and_report
     from morphgen.grammar.compose import compose
-    from morphgen.grammar.request import default_name, parse_request
+    from morphgen.grammar.request import parse_words
 
     library = library_of(args)
-    derivation = parse_request(args.words, library)
-    name = default_name(derivation, library) if args.name is None else args.name
-    robot = compose(derivation, library, name)
+    derivation, name = parse_words(args.words, library)
+    robot = compose(derivation, library, name if args.name is None else args.name)
     return write_and_report(robot, args)

@@ -40,8 +40,11 @@ def run(args: argparse.Namespace) -> int:
     """Import, check, write and say where."""
     from morphgen.cli.written import write_and_report
     from morphgen.errors import FormatError
+    from morphgen.formats.bundle import bundle_folder
     from morphgen.grammar.imported import import_robot
 
+    if args.name is not None:
+        bundle_folder(args.out, args.name)
     pairs = [entry.partition("=") for entry in args.arg]
     for name, equals, value in pairs:
         if not name or not equals:

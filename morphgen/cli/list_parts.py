@@ -7,7 +7,7 @@ import json
 
 from morphgen.cli.options import Subparsers, add_json, add_library, library_of
 
-_KINDS = {"bases": "base", "arms": "arm", "ees": "ee"}
+_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment", "bodies": "body"}
 
 
 def add_parser(commands: Subparsers) -> None:

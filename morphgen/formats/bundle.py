@@ -72,7 +72,7 @@ def write_bundle(
     if folder.exists() and not (folder / CARD).is_file():
         raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
     robot = split_colours(robot)
-    with _replacing(folder) as partial:
+    with replacing_folder(folder) as partial:
         files = _write_meshes(robot, partial / MESHES)
         (partial / URDF).write_text(urdf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
@@ -176,7 +176,7 @@ def _safe(stem: str) -> str:
 
 
 @contextmanager
-def _replacing(folder: Path) -> Iterator[Path]:
+def replacing_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder beside ``folder`` that takes its place if the block succeeds."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

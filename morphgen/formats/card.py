@@ -43,21 +43,21 @@ def card_of(
         "links": len(robot.links),
         "movable": len(robot.movable),
         "dof": robot.dof,
-        "mass": _rounded(robot.mass),
-        "reach": _rounded(reach(robot)) if has_tool and robot.dof else None,
-        "home": {joint.name: _rounded(q) for joint, q in zip(joints, robot.home, strict=True)},
+        "mass": rounded(robot.mass),
+        "reach": rounded(reach(robot)) if has_tool and robot.dof else None,
+        "home": {joint.name: rounded(q) for joint, q in zip(joints, robot.home, strict=True)},
         "frames": {
             frame.name: {
                 "link": frame.link,
-                "position": [_rounded(v) for v in frame.T_link_frame.position],
-                "quaternion": [_rounded(v) for v in frame.T_link_frame.quaternion],
+                "position": [rounded(v) for v in frame.T_link_frame.position],
+                "quaternion": [rounded(v) for v in frame.T_link_frame.quaternion],
             }
             for frame in robot.frames
         },
         "ignore_pairs": [list(pair) for pair in robot.ignore_pairs],
         "actuation": {
             gains.joint: {
-                key: _rounded(value) for key, value in asdict(gains).items() if key != "joint"
+                key: rounded(value) for key, value in asdict(gains).items() if key != "joint"
             }
             for gains in actuation(robot)
         },
@@ -106,7 +106,7 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
     Raises:
         FormatError: If the card lacks a key, or a value is of the wrong type.
     """
-    keys = ("derivation", "source", "repairs", "parts", "accepted")
+    keys = ("derivation", "source", "choices", "repairs", "parts", "accepted")
     try:
         home = card["home"]
         return replace(
@@ -121,5 +121,6 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
         raise FormatError(f"{origin}: home or ignore_pairs: {error}") from error
 
 
-def _rounded(value: float | None) -> float | None:
+def rounded(value: float | None) -> float | None:
+    """A number as files hold it: 12 significant digits."""
     return None if value is None else float(number(value))

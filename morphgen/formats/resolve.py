@@ -152,6 +152,17 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
     raise FormatError(f"{base}: {uri!r} names no file: looked for {_listed(missing)}")
 
 
+def portable_uri(path: Path) -> str:
+    """The ``package://`` URI of a file in a ROS package, which names it on any machine.
+
+    A file in no package (no folder above has a ``package.xml`` or ROS's suffix) keeps its path.
+    """
+    for folder in path.parents:
+        if (folder / "package.xml").is_file() or _PACKAGE_SUFFIX.search(folder.name):
+            return f"package://{folder.name}/{path.relative_to(folder).as_posix()}"
+    return path.as_posix()
+
+
 def distribution_file(package: str, relative: str) -> Path:
     """Return a file of an installed pip distribution.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -44,59 +44,116 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
         FormatError: If a part's source cannot be read.
     """
     robot = join(derivation, library, name)
+    return with_ignore_pairs(robot, derivation, library)
+
+
+def with_ignore_pairs(robot: Robot, derivation: Derivation, library: Library) -> Robot:
+    """A joined robot with the pairs whose contact is no self-collision."""
     return replace(robot, ignore_pairs=_ignored(robot, place(derivation, library).values()))
 
 
 def join(derivation: Derivation, library: Library, name: str) -> Robot:
-    """Build the robot of a derivation without looking at collisions."""
-    links: list[Link] = []
-    joints: list[Joint] = []
-    home: list[float] = []
-    tools: list[tuple[str, Frame]] = []
-    placed = place(derivation, library)
+    """Build the robot of a derivation without looking at collisions.
 
-    def add(node: Derivation, parent: str | None, T_parent_port: Pose) -> None:
-        here = placed[node.label]
+    A part whose root is a bare frame dissolves it: what hangs on the root hangs on the parent.
+    The tool is that of the outermost part which has one, else the first port of the last part.
+    """
+    placed = place(derivation, library)
+    assembly = _Assembly(placed)
+    assembly.add(derivation, None, IDENTITY, owns_tool=True)
+    return Robot(
+        name,
+        tuple(assembly.links),
+        tuple(assembly.joints),
+        _tool_frames(assembly.tools),
+        tuple(assembly.home),
+        provenance={
+            "derivation": str(derivation),
+            "parts": _provenance(placed.values()),
+            "accepted": {
+                here.scoped(link): dict(whys)
+                for here in placed.values()
+                for link, whys in here.part.manifest.accepted.items()
+            },
+        },
+    )
+
+
+class _Assembly:
+    """A robot being put together, parts appended parents first."""
+
+    def __init__(self, placed: Mapping[str, Placed]) -> None:
+        self._placed = placed
+        self._dissolved: dict[str, Frame] = {}
+        self.links: list[Link] = []
+        self.joints: list[Joint] = []
+        self.home: list[float] = []
+        self.tools: list[tuple[str, Frame]] = []
+
+    def add(
+        self, node: Derivation, parent: str | None, T_parent_port: Pose, *, owns_tool: bool
+    ) -> None:
+        """Attach a part, and then what is attached to it."""
+        here = self._placed[node.label]
         part = here.part
-        root = here.scoped(part.body.root.name)
-        T_port_mount = Pose(quaternion=from_rpy((0.0, 0.0, here.mount_yaw)))
-        T_parent_root = T_parent_port @ T_port_mount @ part.T_root_mount.inverse()
-        if parent is not None:
-            joints.append(Joint(here.scoped("mount"), "fixed", parent, root, T_parent_root))
-        elif not part.T_root_mount.is_identity:
-            raise CompositionError(
-                f"{part.manifest.name!r} needs a base: its mount is not its root"
-            )
-        links.extend(replace(link, name=here.scoped(link.name)) for link in part.body.links)
-        joints.extend(_scoped_joint(joint, here) for joint in part.body.joints)
-        home.extend(part.body.home)
+        self._add_root(here, parent, T_parent_port)
+        self.links.extend(
+            replace(link, name=here.scoped(link.name)) for link in part.body.links[1:]
+        )
+        self.joints.extend(self._scoped(joint, here) for joint in part.body.joints)
+        self.home.extend(part.body.home)
         for port, child in node.children:
             if port not in part.ports:
                 raise CompositionError(
                     f"{part.manifest.name!r} has no port {port!r}{nearest(port, part.ports)}"
                 )
-            frame = part.ports[port]
-            add(child, here.scoped(frame.link), frame.T_link_frame)
-        if part.tool is not None and not node.children:
-            tools.append((node.label, replace(part.tool, link=here.scoped(part.tool.link))))
+            frame = self._frame(part.ports[port], here)
+            self.add(
+                child, frame.link, frame.T_link_frame, owns_tool=owns_tool and part.tool is None
+            )
+        tool = part.tool or (None if node.children else next(iter(part.ports.values()), None))
+        if owns_tool and tool is not None:
+            self.tools.append((node.label, self._frame(tool, here)))
 
-    add(derivation, None, IDENTITY)
-    return Robot(
-        name,
-        tuple(links),
-        tuple(joints),
-        _tool_frames(tools),
-        tuple(home),
-        provenance={
-            "derivation": str(derivation),
-            "parts": _provenance(placed.values()),
-            "accepted": {
-                here.scoped(name): dict(whys)
-                for here in placed.values()
-                for name, whys in here.part.manifest.accepted.items()
-            },
-        },
-    )
+    def _add_root(self, here: Placed, parent: str | None, T_parent_port: Pose) -> None:
+        part = here.part
+        root = here.scoped(part.body.root.name)
+        if parent is None:
+            if not part.T_root_mount.is_identity:
+                raise CompositionError(
+                    f"{part.manifest.name!r} needs a base: its mount is not its root"
+                )
+            self.links.append(replace(part.body.root, name=root))
+            return
+        T_port_mount = Pose(quaternion=from_rpy((0.0, 0.0, here.mount_yaw)))
+        T_parent_root = T_parent_port @ T_port_mount @ part.T_root_mount.inverse()
+        if part.body.root.is_empty:
+            self._dissolved[root] = Frame(root, parent, T_parent_root)
+            return
+        self.links.append(replace(part.body.root, name=root))
+        self.joints.append(Joint(here.scoped("mount"), "fixed", parent, root, T_parent_root))
+
+    def _frame(self, frame: Frame, here: Placed) -> Frame:
+        """A part's frame on a link of the robot."""
+        link = here.scoped(frame.link)
+        if link not in self._dissolved:
+            return replace(frame, link=link)
+        parent = self._dissolved[link]
+        return Frame(frame.name, parent.link, parent.T_link_frame @ frame.T_link_frame)
+
+    def _scoped(self, joint: Joint, here: Placed) -> Joint:
+        mimic = joint.mimic
+        if mimic is not None:
+            mimic = Mimic(here.scoped(mimic.joint), mimic.multiplier, mimic.offset)
+        on = self._frame(Frame(joint.name, joint.parent, joint.T_parent_joint), here)
+        return replace(
+            joint,
+            name=here.scoped(joint.name),
+            parent=on.link,
+            child=here.scoped(joint.child),
+            T_parent_joint=on.T_link_frame,
+            mimic=mimic,
+        )
 
 
 def place(derivation: Derivation, library: Library) -> dict[str, Placed]:
@@ -109,19 +166,6 @@ def place(derivation: Derivation, library: Library) -> dict[str, Placed]:
         yaw = values.pop(MOUNT_YAW.name, 0.0)
         placed[node.label] = Placed(node.label, load_part(library.manifest(node.part), values), yaw)
     return placed
-
-
-def _scoped_joint(joint: Joint, here: Placed) -> Joint:
-    mimic = joint.mimic
-    if mimic is not None:
-        mimic = Mimic(here.scoped(mimic.joint), mimic.multiplier, mimic.offset)
-    return replace(
-        joint,
-        name=here.scoped(joint.name),
-        parent=here.scoped(joint.parent),
-        child=here.scoped(joint.child),
-        mimic=mimic,
-    )
 
 
 def _tool_frames(tools: list[tuple[str, Frame]]) -> tuple[Frame, ...]:
@@ -154,7 +198,8 @@ def _ignored(robot: Robot, placed: Iterable[Placed]) -> tuple[Pair, ...]:
     known: list[Pair] = []
     for here in placed:
         owner |= {here.scoped(link.name): here.label for link in here.part.body.links}
-        known += [sorted_pair(here.scoped(a), here.scoped(b)) for a, b in part_pairs(here.part)]
+        pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(here.part)]
+        known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
     return ignore_pairs(robot, known=known, check=lambda a, b: owner[a] != owner[b])
 
 

@@ -1,12 +1,30 @@
-"""Derivations: which parts a body is made of, with which parameters, attached where."""
+"""Derivations: which parts a body is made of, with which parameters, attached where.
+
+The text of a derivation reads ``base=fixed(spread=0.6)[top: arm=ur5[flange: ee=stick]]``: a label,
+the part, its parameters in SI units, and what is attached to its ports.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
+from lark import Lark, Token, Transformer, UnexpectedInput, v_args
+
+from morphgen.errors import GrammarError
 from morphgen.formats.urdf_text import number
+
+_SYNTAX = r"""
+node: NAME "=" NAME ["(" value ("," value)* ")"] ["[" child ("," child)* "]"]
+value: NAME "=" NUMBER
+child: NAME ":" node
+NAME: /[A-Za-z_]\w*/
+NUMBER: /[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?/
+%ignore /\s+/
+"""
 
 
 @dataclass(frozen=True)
@@ -40,3 +58,78 @@ class Derivation:
     def digest(self) -> str:
         """SHA-256 of the text, hexadecimal."""
         return hashlib.sha256(str(self).encode()).hexdigest()
+
+
+def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
+    """Read a derivation's text.
+
+    Raises:
+        GrammarError: At the first place that is none.
+    """
+    try:
+        derivation: Derivation = _Builder().transform(_parser().parse(text))
+    except UnexpectedInput as error:
+        place = f"{origin}:{max(error.line, 1)}:{max(error.column, 1)}"
+        raise GrammarError(
+            f"{place}: no derivation, such as base=fixed[top: arm=ur5[flange: ee=stick]]"
+        ) from error
+    return derivation
+
+
+def outline(derivation: Derivation) -> str:
+    """The derivation with a line a part, indented."""
+    return "\n".join(_outline(derivation, "", 0))
+
+
+def difference(a: Derivation, b: Derivation) -> list[str]:
+    """What differs between two derivations, a line a difference; none if they are the same."""
+    return [f"{sign} {line}" for sign, line in _difference(_flat(a), _flat(b))]
+
+
+def _outline(node: Derivation, port: str, depth: int) -> Iterator[str]:
+    own = Derivation(node.label, node.part, node.parameters)
+    yield "  " * depth + (f"{port}: " if port else "") + str(own)
+    for name, child in node.children:
+        yield from _outline(child, name, depth + 1)
+
+
+def _flat(derivation: Derivation) -> dict[str, str]:
+    """Facts by what they are about: a part's kind and place, and each parameter."""
+    facts: dict[str, str] = {derivation.label: derivation.part}
+    for node in derivation.walk():
+        for name, value in node.parameters:
+            facts[f"{node.label}.{name}"] = number(value)
+        for port, child in node.children:
+            facts[child.label] = f"{child.part} on {node.label}:{port}"
+    return facts
+
+
+def _difference(a: dict[str, str], b: dict[str, str]) -> Iterator[tuple[str, str]]:
+    for key in dict.fromkeys((*a, *b)):
+        if a.get(key) == b.get(key):
+            continue
+        if key in a:
+            yield "-", f"{key} = {a[key]}"
+        if key in b:
+            yield "+", f"{key} = {b[key]}"
+
+
+@lru_cache(maxsize=1)
+def _parser() -> Lark:
+    return Lark(_SYNTAX, parser="lalr", start="node", maybe_placeholders=False)
+
+
+@v_args(inline=True)
+class _Builder(Transformer[Token, Any]):
+    """Lark's tree to derivations."""
+
+    def node(self, label: Token, part: Token, *rest: Any) -> Derivation:
+        values = tuple(entry for entry in rest if isinstance(entry[1], float))
+        children = tuple(entry for entry in rest if isinstance(entry[1], Derivation))
+        return Derivation(str(label), str(part), values, children)
+
+    def value(self, name: Token, text: Token) -> tuple[str, float]:
+        return (str(name), float(text))
+
+    def child(self, port: Token, node: Derivation) -> tuple[str, Derivation]:
+        return (str(port), node)

@@ -13,8 +13,9 @@ import yaml
 from morphgen.errors import PartError, nearest
 from morphgen.grammar.parameters import Parameter
 
-Kind = Literal["arm", "ee", "base"]
-KINDS: tuple[Kind, ...] = ("base", "arm", "ee")
+Kind = Literal["base", "arm", "ee", "segment", "body"]
+KINDS: tuple[Kind, ...] = ("base", "arm", "ee", "segment", "body")
+"""A segment is a piece that grammars chain; a body is a whole robot by itself."""
 Number = float | str
 """A number, or an expression over the part's parameters such as ``${size / 2}``."""
 
@@ -224,7 +225,7 @@ def _triple(data: object, where: str) -> tuple[Number, Number, Number]:
 def _parameter(name: str, data: object, path: Path) -> Parameter:
     where = f"{path}: parameters.{name}"
     entries = _mapping(data, where)
-    allowed = ("default", "min", "max", "unit", "summary")
+    allowed = ("default", "min", "max", "unit", "integer", "summary")
     for key in entries:
         if key not in allowed:
             raise PartError(f"{where}: unknown key {key!r}{nearest(key, allowed)}")
@@ -239,6 +240,7 @@ def _parameter(name: str, data: object, path: Path) -> Parameter:
         high,
         str(entries.get("unit", "")),
         str(entries.get("summary", "")),
+        bool(entries.get("integer", False)),
     )
 
 

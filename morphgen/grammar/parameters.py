@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from morphgen.errors import PartError, nearest
+from morphgen.formats.urdf_text import number
 
 _SCALES: dict[str, dict[str, float]] = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},
@@ -15,6 +16,10 @@ _SCALES: dict[str, dict[str, float]] = {
     "kg": {"kg": 1.0, "g": 0.001},
     "": {},
 }
+UNITS: Mapping[str, tuple[str, float]] = {
+    name: (unit, scale) for unit, scales in _SCALES.items() for name, scale in scales.items()
+}
+"""Every unit that can be written: the SI unit it stands for, and its factor."""
 _VALUE = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[a-zA-Z]*)")
 
 
@@ -29,6 +34,8 @@ class Parameter:
     unit: str = ""
     """``m``, ``rad``, ``kg``, or empty for a pure number."""
     summary: str = ""
+    integer: bool = False
+    """Whether only whole numbers make sense, such as a count."""
 
     def __post_init__(self) -> None:
         if self.unit not in _SCALES:
@@ -69,7 +76,7 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
         if unit not in scales:
             raise PartError(f"{where}={text}: wrong unit {unit!r}{_expected(parameter)}")
         value *= scales[unit]
-    return require_range(value, parameter, where)
+    return require_range(float(number(value)), parameter, where)
 
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
@@ -80,6 +87,8 @@ def require_range(value: float, parameter: Parameter, where: str) -> float:
     """
     if not parameter.minimum <= value <= parameter.maximum:
         raise PartError(f"{where}={value:g}: out of range{_expected(parameter)}")
+    if parameter.integer and value != int(value):
+        raise PartError(f"{where}={value:g}: not a whole number{_expected(parameter)}")
     return value
 
 

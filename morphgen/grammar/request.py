@@ -7,10 +7,15 @@ from dataclasses import dataclass, field
 
 from morphgen.errors import CompositionError, nearest
 from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.derive import First, derive
 from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import KINDS, Kind, Manifest
+from morphgen.grammar.manifest import Kind, Manifest
+from morphgen.grammar.model import find_grammar, load_grammar
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
+from morphgen.grammar.pinning import pin
 
+SLOTS: tuple[Kind, ...] = ("base", "arm", "ee")
+"""Kinds of parts that a request may choose."""
 MAIN_PORTS: Mapping[Kind, str] = {"base": "top", "arm": "flange"}
 """Where the next part goes when no port is named."""
 
@@ -28,6 +33,24 @@ class _Slot:
     @property
     def key(self) -> str:
         return f"{self.port}.{self.kind}" if self.port else self.kind
+
+
+def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str]:
+    """Read words into a derivation and a name for its robot.
+
+    The words are a request (see ``parse_request``), or a grammar's name and what is pinned in it
+    (see ``morphgen.grammar.pinning.pin``): then the grammar's first alternatives, smallest counts
+    and typical values are taken.
+
+    Raises:
+        MorphgenError: If the words name what does not exist or does not fit.
+    """
+    if not words or "=" in words[0]:
+        derivation = parse_request(words, library)
+        return derivation, default_name(derivation, library)
+    grammar = load_grammar(find_grammar(words[0], library.folders), library.folders)
+    derivation = derive(pin(grammar, words[1:], library), library, First())
+    return derivation, "-".join([grammar.name, *([derivation.digest[:6]] if words[1:] else [])])
 
 
 def parse_request(words: Sequence[str], library: Library) -> Derivation:
@@ -84,7 +107,7 @@ def _slots(words: Sequence[str]) -> dict[str, _Slot]:
         if not equals or not key or not value:
             raise CompositionError(f"{word!r} is not of the form key=value, such as arm=ur5")
         *port, last = key.split(".")
-        if last not in KINDS:
+        if last not in SLOTS:
             if key in values:
                 raise CompositionError(f"{key} is given twice")
             values[key] = value

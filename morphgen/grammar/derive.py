@@ -1,0 +1,356 @@
+"""From a grammar to a derivation, one choice after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from morphgen.errors import GrammarError, PartError, nearest
+from morphgen.formats.urdf_text import number
+from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import Manifest
+from morphgen.grammar.model import Grammar
+from morphgen.grammar.parameters import MOUNT_YAW, Parameter, require_range
+from morphgen.grammar.syntax import Alternative, Expression, Item, Production
+from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
+
+MAX_PARTS = 200
+"""Parts of one robot beyond which a recursion is taken to be endless."""
+MAIN_PORTS = ("top", "flange", "end")
+"""Ports where the next part goes when none is named."""
+
+Choices = Mapping[str, float]
+"""What was decided, by the place in the derivation: index, count or value."""
+
+
+class Chooser(Protocol):
+    """Decides what a grammar leaves open."""
+
+    def alternative(self, key: str, weights: list[float]) -> int:
+        """Index of an alternative."""
+
+    def count(self, key: str, low: int, high: int) -> int:
+        """Number of repetitions."""
+
+    def value(self, key: str, distribution: Distribution) -> float:
+        """Value of a distribution."""
+
+
+class First:
+    """Takes the first alternative, the smallest count and the typical value."""
+
+    def alternative(self, key: str, weights: list[float]) -> int:
+        """The first with a positive weight."""
+        return next(i for i, weight in enumerate(weights) if weight > 0)
+
+    def count(self, key: str, low: int, high: int) -> int:
+        """The smallest."""
+        return low
+
+    def value(self, key: str, distribution: Distribution) -> float:
+        """The typical one."""
+        return no_draw(key, distribution)
+
+
+class Random:
+    """Draws from a generator."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+
+    def alternative(self, key: str, weights: list[float]) -> int:
+        """In proportion to the weights."""
+        total = np.cumsum(weights)
+        return int(np.searchsorted(total, self._rng.random() * total[-1], side="right"))
+
+    def count(self, key: str, low: int, high: int) -> int:
+        """Uniformly."""
+        return int(self._rng.integers(low, high + 1))
+
+    def value(self, key: str, distribution: Distribution) -> float:
+        """As the distribution says."""
+        return distribution.draw(self._rng.random, self._rng.standard_normal)
+
+
+@dataclass
+class Recorded:
+    """Takes given choices where they fit, others from another chooser, and notes all."""
+
+    other: Chooser
+    given: Choices = field(default_factory=dict)
+    made: dict[str, float] = field(default_factory=dict)
+
+    def alternative(self, key: str, weights: list[float]) -> int:
+        """The given index if there is such an alternative."""
+        given = self.given.get(key)
+        if given is None or given not in range(len(weights)):
+            given = self.other.alternative(key, weights)
+        return int(self._note(key, given))
+
+    def count(self, key: str, low: int, high: int) -> int:
+        """The given count if it is in range."""
+        given = self.given.get(key)
+        if given is None or given not in range(low, high + 1):
+            given = self.other.count(key, low, high)
+        return int(self._note(key, given))
+
+    def value(self, key: str, distribution: Distribution) -> float:
+        """The given value if the distribution can give it."""
+        given = self.given.get(key)
+        low, high = distribution.bounds
+        if given is None or not low <= given <= high:
+            given = self.other.value(key, distribution)
+        return self._note(key, given)
+
+    def _note(self, key: str, value: float) -> float:
+        if key in self.made:
+            raise GrammarError(f"two choices share the key {key!r}")
+        self.made[key] = value
+        return value
+
+
+@dataclass
+class _Node:
+    """A part under construction."""
+
+    label: str
+    part: str
+    values: dict[str, float]
+    ports: tuple[str, ...]
+    children: list[tuple[str, _Node]] = field(default_factory=list)
+
+    def frozen(self) -> Derivation:
+        return Derivation(
+            self.label,
+            self.part,
+            tuple(self.values.items()),
+            tuple((port, child.frozen()) for port, child in self.children),
+        )
+
+
+class EndlessError(GrammarError):
+    """A derivation has more parts than allowed."""
+
+
+def derive(
+    grammar: Grammar, library: Library, chooser: Chooser, max_parts: int = MAX_PARTS
+) -> Derivation:
+    """Rewrite the start symbol until only parts are left.
+
+    Args:
+        grammar: The grammar.
+        library: Where its parts are.
+        chooser: Decides alternatives, counts and values.
+        max_parts: Parts beyond which the derivation is given up.
+
+    Raises:
+        GrammarError: If a name is unknown, a port is missing or taken, a value does not fit its
+            parameter, or the derivation does not end (``EndlessError``); the message says where in
+            the grammar.
+    """
+    return _Run(grammar, library, chooser, max_parts).tree().frozen()
+
+
+class _Run:
+    """One derivation."""
+
+    def __init__(
+        self, grammar: Grammar, library: Library, chooser: Chooser, max_parts: int
+    ) -> None:
+        self._grammar, self._library, self._chooser = grammar, library, chooser
+        self._max_parts = max_parts
+        self._labels: set[str] = set()
+        self._names: dict[str, tuple[float, str]] = {}
+        for let in grammar.lets:
+            scope = Scope(self._names, chooser.value, f"let {let.name}")
+            self._names[let.name] = evaluate(let.expression, _counted(scope))
+
+    def tree(self) -> _Node:
+        start = self._grammar.production(self._grammar.start)
+        if start is None:
+            symbols = [production.symbol for production in self._grammar.productions]
+            raise GrammarError(
+                f"grammar {self._grammar.name!r} has no symbol {self._grammar.start!r}"
+                + nearest(self._grammar.start, symbols)
+            )
+        first, _ = self._sequence(self._alternative(start, start.symbol), "", start.symbol, 0)
+        return first
+
+    def _expand(
+        self, item: Item, label: str, prefix: str, key: str, depth: int
+    ) -> tuple[_Node, _Node]:
+        """Rewrite one item; return its first part and the one where it goes on.
+
+        A single part takes the label; of several, each takes its own name after the prefix.
+        """
+        production = self._grammar.production(item.name)
+        if production is None:
+            node = self._part(item, label, key)
+            return node, node
+        if item.arguments:
+            raise GrammarError(f"{item.place}: {item.name!r} is a symbol and takes no parameters")
+        if depth > MAX_PARTS:
+            raise EndlessError(f"{item.place}: {item.name!r} does not end: {depth} levels deep")
+        alternative = self._alternative(production, key)
+        if len(alternative.items) == 1:
+            (only,) = alternative.items
+            if only.repetition is None and not only.port:
+                return self._expand(only, label, prefix, f"{key}/{only.name}", depth + 1)
+        return self._sequence(alternative, prefix, key, depth)
+
+    def _sequence(
+        self, alternative: Alternative, prefix: str, key: str, depth: int
+    ) -> tuple[_Node, _Node]:
+        ends: list[tuple[_Node, _Node]] = []
+        trunk: _Node | None = None
+        for position, item in enumerate(alternative.items):
+            limb = f"{prefix}{item.port}_" if item.port else prefix
+            below = f"{key}/{position}.{item.name}"
+            for label, inner, place in self._repeated(item, limb, below):
+                first, last = self._expand(item, label, inner, place, depth + 1)
+                ends.append((first, last))
+                if trunk is not None:
+                    _attach(trunk, first, item)
+                if trunk is None or not item.port:
+                    trunk = last
+        return ends[0][0], trunk or ends[0][1]
+
+    def _repeated(self, item: Item, prefix: str, key: str) -> list[tuple[str, str, str]]:
+        """(label of a single part, prefix of several, key) of every repetition."""
+        if item.repetition is None:
+            return [(prefix + item.name, prefix, key)]
+        low, high = item.repetition
+        n = low if low == high else self._chooser.count(f"{key}#", low, high)
+        names = [f"{prefix}{item.name}{i}" for i in range(1, n + 1)]
+        return [(name, f"{name}_", f"{key}[{i}]") for i, name in enumerate(names, start=1)]
+
+    def _alternative(self, production: Production, key: str) -> Alternative:
+        weights = []
+        for alternative in production.alternatives:
+            weight = 1.0
+            if alternative.weight is not None:
+                scope = Scope(self._names, no_draw, key)
+                weight = evaluate(alternative.weight, scope)[0]
+                if weight < 0:
+                    raise GrammarError(
+                        f"{alternative.weight.place}: a weight is negative: {weight:g}"
+                    )
+            weights.append(weight)
+        if sum(weights) <= 0:
+            raise GrammarError(f"{production.place}: all weights of {production.symbol!r} are zero")
+        if len(weights) == 1:
+            return production.alternatives[0]
+        return production.alternatives[self._chooser.alternative(key, weights)]
+
+    def _part(self, item: Item, label: str, key: str) -> _Node:
+        manifest = require_part(item, self._grammar, self._library)
+        parameters = attached_parameters(manifest)
+        values = {name: parameter.default for name, parameter in parameters.items()}
+        for name, expression in item.arguments:
+            scope = _counted(Scope(self._names, self._chooser.value, f"{key}.{name}"))
+            values[name] = argument(item, name, expression, parameters, scope)
+        if values[MOUNT_YAW.name] == 0.0:
+            del values[MOUNT_YAW.name]
+        node = _Node(self._free(label), item.name, values, tuple(manifest.ports))
+        if len(self._labels) > self._max_parts:
+            raise EndlessError(f"{item.place}: more than {self._max_parts} parts: does it end?")
+        return node
+
+    def _free(self, label: str) -> str:
+        free, k = label, 1
+        while free in self._labels:
+            k += 1
+            free = f"{label}_{k}"
+        self._labels.add(free)
+        return free
+
+
+def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
+    """The manifest of an item that is no symbol.
+
+    Raises:
+        GrammarError: If it is no part either.
+    """
+    if item.name not in library.paths:
+        valid = [*(production.symbol for production in grammar.productions), *library.paths]
+        raise GrammarError(
+            f"{item.place}: {item.name!r} is neither a symbol nor a part{nearest(item.name, valid)}"
+        )
+    return library.manifest(item.name)
+
+
+def attached_parameters(manifest: Manifest) -> dict[str, Parameter]:
+    """Parameters of a part in a tree: its own, and the turn of its mount."""
+    return {**manifest.parameters, MOUNT_YAW.name: MOUNT_YAW}
+
+
+def argument(
+    item: Item,
+    name: str,
+    expression: Expression,
+    parameters: Mapping[str, Parameter],
+    scope: Scope,
+) -> float:
+    """The value of an item's argument.
+
+    Raises:
+        GrammarError: If there is no such parameter, or the value is of another unit or out of
+            range.
+    """
+    if name not in parameters:
+        raise GrammarError(
+            f"{expression.place}: {item.name!r} has no parameter {name!r}"
+            + nearest(name, parameters)
+        )
+    parameter = parameters[name]
+    value, unit = evaluate(expression, scope)
+    if unit and unit != parameter.unit:
+        raise GrammarError(
+            f"{expression.place}: {name} is in {parameter.unit or 'pure numbers'}, "
+            f"{expression} in {unit}"
+        )
+    try:
+        return require_range(float(number(value)), parameter, f"{item.name}.{name}")
+    except PartError as error:
+        raise GrammarError(f"{expression.place}: {error}") from error
+
+
+def _counted(scope: Scope) -> Scope:
+    """A scope whose second and later distributions of one expression have keys of their own."""
+    calls = 0
+
+    def draw(key: str, distribution: Distribution) -> float:
+        nonlocal calls
+        calls += 1
+        return scope.draw(key if calls == 1 else f"{key}~{calls}", distribution)
+
+    return Scope(scope.names, draw, scope.key)
+
+
+def _attach(trunk: _Node, node: _Node, item: Item) -> None:
+    port = item.port or _main_port(trunk, item)
+    if port not in trunk.ports:
+        raise GrammarError(
+            f"{item.place}: {trunk.part!r} has no port {port!r}{nearest(port, trunk.ports)}"
+        )
+    if any(port == taken for taken, _ in trunk.children):
+        raise GrammarError(f"{item.place}: port {port!r} of {trunk.part!r} is taken already")
+    trunk.children.append((port, node))
+
+
+def _main_port(trunk: _Node, item: Item) -> str:
+    for port in MAIN_PORTS:
+        if port in trunk.ports:
+            return port
+    if len(trunk.ports) == 1:
+        return trunk.ports[0]
+    if not trunk.ports:
+        raise GrammarError(f"{item.place}: nothing can go on {trunk.part!r}: it has no port")
+    raise GrammarError(
+        f"{item.place}: say on which port of {trunk.part!r}, such as "
+        f"{trunk.ports[0]}:{item.name}; ports: {', '.join(trunk.ports)}"
+    )

@@ -1,0 +1,245 @@
+"""A set of robots on disk: drawn in parallel, resumed after any interruption, the same bytes.
+
+    <set>/set.json          grammar, seed, conditions, format
+    <set>/grammar.grammar   the grammar with its includes, as one text
+    <set>/<name>-000017/    a bundle, or with ``light`` its URDF and derivation only
+    <set>/index.jsonl       a line a robot, by number
+
+While a run lasts, what is done stands in ``.journal.jsonl``.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from morphgen.errors import FormatError
+from morphgen.formats.bundle import URDF, replacing_folder, write_bundle
+from morphgen.formats.card import rounded
+from morphgen.formats.resolve import portable_uri
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.model import Grammar, grammar_from_text
+from morphgen.grammar.sampling import Sample, draw
+from morphgen.grammar.syntax import parse_condition
+from morphgen.model.robot import Robot
+
+INDEX = "index.jsonl"
+SETTINGS = "set.json"
+GRAMMAR = "grammar.grammar"
+DERIVATION = "derivation.txt"
+JOURNAL = ".journal.jsonl"
+
+Record = dict[str, Any]
+"""A line of the index."""
+Work = Callable[["SetPlan", Sequence[int]], Iterator[Record]]
+"""Makes the robots of the given numbers, in any order."""
+
+
+@dataclass(frozen=True)
+class SetPlan:
+    """Everything that a worker needs to make the robots of a set; plain data."""
+
+    folder: Path
+    grammar_name: str
+    grammar_text: str
+    seed: int
+    where: tuple[str, ...]
+    light: bool
+    picture: bool
+    library: tuple[Path, ...]
+    """The user's folders of parts."""
+
+    def settings(self) -> Record:
+        """What ``set.json`` holds: a set is only continued with the same."""
+        return {
+            "format": 1,
+            "grammar": self.grammar_name,
+            "seed": self.seed,
+            "where": list(self.where),
+            "light": self.light,
+        }
+
+
+@dataclass(frozen=True)
+class SetReport:
+    """What a run did."""
+
+    made: int
+    kept: int
+    """Robots that were there already."""
+    rejected: dict[str, int]
+    """Draws that were thrown away over the whole set, by the reason."""
+    duplicates: list[tuple[str, str]]
+    """Robots with the same body as an earlier one: (name, name of the earlier)."""
+
+
+def make_set(
+    plan: SetPlan, n: int, work: Work, progress: Callable[[int], None] = lambda done: None
+) -> SetReport:
+    """Make robots 0 to n - 1 of a set, but for those that are there.
+
+    Args:
+        plan: The set.
+        n: How many robots it shall hold.
+        work: Makes robots, such as ``make_serially``.
+        progress: Told how many are done, again and again.
+
+    Raises:
+        FormatError: If the folder holds a set made otherwise, or something else, or cannot be
+            written.
+        SamplingError: If a robot's conditions cannot be met.
+    """
+    _prepare(plan)
+    done = {record["index"]: record for record in _finished(plan)}
+    kept = len(done)
+    missing = [i for i in range(n) if i not in done]
+    progress(n - len(missing))
+    with (plan.folder / JOURNAL).open("a", encoding="utf-8") as journal:
+        for record in work(plan, missing):
+            journal.write(json.dumps(record) + "\n")
+            journal.flush()
+            done[record["index"]] = record
+            progress(n - len(missing) + len(done) - kept)
+    records = [done[i] for i in sorted(done)]
+    _write_atomic(plan.folder / INDEX, "".join(json.dumps(r) + "\n" for r in records))
+    (plan.folder / JOURNAL).unlink()
+    return _report(records, len(missing), kept)
+
+
+def make_serially(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
+    """Make robots one after the other in this process."""
+    maker = Maker(plan)
+    for index in indices:
+        yield maker.make(index)
+
+
+class Maker:
+    """Draws and writes robots of a set."""
+
+    def __init__(self, plan: SetPlan) -> None:
+        self._plan = plan
+        self._library: Library = default_library(plan.library)
+        self._grammar: Grammar = grammar_from_text(plan.grammar_text, plan.grammar_name)
+        self._where = [parse_condition(text) for text in plan.where]
+
+    def make(self, index: int) -> Record:
+        """Draw and write one robot; return its line of the index."""
+        plan = self._plan
+        drawn = draw(self._grammar, self._library, index, seed=plan.seed, where=self._where)
+        folder = plan.folder / drawn.robot.name
+        if plan.light:
+            _write_light(drawn, folder)
+        else:
+            write_bundle(drawn.robot, folder, drawn.findings, picture=plan.picture)
+        return _record(drawn)
+
+
+def read_index(folder: Path) -> list[Record]:
+    """The index of a set.
+
+    Raises:
+        FormatError: If the folder is no finished set.
+    """
+    path = folder / INDEX
+    if not path.is_file():
+        raise FormatError(f"{folder} is no finished set: it has no {INDEX}")
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def _record(drawn: Sample) -> Record:
+    robot = drawn.robot
+    return {
+        "index": drawn.index,
+        "name": robot.name,
+        "hash": drawn.derivation.digest,
+        "derivation": str(drawn.derivation),
+        "dof": robot.dof,
+        "links": len(robot.links),
+        "movable": len(robot.movable),
+        "reach": rounded(drawn.properties.reach),
+        "mass": rounded(robot.mass),
+        "findings": sorted({finding.code for finding in drawn.findings}),
+        "rejected": dict(sorted(drawn.rejected.items())),
+        "choices": {key: rounded(value) for key, value in drawn.choices.items()},
+    }
+
+
+def _write_light(drawn: Sample, folder: Path) -> None:
+    with replacing_folder(folder) as partial:
+        (partial / URDF).write_text(light_urdf(drawn.robot), encoding="utf-8")
+        (partial / DERIVATION).write_text(f"{drawn.derivation}\n", encoding="utf-8")
+
+
+def light_urdf(robot: Robot) -> str:
+    """URDF without a bundle: meshes are named where their data package has them."""
+    return urdf_text(robot, lambda mesh: portable_uri(mesh.path))
+
+
+def _prepare(plan: SetPlan) -> None:
+    """Make the folder, or see that it holds the same set."""
+    path = plan.folder / SETTINGS
+    wanted = plan.settings()
+    if not path.exists():
+        if plan.folder.exists() and any(plan.folder.iterdir()):
+            raise FormatError(f"{plan.folder} exists and is no set (no {SETTINGS}); name another")
+        try:
+            plan.folder.mkdir(parents=True, exist_ok=True)
+            _write_atomic(plan.folder / GRAMMAR, plan.grammar_text)
+            _write_atomic(path, json.dumps(wanted, indent=2) + "\n")
+        except OSError as error:
+            raise FormatError(f"cannot write to {plan.folder}: {error.strerror}") from error
+        return
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FormatError(f"{path}: no valid JSON: {error}") from error
+    for key, value in wanted.items():
+        if found.get(key) != value:
+            raise FormatError(
+                f"{plan.folder} holds another set: its {key} is {found.get(key)!r}, not {value!r}; "
+                "name another folder"
+            )
+    if (plan.folder / GRAMMAR).read_text(encoding="utf-8") != plan.grammar_text:
+        raise FormatError(f"{plan.folder} holds a set of another grammar; name another folder")
+
+
+def _finished(plan: SetPlan) -> Iterator[Record]:
+    """Records of robots that are there; a line cut short by an interruption counts for nothing."""
+    for name in (INDEX, JOURNAL):
+        path = plan.folder / name
+        if not path.is_file():
+            continue
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                record = json.loads(line)
+            except ValueError:
+                continue
+            if (plan.folder / record["name"] / URDF).is_file():
+                yield record
+    for leftover in plan.folder.glob(".*.*"):
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _report(records: Iterable[Record], made: int, kept: int) -> SetReport:
+    rejected: dict[str, int] = {}
+    first: dict[str, str] = {}
+    duplicates = []
+    for record in records:
+        for reason, times in record["rejected"].items():
+            rejected[reason] = rejected.get(reason, 0) + times
+        earlier = first.setdefault(record["hash"], record["name"])
+        if earlier != record["name"]:
+            duplicates.append((record["name"], earlier))
+    return SetReport(made, kept, rejected, duplicates)
+
+
+def _write_atomic(path: Path, text: str) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)

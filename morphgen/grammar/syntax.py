@@ -1,0 +1,352 @@
+"""The notation: ``*.grammar`` text to a syntax tree, with errors by line and column."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from lark import Lark, Token, Transformer, UnexpectedInput, v_args
+from lark.exceptions import VisitError
+
+from morphgen.errors import GrammarError, nearest
+
+_SYNTAX = r"""
+grammar: _END? [statement (_END statement)*]
+?statement: include | let | where | production
+include: "include" (STRING | NAME)
+let: "let" NAME "=" sum
+where: "where" or_
+production: NAME _ARROW alternative ("|" alternative)*
+alternative: weight? item+
+weight: _WEIGHT "(" sum ")"
+item: [NAME ":"] NAME ["(" [argument ("," argument)*] ")"] [repetition]
+argument: NAME "=" sum
+repetition: "{" INT ["," INT] "}"
+
+?or_: and_ ("or" and_)*
+?and_: not_ ("and" not_)*
+?not_: "not" not_ -> negation
+     | comparison
+?comparison: sum (COMPARATOR sum)*
+
+?sum: product (SIGN product)*
+?product: signed (FACTOR signed)*
+?signed: SIGN signed -> unary
+       | atom
+?atom: QUANTITY -> quantity
+     | INT -> quantity
+     | NAME "(" [sum ("," sum)*] ")" -> call
+     | NAME -> name
+     | "(" or_ ")"
+
+_ARROW: "->"
+_WEIGHT: "@weight"
+COMPARATOR: "<=" | ">=" | "==" | "!=" | "<" | ">"
+SIGN: "+" | "-"
+FACTOR: "*" | "/"
+INT: /\d+(?![\w.])/
+QUANTITY: /(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?[a-zA-Z]*/
+NAME: /(?!(include|let|where|and|or|not)\b)[A-Za-z_]\w*/
+STRING: /"[^"\n]*"/
+_END: /\n+(?=[^ \t\r\n|#])/
+_CONTINUED: /\n/
+_COMMENT: /#[^\n]*/
+_SPACE: /[ \t\r]+/
+%ignore _CONTINUED
+%ignore _COMMENT
+%ignore _SPACE
+"""
+
+_WORDS = {
+    "$END": "the end",
+    "_END": "a new line",
+    "NAME": "a name",
+    "INT": "a whole number",
+    "QUANTITY": "a number",
+    "STRING": 'a "path"',
+    "SIGN": "'+' or '-'",
+    "FACTOR": "'*' or '/'",
+    "COMPARATOR": "a comparison such as '<'",
+    "LPAR": "'('",
+    "RPAR": "')'",
+    "LBRACE": "'{'",
+    "RBRACE": "'}'",
+    "VBAR": "'|'",
+    "EQUAL": "'='",
+    "COLON": "':'",
+    "COMMA": "','",
+    "AND": "'and'",
+    "OR": "'or'",
+    "NOT": "'not'",
+    "INCLUDE": "'include'",
+    "LET": "'let'",
+    "WHERE": "'where'",
+    "_WEIGHT": "'@weight'",
+    "_ARROW": "'->'",
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where something stands in a text."""
+
+    origin: str
+    line: int
+    column: int
+
+    def __str__(self) -> str:
+        return f"{self.origin}:{self.line}:{self.column}"
+
+
+@dataclass(frozen=True)
+class Expression:
+    """An arithmetic expression or a condition."""
+
+    operator: str
+    """``number``, ``name``, ``call``, ``negative``, an arithmetic sign, a comparator, ``and``,
+    ``or`` or ``not``."""
+    operands: tuple[Expression, ...]
+    place: Place
+    text: str = ""
+    """The name, the function's name, or the unit of a number."""
+    value: float = 0.0
+    """Of a number, as written: not in SI yet."""
+
+    def __str__(self) -> str:
+        match self.operator:
+            case "number":
+                return f"{self.value:.12g}{self.text}"
+            case "name":
+                return self.text
+            case "call":
+                return f"{self.text}({', '.join(map(str, self.operands))})"
+            case "not":
+                return f"not {self.operands[0]}"
+            case "negative":
+                return f"-{self.operands[0]}"
+            case _:
+                return f"({f' {self.operator} '.join(map(str, self.operands))})"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A symbol or part in a sequence."""
+
+    name: str
+    place: Place
+    port: str = ""
+    """Port of the part before that it goes to; empty for the main one."""
+    arguments: tuple[tuple[str, Expression], ...] = ()
+    repetition: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One way to rewrite a symbol: a sequence of items."""
+
+    items: tuple[Item, ...]
+    weight: Expression | None = None
+
+
+@dataclass(frozen=True)
+class Production:
+    """A symbol and its alternatives."""
+
+    symbol: str
+    alternatives: tuple[Alternative, ...]
+    place: Place
+
+
+@dataclass(frozen=True)
+class Include:
+    """Another grammar whose statements are taken over."""
+
+    target: str
+    place: Place
+
+
+@dataclass(frozen=True)
+class Let:
+    """A value that is drawn once a robot."""
+
+    name: str
+    expression: Expression
+    place: Place
+
+
+@dataclass(frozen=True)
+class Where:
+    """A condition that every robot meets."""
+
+    condition: Expression
+
+
+Statement = Production | Include | Let | Where
+
+
+def parse_grammar(text: str, origin: str) -> tuple[Statement, ...]:
+    """Parse grammar text.
+
+    Args:
+        text: The grammar.
+        origin: What to call it in messages, usually its path.
+
+    Raises:
+        GrammarError: At the first place that is no grammar, with what was expected there.
+    """
+    return tuple(_parsed(text, origin, "grammar"))
+
+
+def parse_condition(text: str, origin: str = "--where") -> Expression:
+    """Parse a condition such as ``reach > 0.4 and dof >= 5``.
+
+    Raises:
+        GrammarError: At the first place that is no condition.
+    """
+    condition: Expression = _parsed(text, origin, "or_")
+    return condition
+
+
+def _parsed(text: str, origin: str, start: str) -> Any:
+    try:
+        tree = _parser().parse(text.replace("\r\n", "\n"), start=start)
+    except UnexpectedInput as error:
+        raise GrammarError(_explained(error, text, origin)) from error
+    try:
+        return _Builder(origin).transform(tree)
+    except VisitError as error:
+        raise error.orig_exc from error
+
+
+@lru_cache(maxsize=1)
+def _parser() -> Lark:
+    return Lark(_SYNTAX, parser="lalr", start=["grammar", "or_"], maybe_placeholders=True)
+
+
+def _explained(error: UnexpectedInput, text: str, origin: str) -> str:
+    line, column = error.line, error.column
+    if line < 1:
+        line, column = text.count("\n") + 1, len(text.rsplit("\n", 1)[-1]) + 1
+    names = getattr(error, "accepts", None) or getattr(error, "expected", None)
+    names = names or getattr(error, "allowed", None) or ()
+    expected = sorted({_WORDS.get(name, name) for name in names})
+    token = getattr(error, "token", None)
+    if token is not None and token.type == "$END":
+        found = "the end"
+    elif token is not None:
+        found = "the end of the line" if token.type == "_END" else repr(str(token))
+    else:
+        found = repr(text.splitlines()[line - 1][column - 1 : column])
+    return f"{origin}:{line}:{column}: found {found}, expected {' or '.join(expected)}"
+
+
+@v_args(inline=True)
+class _Builder(Transformer[Token, Any]):
+    """Lark's tree to ours."""
+
+    def __init__(self, origin: str) -> None:
+        super().__init__()
+        self._origin = origin
+
+    def _place(self, token: Token) -> Place:
+        return Place(self._origin, token.line or 1, token.column or 1)
+
+    def grammar(self, *statements: Statement | None) -> list[Statement]:
+        return [statement for statement in statements if statement is not None]
+
+    def include(self, target: Token) -> Include:
+        return Include(str(target).strip('"'), self._place(target))
+
+    def let(self, name: Token, expression: Expression) -> Let:
+        return Let(str(name), expression, self._place(name))
+
+    def where(self, condition: Expression) -> Where:
+        return Where(condition)
+
+    def production(self, symbol: Token, *alternatives: Alternative) -> Production:
+        return Production(str(symbol), alternatives, self._place(symbol))
+
+    def weight(self, expression: Expression) -> Expression:
+        return expression
+
+    def alternative(self, *parts: Item | Expression | None) -> Alternative:
+        items = tuple(part for part in parts if isinstance(part, Item))
+        weights = [part for part in parts if isinstance(part, Expression)]
+        return Alternative(items, weights[0] if weights else None)
+
+    def argument(self, name: Token, expression: Expression) -> tuple[Token, Expression]:
+        return (name, expression)
+
+    def repetition(self, low: Token, high: Token | None) -> tuple[int, int]:
+        counts = (int(low), int(high if high is not None else low))
+        if not 0 < counts[0] <= counts[1]:
+            raise GrammarError(
+                f"{self._place(low)}: repetition {{{counts[0]},{counts[1]}}} needs 1 <= m <= n"
+            )
+        return counts
+
+    def item(self, port: Token | None, name: Token, *rest: Any) -> Item:
+        arguments: dict[str, Expression] = {}
+        for entry in rest[:-1]:
+            if entry is None:
+                continue
+            if str(entry[0]) in arguments:
+                raise GrammarError(f"{self._place(entry[0])}: {entry[0]} is given twice")
+            arguments[str(entry[0])] = entry[1]
+        return Item(
+            str(name), self._place(name), str(port or ""), tuple(arguments.items()), rest[-1]
+        )
+
+    def quantity(self, token: Token) -> Expression:
+        text = str(token)
+        digits = text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ")
+        try:
+            value = float(digits)
+        except ValueError as error:
+            raise GrammarError(f"{self._place(token)}: {text!r} is no number") from error
+        return Expression("number", (), self._place(token), text[len(digits) :], value)
+
+    def name(self, token: Token) -> Expression:
+        return Expression("name", (), self._place(token), str(token))
+
+    def call(self, name: Token, *operands: Expression | None) -> Expression:
+        given = tuple(operand for operand in operands if operand is not None)
+        return Expression("call", given, self._place(name), str(name))
+
+    def unary(self, sign: Token, operand: Expression) -> Expression:
+        return operand if sign == "+" else Expression("negative", (operand,), self._place(sign))
+
+    def sum(self, *parts: Any) -> Expression:
+        return self._folded(parts)
+
+    def product(self, *parts: Any) -> Expression:
+        return self._folded(parts)
+
+    def comparison(self, *parts: Any) -> Expression:
+        pairs = [
+            Expression(str(parts[i + 1]), (parts[i], parts[i + 2]), self._place(parts[i + 1]))
+            for i in range(0, len(parts) - 2, 2)
+        ]
+        return pairs[0] if len(pairs) == 1 else Expression("and", tuple(pairs), pairs[0].place)
+
+    def or_(self, *parts: Expression) -> Expression:
+        return Expression("or", parts, parts[0].place)
+
+    def and_(self, *parts: Expression) -> Expression:
+        return Expression("and", parts, parts[0].place)
+
+    def negation(self, operand: Expression) -> Expression:
+        return Expression("not", (operand,), operand.place)
+
+    def _folded(self, parts: Sequence[Any]) -> Expression:
+        folded: Expression = parts[0]
+        for i in range(1, len(parts), 2):
+            folded = Expression(str(parts[i]), (folded, parts[i + 1]), self._place(parts[i]))
+        return folded
+
+
+def unknown(what: str, name: str, place: Place, valid: Sequence[str]) -> GrammarError:
+    """The error for a name that means nothing, with the nearest that does."""
+    return GrammarError(f"{place}: unknown {what} {name!r}{nearest(name, valid)}")

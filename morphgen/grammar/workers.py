@@ -1,0 +1,92 @@
+"""Make the robots of a set in several processes, or on a Ray cluster."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from multiprocessing import get_context
+
+from morphgen.errors import MissingDependencyError, MorphgenError
+from morphgen.grammar.robot_set import Maker, Record, SetPlan, Work
+
+CHUNK = 8
+"""Robots that a worker makes before it reports."""
+
+_maker: Maker | None = None
+
+
+def make_in_processes(jobs: int) -> Work:
+    """Work in ``jobs`` processes of this machine."""
+
+    def work(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
+        pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start, (plan,))
+        chunks = iter([indices[i : i + CHUNK] for i in range(0, len(indices), CHUNK)])
+        try:
+            running = {pool.submit(_make, chunk) for chunk in itertools.islice(chunks, 2 * jobs)}
+            while running:
+                finished, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    yield from _records(future)
+                    running |= {pool.submit(_make, c) for c in itertools.islice(chunks, 1)}
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    return work
+
+
+def make_on_ray(address: str | None) -> Work:
+    """Work on the Ray cluster at an address; without one, on a local Ray.
+
+    Raises:
+        MissingDependencyError: If ray is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--ray needs the package ray: pip install 'morphgen[ray]'"
+        ) from error
+
+    def work(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
+        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
+        remote = ray.remote(_make_alone)
+        chunks = [indices[i : i + 2 * CHUNK] for i in range(0, len(indices), 2 * CHUNK)]
+        running = [remote.remote(plan, list(chunk)) for chunk in chunks]
+        while running:
+            finished, running = ray.wait(running)
+            for done in finished:
+                yield from ray.get(done)
+
+    return work
+
+
+def _records(future: Future[list[Record]]) -> list[Record]:
+    try:
+        return future.result()
+    except MorphgenError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise MorphgenError(
+            f"a worker died ({error or type(error).__name__}); what is done is kept: run again"
+        ) from error
+
+
+def _start(plan: SetPlan) -> None:
+    """Prepare a worker; Ctrl-C is for the parent, which lets it finish its chunk."""
+    global _maker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _maker = Maker(plan)
+
+
+def _make(indices: Sequence[int]) -> list[Record]:
+    if _maker is None:
+        raise RuntimeError("the worker was not prepared")
+    return [_maker.make(index) for index in indices]
+
+
+def _make_alone(plan: SetPlan, indices: Sequence[int]) -> list[Record]:
+    """Make robots on a machine that shares the set's folder."""
+    maker = Maker(plan)
+    return [maker.make(index) for index in indices]

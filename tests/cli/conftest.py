@@ -1,0 +1,69 @@
+"""Every test of the command line runs in a folder of its own."""
+
+from dataclasses import replace
+
+import pytest
+from commands import tree
+
+from morphgen.cli import main
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.library import ENVIRONMENT
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+
+
+@pytest.fixture
+def run(capfd):
+    """Run a command in this process; return its exit code, stdout and stderr."""
+
+    def command(*argv):
+        code = main([str(word) for word in argv])
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return command
+
+
+@pytest.fixture
+def refused(run, tmp_path):
+    """Run a command that must be refused: exit code 2, one line, nothing changed on disk."""
+
+    def command(*argv):
+        before = tree(tmp_path)
+        code, out, err = run(*argv)
+        assert (code, out) == (2, "")
+        assert err.startswith("morphgen: ")
+        assert err.index("\n") == len(err) - 1
+        assert tree(tmp_path) == before
+        return err
+
+    return command
+
+
+@pytest.fixture
+def robot_urdf(tmp_path):
+    """Write a robot as ``some_robot.urdf``."""
+
+    def write(robot):
+        path = tmp_path / "some_robot.urdf"
+        path.write_text(urdf_text(replace(robot, frames=()), str))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    """Write XML as ``urdf/robot.urdf``, so that the description is all of its folder."""
+
+    def write(content):
+        path = tmp_path / "urdf" / "broken.urdf"
+        path.parent.mkdir()
+        path.write_text(content)
+        return path
+
+    return write

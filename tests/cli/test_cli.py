@@ -1,0 +1,256 @@
+"""What every command writes and prints, the same bytes each time."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from broken import sound, with_joint
+from commands import start, tree
+from parts import PINCER, write_part
+from robots import arm
+
+from morphgen import cli
+from morphgen.cli import main
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.library import ENVIRONMENT
+
+COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
+
+
+def test_compose_writes_a_bundle_and_says_what_it_is(run, tmp_path):
+    code, out, err = run("compose", "base=gantry", "ee=plane", "--out", "robots")
+    assert (code, err) == (0, "")
+    first, *files = out.splitlines()
+    assert first.startswith("robots/gantry-plane: 7 links, 5 DoF, ")
+    assert [name.strip() for name in files] == [
+        "card.json",
+        "preview.png",
+        "robot.urdf",
+        "robot.xml",
+    ]
+    assert [path.name for path in (tmp_path / "robots").iterdir()] == ["gantry-plane"]
+
+
+def test_compose_again_replaces_the_bundle(run, tmp_path):
+    options = ("--no-picture", "--out", "o", "--name", "g")
+    assert run("compose", "base=gantry", "ee=plane", *options)[0] == 0
+    assert run("compose", "base=gantry", "ee=cube", *options)[0] == 0
+    assert "ee_cube" in read_bundle(tmp_path / "o" / "g").link_index
+    assert [path.name for path in (tmp_path / "o").iterdir()] == ["g"]
+
+
+def test_compose_prints_the_card_as_json_and_nothing_else():
+    process = start("compose", "base=gantry", "ee=plane", "--out", "robots", "--json")
+    out, err = process.communicate()
+    assert (process.returncode, err) == (0, "")
+    data = json.loads(out)
+    assert data["folder"] == "robots/gantry-plane"
+    assert data["card"] == json.loads(Path("robots/gantry-plane/card.json").read_text())
+
+
+def test_list_prints_a_row_a_part(run):
+    code, out, err = run("list", "bases")
+    assert (code, err) == (0, "")
+    rows = [line.split() for line in out.splitlines()[2:]]
+    assert {"fixed", "gantry", "pedestal", "planar"} <= {row[0] for row in rows}
+    assert {row[1] for row in rows} == {"base"}
+    code, out, err = run("list", "bases", "--json")
+    assert {row["name"]: row["dof"] for row in json.loads(out)}["gantry"] == 5
+
+
+def test_show_prints_the_tree(run, robot_urdf):
+    code, out, err = run("show", robot_urdf(arm()))
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0].startswith("arm: 6 links, 4 DoF, ")
+    assert "\n  upper  shoulder: revolute (0 1 0) [-114.6, 114.6] deg  " in out
+    assert "extend: prismatic (0 0 1) [0, 0.04] m" in out
+    assert "right: prismatic (0 1 0) [-0.04, 0] m = -1 * left + 0" in out
+
+
+def test_show_prints_the_frames_of_a_bundle_as_json(run, tmp_path):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    code, out, err = run("show", folder, "--json")
+    assert (code, err) == (0, "")
+    data = json.loads(out)
+    assert [link["name"] for link in data["links"]][:2] == ["base", "upper"]
+    assert data["frames"]["tool"]["link"] == "slider"
+    assert {joint["name"]: joint["mimic"] for joint in data["joints"]}["right"] == "left"
+
+
+def test_check_is_silent_about_a_sound_bundle(run, tmp_path):
+    folder = write_bundle(sound(), tmp_path / "sound", picture=False)
+    assert run("check", folder, "--strict") == (0, f"{folder}: 0 error, 0 warning, 0 info\n", "")
+
+
+@pytest.mark.parametrize(
+    ("change", "codes"),
+    [
+        ({"limits": (1.0, -1.0)}, (1, 1)),
+        ({"limits": (-180.0, 180.0)}, (0, 1)),
+        ({"damping": 0.1}, (0, 0)),
+    ],
+)
+def test_check_fails_for_errors_and_if_strict_for_warnings(run, robot_urdf, change, codes):
+    path = robot_urdf(with_joint(sound(), "elbow", **change))
+    assert (run("check", path)[0], run("check", path, "--strict")[0]) == codes
+
+
+def test_check_says_what_is_wrong_where_and_how_to_mend_it(run, robot_urdf):
+    path = robot_urdf(with_joint(sound(), "elbow", limits=(1.0, -1.0)))
+    _, out, _ = run("check", path)
+    _, finding, remedy = out.splitlines()
+    assert finding.startswith("  error limits-inverted at joint elbow: ")
+    assert remedy.startswith("    fix: ")
+    _, out, _ = run("check", path, "--json")
+    (data,) = json.loads(out)[str(path)]["findings"]
+    assert (data["code"], data["where"], data["severity"]) == (
+        "limits-inverted",
+        "joint elbow",
+        "error",
+    )
+
+
+def test_check_reports_a_broken_structure_as_findings(run, urdf):
+    path = urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
+    code, out, err = run("check", path, "--json")
+    assert (code, err) == (1, "")
+    assert [finding["severity"] for finding in json.loads(out)[str(path)]["findings"]] == ["error"]
+
+
+def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
+    path = urdf(urdf_text(replace(sound(), frames=()), str).replace('xyz="1 0 0"', 'xyz="3 0 0"'))
+    code, out, err = run("check", path, "--fix", "mended")
+    assert (code, err) == (0, "")
+    assert "repaired axis-not-unit at joint elbow" in out
+    assert read_bundle(tmp_path / "mended" / "arm").joints[1].axis == (1, 0, 0)
+    code, out, err = run("check", path, "--fix", "mended", "--json")
+    assert [f["code"] for f in json.loads(out)[str(path)]["repaired"]] == ["axis-not-unit"]
+    assert "axis-not-unit" in run("check", path)[1]
+
+
+def test_import_makes_a_bundle_of_any_urdf(run, robot_urdf, tmp_path):
+    path = robot_urdf(arm())
+    code, out, err = run("import", path, "--root", "upper", "--tool", "slider", "--out", "robots")
+    assert (code, err) == (0, "")
+    assert out.startswith("robots/arm: 5 links, 3 DoF, ")
+    assert read_bundle(tmp_path / "robots" / "arm").frame("tool").link == "slider"
+    words = ("import", path, "--name", "limb", "--no-picture", "--json")
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    assert json.loads(out)["folder"] == "robots/limb"
+    assert json.loads(out)["card"]["source"] == "some_robot.urdf"
+
+
+def test_import_passes_arguments_to_xacro_and_tells_its_repairs(run, tmp_path):
+    path = tmp_path / "pincer.xacro"
+    path.write_text(PINCER.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 2 0"/>'))
+    words = ("import", path, "--arg", "length=0.4", "--no-picture", "--out", "o")
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    assert "  repaired joint left_slide: its axis (0.0, 2.0, 0.0) is 2 long" in out
+    palm = read_bundle(tmp_path / "o" / "pincer").link("palm")
+    assert palm.collisions[0].geometry.size == pytest.approx((0.02, 0.02, 0.4))
+    code, out, _ = run(*words, "--as-is", "--name", "as_is")
+    assert code == 0
+    assert "repaired" not in out
+
+
+def test_conform_compares_all_loaders(run, tmp_path):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    code, out, err = run("conform", folder, "--samples", "5")
+    assert (code, err) == (0, "")
+    for loader in ("yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio"):
+        assert f"arm      {loader}" in out
+
+
+def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    other = write_bundle(replace(sound(), name="other"), tmp_path / "other", picture=False)
+    (folder / "robot.xml").write_bytes(
+        (other / "robot.xml").read_bytes().replace(b"elbow", b"knee")
+    )
+    code, out, _ = run("conform", folder, "--samples", "2")
+    assert code == 1
+    assert "lacks joints elbow" in out
+
+
+def test_conform_prints_json_and_nothing_else(tmp_path):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    process = start("conform", folder, "--samples", "3", "--json")
+    out, err = process.communicate()
+    assert (process.returncode, err) == (0, "")
+    (report,) = json.loads(out)
+    assert (report["robot"], report["passed"], len(report["rows"])) == ("arm", True, 5)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(capsys, command):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    assert f"usage: morphgen {command}" in capsys.readouterr().out
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    listed = capsys.readouterr().out
+    assert all(f"    {command} " in listed for command in COMMANDS)
+
+
+def test_no_command_is_no_success(run):
+    code, out, _ = run()
+    assert code == 2
+    assert out.startswith("usage: morphgen")
+
+
+def test_version(run):
+    assert run("--version") == (0, "morphgen 0.1.0\n", "")
+
+
+def test_ones_own_library_is_used(run, tmp_path, monkeypatch):
+    write_part(tmp_path / "own")
+    words = ("compose", "base=gantry", "ee=pincer", "ee.length=30cm", "--no-picture", "--out", "o")
+    assert run(*words, "--library", "own", "--name", "a")[0] == 0
+    monkeypatch.setenv(ENVIRONMENT, "own")
+    assert run(*words, "--name", "b")[0] == 0
+    assert run(*words, "--library", tmp_path / "own", "--name", "c")[0] == 0
+    a, b, c = ((tmp_path / "o" / name / "robot.urdf").read_text() for name in "abc")
+    assert a == b.replace('name="b"', 'name="a"') == c.replace('name="c"', 'name="a"')
+    tool = read_bundle(tmp_path / "o" / "a").frame("tool")
+    assert tool.T_link_frame.position == pytest.approx((0, 0, 0.35))
+
+
+def test_two_processes_write_the_same_bytes(tmp_path):
+    words = ("compose", "arm=lwr", "ee=robotiq_2f85", "ee.mount_yaw=45deg", "--out")
+    processes = [start(*words, tmp_path / seed, PYTHONHASHSEED=seed) for seed in ("1", "2")]
+    for process in processes:
+        _, err = process.communicate()
+        assert (process.returncode, err) == (0, "")
+    first, second = tree(tmp_path / "1"), tree(tmp_path / "2")
+    assert first == second
+    (folder,) = (tmp_path / "1").iterdir()
+    assert {"robot.urdf", "card.json", "robot.xml", "preview.png", "meshes"} == {
+        path.name for path in folder.iterdir()
+    }
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    process = start("--version", PYTHONUNBUFFERED="")
+    process.stdout.close()
+    assert process.wait() == 1
+    assert process.stderr.read() == ""
+
+
+def test_an_unforeseen_fault_is_not_hidden(monkeypatch):
+    """Only what a user can cause is one line; a fault of the program keeps its traceback."""
+
+    def fail(_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli.list_parts, "run", fail)
+    with pytest.raises(ZeroDivisionError):
+        main(["list"])

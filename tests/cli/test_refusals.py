@@ -1,0 +1,229 @@
+"""What is wrong is refused in one line, and nothing half-written is left."""
+
+import json
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from commands import start, tree
+from parts import write_part
+from robots import arm
+
+from morphgen.formats import bundle
+from morphgen.formats.bundle import write_bundle
+
+LINK = '<link name="a">{}</link>'
+SHAPE = '<visual><geometry><mesh filename="{}"/></geometry></visual>'
+BOMB = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "lol"}">' for i in range(12))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("arm=ur55 ee=plane", "unknown arm 'ur55'; did you mean 'ur5'?"),
+        ("arm=ur5 ee=plnae", "unknown ee 'plnae'; did you mean 'plane'?"),
+        ("base=gantri arm=ur5", "unknown base 'gantri'; did you mean 'gantry'?"),
+        (
+            "base=gantry ee=plane ee.sise=1",
+            "'plane' has no parameter 'sise'; did you mean 'size'? valid: mount_yaw, size,",
+        ),
+        (
+            "base=gantry ee=plane ee.size=5m",
+            "ee.size=5: out of range; expected 0.02 to 1 m (units: m/cm/mm)",
+        ),
+        (
+            "base=gantry ee=plane ee.size=5kg",
+            "ee.size=5kg: wrong unit 'kg'; expected 0.02 to 1 m (units: m/cm/mm)",
+        ),
+        ("base=gantry ee=plane ee.size=big", "ee.size=big: not a number; expected"),
+        ("base=gantry ee=plane ee.mount_yaw=1m", "wrong unit 'm'; expected"),
+        ("base=gantry up.ee=plane", "'gantry' has no port 'up'"),
+        ("base=gantry", "nothing to compose"),
+        ("ur5", "'ur5' is not of the form key=value, such as arm=ur5"),
+        ("base=gantry ee=plane --library nowhere", "nowhere does not exist"),
+    ],
+)
+def test_a_wrong_request_is_refused(refused, words, message):
+    assert message in refused("compose", *words.split(), "--out", "out")
+
+
+@pytest.mark.parametrize("name", ["../x", "", "a/b", ".", "..", ".hidden", "-x", "a b", "n" * 300])
+def test_a_name_that_is_no_plain_folder_is_refused(refused, robot_urdf, name):
+    naming = ("--no-picture", "--out", "out", f"--name={name}")
+    assert f"name {name!r}: use letters" in refused("compose", "base=gantry", "ee=plane", *naming)
+    assert f"name {name!r}: use letters" in refused("import", robot_urdf(arm()), *naming)
+
+
+def test_a_files_own_name_cannot_lead_out_of_the_folder(refused, robot_urdf):
+    path = robot_urdf(replace(arm(), name=".."))
+    assert "name '..': use letters" in refused("check", path, "--fix", "out")
+    assert "name '..': use letters" in refused("import", path, "--out", "out", "--as-is")
+    path = robot_urdf(replace(arm(), name="../../x"))
+    assert "use letters" in refused("check", path, "--fix", "out")
+
+
+@pytest.mark.parametrize(
+    ("xml", "message"),
+    [
+        ('<robot name="r">\n<link name="a">\n</robot>', "broken.urdf:3:"),
+        ("", "broken.urdf:1:"),
+        (f'<!DOCTYPE r [{BOMB}]><robot name="r">&e11;</robot>', "broken.urdf"),
+        ('<!DOCTYPE r SYSTEM "x.dtd"><robot name="r"/>', "DOCTYPE"),
+        (
+            f'<robot name="r">\n{LINK.format(SHAPE.format("../../etc/hand.stl"))}</robot>',
+            "'../../etc/hand.stl' leaves ",
+        ),
+        (
+            f'<robot name="r">\n{LINK.format(SHAPE.format("/etc/passwd"))}</robot>',
+            "'/etc/passwd' leaves ",
+        ),
+        (
+            f'<robot name="r">\n{LINK.format(SHAPE.format("hand.stl"))}</robot>',
+            "broken.urdf:2: ",
+        ),
+        (
+            f'<robot name="r">{LINK.format(SHAPE.format("package://nowhere/hand.stl"))}</robot>',
+            "package 'nowhere' not found",
+        ),
+        ("<sdf/>", "<sdf>"),
+    ],
+    ids=["broken", "empty", "bomb", "dtd", "climbing", "absolute", "mesh", "package", "sdf"],
+)
+def test_a_broken_description_is_refused(refused, urdf, xml, message):
+    started = time.perf_counter()
+    path = urdf(xml)
+    assert message in refused("import", path, "--out", "out")
+    assert message in refused("show", path)
+    assert time.perf_counter() - started < 5
+
+
+@pytest.mark.parametrize("xml", ["<robot", f'<!DOCTYPE r [{BOMB}]><robot name="r">&e11;</robot>'])
+def test_check_refuses_what_is_no_xml(refused, urdf, xml):
+    assert "broken.urdf" in refused("check", urdf(xml))
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("show nowhere.urdf", "nowhere.urdf: no such file"),
+        ("check nowhere", "nowhere: no such file"),
+        ("import nowhere.xacro", "nowhere.xacro: no such file"),
+        ("conform .", "is no bundle: it has no card.json"),
+        ("show .", "is no bundle: it has no card.json"),
+        (f"show {'n' * 300}", "File name too long"),
+        ("import x.xacro --arg length", "--arg length: expected NAME=VALUE"),
+        ("import x.xacro --arg =1", "--arg =1: expected NAME=VALUE"),
+        ("conform . --samples 0", "--samples 0: expected 1 or more"),
+        ("conform . --seed -1", "--seed -1: expected 0 or more"),
+    ],
+)
+def test_what_is_not_there_is_named(refused, argv, message):
+    assert message in refused(*argv.split())
+
+
+def test_links_that_a_file_does_not_have_name_the_nearest(refused, robot_urdf):
+    path = robot_urdf(arm())
+    assert "did you mean 'slider'" in refused("import", path, "--tool", "slidr")
+    assert "did you mean 'base'" in refused("import", path, "--root", "bas")
+
+
+@pytest.mark.parametrize(
+    "card",
+    [
+        "{",
+        "[]",
+        "{}",
+        '{"format": 99}',
+        '{"format": 1}',
+        '{"format": 1, "frames": 5}',
+        '{"format": 1, "home": 5, "ignore_pairs": []}',
+        '{"format": 1, "home": {"j": "x"}, "ignore_pairs": []}',
+    ],
+)
+def test_a_bundle_with_a_broken_card_is_refused(refused, tmp_path, card):
+    folder = write_bundle(replace(arm(), frames=()), tmp_path / "arm", picture=False)
+    (folder / "card.json").write_text(card)
+    assert "card" in refused("show", folder)
+
+
+def test_an_error_is_json_for_who_asks_for_it(run):
+    code, out, err = run("compose", "arm=ur55", "--json")
+    assert code == 2
+    data = json.loads(out)
+    assert data["error"] == "PartError"
+    assert err == f"morphgen: {data['message']}\n"
+
+
+def test_a_missing_data_package_says_how_to_install_it(refused, tmp_path):
+    source = {"package": "no-such-data", "file": "x.urdf"}
+    write_part(tmp_path, source=source, file=None, density=None, parameters=None)
+    message = refused("compose", "base=gantry", "ee=pincer", "--library", ".")
+    assert "'x.urdf' is part of 'no-such-data', not installed: pip install no-such-data" in message
+
+
+def test_a_broken_manifest_is_named_by_line_and_column(refused, tmp_path):
+    (tmp_path / "stump.yaml").write_text("name: stump\nkind: [\n")
+    assert "stump.yaml:3:1: no valid YAML" in refused("compose", "ee=stump", "--library", ".")
+
+
+def test_an_output_folder_that_cannot_be_written_is_named(refused, tmp_path):
+    (tmp_path / "file").write_text("a plain file")
+    words = ("compose", "base=gantry", "ee=plane", "--no-picture")
+    assert "cannot write to file/deep" in refused(*words, "--out", "file/deep")
+    assert "cannot write to file" in refused(*words, "--out", "file")
+
+
+def test_a_folder_that_is_no_bundle_is_never_replaced(refused, tmp_path):
+    (tmp_path / "out" / "gantry-plane").mkdir(parents=True)
+    (tmp_path / "out" / "gantry-plane" / "thesis.txt").write_text("years of work")
+    words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
+    assert "out/gantry-plane exists and is no bundle" in refused(*words)
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("step", ["urdf_text", "mjcf_text", "card_text", "render"])
+def test_an_interrupted_run_leaves_no_half_bundle(run, tmp_path, monkeypatch, step):
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr(bundle, step, interrupt)
+    code, out, err = run("compose", "base=gantry", "ee=plane", "--out", "out")
+    assert (code, out) == (130, "")
+    assert err == "morphgen: interrupted; nothing half-written is left\n"
+    assert tree(tmp_path / "out") == {}
+
+
+@pytest.mark.parametrize("move", [1, 2])
+def test_an_interrupted_replacement_leaves_the_old_bundle(run, tmp_path, monkeypatch, move):
+    words = ("compose", "--no-picture", "--out", "out", "--name", "g", "base=gantry", "ee=plane")
+    assert run(*words)[0] == 0
+    before = tree(tmp_path / "out")
+    rename, moves = Path.rename, []
+
+    def interrupted(path, target):
+        moves.append(path)
+        if len(moves) == move:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    assert run(*words, "ee.size=0.2")[0] == 130
+    assert tree(tmp_path / "out") == before
+
+
+def test_an_interrupted_process_leaves_neither_half_a_bundle_nor_a_temporary_folder(tmp_path):
+    out = tmp_path / "out"
+    process = start("compose", "arm=kinova_gen3", "ee=robotiq_2f85", "--out", out)
+    deadline = time.monotonic() + 60
+    while not list(out.glob(".*/meshes/*")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    process.send_signal(signal.SIGINT)
+    printed, err = process.communicate()
+    assert (process.returncode, printed) == (130, "")
+    assert err == "morphgen: interrupted; nothing half-written is left\n"
+    assert list(out.iterdir()) == []

@@ -1,0 +1,24 @@
+"""Run the command line in another process, and see what it leaves on disk."""
+
+import os
+import subprocess
+import sys
+
+
+def tree(folder):
+    """Content of every file below a folder, by path; None for a folder."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
+
+
+def start(*argv, **environment):
+    """Start ``morphgen`` with words and environment variables; its output is piped."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "morphgen.cli", *map(str, argv)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+    )

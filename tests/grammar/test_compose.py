@@ -1,0 +1,378 @@
+"""Composition: parts are joined exactly, and what each of them was it stays."""
+
+import json
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from parts import write_part
+
+from morphgen.checks import check
+from morphgen.checks.conformance import conformance
+from morphgen.checks.self_collision import self_collisions
+from morphgen.errors import CompositionError, PartError
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.grammar.compose import compose, join, place
+from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import default_name, parse_request
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import forward_kinematics, frame_pose, random_configurations
+from morphgen.model.robot import Inertial
+
+LIBRARY = default_library()
+PAPER_ARMS = ("ur5", "panda", "kinova_gen3", "jaco2", "xarm7", "lwr", "yumi_right", "widowx")
+EES = LIBRARY.names("ee")
+SAMPLE = [
+    ("ur5", "stick"),
+    ("panda", "robotiq_2f85"),
+    ("lwr", "panda_hand"),
+    ("widowx", "sake_ez"),
+]
+
+
+def derive(text, library=LIBRARY):
+    return parse_request(text.split(), library)
+
+
+def composed(text):
+    return compose(derive(text), LIBRARY, "robot")
+
+
+def joined(text):
+    return join(derive(text), LIBRARY, "robot")
+
+
+class Situation:
+    """A robot in one configuration, and where its parts are in it."""
+
+    def __init__(self, text, seed=0):
+        self.placed = place(derive(text), LIBRARY)
+        self.robot = joined(text)
+        (self.q,) = random_configurations(self.robot, 1, np.random.default_rng(seed))
+        self.T_world_link = forward_kinematics(self.robot, self.q)
+        names = [self.robot.joints[k].name for k in self.robot.independent]
+        self.positions = dict(zip(names, self.q, strict=True))
+
+    def alone(self, label):
+        """Pose of every link of a part in the part's root, the part by itself in that pose."""
+        body = self.placed[label].part.body
+        joints = [body.joints[k].name for k in body.independent]
+        return forward_kinematics(body, [self.positions[f"{label}_{name}"] for name in joints])
+
+    def links(self, label):
+        """(pose in the robot, pose in the part alone) of every link of a part."""
+        body = self.placed[label].part.body
+        pairs = zip(body.links, self.alone(label), strict=True)
+        index = self.robot.link_index
+        there = [(f"{label}_{link.name}", T_part_link) for link, T_part_link in pairs]
+        return [(self.T_world_link[index[n]], T) for n, T in there if n in index]
+
+    def root(self, label):
+        """Pose of a part's root in the robot."""
+        T_world_link, T_part_link = self.links(label)[-1]
+        return T_world_link @ np.linalg.inv(T_part_link)
+
+    def placement(self, label, placement):
+        """Pose of a frame of a part's manifest, of plain numbers, in the robot."""
+        part = self.placed[label].part
+        link = placement.link.replace("/", "_")
+        T_part_link = self.alone(label)[part.body.link_index[link]]
+        offset = Pose.from_xyz_rpy(placement.xyz, placement.rpy).matrix
+        return self.root(label) @ T_part_link @ offset
+
+    def flange(self):
+        return self.placement("arm", self.placed["arm"].part.manifest.ports["flange"])
+
+    def mount(self):
+        return self.placement("ee", self.placed["ee"].part.manifest.mount)
+
+
+def turn(yaw):
+    return Pose.from_xyz_rpy((0, 0, 0), (0, 0, yaw)).matrix
+
+
+@pytest.mark.parametrize("ee", [name for name in EES if name != "none"])
+def test_an_end_effectors_mount_lies_on_the_flange_turned_by_the_yaw_alone(ee):
+    there = Situation(f"arm=ur5 ee={ee} ee.mount_yaw=33deg")
+    expected = there.flange() @ turn(math.radians(33))
+    np.testing.assert_allclose(there.mount(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("arm", PAPER_ARMS)
+def test_every_arm_carries_a_hand_on_its_flange(arm):
+    there = Situation(f"arm={arm} ee=panda_hand", seed=1)
+    np.testing.assert_allclose(there.mount(), there.flange(), atol=1e-12)
+
+
+def test_with_no_end_effector_the_tool_is_the_flange():
+    there = Situation("arm=ur5 ee.mount_yaw=90deg ee=none")
+    tool = frame_pose(there.robot, there.q)
+    np.testing.assert_allclose(tool, there.flange() @ turn(math.pi / 2), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text", ["base=planar arm=panda ee=robotiq_2f85", "arm=lwr ee=jaco_fingers"]
+)
+def test_parts_move_in_the_robot_as_they_move_alone(text):
+    there = Situation(text, seed=2)
+    for label in there.placed:
+        for T_world_link, T_part_link in there.links(label):
+            np.testing.assert_allclose(T_world_link, there.root(label) @ T_part_link, atol=1e-12)
+
+
+def test_joints_keep_axis_limits_effort_velocity_damping_and_mimic():
+    text = "arm=panda ee=robotiq_2f85"
+    robot = joined(text)
+    for label, here in place(derive(text), LIBRARY).items():
+        for joint in here.part.body.joints:
+            found = robot.joints[robot.joint_index[f"{label}_{joint.name}"]]
+            kept = ("kind", "axis", "limits", "effort", "velocity", "damping", "friction")
+            assert [getattr(found, key) for key in kept] == [getattr(joint, key) for key in kept]
+            if joint.mimic is None:
+                assert found.mimic is None
+            else:
+                assert found.mimic == replace(joint.mimic, joint=f"{label}_{joint.mimic.joint}")
+
+
+def test_mimic_joints_follow_the_leader_of_their_own_hand():
+    robot = composed(
+        "base=pedestal left.arm=lwr left.ee=robotiq_2f85 right.arm=lwr right.ee=robotiq_2f85"
+    )
+    followers = [joint for joint in robot.joints if joint.mimic]
+    assert len(followers) == 10
+    for joint in followers:
+        assert joint.mimic.joint.split("_ee_")[0] == joint.name.split("_ee_")[0]
+
+
+def test_names_say_which_part_they_belong_to_and_do_not_clash():
+    robot = composed("base=pedestal left.arm=ur5 left.ee=plane right.arm=ur5 right.ee=plane")
+    scopes = ("base_", "left_arm_", "left_ee_", "right_arm_", "right_ee_")
+    for names in ([j.name for j in robot.joints], [link.name for link in robot.links]):
+        assert len(set(names)) == len(names)
+        assert all(name.startswith(scopes) for name in names)
+    assert "left_arm_wrist_3_joint" in robot.joint_index
+    assert "right_arm_wrist_3_joint" in robot.joint_index
+
+
+def test_mass_is_the_sum_of_the_parts():
+    text = "base=pedestal left.arm=ur5 left.ee=stick right.arm=panda right.ee=panda_hand"
+    parts = place(derive(text), LIBRARY).values()
+    assert joined(text).mass == pytest.approx(math.fsum(here.part.body.mass for here in parts))
+
+
+def test_home_is_each_parts_own():
+    robot = composed("base=gantry ee=robotiq_2f140")
+    home = dict(zip([robot.joints[k].name for k in robot.independent], robot.home, strict=True))
+    assert home["base_z"] == pytest.approx(0.8)
+    assert robot.home[:5] == pytest.approx((0, 0, 0.8, 0, 0))
+    assert list(home)[5:] == ["ee_finger_joint"]
+    ur5 = composed("arm=ur5 ee=yumi_gripper")
+    assert ur5.home == pytest.approx((0, -1.57, 1.57, -1.57, -1.57, 0, 0.025))
+
+
+def test_the_tool_is_at_the_working_point():
+    """At the plate's far edge, the centre of the stick's ball, and where fingers meet."""
+    for ee, ahead in (
+        ("plane ee.size=80mm", 0.08),
+        ("stick ee.length=0.25", 0.25),
+        ("sphere", 0.1),
+        ("panda_hand", 0.1034),
+        ("robotiq_2f85", 0.144),
+    ):
+        there = Situation(f"arm=ur5 ee={ee}")
+        T_flange_tool = np.linalg.inv(there.flange()) @ frame_pose(there.robot, there.q)
+        assert T_flange_tool[:3, 3] == pytest.approx([0, 0, ahead], abs=1e-9)
+        assert T_flange_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-9)
+
+
+def test_the_panda_and_its_hand_make_the_real_robot():
+    """The hand sits turned by 45 degrees, as Franka Emika delivers it."""
+    there = Situation("arm=panda ee=panda_hand")
+    hand = there.T_world_link[there.robot.link_index["ee_panda_hand"]]
+    np.testing.assert_allclose(hand, there.flange() @ turn(-math.pi / 4), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "arm=panda ee=robotiq_2f85",
+        "arm=yumi left.ee=yumi_gripper right.ee=yumi_gripper",
+        "base=pedestal left.arm=ur5 left.ee=stick right.arm=xarm7 right.ee=panda_hand",
+        "base=planar arm=lwr ee=stick",
+    ],
+)
+def test_no_robot_collides_with_itself_at_home(text):
+    robot = composed(text)
+    assert self_collisions(robot, [robot.home]) == [{}]
+    assert robot.ignore_pairs == tuple(sorted({tuple(sorted(pair)) for pair in robot.ignore_pairs}))
+    assert {name for pair in robot.ignore_pairs for name in pair} <= set(robot.link_index)
+
+
+def test_what_can_collide_is_not_ignored():
+    """Arms side by side can strike each other, and an arm its own foot."""
+    robot = composed("left.arm=ur5 right.arm=ur5 base=fixed base.spread=0.5")
+    assert ("left_arm_forearm_link", "right_arm_forearm_link") not in robot.ignore_pairs
+    assert ("left_arm_base_link", "left_arm_forearm_link") not in robot.ignore_pairs
+    home = list(robot.home[6:])
+    stretched = [[pan, 0, 0, 0, 0, 0, *home] for pan in (math.pi / 2, -math.pi / 2)]
+    outwards, inwards = self_collisions(robot, stretched)
+    assert outwards == {}
+    assert ("left_arm_forearm_link", "right_arm_upper_arm_link") in inwards
+
+
+def test_two_arms_stand_where_their_ports_are():
+    robot = composed("base=pedestal left.arm=ur5 left.ee=stick right.arm=xarm7 right.ee=panda_hand")
+    T_root_link = forward_kinematics(robot, robot.home)
+    left = T_root_link[robot.link_index["left_arm_base_link"]]
+    right = T_root_link[robot.link_index["right_arm_link_base"]]
+    np.testing.assert_allclose(left[:3, 3], [0, 0.3, 0.5], atol=1e-12)
+    np.testing.assert_allclose(right[:3, 3], [0, -0.3, 0.5], atol=1e-12)
+    assert robot.dof == 6 + 7 + 1
+
+
+def test_one_limb_has_one_tool_and_several_have_one_each():
+    assert [frame.name for frame in joined("arm=ur5 ee=plane").frames] == ["tool"]
+    robot = joined("base=pedestal left.arm=ur5 left.ee=stick right.arm=ur5 right.ee=plane")
+    assert {frame.name for frame in robot.frames} == {"tool", "left_tool", "right_tool"}
+    assert robot.frame("left_tool").link == "left_ee_stick"
+    assert robot.frame("tool").link == robot.frame("right_tool").link == "right_ee_plate"
+
+
+def test_both_hands_of_yumi_hold_a_gripper_and_the_right_one_is_the_tool():
+    robot = composed("arm=yumi left.ee=yumi_gripper right.ee=yumi_gripper")
+    assert robot.dof == 14 + 2
+    tools = {
+        name: frame_pose(robot, robot.home, name) for name in ("tool", "left_tool", "right_tool")
+    }
+    np.testing.assert_array_equal(tools["tool"], tools["right_tool"])
+    assert tools["left_tool"][1, 3] > 0.05 > -0.05 > tools["right_tool"][1, 3]
+    mirrored = tools["right_tool"][:3, 3] * [1, -1, 1]
+    assert tools["left_tool"][:3, 3] == pytest.approx(mirrored, abs=0.03)
+
+
+def test_a_plate_under_the_gantry_is_the_papers_primitive_and_points_down():
+    robot = composed("base=gantry ee=plane")
+    assert len(robot.links) == 7
+    assert len(robot.movable) == robot.dof == 5
+    assert [robot.joints[k].kind for k in robot.movable] == ["prismatic"] * 3 + ["revolute"] * 2
+    tool = frame_pose(robot, robot.home)
+    assert tool[:3, 2] == pytest.approx([0, 0, -1], abs=1e-12)
+    assert tool[:3, 3] == pytest.approx([0, 0, 0.8 - 0.1], abs=1e-12)
+
+
+def test_a_parts_root_that_is_a_bare_frame_adds_no_body():
+    robot = joined("arm=ur5 ee=none")
+    assert [link.name for link in robot.links if link.name.startswith("ee")] in ([], ["ee_link"])
+    assert robot.mass == pytest.approx(joined("arm=ur5 ee=plane").mass - 0.01 * 0.1 * 0.1 * 1000)
+
+
+def test_the_derivation_says_which_parts_with_which_parameters_stand_where():
+    derivation = derive("base=pedestal base.height=40cm arm=ur5 ee=plane ee.mount_yaw=90deg")
+    assert str(derivation) == (
+        "base=pedestal(height=0.4, radius=0.08, spread=0.6)"
+        "[top: arm=ur5[flange: ee=plane(size=0.1, thickness=0.01, mount_yaw=1.57079632679)]]"
+    )
+    robot = join(derivation, LIBRARY, "robot")
+    assert robot.provenance["derivation"] == str(derivation)
+    other = derive("base=pedestal base.height=41cm arm=ur5 ee=plane ee.mount_yaw=90deg")
+    assert derivation.digest != other.digest
+
+
+def test_provenance_names_licence_and_citation_of_every_part():
+    parts = joined("arm=ur5 ee=robotiq_2f85").provenance["parts"]
+    assert [(part["label"], part["part"]) for part in parts] == [
+        ("base", "fixed"),
+        ("arm", "ur5"),
+        ("ee", "robotiq_2f85"),
+    ]
+    assert parts[1]["licence"] == "BSD-3-Clause"
+    assert "universal_robot" in parts[1]["citation"]
+    assert "linkage is open" in parts[2]["notes"]
+    assert "notes" not in parts[0]
+
+
+def test_a_finding_that_a_part_accepts_is_information_with_its_reason():
+    robot = joined("arm=panda")
+    by_itself = [f for f in check(replace(robot, provenance={})) if f.severity == "warning"]
+    assert ("inertia-implausible", "link arm_panda_link1") in {(f.code, f.where) for f in by_itself}
+    (finding,) = [f for f in check(robot) if f.where == "link arm_panda_link1"]
+    assert finding.severity == "info"
+    assert "; accepted: identified on the real arm" in finding.why
+
+
+def test_an_accepted_finding_stays_accepted_in_the_bundle(tmp_path):
+    robot = joined("arm=panda")
+    folder = write_bundle(robot, tmp_path / "panda", check(robot), picture=False)
+    card = json.loads((folder / "card.json").read_text())
+    assert [f["severity"] for f in card["findings"] if f["code"] == "inertia-implausible"] == [
+        "info"
+    ]
+    assert {f.severity for f in check(read_bundle(folder))} <= {"info"}
+
+
+def test_accepting_one_finding_accepts_no_other(tmp_path):
+    """Neither the same fault of another link, nor another fault of the same link."""
+    write_part(tmp_path, accepted={"disc": {"inertia-implausible": "it is a flywheel"}})
+    library = default_library([tmp_path])
+    robot = join(derive("arm=lwr ee=pincer", library), library, "robot")
+    light, odd = robot.link("ee_disc").inertial.mass, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+    disc = replace(robot.link("ee_disc"), inertial=Inertial(100 * light, inertia=odd))
+    palm = replace(robot.link("ee_palm"), inertial=Inertial(0.08, (0, 0, 0.1), odd))
+    severity = {(f.where, f.code): f.severity for f in check(robot.with_links([disc, palm]))}
+    assert severity["link ee_disc", "inertia-implausible"] == "info"
+    assert severity["link ee_disc", "density-implausible"] == "warning"
+    assert severity["link ee_palm", "inertia-implausible"] == "warning"
+
+
+@pytest.mark.parametrize(
+    ("node", "message"),
+    [
+        (
+            Derivation("base", "fixed", (), (("topp", Derivation("arm", "ur5")),)),
+            "'fixed' has no port 'topp'; did you mean 'top'? valid: left, right, top",
+        ),
+        (
+            Derivation("base", "fixed", (), (("top", Derivation("base", "ur5")),)),
+            "two parts are labelled 'base'",
+        ),
+        (Derivation("arm", "yumi"), "'yumi' needs a base: its mount is not its root"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(node, message):
+    with pytest.raises(CompositionError) as caught:
+        compose(node, LIBRARY, "robot")
+    assert str(caught.value) == message
+
+
+def test_a_derivation_of_an_unknown_part_is_refused():
+    with pytest.raises(PartError, match="unknown part 'ur55'; did you mean 'ur5'"):
+        compose(Derivation("arm", "ur55"), LIBRARY, "robot")
+
+
+def conforms(arm, ee, tmp_path, samples):
+    derivation = derive(f"arm={arm} ee={ee}")
+    robot = compose(derivation, LIBRARY, default_name(derivation, LIBRARY))
+    findings = check(robot)
+    assert Counter(f.severity for f in findings if f.severity != "info") == {}
+    report = conformance(
+        write_bundle(robot, tmp_path / robot.name, findings, picture=False), samples
+    )
+    assert [(row.loader, row.passed, row.message) for row in report.rows] == [
+        (row.loader, True, "") for row in report.rows
+    ]
+    assert len(report.rows) == 5
+
+
+@pytest.mark.parametrize(("arm", "ee"), SAMPLE)
+def test_all_loaders_agree_on_a_sample_of_robots(arm, ee, tmp_path):
+    conforms(arm, ee, tmp_path, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ee", EES)
+@pytest.mark.parametrize("arm", PAPER_ARMS)
+def test_all_loaders_agree_on_every_arm_of_the_paper_with_every_end_effector(arm, ee, tmp_path):
+    conforms(arm, ee, tmp_path, 100)

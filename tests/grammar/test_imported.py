@@ -1,0 +1,123 @@
+"""Any URDF or xacro becomes a robot with a tool, a home and pairs to ignore."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from broken import with_joint
+from parts import PINCER
+from robots import arm
+
+from morphgen.checks import check
+from morphgen.checks.self_collision import self_collisions
+from morphgen.errors import FormatError
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.imported import import_robot
+from morphgen.model.geometry import IDENTITY, Box
+from morphgen.model.kinematics import frame_pose
+from morphgen.model.tree import renamed
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    """Write a robot as a URDF."""
+
+    def write(robot):
+        path = tmp_path / "some_robot.urdf"
+        path.write_text(urdf_text(replace(robot, frames=()), str))
+        return path
+
+    return write
+
+
+def test_the_tool_is_the_frame_of_the_link_that_is_named(urdf):
+    robot = import_robot(urdf(arm()), tool="left")
+    frame = robot.frame("tool")
+    assert (frame.link, frame.T_link_frame) == ("left", IDENTITY)
+    assert robot.provenance["source"] == "some_robot.urdf"
+
+
+def test_without_a_tool_there_is_no_frame(urdf):
+    robot = import_robot(urdf(arm()))
+    assert robot.frames == ()
+    assert "tool-missing" in {finding.code for finding in check(robot)}
+
+
+def test_the_robot_begins_at_the_root_that_is_named(urdf):
+    robot = import_robot(urdf(arm()), root="lower", tool="slider")
+    assert [link.name for link in robot.links] == ["lower", "slider", "left", "right"]
+    assert frame_pose(robot, (0.02, 0.0))[:3, 3] == pytest.approx([0, 0, 0.32])
+
+
+def test_it_has_the_files_name_or_the_one_that_is_given(urdf):
+    assert import_robot(urdf(arm())).name == "arm"
+    assert import_robot(urdf(arm()), name="limb").name == "limb"
+
+
+def test_nothing_is_in_self_collision_at_home(urdf):
+    robot = import_robot(urdf(arm()))
+    assert self_collisions(robot, [robot.home]) == [{}]
+    assert ("left", "slider") in robot.ignore_pairs
+
+
+def test_a_home_is_zero_or_the_middle_of_a_range_without_zero(urdf):
+    robot = import_robot(urdf(with_joint(arm(), "elbow", limits=(0.5, 1.5))))
+    assert robot.home == pytest.approx((0.0, 1.0, 0.0, 0.0))
+
+
+def test_safe_repairs_are_made_and_told(urdf):
+    path = urdf(arm())
+    path.write_text(path.read_text().replace('<axis xyz="1 0 0"', '<axis xyz="2 0 0"'))
+    robot = import_robot(path)
+    assert robot.joints[1].axis == pytest.approx((1, 0, 0))
+    assert any("joint elbow" in repair for repair in robot.provenance["repairs"])
+    as_is = import_robot(path, repair=False)
+    assert as_is.joints[1].axis == (2.0, 0.0, 0.0)
+    assert "repairs" not in as_is.provenance
+
+
+def test_a_sound_robot_is_not_repaired(urdf):
+    path = urdf(with_joint(arm(), "right", mimic=None))
+    assert import_robot(path).provenance["repairs"] == []
+
+
+def test_a_link_that_is_called_tool_makes_room_for_the_frame(urdf):
+    path = urdf(renamed(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
+    robot = import_robot(path, tool="tool")
+    assert robot.frame("tool").link == "tool_link"
+    assert {"tool", "tool_joint"}.isdisjoint({*robot.link_index, *robot.joint_index})
+    assert "frame-name-taken" not in {finding.code for finding in check(robot)}
+    np.testing.assert_allclose(
+        frame_pose(robot, robot.home),
+        frame_pose(import_robot(urdf(arm()), tool="slider"), robot.home),
+        atol=1e-12,
+    )
+
+
+def test_a_xacro_takes_arguments(tmp_path):
+    path = tmp_path / "pincer.urdf.xacro"
+    path.write_text(PINCER)
+    robot = import_robot(path, {"length": "0.3"}, root="palm")
+    assert robot.root.collisions[0].geometry == Box((0.02, 0.02, 0.3))
+    assert robot.joints[1].mimic.joint == "left_slide"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"root": "bass"}, "no link 'bass' for root; did you mean 'base'? valid: base, left,"),
+        ({"tool": "slidr"}, "no link 'slidr' for tool; did you mean 'slider'?"),
+        ({"root": "slider", "tool": "base"}, "tool 'base' is not below root 'slider'"),
+        ({"args": {"length": "1"}}, "xacro arguments length for a file that is no xacro"),
+    ],
+)
+def test_what_the_file_does_not_have_is_refused(urdf, options, message):
+    path = urdf(arm())
+    with pytest.raises(FormatError) as caught:
+        import_robot(path, **options)
+    assert str(caught.value).startswith(f"{path}: {message}")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(FormatError, match=r"nowhere\.urdf: no such file"):
+        import_robot(tmp_path / "nowhere.urdf")

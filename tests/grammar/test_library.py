@@ -1,0 +1,178 @@
+"""The library: every part there is can be found, composed and trusted, and so can a user's own."""
+
+import os
+import re
+
+import numpy as np
+import pytest
+from parts import write_part
+
+from morphgen.checks import check
+from morphgen.errors import PartError
+from morphgen.grammar.catalogue import catalogue
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import ENVIRONMENT, Library, default_library
+from morphgen.grammar.manifest import KINDS
+from morphgen.grammar.part import load_part
+from morphgen.grammar.request import default_name, parse_request
+from morphgen.model.kinematics import forward_kinematics
+
+LIBRARY = default_library()
+REQUESTS = {"base": "base={} arm=ur5", "arm": "arm={}", "ee": "arm=ur5 ee={}"}
+PARTS = {part.name: REQUESTS[part.kind] for part in LIBRARY.manifests() if part.kind in REQUESTS}
+DEGREES_OF_FREEDOM = {
+    "ur3": 6,
+    "ur5": 6,
+    "ur10": 6,
+    "panda": 7,
+    "kinova_gen3": 7,
+    "jaco2": 7,
+    "xarm7": 7,
+    "lwr": 7,
+    "iiwa14": 7,
+    "yumi": 14,
+    "yumi_left": 7,
+    "yumi_right": 7,
+    "widowx": 6,
+    "puma560": 6,
+    "z1": 6,
+    "so101": 5,
+    "none": 0,
+    "stick": 0,
+    "plane": 0,
+    "cylinder": 0,
+    "cube": 0,
+    "sphere": 0,
+    "panda_hand": 1,
+    "robotiq_2f85": 1,
+    "robotiq_2f140": 1,
+    "jaco_fingers": 6,
+    "fixed": 0,
+    "pedestal": 0,
+    "planar": 3,
+    "gantry": 5,
+}
+DETAILED = {"so101", "so101_gripper", "yumi", "yumi_left", "z1", "z1_gripper"}
+"""Parts whose meshes take seconds each."""
+ANTHROPOMORPHIC = {"allegro", "dex3"}
+"""Hands whose fingers oppose each other beside the axis of the wrist."""
+
+
+@pytest.fixture(autouse=True)
+def _no_library_of_the_users_own(monkeypatch):
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] if n in DETAILED else []) for n in PARTS],
+)
+def test_every_part_composes_into_a_robot_that_the_checks_find_sound(name):
+    derivation = parse_request(PARTS[name].format(name).split(), LIBRARY)
+    robot = compose(derivation, LIBRARY, default_name(derivation, LIBRARY))
+    assert [finding for finding in check(robot) if finding.severity != "info"] == []
+    assert robot.frame("tool")
+
+
+@pytest.mark.parametrize("name", sorted(DEGREES_OF_FREEDOM))
+def test_parts_have_the_joints_that_they_are_known_for(name):
+    assert load_part(LIBRARY.manifest(name)).body.dof == DEGREES_OF_FREEDOM[name]
+
+
+@pytest.mark.parametrize("name", LIBRARY.names("ee"))
+def test_a_tool_points_out_of_the_hand_and_lies_in_front_of_it(name):
+    part = load_part(LIBRARY.manifest(name))
+    T_root_link = forward_kinematics(part.body, part.body.home)
+    T_root_tool = T_root_link[part.body.link_index[part.tool.link]] @ part.tool.T_link_frame.matrix
+    T_mount_tool = part.T_root_mount.inverse().matrix @ T_root_tool
+    assert T_mount_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-3)
+    beside, ahead = np.hypot(*T_mount_tool[:2, 3]), T_mount_tool[2, 3]
+    assert ahead == 0 if name == "none" else 0.03 < ahead < 0.4
+    assert name in ANTHROPOMORPHIC or beside < 0.01
+
+
+@pytest.mark.parametrize("name", [m.name for m in LIBRARY.manifests() if not m.is_template])
+def test_every_real_part_says_whose_work_it_is(name):
+    manifest = LIBRARY.manifest(name)
+    assert re.fullmatch(r"[A-Za-z]+-[A-Za-z0-9.-]+|MIT|ISC", manifest.licence)
+    assert len(manifest.citation) > 20
+    assert manifest.summary
+
+
+def test_templates_and_real_parts_of_every_kind_are_there():
+    assert {"fixed", "pedestal", "planar", "gantry"} <= set(LIBRARY.names("base"))
+    assert {"ur5", "lwr", "widowx"} <= set(LIBRARY.names("arm"))
+    assert {"none", "stick", "robotiq_2f85", "rethink", "sake_ez"} <= set(LIBRARY.names("ee"))
+    kinds = [manifest.kind for manifest in LIBRARY.manifests()]
+    assert kinds == sorted(kinds, key=KINDS.index)
+    assert len(kinds) == len(LIBRARY.names())
+
+
+def test_the_catalogue_has_a_row_a_part_with_figures_that_can_be():
+    rows = {row["name"]: row for row in catalogue(LIBRARY, "base")}
+    assert set(rows) == set(LIBRARY.names("base"))
+    assert rows["gantry"]["dof"] == 5
+    assert rows["gantry"]["reach"] == pytest.approx(np.hypot(0.8, np.hypot(0.5, 0.5)), abs=0.01)
+    assert rows["fixed"]["mass"] == 0
+    assert {row["source"] for row in rows.values()} == {"template"}
+    assert {row["kind"] for row in rows.values()} == {"base"}
+
+
+def test_an_unknown_part_names_the_nearest_of_its_kind():
+    with pytest.raises(PartError, match="unknown ee 'plan'; did you mean 'plane'") as caught:
+        LIBRARY.manifest("plan", "ee")
+    assert "ur5" not in str(caught.value)
+
+
+def test_a_part_of_another_kind_is_refused():
+    with pytest.raises(PartError, match="'plane' is of kind ee, not arm"):
+        LIBRARY.manifest("plane", "arm")
+
+
+def test_a_folder_of_ones_own_adds_parts(tmp_path):
+    write_part(tmp_path / "deep" / "down")
+    library = default_library([tmp_path])
+    assert "pincer" in library.names("ee")
+    assert "pincer" not in default_library().names()
+
+
+def test_the_environment_names_folders_like_a_path(tmp_path, monkeypatch):
+    write_part(tmp_path / "a", name="pincer_a")
+    write_part(tmp_path / "b", name="pincer_b")
+    monkeypatch.setenv(ENVIRONMENT, os.pathsep.join([str(tmp_path / "a"), str(tmp_path / "b")]))
+    assert {"pincer_a", "pincer_b"} <= set(default_library().names("ee"))
+
+
+def test_a_folder_that_is_given_twice_is_one_folder(tmp_path, monkeypatch):
+    write_part(tmp_path)
+    monkeypatch.setenv(ENVIRONMENT, str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert "pincer" in default_library([tmp_path, tmp_path.relative_to(tmp_path)]).names()
+
+
+def test_the_name_of_another_part_is_refused(tmp_path):
+    own = write_part(tmp_path, name="ur5", kind="arm")
+    message = rf"part 'ur5' is in \S*/robots_real/ur5\.yaml and in {re.escape(str(own))}"
+    with pytest.raises(PartError, match=message):
+        default_library([tmp_path]).names()
+
+
+def test_two_files_of_one_name_are_refused(tmp_path):
+    write_part(tmp_path / "a")
+    write_part(tmp_path / "b")
+    with pytest.raises(PartError, match="part 'pincer' is in"):
+        Library([tmp_path]).names()
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(PartError, match=r"library folder .*nowhere does not exist"):
+        default_library([tmp_path / "nowhere"]).names()
+
+
+def test_a_broken_manifest_does_not_keep_the_other_parts_from_being_used(tmp_path):
+    write_part(tmp_path)
+    (tmp_path / "broken.yaml").write_text("name: ]")
+    library = default_library([tmp_path])
+    assert library.manifest("pincer", "ee").name == "pincer"
+    with pytest.raises(PartError, match=r"broken\.yaml:1:7: no valid YAML"):
+        library.names("ee")

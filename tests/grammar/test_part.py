@@ -1,0 +1,215 @@
+"""A part is what its source says, corrected by what its manifest says."""
+
+import importlib.metadata
+import math
+
+import pytest
+from parts import PINCER, write_part
+
+from morphgen.errors import PartError
+from morphgen.formats.resolve import PackageFinder
+from morphgen.formats.xacro import expand_text
+from morphgen.grammar import part as module
+from morphgen.grammar.library import default_library
+from morphgen.grammar.manifest import read_manifest
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import Box
+
+BAR = 0.02 * 0.02 * 1000  # kg a metre
+
+
+def template(folder, values=None, **changes):
+    return load_part(read_manifest(write_part(folder, **changes)), values)
+
+
+@pytest.fixture
+def real(tmp_path, monkeypatch):
+    """Make a real part: the pincer's URDF stands for a file of a data package."""
+
+    def make(**changes):
+        urdf = tmp_path / "pincer.urdf"
+        urdf.write_bytes(expand_text(PINCER, {}, urdf, PackageFinder()))
+        monkeypatch.setattr(module, "distribution_file", lambda package, file: tmp_path / file)
+        source = {"source": {"package": "rtb-data", "file": "pincer.urdf"}}
+        tool = {"link": "palm", "xyz": [0, 0, 0.25]}
+        gone = {"file": None, "density": None, "parameters": None}
+        manifest = write_part(tmp_path, **gone | source | {"tool": tool} | changes)
+        return load_part(read_manifest(manifest))
+
+    return make
+
+
+def test_a_part_begins_at_its_root(tmp_path):
+    body = template(tmp_path).body
+    assert [link.name for link in body.links] == ["palm", "left", "right", "disc"]
+    assert [joint.name for joint in body.joints] == ["left_slide", "right_slide", "wheel"]
+
+
+def test_links_that_it_goes_without_are_cut_off_with_their_joints(tmp_path):
+    body = template(tmp_path, without=["disc"], home={"left_slide": 0.01}).body
+    assert [link.name for link in body.links] == ["palm", "left", "right"]
+    assert body.home == (0.01,)
+
+
+def test_parameters_shape_the_links_and_the_frames(tmp_path):
+    part = template(tmp_path, {"length": 0.4})
+    assert part.body.link("palm").collisions[0].geometry == Box((0.02, 0.02, 0.4))
+    assert part.tool.T_link_frame.position == pytest.approx((0, 0, 0.45))
+    assert part.values == {"length": 0.4}
+    assert template(tmp_path).values == {"length": 0.2}
+
+
+def test_expressions_stand_in_home_too(tmp_path):
+    part = template(tmp_path, {"length": 0.3}, home={"left_slide": "${length / 10}"})
+    assert part.body.home == pytest.approx((0.03, 0.0))
+
+
+def test_the_density_gives_masses_where_there_are_none(tmp_path):
+    part = template(tmp_path)
+    palm = part.body.link("palm").inertial
+    assert palm.mass == pytest.approx(BAR * 0.2)
+    assert palm.com == pytest.approx((0, 0, 0.1))
+    assert palm.inertia[0] == pytest.approx(palm.mass * (0.02**2 + 0.2**2) / 12)
+
+
+def test_the_same_part_is_built_once(tmp_path):
+    manifest = read_manifest(write_part(tmp_path))
+    assert load_part(manifest, {"length": 0.3}) is load_part(manifest, {"length": 0.3})
+    assert load_part(manifest, {"length": 0.2}) is load_part(manifest)
+    assert load_part(manifest, {"length": 0.3}) is not load_part(manifest)
+
+
+def test_home_effort_and_velocity_of_the_manifest_replace_the_sources(tmp_path):
+    body = template(tmp_path, effort={"wheel": 7}, velocity={"left_slide": 0.3}).body
+    left, right, wheel = body.joints
+    assert body.home == (0.01, 0.5)
+    assert (left.effort, left.velocity) == (10, 0.3)
+    assert (wheel.effort, wheel.velocity) == (7, 2)
+    assert (right.effort, right.limits, right.mimic.joint) == (10, (-0.04, 0), "left_slide")
+
+
+def test_a_continuous_joint_has_no_limits(tmp_path):
+    assert template(tmp_path).body.joints[2].limits is None
+
+
+def test_names_that_loaders_dislike_are_made_safe_in_every_place(tmp_path):
+    xacro = PINCER.replace('"palm"', '"the palm"').replace('name="wheel"', 'name="big/wheel"')
+    link = {"link": "the palm"}
+    part = template(
+        tmp_path, xacro=xacro, root="the palm", mount=link, tool=link, home={"big/wheel": 1}
+    )
+    assert part.body.root.name == part.tool.link == "the_palm"
+    assert part.body.joints[2].name == "big_wheel"
+
+
+def test_a_mount_may_lie_behind_a_fixed_joint(tmp_path):
+    mount = {"link": "palm", "xyz": [0, 0, 0.01], "rpy": [0, 0, math.pi / 2]}
+    part = template(tmp_path, root="plinth", mount=mount)
+    assert part.T_root_mount.position == pytest.approx((0, 0, 1.01))
+    x_axis = part.T_root_mount.matrix[:3, 0]
+    assert x_axis == pytest.approx([0, 1, 0])
+
+
+def test_a_mass_of_the_manifest_brings_the_inertia_of_the_geometry(real):
+    body = real(mass={"palm": 2}).body
+    palm = body.link("palm").inertial
+    assert palm.mass == 2
+    assert palm.com == pytest.approx((0, 0, 0.1))
+    assert palm.inertia[5] == pytest.approx(2 * (0.02**2 + 0.02**2) / 12)
+    assert body.link("disc").inertial is None
+
+
+def test_a_mass_of_zero_takes_the_inertial_away(real):
+    assert real(mass={"palm": 0, "left": 1}).body.link("palm").inertial is None
+
+
+def test_visual_shapes_can_stand_for_collision_shapes(real):
+    palm = real(collision_from_visual=["palm"]).body.link("palm")
+    assert [shape.geometry for shape in palm.collisions] == [Box((0.02, 0.02, 0.2))]
+    assert palm.collisions[0].rgba is None
+    assert palm.visuals[0].rgba == (1, 0, 0, 1)
+
+
+def test_a_dropped_mesh_is_gone_from_sight_and_touch():
+    """The palm belongs to Jaco's hand, not to the last link of its arm."""
+    arm = load_part(default_library().manifest("jaco2"))
+    shapes = [s for link in arm.body.links for s in (*link.visuals, *link.collisions)]
+    meshes = {shape.geometry.path.name for shape in shapes}
+    assert "hand_3finger.dae" not in meshes
+    assert "ring_small.dae" in meshes
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"root": "pallm"}, "no link 'pallm'; did you mean 'palm'"),
+        ({"without": ["disk"]}, "no link 'disk'; did you mean 'disc'"),
+        ({"without": ["left"]}, "joint 'right_slide' mimics 'left_slide'"),
+        ({"home": {"weel": 0}}, "home: no joint 'weel'; did you mean 'wheel'"),
+        ({"home": {"right_slide": 0}}, "home: 'right_slide' does not move by itself"),
+        ({"effort": {"weel": 0}}, "effort: no joint 'weel'; did you mean 'wheel'"),
+        ({"velocity": {"foot": 0}}, "velocity: no joint 'foot'"),
+        ({"mount": {"link": "plinth"}}, "no link 'plinth' in the part"),
+        ({"mount": {"link": "disc"}}, "mount is on 'disc', which moves ('wheel')"),
+        ({"tool": {"link": "tip"}}, "no link 'tip' in the part"),
+        ({"ports": {"wrist": {"link": "arm"}}}, "no link 'arm' in the part"),
+        ({"tool": {"link": "palm", "xyz": [0, 0, "length"]}}, "'length' is neither a number nor"),
+        ({"tool": {"link": "palm", "xyz": [0, 0, "${lenth}"]}}, "did you mean 'length'"),
+        ({"home": {"wheel": "${1 / 0}"}}, "${1 / 0}: "),
+        ({"file": "tongs.xacro"}, "tongs.xacro: cannot be read: No such file"),
+        ({"xacro": PINCER.replace("</robot>", "")}, "pincer.xacro:"),
+        ({"xacro": PINCER.replace('parent link="palm"', 'parent link="pam"')}, "'pam'"),
+        ({"xacro": PINCER.replace("length", "size")}, "no argument 'length'"),
+    ],
+)
+def test_a_manifest_that_does_not_fit_its_source_is_refused_by_name(tmp_path, changes, message):
+    with pytest.raises(PartError, match=r"^[^\n]*$") as caught:
+        template(tmp_path, **changes)
+    assert message in str(caught.value)
+    assert "pincer" in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["mass", "drop"])
+def test_keys_of_real_parts_name_links_that_are_there(real, key):
+    value = 1 if key == "mass" else ["x.dae"]
+    with pytest.raises(PartError, match=f"{key}: no link 'pam'; did you mean 'palm'"):
+        real(**{key: {"pam": value}})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"lenth": 0.2}, "pincer has no parameter 'lenth'; did you mean 'length'"),
+        ({"length": 2.0}, r"pincer\.length=2: out of range; expected 0\.1 to 0\.5 m"),
+    ],
+)
+def test_parameters_are_checked(tmp_path, values, message):
+    with pytest.raises(PartError, match=message):
+        template(tmp_path, values)
+
+
+@pytest.mark.parametrize(
+    ("package", "install"),
+    [
+        ("rtb-data", "pip install rtb-data==1.1.0"),
+        ("example-robot-data", "pip install example-robot-data"),
+    ],
+)
+def test_a_missing_data_package_says_how_to_install_it(tmp_path, monkeypatch, package, install):
+    def absent(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", absent)
+    source = {"package": package, "file": "robots/x.urdf"}
+    gone = {"file": None, "density": None, "parameters": None}
+    manifest = read_manifest(write_part(tmp_path, source=source, **gone))
+    with pytest.raises(PartError, match="not installed: " + install):
+        load_part(manifest)
+
+
+def test_a_file_that_the_data_package_lacks_is_named(tmp_path):
+    source = {"package": "rtb-data", "file": "rtbdata/xacro/nowhere.urdf"}
+    gone = {"file": None, "density": None, "parameters": None}
+    manifest = read_manifest(write_part(tmp_path, source=source, **gone))
+    with pytest.raises(PartError, match=r"rtb-data 1\.1\.0 has no file .*nowhere\.urdf"):
+        load_part(manifest)

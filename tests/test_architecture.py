@@ -1,0 +1,94 @@
+"""The house stands as designed: imports go down only, and help is quick."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import morphgen
+
+PACKAGE = Path(morphgen.__file__).parent
+ROOMS = ("errors", "model", "formats", "checks", "grammar", "api", "cli")
+"""Rooms of the package, the lowest first; each may import itself and those below."""
+MODULES = sorted(PACKAGE.rglob("*.py"))
+SIMULATORS_AND_MESHES = (
+    "coacd",
+    "manifold3d",
+    "mujoco",
+    "pybullet",
+    "torch",
+    "trimesh",
+    "viser",
+    "yourdfpy",
+)
+
+
+def name_of(path):
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(path):
+    """Modules that a module imports anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: a relative import"
+            yield from ([node.module] if node.module else [])
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def room(module):
+    _, _, below = module.partition(".")
+    return below.partition(".")[0]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_imports_go_down_only(path):
+    mine = room(name_of(path))
+    for module in imports(path):
+        if module.partition(".")[0] != "morphgen" or mine == "":
+            continue
+        allowed = ROOMS[: ROOMS.index(mine) + 1]
+        if room(module) in ROOMS:
+            assert room(module) in allowed, f"{name_of(path)} imports {module}"
+        elif room(module):
+            assert mine == "cli", f"{name_of(path)} imports {module}, which stands above"
+
+
+@pytest.mark.parametrize("folder", ["morphgen", "viewer", "tasks", "rl", "benchmarks", "docs"])
+def test_nobody_imports_the_front_door(folder):
+    modules = (PACKAGE.parent / folder).rglob("*.py")
+    outside = [path for path in modules if PACKAGE / "cli" not in path.parents]
+    guilty = [str(path) for path in outside if "morphgen.cli" in set(imports(path))]
+    assert guilty == []
+
+
+def test_every_room_has_its_place():
+    assert {room(name_of(path)) for path in MODULES} - {""} == set(ROOMS)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_modules_are_short(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 500
+
+
+def modules_after(statement):
+    code = f"import sys; {statement}; print(' '.join({{m.partition('.')[0] for m in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize("statement", ["import morphgen", "import morphgen.cli"])
+def test_the_front_door_loads_nothing_heavy(statement):
+    loaded = modules_after(statement)
+    assert "morphgen" in loaded
+    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "numpy", "scipy", "lxml", "yaml"})
+
+
+def test_reading_manifests_loads_no_simulator():
+    loaded = modules_after("import morphgen.grammar.library")
+    assert loaded.isdisjoint(SIMULATORS_AND_MESHES)
