@@ -45,7 +45,7 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
     Raises:
         MorphgenError: If the words name what does not exist or does not fit.
     """
-    if not words or "=" in words[0]:
+    if not words or "=" in words[0] or words[0] in library.paths:
         derivation = parse_request(words, library)
         return derivation, default_name(derivation, library)
     grammar = load_grammar(find_grammar(words[0], library.folders), library.folders)
