@@ -193,14 +193,18 @@ def _provenance(placed: Iterable[Placed]) -> list[dict[str, object]]:
 
 
 def _ignored(robot: Robot, placed: Iterable[Placed]) -> tuple[Pair, ...]:
-    """Pairs to ignore: those of each part by itself, and those across parts."""
+    """Pairs to ignore: those of each real part, known from before, and all others, tested."""
     owner: dict[str, str] = {}
     known: list[Pair] = []
     for here in placed:
+        if here.part.manifest.is_template:
+            continue
         owner |= {here.scoped(link.name): here.label for link in here.part.body.links}
         pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(here.part)]
         known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
-    return ignore_pairs(robot, known=known, check=lambda a, b: owner[a] != owner[b])
+    return ignore_pairs(
+        robot, known=known, check=lambda a, b: a not in owner or owner[a] != owner.get(b)
+    )
 
 
 @lru_cache(maxsize=256)

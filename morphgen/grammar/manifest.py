@@ -31,7 +31,15 @@ _COMMON = _REQUIRED | {
     "velocity",
     "without",
 }
-_REAL = _COMMON | {"source", "citation", "mass", "drop", "collision_from_visual"}
+_REAL = _COMMON | {
+    "source",
+    "citation",
+    "mass",
+    "drop",
+    "collision_from_visual",
+    "parameters",
+    "scaling",
+}
 _TEMPLATE = _COMMON | {"file", "density", "parameters", "reference"}
 
 
@@ -81,6 +89,8 @@ class Manifest:
     """Links whose visual shapes replace their collision shapes."""
     accepted: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     """Findings that are as they should be: by link or joint and code, why."""
+    scaling: Mapping[str, str] = field(default_factory=dict)
+    """Parameter that scales a link with all that is on it, by link."""
     density: float | None = None
     """Of links without inertial, kg/m^3."""
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
@@ -133,6 +143,7 @@ def read_manifest(path: Path) -> Manifest:
             link: _names(names, f"{path}: drop.{link}")
             for link, names in _mapping(data.get("drop"), f"{path}: drop").items()
         },
+        scaling=_texts(data.get("scaling"), f"{path}: scaling"),
         collision_from_visual=_names(
             data.get("collision_from_visual"), f"{path}: collision_from_visual"
         ),
@@ -255,6 +266,10 @@ def _home(data: Mapping[str, Any], path: Path) -> dict[str, Number]:
         name: value if isinstance(value, str) else _float(value, f"{path}: home.{name}")
         for name, value in entries.items()
     }
+
+
+def _texts(data: object, where: str) -> dict[str, str]:
+    return {name: str(value) for name, value in _mapping(data, where).items()}
 
 
 def _float(value: object, where: str) -> float:

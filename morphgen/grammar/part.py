@@ -19,6 +19,7 @@ from morphgen.grammar.parameters import resolve_values
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
 from morphgen.model.inertia import inertial_of_mass, with_inertia
 from morphgen.model.robot import Frame, Link, Robot
+from morphgen.model.scaling import scaled
 from morphgen.model.tree import renamed, subtree
 
 _EXPRESSION = re.compile(r"\$\{(.*)\}")
@@ -78,22 +79,43 @@ def _load(path: Path, frozen: _Frozen) -> Part:
         raise PartError(f"{manifest.path}: {error}") from error
     body = _with_bodies(_with_motion(body, manifest, values), manifest)
     T_root_mount = _mount(body, manifest, values)
-    ports = {
-        name: Frame(name, placement.link, _pose(placement, body, manifest, values))
-        for name, placement in manifest.ports.items()
-    }
-    tool = None
-    if manifest.tool is not None:
-        tool = Frame("tool", manifest.tool.link, _pose(manifest.tool, body, manifest, values))
+    body = _with_frames(body, manifest, values)
+    body = scaled(body, _factors(body, manifest, values))
     links = safe_names(link.name for link in body.links)
+    body = renamed(body, links, safe_names(joint.name for joint in body.joints))
+    has_tool = manifest.tool is not None
     return Part(
         manifest,
         values,
-        renamed(body, links, safe_names(joint.name for joint in body.joints)),
+        replace(body, frames=()),
         T_root_mount,
-        {name: replace(port, link=links[port.link]) for name, port in ports.items()},
-        tool and replace(tool, link=links[tool.link]),
+        {port.name: port for port in body.frames[has_tool:]},
+        body.frames[0] if has_tool else None,
     )
+
+
+def _with_frames(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Robot:
+    """The body with the tool, if there is one, and the ports as its frames."""
+    placements = {"tool": manifest.tool} if manifest.tool is not None else {}
+    frames = [
+        Frame(name, placement.link, _pose(placement, body, manifest, values))
+        for name, placement in (*placements.items(), *manifest.ports.items())
+    ]
+    return replace(body, frames=tuple(frames))
+
+
+def _factors(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> dict[str, float]:
+    """Scale of every link that the manifest lets grow."""
+    for link, parameter in manifest.scaling.items():
+        if link not in body.link_index:
+            raise PartError(
+                f"{manifest.path}: scaling: no link {link!r}{nearest(link, body.link_index)}"
+            )
+        if parameter not in values:
+            raise PartError(
+                f"{manifest.path}: scaling: no parameter {parameter!r}{nearest(parameter, values)}"
+            )
+    return {link: values[parameter] for link, parameter in manifest.scaling.items()}
 
 
 def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:
