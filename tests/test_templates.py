@@ -45,13 +45,7 @@ def troubles(robot: Robot, *, tool_required: bool = True) -> list[str]:
     ]
 
 
-TOO_WIDE = pytest.mark.xfail(strict=True, reason="its longest slides are longer than plausible")
-RANGES = [
-    pytest.param(
-        manifest, id=manifest.name, marks=[TOO_WIDE] * (manifest.name in ("gantry", "planar"))
-    )
-    for manifest in TEMPLATES
-]
+RANGES = [pytest.param(manifest, id=manifest.name) for manifest in TEMPLATES]
 
 
 @pytest.mark.parametrize("manifest", RANGES)

@@ -57,17 +57,22 @@ _RANK = {"error": 0, "warning": 1, "info": 2}
 __all__ = ["CHECKS", "Check", "check", "fix"]
 
 
-def check(robot: Robot, *, tool_required: bool = True) -> tuple[Finding, ...]:
+def check(
+    robot: Robot, *, tool_required: bool = True, home_tested: bool = False
+) -> tuple[Finding, ...]:
     """Run every check.
 
     Args:
         robot: The body.
         tool_required: Whether a missing or motionless tool is a finding; not so for a part.
+        home_tested: Whether it is known that nothing collides at home, as after ``survey``.
 
     Returns:
         Findings by severity, code and place; the same robot gives the same ones.
     """
     checks = (*CHECKS, check_tool) if tool_required else CHECKS
+    if home_tested:
+        checks = tuple(run for run in checks if run is not check_self_collision)
     findings = {_judged(finding, robot) for run in checks for finding in run(robot)}
     return tuple(sorted(findings, key=lambda f: (_RANK[f.severity], f.code, f.where, f.why)))
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from morphgen.checks.joints import reachable
 from morphgen.model.findings import Finding
-from morphgen.model.kinematics import mimic_map
 from morphgen.model.robot import Joint, Mimic, Robot
 
 RANGE_TOLERANCE = 0.01
@@ -25,7 +24,7 @@ def check_mimic(robot: Robot) -> Iterator[Finding]:
 
 def check_mimic_range(robot: Robot) -> Iterator[Finding]:
     """Find followers that their leaders' ranges send past their own limits."""
-    matrix, offset = mimic_map(robot)
+    matrix, offset = robot.mimic_map
     for row, k in enumerate(robot.movable):
         follower = robot.joints[k]
         lower, upper = reachable(follower)

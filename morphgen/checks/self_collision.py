@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import combinations, product
 
 import mujoco
@@ -31,7 +32,7 @@ PENETRATION = 1e-4
 """Depth from which an overlap counts as penetration, metres; faces that only meet do not."""
 MOSTLY = 0.95
 """Share of random configurations from which a penetrating pair counts as never separating."""
-SAMPLES = 256
+SAMPLES = 128
 """Random configurations that ``ignore_pairs`` draws."""
 _MEMORY = "16M"
 
@@ -100,6 +101,16 @@ class SelfCollision:
         return depths
 
 
+@dataclass(frozen=True)
+class Survey:
+    """The pairs whose contact is no self-collision, and why home is without any."""
+
+    ignored: tuple[Pair, ...]
+    """Sorted pairs, in alphabetical order."""
+    at_home: Mapping[Pair, float]
+    """Depth of pairs that penetrate at home, but for neighbours and known pairs, metres."""
+
+
 def self_collisions(robot: Robot, q: ArrayLike) -> list[dict[Pair, float]]:
     """Penetrating pairs of links, less ``robot.ignore_pairs``, at configurations.
 
@@ -149,18 +160,31 @@ def ignore_pairs(
     Raises:
         MeshError: If a collision mesh cannot be read.
     """
+    return survey(robot, known=known, check=check, samples=samples, seed=seed).ignored
+
+
+def survey(
+    robot: Robot,
+    *,
+    known: Iterable[Pair] = (),
+    check: Callable[[str, str], bool] | None = None,
+    samples: int = SAMPLES,
+    seed: int = 0,
+) -> Survey:
+    """What ``ignore_pairs`` returns, with what it saw at home; see there."""
     ignored = {sorted_pair(*pair) for pair in known} | set(attached_pairs(robot))
     left = set(_pairs(_touchable(robot))) - ignored
     if not left:
-        return tuple(sorted(ignored))
+        return Survey(tuple(sorted(ignored)), {})
     tested = SelfCollision(robot, ignored)
-    ignored.update(tested.penetrations([robot.home])[0])
+    (at_home,) = tested.penetrations([robot.home])
+    ignored.update(at_home)
     left = {pair for pair in left - ignored if check is None or check(*pair)}
     if left and robot.dof:
         q = random_configurations(robot, samples, np.random.default_rng(seed))
         counts = Counter(pair for pairs in tested.penetrations(q) for pair in pairs)
         ignored.update(pair for pair in left if counts[pair] >= MOSTLY * samples)
-    return tuple(sorted(ignored))
+    return Survey(tuple(sorted(ignored)), at_home)
 
 
 def attached_pairs(robot: Robot) -> tuple[Pair, ...]:

@@ -17,7 +17,7 @@ from morphgen.formats.mjcf_elements import (
 )
 from morphgen.formats.mujoco_urdf import BOUND_INERTIA, BOUND_MASS
 from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, Actuation, actuation
-from morphgen.model.kinematics import mimic_map, movable_positions
+from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Joint, Link, Robot
 
 TIMESTEP = 0.005
@@ -180,7 +180,7 @@ def _write_constraints(root: etree._Element, robot: Robot) -> None:
     for a, b in robot.ignore_pairs:
         etree.SubElement(contact, "exclude", body1=a, body2=b)
     equality = etree.SubElement(root, "equality")
-    matrix, offset = mimic_map(robot)
+    matrix, offset = robot.mimic_map
     for row, k in enumerate(robot.movable):
         joint = robot.joints[k]
         if joint.mimic is None:

@@ -55,11 +55,7 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
         FormatError: The file or one that it includes is missing, broken or cannot be expanded, or
             ``args`` names an argument that neither declares.
     """
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
-    return expand_text(text, args, path, finder)
+    return Expansion(args, path.absolute(), finder).run_file()
 
 
 def expand_text(
@@ -76,7 +72,7 @@ def expand_text(
     Raises:
         FormatError: As `expand`.
     """
-    expansion = _Expansion(args, origin.absolute(), finder)
+    expansion = Expansion(args, origin.absolute(), finder)
     return expansion.run(text.encode() if isinstance(text, str) else text)
 
 
@@ -105,26 +101,58 @@ def evaluate(expression: str, values: Mapping[str, float]) -> float:
     return float(result)
 
 
-class _Expansion:
+class Expansion:
     """One call's state: the arguments, the files read, and what they declare."""
 
-    def __init__(self, args: Mapping[str, str], origin: Path, finder: PackageFinder) -> None:
+    def __init__(
+        self,
+        args: Mapping[str, str],
+        origin: Path,
+        finder: PackageFinder,
+        objects: Mapping[str, object] | None = None,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            args: Values of the document's ``xacro:arg``.
+            origin: The file, absolute.
+            finder: Where ``$(find package)`` looks.
+            objects: Values of further arguments that reach expressions as they are.
+        """
         self.engine = thread_engine()
         self.engine.parse = self._parse_include
         self.engine.eval_extension = self._substitute
+        self.objects = dict(objects or {})
         self.given = {name: str(value) for name, value in args.items()}
         self.arguments = _Arguments(self.engine.XacroException, self.given)
         self.declared: set[str] = set()
         self.origin = origin
         self.finder = finder
 
+    def run_file(self) -> bytes:
+        """Expand the file.
+
+        Raises:
+            FormatError: As ``expand``.
+        """
+        try:
+            data = self.origin.read_bytes()
+        except OSError as error:
+            raise FormatError(f"{self.origin}: cannot be read: {error.strerror}") from error
+        return self.run(data)
+
     def run(self, data: bytes) -> bytes:
+        """Expand a document that stands for the file.
+
+        Raises:
+            FormatError: As ``expand``.
+        """
         self.engine.init_stacks(str(self.origin))
         with self._located():
             document = self._parse(data, str(self.origin))
             self.engine.process_doc(document, mappings=self.arguments)
         known = self.declared | self.arguments.used
-        for name in self.given:
+        for name in (*self.given, *self.objects):
             if name not in known:
                 raise FormatError(f"{self.origin}: no argument {name!r}{nearest(name, known)}")
         return "".join(_serialised(document.documentElement)).encode()
@@ -159,9 +187,11 @@ class _Expansion:
             raise self.engine.XacroException(exc=missing) from error
         return self._parse(data, filename)
 
-    def _substitute(self, text: str) -> str:
+    def _substitute(self, text: str) -> object:
         """Evaluate one ``$(command words)``."""
         match text[2:-1].split():
+            case ["arg", name] if name in self.objects:
+                return self.objects[name]
             case ["arg", name]:
                 return self.arguments[name]
             case ["find", package]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from morphgen.checks.self_collision import ignore_pairs
+from morphgen.checks.self_collision import Survey, ignore_pairs, survey
 from morphgen.errors import CompositionError, nearest
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
@@ -44,12 +44,7 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
         FormatError: If a part's source cannot be read.
     """
     robot = join(derivation, library, name)
-    return with_ignore_pairs(robot, derivation, library)
-
-
-def with_ignore_pairs(robot: Robot, derivation: Derivation, library: Library) -> Robot:
-    """A joined robot with the pairs whose contact is no self-collision."""
-    return replace(robot, ignore_pairs=_ignored(robot, place(derivation, library).values()))
+    return replace(robot, ignore_pairs=survey_of(robot, derivation, library).ignored)
 
 
 def join(derivation: Derivation, library: Library, name: str) -> Robot:
@@ -192,19 +187,22 @@ def _provenance(placed: Iterable[Placed]) -> list[dict[str, object]]:
     ]
 
 
-def _ignored(robot: Robot, placed: Iterable[Placed]) -> tuple[Pair, ...]:
-    """Pairs to ignore: those of each real part, known from before, and all others, tested."""
+def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Survey:
+    """Which contacts of a joined robot are no self-collision.
+
+    Those of each real part, as it is made, are known from before; all others are tested.
+    """
     owner: dict[str, str] = {}
     known: list[Pair] = []
-    for here in placed:
-        if here.part.manifest.is_template:
+    for here in place(derivation, library).values():
+        manifest = here.part.manifest
+        if manifest.is_template:
             continue
-        owner |= {here.scoped(link.name): here.label for link in here.part.body.links}
-        pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(here.part)]
+        pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(load_part(manifest))]
         known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
-    return ignore_pairs(
-        robot, known=known, check=lambda a, b: a not in owner or owner[a] != owner.get(b)
-    )
+        if not manifest.scaling:
+            owner |= {here.scoped(link.name): here.label for link in here.part.body.links}
+    return survey(robot, known=known, check=lambda a, b: a not in owner or owner[a] != owner.get(b))
 
 
 @lru_cache(maxsize=256)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from weakref import WeakSet
 
 from morphgen.checks.names import safe_names
 from morphgen.errors import FormatError, MorphgenError, PartError, RobotError, nearest
@@ -14,6 +15,7 @@ from morphgen.formats.resolve import PackageFinder, distribution_file
 from morphgen.formats.urdf import read_urdf, robot_from_xml
 from morphgen.formats.urdf_text import number
 from morphgen.formats.xacro import evaluate, expand
+from morphgen.formats.xacro_compile import CompiledXacro, compile_xacro
 from morphgen.grammar.manifest import Manifest, Number, PackageSource, Placement
 from morphgen.grammar.parameters import resolve_values
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
@@ -22,6 +24,7 @@ from morphgen.model.robot import Frame, Link, Robot
 from morphgen.model.scaling import scaled
 from morphgen.model.tree import renamed, subtree
 
+_examined: WeakSet[CompiledXacro] = WeakSet()
 _EXPRESSION = re.compile(r"\$\{(.*)\}")
 
 
@@ -123,12 +126,26 @@ def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:
         if isinstance(manifest.source, PackageSource):
             file = distribution_file(manifest.source.package, manifest.source.file)
             return read_urdf(file, manifest.source.args)
-        arguments = {name: number(value) for name, value in values.items()}
-        finder = PackageFinder()
-        data = expand(manifest.source, arguments, finder)
-        return robot_from_xml(data, manifest.source, finder)
+        return _read_template(manifest.source, manifest, values)
     except FormatError as error:
         raise PartError(f"part {manifest.name!r}: {error}") from error
+
+
+def _read_template(path: Path, manifest: Manifest, values: Mapping[str, float]) -> Robot:
+    """A template's body; its structure is examined once for all values of its numbers."""
+    constants: dict[str, str] = {}
+    numbers: dict[str, str] = {}
+    for name, value in values.items():
+        kind = constants if manifest.parameters[name].integer else numbers
+        kind[name] = number(value)
+    finder = PackageFinder()
+    compiled = compile_xacro(path, constants, numbers, finder)
+    if compiled is None:
+        data = expand(path, {**constants, **numbers}, finder)
+        return robot_from_xml(data, path, finder)
+    body = robot_from_xml(compiled.fill(numbers), path, finder, trusted=compiled in _examined)
+    _examined.add(compiled)
+    return body
 
 
 def _with_motion(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Robot:

@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.checks import check
-from morphgen.checks.self_collision import SelfCollision, attached_pairs
 from morphgen.errors import MorphgenError
 from morphgen.formats.card import rounded
-from morphgen.grammar.compose import join, part_pairs, place, with_ignore_pairs
+from morphgen.grammar.compose import join, survey_of
 from morphgen.grammar.conditions import Properties, clauses, holds
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import Random, Recorded, derive
@@ -20,7 +19,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.syntax import Expression
 from morphgen.model.findings import Finding
-from morphgen.model.robot import Robot, sorted_pair
+from morphgen.model.robot import Robot
 
 MAX_ATTEMPTS = 500
 """Draws for one robot before its conditions are taken to be too hard."""
@@ -123,23 +122,12 @@ def build(
     for condition in conditions:
         if not holds(condition, properties):
             return f"where {condition}"
-    if _overlaps(robot, derivation, library):
+    contacts = survey_of(robot, derivation, library)
+    if any(depth > TOUCH for depth in contacts.at_home.values()):
         return "links overlap at home"
-    robot = with_ignore_pairs(robot, derivation, library)
-    findings = check(robot)
+    robot = replace(robot, ignore_pairs=contacts.ignored)
+    findings = check(robot, home_tested=True)
     for finding in findings:
         if finding.severity != "info":
             return f"check {finding.code}"
     return robot, properties, findings
-
-
-def _overlaps(robot: Robot, derivation: Derivation, library: Library) -> bool:
-    """Whether links that are not neighbours overlap at home, but for those of one real part."""
-    usual = {
-        sorted_pair(here.scoped(a), here.scoped(b))
-        for here in place(derivation, library).values()
-        if not here.part.manifest.is_template
-        for a, b in part_pairs(here.part)
-    }
-    (depths,) = SelfCollision(robot, attached_pairs(robot)).penetrations([robot.home])
-    return any(depth > TOUCH for pair, depth in depths.items() if pair not in usual)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.model.kinematics import forward_kinematics, mimic_map
+from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
         linear = jacobian[i, :3] + np.cross(angular, com, axis=0)
         M += link.inertial.mass * linear.T @ linear
         M += angular.T @ (R @ link.inertial.matrix @ R.T) @ angular
-    matrix, _ = mimic_map(robot)
+    matrix, _ = robot.mimic_map
     return np.asarray(matrix.T @ M @ matrix)
 
 

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import manifold3d
 import numpy as np
@@ -97,7 +98,14 @@ def inertial_of_mass(link: Link, mass: float) -> Inertial:
 
 
 def union_moments(shapes: Sequence[Shape]) -> Moments:
-    """Volume integrals of the union of shapes about the link's origin."""
+    """Volume integrals of the union of shapes about the link's origin; memoised."""
+    return _union_moments(tuple(shapes), _stamps(shapes))
+
+
+@lru_cache(maxsize=4096)
+def _union_moments(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> Moments:
+    """The integrals while mesh files are as at their stamps."""
+    del stamps
     total = Moments(0.0, np.zeros(3), np.zeros((3, 3)))
     for shape in shapes:
         total += _moments(shape)
@@ -131,9 +139,24 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
 
 
 def bounding_box(shapes: Sequence[Shape]) -> Array:
-    """Axis-aligned bounds of shapes in the link frame, shape (2, 3), metres."""
+    """Axis-aligned bounds of shapes in the link frame, shape (2, 3), metres; memoised."""
+    return _bounding_box(tuple(shapes), _stamps(shapes))
+
+
+@lru_cache(maxsize=4096)
+def _bounding_box(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> Array:
+    """The bounds while mesh files are as at their stamps."""
+    del stamps
     corners = np.concatenate([_corners(shape) for shape in shapes])
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+    bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    bounds.setflags(write=False)
+    return bounds
+
+
+def _stamps(shapes: Sequence[Shape]) -> tuple[int, ...]:
+    """When the mesh files of shapes were changed."""
+    paths = [shape.geometry.path for shape in shapes if isinstance(shape.geometry, Mesh)]
+    return tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in paths)
 
 
 def _corners(shape: Shape) -> Array:

@@ -40,29 +40,8 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
     q = np.asarray(q, dtype=np.float64)
     if q.shape[-1:] != (robot.dof,):
         raise ValueError(f"q has shape {q.shape}; {robot.name} needs (..., {robot.dof})")
-    matrix, offset = mimic_map(robot)
+    matrix, offset = robot.mimic_map
     return np.asarray(q @ matrix.T + offset)
-
-
-def mimic_map(robot: Robot) -> tuple[Array, Array]:
-    """The affine map from independent to movable positions.
-
-    Returns:
-        Matrix (n_movable, dof) and offset (n_movable,); chains of mimic joints are followed.
-    """
-    column = {robot.joints[k].name: i for i, k in enumerate(robot.independent)}
-    matrix = np.zeros((len(robot.movable), robot.dof))
-    offset = np.zeros(len(robot.movable))
-    for row, k in enumerate(robot.movable):
-        joint, gain, shift = robot.joints[k], 1.0, 0.0
-        while joint.mimic is not None:
-            shift += gain * joint.mimic.offset
-            gain *= joint.mimic.multiplier
-            joint = robot.joints[robot.joint_index[joint.mimic.joint]]
-        if joint.name in column:
-            matrix[row, column[joint.name]] = gain
-        offset[row] = shift
-    return matrix, offset
 
 
 def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
@@ -102,7 +81,7 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = "tool") -> Array:
     return np.asarray(T_root_link @ named.T_link_frame.matrix)
 
 
-def reach(robot: Robot, frame: str = "tool", samples: int = 512, rounds: int = 24) -> float:
+def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 9) -> float:
     """Largest distance between a frame and the root's origin, metres.
 
     Random configurations, the best of which climb by shrinking random steps; the seed is
@@ -120,15 +99,16 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 512, rounds: int = 2
     rng = np.random.default_rng(0)
     limits = bounds(robot)
     q = random_configurations(robot, samples, rng)
-    distance = _distance(robot, q, frame)
+    path = _Path(robot, frame)
+    distance = path.distance(q)
     keep = np.argsort(-distance, kind="stable")[:8]
     q, distance = q[keep], distance[keep]
     width = limits[:, 1] - limits[:, 0]
     for i in range(rounds):
-        step = 0.3 * 0.8**i * width
+        step = 0.3 * 0.6**i * width
         trial = q[:, None, :] + rng.uniform(-1, 1, (len(q), 16, robot.dof)) * step
         trial = np.clip(trial, limits[:, 0], limits[:, 1])
-        found = _distance(robot, trial, frame)
+        found = path.distance(trial)
         best = found.argmax(axis=1)
         rows = np.arange(len(q))
         better = found[rows, best] > distance
@@ -137,8 +117,42 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 512, rounds: int = 2
     return float(distance.max())
 
 
-def _distance(robot: Robot, q: Array, frame: str) -> Array:
-    return np.asarray(np.linalg.norm(frame_pose(robot, q, frame)[..., :3, 3], axis=-1))
+class _Path:
+    """The joints from a frame up to the root, for its distance from the root's origin."""
+
+    def __init__(self, robot: Robot, frame: str) -> None:
+        self._robot = robot
+        named = robot.frame(frame)
+        self._start = np.array(named.T_link_frame.position)
+        self._steps: list[tuple[int, int]] = []
+        column = {k: i for i, k in enumerate(robot.movable)}
+        link = robot.link_index[named.link]
+        while link > 0:
+            self._steps.append((link - 1, column.get(link - 1, -1)))
+            link = robot.parents[link]
+
+    def distance(self, q: Array) -> Array:
+        """Distance at configurations (..., dof), shape (...,), metres."""
+        positions = movable_positions(self._robot, q)
+        point = np.broadcast_to(self._start, (*q.shape[:-1], 3))
+        for k, column in self._steps:
+            joint = self._robot.joints[k]
+            if column >= 0:
+                point = _moved(point, joint.kind, joint.unit_axis, positions[..., column, None])
+            T = joint.T_parent_joint.matrix
+            point = point @ T[:3, :3].T + T[:3, 3]
+        return np.asarray(np.sqrt((point * point).sum(axis=-1)))
+
+
+def _moved(point: Array, kind: str, axis: tuple[float, float, float], position: Array) -> Array:
+    """Points (..., 3) moved by a joint; a turn by Rodrigues' formula."""
+    a = np.array(axis)
+    if kind == "prismatic":
+        return np.asarray(point + position * a)
+    c, s = np.cos(position), np.sin(position)
+    x, y, z = axis
+    cross = point @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+    return np.asarray(point * c + cross * s + (point @ a)[..., None] * (1 - c) * a)
 
 
 def _joint_motion(kind: str, axis: tuple[float, float, float], position: Array) -> Array:

@@ -228,6 +228,26 @@ class Robot:
         """Indices of the joints that move by themselves; ``q`` is in this order."""
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_independent)
 
+    @cached_property
+    def mimic_map(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The affine map from independent to movable positions, mimic chains followed.
+
+        Matrix (n_movable, dof) and offset (n_movable,).
+        """
+        column = {self.joints[k].name: i for i, k in enumerate(self.independent)}
+        matrix = np.zeros((len(self.movable), self.dof))
+        offset = np.zeros(len(self.movable))
+        for row, k in enumerate(self.movable):
+            joint, gain, shift = self.joints[k], 1.0, 0.0
+            while joint.mimic is not None:
+                shift += gain * joint.mimic.offset
+                gain *= joint.mimic.multiplier
+                joint = self.joints[self.joint_index[joint.mimic.joint]]
+            if joint.name in column:
+                matrix[row, column[joint.name]] = gain
+            offset[row] = shift
+        return matrix, offset
+
     @property
     def dof(self) -> int:
         """Number of independent joints."""

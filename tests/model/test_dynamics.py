@@ -8,7 +8,7 @@ from robots import arm
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, actuation, mass_matrix
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import mimic_map, movable_positions
+from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 
 
@@ -50,7 +50,7 @@ def mujoco_mass_matrix(robot, q):
     full = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, full)
     full -= np.diag(model.dof_armature)
-    matrix, _ = mimic_map(robot)
+    matrix, _ = robot.mimic_map
     return matrix.T @ full[np.ix_(addresses, addresses)] @ matrix
 
 

@@ -1,0 +1,188 @@
+"""Xacro expanded once for all values of its parameters.
+
+Expanding a xacro takes longer than all else that composing does. Where parameters only enter
+numbers by arithmetic, one expansion with symbols in their place gives the document as text with
+expressions in it; filling that in for new values gives the same bytes as expanding anew.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import CodeType
+
+from morphgen.errors import FormatError
+from morphgen.formats.resolve import PackageFinder
+from morphgen.formats.xacro import Expansion
+
+_OPEN, _CLOSE = "\ue000", "\ue001"
+_MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
+_NAMES: Mapping[str, object] = {
+    name: getattr(math, name)
+    for name in ("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "fabs", "pow")
+} | {"radians": math.radians, "degrees": math.degrees, "min": min, "max": max, "abs": abs}
+
+
+class UntraceableError(Exception):
+    """A template does more with a parameter than arithmetic."""
+
+
+class Traced:
+    """A number that is not known yet: notes what is done with it."""
+
+    def __init__(self, code: str) -> None:
+        self.code = code
+
+    def __str__(self) -> str:
+        return f"{_OPEN}{self.code}{_CLOSE}"
+
+    def __add__(self, other: object) -> Traced:
+        return _binary(self, "+", other)
+
+    def __radd__(self, other: object) -> Traced:
+        return _binary(other, "+", self)
+
+    def __sub__(self, other: object) -> Traced:
+        return _binary(self, "-", other)
+
+    def __rsub__(self, other: object) -> Traced:
+        return _binary(other, "-", self)
+
+    def __mul__(self, other: object) -> Traced:
+        return _binary(self, "*", other)
+
+    def __rmul__(self, other: object) -> Traced:
+        return _binary(other, "*", self)
+
+    def __truediv__(self, other: object) -> Traced:
+        return _binary(self, "/", other)
+
+    def __rtruediv__(self, other: object) -> Traced:
+        return _binary(other, "/", self)
+
+    def __pow__(self, other: object) -> Traced:
+        return _binary(self, "**", other)
+
+    def __neg__(self) -> Traced:
+        return Traced(f"(-{self.code})")
+
+    def __pos__(self) -> Traced:
+        return self
+
+    def _refuse(self, *_: object) -> bool:
+        raise UntraceableError(f"a decision depends on {self.code}")
+
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = _refuse
+    __float__ = __int__ = __index__ = __hash__ = _refuse
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledXacro:
+    """A document with expressions over parameters."""
+
+    texts: tuple[str, ...]
+    """What stands before, between and after the expressions."""
+    expressions: CodeType
+    """Gives the tuple of all values."""
+
+    def fill(self, values: Mapping[str, str]) -> bytes:
+        """The document for values of the parameters, given as xacro arguments.
+
+        Raises:
+            FormatError: If an expression cannot be evaluated for them.
+        """
+        names = dict(_NAMES) | {_symbol(name): _literal(text) for name, text in values.items()}
+        try:
+            numbers = eval(self.expressions, {"__builtins__": {}}, names)
+        except (ArithmeticError, ValueError) as error:
+            raise FormatError(
+                f"a template's expression fails for {dict(values)}: {error}"
+            ) from error
+        pieces = [self.texts[0]]
+        for number, text in zip(numbers, self.texts[1:], strict=True):
+            pieces += (str(number), text)
+        return "".join(pieces).encode()
+
+
+def compile_xacro(
+    path: Path, constants: Mapping[str, str], names: Iterable[str], finder: PackageFinder
+) -> CompiledXacro | None:
+    """Expand a xacro file for all values of some of its arguments; memoised.
+
+    Args:
+        path: The file.
+        constants: Arguments that decide the document's structure, such as counts.
+        names: Arguments that are numbers.
+        finder: Where ``$(find package)`` looks.
+
+    Returns:
+        The compiled document; None if the file does more with a number than arithmetic.
+
+    Raises:
+        FormatError: As ``expand``.
+    """
+    stamp = path.stat().st_mtime_ns if path.is_file() else 0
+    return _compiled(path, stamp, tuple(constants.items()), tuple(names), finder)
+
+
+@lru_cache(maxsize=256)
+def _compiled(
+    path: Path,
+    stamp: int,
+    constants: tuple[tuple[str, str], ...],
+    names: tuple[str, ...],
+    finder: PackageFinder,
+) -> CompiledXacro | None:
+    """The compiled form of a file as it is at ``stamp``."""
+    del stamp
+    traced = {name: Traced(_symbol(name)) for name in names}
+    expansion = Expansion(dict(constants), path.absolute(), finder, traced)
+    for name, function in _NAMES.items():
+        if name in expansion.engine._global_symbols:
+            expansion.engine._global_symbols[name] = _lifted(name, function)
+    try:
+        document = expansion.run_file().decode()
+    except UntraceableError:
+        return None
+    pieces = _MARK.split(document)
+    code = "".join(f"{expression}," for expression in pieces[1::2])
+    return CompiledXacro(tuple(pieces[::2]), compile(f"({code})", str(path), "eval"))
+
+
+def _lifted(name: str, function: object) -> Callable[..., object]:
+    """A function that notes its call where an argument is not known yet."""
+
+    def call(*operands: object) -> object:
+        if any(isinstance(operand, Traced) for operand in operands):
+            return Traced(f"{name}({', '.join(map(_code, operands))})")
+        return function(*operands)  # type: ignore[operator]
+
+    return call
+
+
+def _binary(left: object, sign: str, right: object) -> Traced:
+    return Traced(f"({_code(left)} {sign} {_code(right)})")
+
+
+def _code(operand: object) -> str:
+    if isinstance(operand, Traced):
+        return operand.code
+    if isinstance(operand, bool) or not isinstance(operand, int | float):
+        raise UntraceableError(f"{operand!r} is no number")
+    return f"({operand!r})"
+
+
+def _symbol(name: str) -> str:
+    return f"p_{name}"
+
+
+def _literal(text: str) -> int | float:
+    """A xacro argument as xacro takes it: whole numbers are ints."""
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
