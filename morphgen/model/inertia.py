@@ -99,7 +99,7 @@ def inertial_of_mass(link: Link, mass: float) -> Inertial:
 
 def union_moments(shapes: Sequence[Shape]) -> Moments:
     """Volume integrals of the union of shapes about the link's origin; memoised."""
-    return _union_moments(tuple(shapes), _stamps(shapes))
+    return _union_moments(_uncoloured(shapes), _stamps(shapes))
 
 
 @lru_cache(maxsize=4096)
@@ -140,7 +140,7 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
 
 def bounding_box(shapes: Sequence[Shape]) -> Array:
     """Axis-aligned bounds of shapes in the link frame, shape (2, 3), metres; memoised."""
-    return _bounding_box(tuple(shapes), _stamps(shapes))
+    return _bounding_box(_uncoloured(shapes), _stamps(shapes))
 
 
 @lru_cache(maxsize=4096)
@@ -151,6 +151,14 @@ def _bounding_box(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> Array:
     bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
     bounds.setflags(write=False)
     return bounds
+
+
+def _uncoloured(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+    """Shapes without what does not matter to their volume."""
+    return tuple(
+        shape if shape.rgba is None else Shape(shape.geometry, shape.T_link_shape)
+        for shape in shapes
+    )
 
 
 def _stamps(shapes: Sequence[Shape]) -> tuple[int, ...]:
