@@ -84,14 +84,14 @@ class SelfCollision:
         data.qpos[self._addresses] = positions
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
+        depths: dict[Pair, float] = {}
+        if data.ncon == 0:
+            return depths
         if data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
             raise RobotError(
                 f"robot {self._robot.name!r}: its contacts at one configuration exceed {_MEMORY}; "
                 "ignore the pairs that always overlap"
             )
-        depths: dict[Pair, float] = {}
-        if data.ncon == 0:
-            return depths
         contact = data.contact
         for (a, b), distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
             if distance < -PENETRATION:
