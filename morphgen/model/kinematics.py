@@ -81,7 +81,7 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = "tool") -> Array:
     return np.asarray(T_root_link @ named.T_link_frame.matrix)
 
 
-def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 9) -> float:
+def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6) -> float:
     """Largest distance between a frame and the root's origin, metres.
 
     Random configurations, the best of which climb by shrinking random steps; the seed is
@@ -105,7 +105,7 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 9
     q, distance = q[keep], distance[keep]
     width = limits[:, 1] - limits[:, 0]
     for i in range(rounds):
-        step = 0.3 * 0.6**i * width
+        step = 0.3 * 0.5**i * width
         trial = q[:, None, :] + rng.uniform(-1, 1, (len(q), 16, robot.dof)) * step
         trial = np.clip(trial, limits[:, 0], limits[:, 1])
         found = path.distance(trial)
