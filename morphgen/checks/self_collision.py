@@ -257,6 +257,11 @@ def _model(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
     for pair in ignore:
         a, b = (_index(robot, name) for name in pair)
         etree.SubElement(contact, "exclude", body1=str(a), body2=str(b))
-    spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
-    meshes.add_to(spec)
-    return spec.compile()
+    try:
+        spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
+        meshes.add_to(spec)
+        return spec.compile()
+    except ValueError as error:
+        raise RobotError(
+            f"robot {robot.name!r} has a shape or depth that MuJoCo refuses: {error}"
+        ) from error

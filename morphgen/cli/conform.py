@@ -32,8 +32,8 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.checks.conformance import conformance
     from morphgen.errors import MorphgenError
 
-    if args.samples < 1:
-        raise MorphgenError(f"--samples {args.samples}: expected 1 or more")
+    if not 1 <= args.samples <= 100_000:
+        raise MorphgenError(f"--samples {args.samples}: expected 1 to 100000")
     if args.seed < 0:
         raise MorphgenError(f"--seed {args.seed}: expected 0 or more")
     reports = [conformance(path, args.samples, args.seed) for path in args.bundles]

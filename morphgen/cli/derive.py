@@ -135,7 +135,7 @@ def _derivation(folder: Path) -> Derivation:
         raise FormatError(f"{folder} is no robot: it has neither {CARD} nor {DERIVATION}")
     try:
         content: Any = json.loads(card.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"{card}: no valid JSON: {error}") from error
     if "derivation" not in content:
         raise FormatError(f"{card} has no derivation: the robot was imported, not composed")

@@ -25,8 +25,11 @@ def add_parser(commands: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted."""
+    from morphgen.errors import MorphgenError
     from morphgen.viewer.page import serve
 
+    if not 0 < args.port < 65536:
+        raise MorphgenError(f"--port {args.port}: expected 1 to 65535")
     server = serve(args.bundle, args.host, args.port)
     print(f"http://{args.host}:{server.get_port()}  (stop with Ctrl-C)", flush=True)
     try:

@@ -99,7 +99,7 @@ def read_bundle(folder: Path) -> Robot:
         raise FormatError(f"{folder} is no bundle: it has no {CARD}")
     try:
         card = json.loads(card_path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"{card_path}: no valid JSON: {error}") from error
     frames = card_frames(card, str(card_path))
     return apply_card(with_frames(read_urdf(folder / URDF), frames), card, str(card_path))

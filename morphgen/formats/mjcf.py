@@ -33,7 +33,8 @@ def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
     Every link is a body of its name, the root welded to the world (a root named ``world``, a name
     that MuJoCo keeps for itself, is the world body). Visual shapes are in group 2 and touch
     nothing, collision shapes in group 3. Every independent joint has a position actuator of its
-    name, with the gains of ``morphgen.model.dynamics.actuation``; mimic joints are equality
+    name, with the gains of ``morphgen.model.dynamics.actuation``, and the robot carries its own
+    weight (``gravcomp``), as the controllers of real arms see to it; mimic joints are equality
     constraints, ignored pairs ``<exclude>``, frames sites; ``home`` is a keyframe.
 
     Numbers are written here with 12 significant digits. ``MjSpec.to_xml``, with its 6 digits,
@@ -132,7 +133,8 @@ def _write_bodies(
             body = etree.SubElement(
                 bodies[robot.parents[i]] if i else world,
                 "body",
-                {"name": link.name} | (pose_attributes(joint.T_parent_joint) if joint else {}),
+                {"name": link.name, "gravcomp": "1"}
+                | (pose_attributes(joint.T_parent_joint) if joint else {}),
             )
             _write_inertial(body, link)
             if joint is not None and joint.is_movable:

@@ -28,6 +28,10 @@ class Numbers:
     """Whether commas between the numbers are understood all the same."""
 
 
+LARGEST = 1e9
+"""Largest number that a URDF may hold: beyond, simulators overflow."""
+SMALLEST = 1e-6
+"""Smallest length of a primitive, metres: below, simulators round it to nothing."""
 CHILDREN = {
     "link": ("inertial", "visual", "collision"),
     "inertial": ("origin", "mass", "inertia"),
@@ -229,6 +233,13 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
             severity="warning" if numbers.commas_read else "error",
         )
     values = [float(word) for word in words]
+    if max(map(abs, values)) > LARGEST or (numbers.positive and 0 < min(values) < SMALLEST):
+        yield place.finding(
+            element,
+            "number-absurd",
+            f"{shown} is no number of a robot",
+            f"write numbers up to {LARGEST:g} and lengths from {SMALLEST:g}, in SI units",
+        )
     if numbers.positive and min(values) <= 0:
         yield place.finding(
             element,

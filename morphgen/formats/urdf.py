@@ -50,6 +50,8 @@ def read_urdf(
     """
     if not path.is_file():
         raise FormatError(f"{path}: no such file")
+    if str(path).encode(errors="replace").decode() != str(path):
+        raise FormatError(f"{str(path)!a}: the file's name is no UTF-8 text")
     finder = finder or default_finder()
     if path.suffix == ".xacro":
         data = expand(path, args or {}, finder)

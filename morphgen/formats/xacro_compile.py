@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from types import CodeType
 
 from morphgen.errors import FormatError
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.xacro import Expansion
+from morphgen.formats.xacro import Expansion, expand
 
 _OPEN, _CLOSE = "\ue000", "\ue001"
 _MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
@@ -29,6 +29,10 @@ _NAMES: Mapping[str, object] = {
 
 class UntraceableError(Exception):
     """A template does more with a parameter than arithmetic."""
+
+
+_UNTRACEABLE = (UntraceableError, FormatError, SyntaxError, NameError, TypeError, LookupError)
+"""What a template that does so makes the evaluator raise."""
 
 
 class Traced:
@@ -109,24 +113,33 @@ class CompiledXacro:
 
 
 def compile_xacro(
-    path: Path, constants: Mapping[str, str], names: Iterable[str], finder: PackageFinder
+    path: Path, constants: Mapping[str, str], numbers: Mapping[str, str], finder: PackageFinder
 ) -> CompiledXacro | None:
     """Expand a xacro file for all values of some of its arguments; memoised.
 
     Args:
         path: The file.
         constants: Arguments that decide the document's structure, such as counts.
-        names: Arguments that are numbers.
+        numbers: Arguments that are numbers. The first time, what is filled in for these values is
+            compared with an expansion.
         finder: Where ``$(find package)`` looks.
 
     Returns:
-        The compiled document; None if the file does more with a number than arithmetic.
-
-    Raises:
-        FormatError: As ``expand``.
+        The compiled document; None if the file does more with a number than arithmetic, or cannot
+        be expanded for these: ``expand`` does it, or tells why not.
     """
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
-    return _compiled(path, stamp, tuple(constants.items()), tuple(names), finder)
+    return _compiled(path, stamp, tuple(constants.items()), _Example(numbers), finder)
+
+
+class _Example(dict[str, str]):
+    """Values of numbers, all alike as a key of the cache if the names are the same."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Example) and tuple(self) == tuple(other)
 
 
 @lru_cache(maxsize=256)
@@ -134,23 +147,24 @@ def _compiled(
     path: Path,
     stamp: int,
     constants: tuple[tuple[str, str], ...],
-    names: tuple[str, ...],
+    example: _Example,
     finder: PackageFinder,
 ) -> CompiledXacro | None:
     """The compiled form of a file as it is at ``stamp``."""
     del stamp
-    traced = {name: Traced(_symbol(name)) for name in names}
+    traced = {name: Traced(_symbol(name)) for name in example}
     expansion = Expansion(dict(constants), path.absolute(), finder, traced)
     for name, function in _NAMES.items():
         if name in expansion.engine._global_symbols:
             expansion.engine._global_symbols[name] = _lifted(name, function)
     try:
-        document = expansion.run_file().decode()
-    except UntraceableError:
+        pieces = _MARK.split(expansion.run_file().decode())
+        code = "".join(f"{expression}," for expression in pieces[1::2])
+        compiled = CompiledXacro(tuple(pieces[::2]), compile(f"({code})", str(path), "eval"))
+        same = compiled.fill(example) == expand(path, dict(constants) | example, finder)
+    except _UNTRACEABLE:
         return None
-    pieces = _MARK.split(document)
-    code = "".join(f"{expression}," for expression in pieces[1::2])
-    return CompiledXacro(tuple(pieces[::2]), compile(f"({code})", str(path), "eval"))
+    return compiled if same else None
 
 
 def _lifted(name: str, function: object) -> Callable[..., object]:

@@ -20,7 +20,7 @@ from morphgen.grammar.derive import (
 )
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
-from morphgen.grammar.syntax import Expression, Item, Production
+from morphgen.grammar.syntax import Alternative, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, distribution_of, evaluate, no_draw
 
 CHECKED_STRUCTURES = 500
@@ -43,15 +43,18 @@ def faults(grammar: Grammar, library: Library) -> list[str]:
     Unknown names, parameters, units and values out of range; symbols that cannot be reached or
     never end; values that are never used; ports that do not exist.
     """
-    found = [*_item_faults(grammar, library), *_endless(grammar), *_unreached(grammar)]
-    found += _unused(grammar)
+    found = [*_item_faults(grammar, library), *_endless(grammar), *_circular(grammar)]
+    found += [*_unreached(grammar), *_unused(grammar)]
     if not found:
         found += _structure_faults(grammar, library)
     return found
 
 
 def count(grammar: Grammar) -> float:
-    """Number of structures, values aside; infinite for a grammar that recurs."""
+    """Number of structures, values aside; infinite for a grammar that recurs.
+
+    One that can be derived in two ways counts twice.
+    """
     return _count(grammar, grammar.start, ())
 
 
@@ -77,12 +80,13 @@ def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivat
     Raises:
         GrammarError: If a structure cannot be derived.
     """
-    if math.isfinite(count(grammar)):
-        yield from _structures(grammar, library, MAX_PARTS)
-        return
-    for parts in range(1, MAX_PARTS + 1):
+    seen: set[str] = set()
+    endless = math.isinf(count(grammar))
+    for parts in range(1, MAX_PARTS + 1) if endless else (MAX_PARTS,):
         for derivation in _structures(grammar, library, parts):
-            if sum(1 for _ in derivation.walk()) == parts:
+            fits = not endless or sum(1 for _ in derivation.walk()) == parts
+            if fits and derivation.digest not in seen:
+                seen.add(derivation.digest)
                 yield derivation
 
 
@@ -122,7 +126,7 @@ def _structures(grammar: Grammar, library: Library, max_parts: int) -> Iterator[
 
 def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     symbols = {production.symbol for production in grammar.productions}
-    for draw in (_lowest, no_draw, _highest):
+    for draw in (_lowest, no_draw, _inner, _highest):
         names: dict[str, tuple[float, str]] = {}
         reported: set[str] = set()
         try:
@@ -173,6 +177,24 @@ def _endless(grammar: Grammar) -> Iterator[str]:
             yield f"{production.place}: {production.symbol!r} never ends: it always holds itself"
 
 
+def _circular(grammar: Grammar) -> Iterator[str]:
+    """Symbols that can be rewritten to themselves and nothing else."""
+    alone = {
+        production.symbol: {
+            alternative.items[0].name
+            for alternative in production.alternatives
+            if len(alternative.items) == 1
+        }
+        for production in grammar.productions
+    }
+    for production in grammar.productions:
+        below = set(alone[production.symbol])
+        while more := {name for symbol in below for name in alone.get(symbol, ())} - below:
+            below |= more
+        if production.symbol in below:
+            yield f"{production.place}: {production.symbol!r} can be rewritten to itself alone"
+
+
 def _unreached(grammar: Grammar) -> Iterator[str]:
     reached, fresh = {grammar.start}, [grammar.start]
     while fresh:
@@ -216,7 +238,7 @@ def _count(grammar: Grammar, symbol: str, above: tuple[str, ...]) -> float:
     if symbol in above:
         return math.inf
     total: float = 0
-    for alternative in production.alternatives:
+    for alternative in _possible(grammar, production):
         product: float = 1
         for item in alternative.items:
             each = _count(grammar, item.name, (*above, symbol))
@@ -224,6 +246,14 @@ def _count(grammar: Grammar, symbol: str, above: tuple[str, ...]) -> float:
             product *= sum(each**n for n in range(low, high + 1))
         total += product
     return total
+
+
+def _possible(grammar: Grammar, production: Production) -> Iterator[Alternative]:
+    """Alternatives whose weight is not zero where values are typical."""
+    scope = Scope(_typical_names(grammar), no_draw, "")
+    for alternative in production.alternatives:
+        if alternative.weight is None or evaluate(alternative.weight, scope)[0] > 0:
+            yield alternative
 
 
 def _items(production: Production) -> Iterator[Item]:
@@ -257,6 +287,11 @@ def _described(call: Expression, names: dict[str, tuple[float, str]]) -> tuple[D
 
 def _lowest(key: str, distribution: Distribution) -> float:
     return distribution.bounds[0]
+
+
+def _inner(key: str, distribution: Distribution) -> float:
+    """A value that is neither end nor middle, nor whole if it need not be."""
+    return distribution.draw(lambda: 0.381966, lambda: 0.381966)
 
 
 def _highest(key: str, distribution: Distribution) -> float:

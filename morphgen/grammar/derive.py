@@ -100,11 +100,10 @@ class Recorded:
 
     def value(self, key: str, distribution: Distribution) -> float:
         """The given value if the distribution can give it."""
-        given = self.given.get(key)
-        low, high = distribution.bounds
-        if given is None or not low <= given <= high:
+        given = distribution.nearest(self.given[key]) if key in self.given else None
+        if given is None:
             given = self.other.value(key, distribution)
-        return self._note(key, given)
+        return self._note(key, float(number(given)))
 
     def _note(self, key: str, value: float) -> float:
         if key in self.made:
@@ -178,6 +177,10 @@ class _Run:
                 + nearest(self._grammar.start, symbols)
             )
         first, _ = self._sequence(self._alternative(start, start.symbol), "", start.symbol, 0)
+        if MOUNT_YAW.name in first.values:
+            raise GrammarError(
+                f"{start.place}: {first.part!r} stands on no port: it has no {MOUNT_YAW.name}"
+            )
         return first
 
     def _expand(

@@ -147,7 +147,7 @@ def _read(
     path: Path, folders: tuple[Path, ...], above: tuple[Path, ...]
 ) -> tuple[list[Statement], list[str]]:
     """Statements of a file after those of its includes, and all texts."""
-    if path in above:
+    if path.resolve() in (p.resolve() for p in above):
         chain = " -> ".join(p.name for p in (*above, path))
         raise GrammarError(f"{above[-1]}: grammars include each other: {chain}")
     try:

@@ -80,12 +80,14 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
 
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
-    """Return the value if it lies in the parameter's range.
+    """Return the value if it lies in the parameter's range, to 12 digits.
 
     Raises:
         PartError: If it does not.
     """
-    if not parameter.minimum <= value <= parameter.maximum:
+    low = min(parameter.minimum, float(number(parameter.minimum)))
+    high = max(parameter.maximum, float(number(parameter.maximum)))
+    if not low <= value <= high:
         raise PartError(f"{where}={value:g}: out of range{_expected(parameter)}")
     if parameter.integer and value != int(value):
         raise PartError(f"{where}={value:g}: not a whole number{_expected(parameter)}")

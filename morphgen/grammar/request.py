@@ -10,7 +10,7 @@ from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import First, derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Kind, Manifest
-from morphgen.grammar.model import find_grammar, load_grammar
+from morphgen.grammar.model import find_grammar, grammar_names, load_grammar
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
 from morphgen.grammar.pinning import pin
 
@@ -45,7 +45,8 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
     Raises:
         MorphgenError: If the words name what does not exist or does not fit.
     """
-    if not words or "=" in words[0] or words[0] in library.paths:
+    is_part = words[0] in library.paths and words[0] not in grammar_names() if words else True
+    if is_part or "=" in words[0]:
         derivation = parse_request(words, library)
         return derivation, default_name(derivation, library)
     grammar = load_grammar(find_grammar(words[0], library.folders), library.folders)

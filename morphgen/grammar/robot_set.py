@@ -185,7 +185,7 @@ def _prepare(plan: SetPlan) -> None:
     path = plan.folder / SETTINGS
     wanted = plan.settings()
     if not path.exists():
-        if plan.folder.exists() and any(plan.folder.iterdir()):
+        if plan.folder.exists() and not _is_barely_begun(plan):
             raise FormatError(f"{plan.folder} exists and is no set (no {SETTINGS}); name another")
         try:
             plan.folder.mkdir(parents=True, exist_ok=True)
@@ -206,6 +206,15 @@ def _prepare(plan: SetPlan) -> None:
             )
     if (plan.folder / GRAMMAR).read_text(encoding="utf-8") != plan.grammar_text:
         raise FormatError(f"{plan.folder} holds a set of another grammar; name another folder")
+
+
+def _is_barely_begun(plan: SetPlan) -> bool:
+    """Whether a folder is empty, or what a run left that was interrupted before it made a set."""
+    grammar = plan.folder / GRAMMAR
+    own = {_partial(grammar), _partial(plan.folder / SETTINGS)}
+    if grammar.is_file() and grammar.read_bytes() == plan.grammar_text.encode():
+        own.add(grammar)
+    return plan.folder.is_dir() and own >= set(plan.folder.iterdir())
 
 
 def _finished(plan: SetPlan) -> Iterator[Record]:
@@ -240,6 +249,10 @@ def _report(records: Iterable[Record], made: int, kept: int) -> SetReport:
 
 
 def _write_atomic(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.partial")
+    partial = _partial(path)
     partial.write_text(text, encoding="utf-8")
     partial.replace(path)
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.name}.partial")

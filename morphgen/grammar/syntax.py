@@ -51,7 +51,7 @@ QUANTITY: /(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?[a-zA-Z]*/
 NAME: /(?!(include|let|where|and|or|not)\b)[A-Za-z_]\w*/
 STRING: /"[^"\n]*"/
 _END: /\n+(?=[^ \t\r\n|#])/
-_CONTINUED: /\n/
+_CONTINUED: /\n(?=[ \t\r\n|#]|\Z)/
 _COMMENT: /#[^\n]*/
 _SPACE: /[ \t\r]+/
 %ignore _CONTINUED
@@ -117,7 +117,7 @@ class Expression:
     def __str__(self) -> str:
         match self.operator:
             case "number":
-                return f"{self.value:.12g}{self.text}"
+                return f"{str(self.value).removesuffix('.0')}{self.text}"
             case "name":
                 return self.text
             case "call":
@@ -226,14 +226,15 @@ def _parser() -> Lark:
 
 
 def _explained(error: UnexpectedInput, text: str, origin: str) -> str:
-    line, column = error.line, error.column
-    if line < 1:
-        line, column = text.count("\n") + 1, len(text.rsplit("\n", 1)[-1]) + 1
+    line, column, token = error.line, error.column, getattr(error, "token", None)
+    ended = token is not None and token.type == "$END"
+    if ended:
+        lines = text.rstrip().split("\n")
+        line, column = len(lines), len(lines[-1]) + 1
     names = getattr(error, "accepts", None) or getattr(error, "expected", None)
     names = names or getattr(error, "allowed", None) or ()
     expected = sorted({_WORDS.get(name, name) for name in names})
-    token = getattr(error, "token", None)
-    if token is not None and token.type == "$END":
+    if ended:
         found = "the end"
     elif token is not None:
         found = "the end of the line" if token.type == "_END" else repr(str(token))

@@ -49,6 +49,18 @@ class Distribution:
             case _:
                 return low
 
+    def nearest(self, value: float) -> float | None:
+        """What it can give that is ``value`` to 11 digits; None if there is nothing."""
+        low, high = self.bounds
+        match self.kind:
+            case "choice":
+                found = min(self.arguments, key=lambda choice: abs(choice - value))
+            case "randint":
+                found = min(max(round(value), low), high)
+            case _:
+                found = min(max(value, low), high)
+        return found if math.isclose(found, value, rel_tol=1e-11, abs_tol=1e-12) else None
+
     def draw(self, uniform: Callable[[], float], normal: Callable[[], float]) -> float:
         """Draw a value.
 

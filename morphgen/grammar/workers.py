@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 
 from morphgen.errors import MissingDependencyError, MorphgenError
 from morphgen.grammar.robot_set import Maker, Record, SetPlan, Work
@@ -77,7 +79,16 @@ def _start(plan: SetPlan) -> None:
     """Prepare a worker; Ctrl-C is for the parent, which lets it finish its chunk."""
     global _maker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
     _maker = Maker(plan)
+
+
+def _end_with_parent() -> None:
+    """A killed parent tells its workers nothing, and they would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _make(indices: Sequence[int]) -> list[Record]:

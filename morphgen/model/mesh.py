@@ -57,6 +57,8 @@ _UNREADABLE = (
 _Triangles: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices (n, 3) and faces (m, 3)."""
 
+LARGEST_COORDINATE = 1e9
+"""Coordinate beyond which a mesh file is taken to be broken, in its own unit or metres."""
 MAX_STL_FACES = 200_000
 """Triangles of the largest STL that MuJoCo reads."""
 
@@ -186,6 +188,8 @@ def _in_scene(geometry: trimesh.Trimesh, T_scene_node: NDArray[np.float64]) -> _
     vertices = trimesh.transform_points(geometry.vertices, T_scene_node) * _unit(geometry)
     if not np.isfinite(vertices[faces]).all():
         raise ValueError("a vertex is not finite")
+    if np.abs(vertices[faces]).max(initial=0.0) > LARGEST_COORDINATE:
+        raise ValueError(f"a vertex is beyond {LARGEST_COORDINATE:g} m")
     mirrored = np.linalg.det(T_scene_node[:3, :3]) < 0
     return vertices, faces[:, ::-1] if mirrored else faces
 
