@@ -115,7 +115,7 @@ def test_check_refuses_what_is_no_xml(refused, urdf, xml):
         (f"show {'n' * 300}", "File name too long"),
         ("import x.xacro --arg length", "--arg length: expected NAME=VALUE"),
         ("import x.xacro --arg =1", "--arg =1: expected NAME=VALUE"),
-        ("conform . --samples 0", "--samples 0: expected 1 or more"),
+        ("conform . --samples 0", "--samples 0: expected 1 to 100000"),
         ("conform . --seed -1", "--seed -1: expected 0 or more"),
     ],
 )
