@@ -16,7 +16,9 @@ Exit code 1 if anything crashed or is wrong.
 from __future__ import annotations
 
 import argparse
+import json
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -29,9 +31,6 @@ from pathlib import Path
 
 from tabulate import tabulate
 from tqdm import tqdm
-
-from morphgen.checks.conformance import conformance
-from morphgen.formats.bundle import read_bundle
 
 ROOTS = {
     "rtb-data": "rtbdata",
@@ -78,11 +77,8 @@ def _files() -> Iterator[tuple[str, Path]]:
 
 
 def _import(name: str, path: Path, out: Path) -> Outcome:
-    command = [sys.executable, "-m", "morphgen.cli", "import", str(path), "--no-picture"]
-    command += ["--out", str(out), "--name", "robot"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
-    except subprocess.TimeoutExpired:
+    done = _run(["import", str(path), "--no-picture", "--out", str(out), "--name", "robot"])
+    if done is None:
         return Outcome(name, "CRASHED", f"no answer in {TIMEOUT_S} s")
     if done.returncode == 2 and "Traceback" not in done.stderr:
         reason = done.stderr.strip().splitlines()[-1].removeprefix("morphgen: ")
@@ -91,12 +87,25 @@ def _import(name: str, path: Path, out: Path) -> Outcome:
     if done.returncode != 0:
         return Outcome(name, "CRASHED", done.stderr.strip().splitlines()[-1])
     folder = out / "robot"
-    report = conformance(folder, 20, 0)
-    if not report.passed:
-        bad = "; ".join(f"{row.loader}: {row.message}" for row in report.rows if not row.passed)
-        return Outcome(name, "wrong", bad)
-    robot = read_bundle(folder)
-    return Outcome(name, "imported", f"{len(robot.links)} links, {robot.dof} DoF")
+    compared = _run(["conform", str(folder), "--samples", "20", "--json"])
+    if compared is None or compared.returncode not in (0, 1):
+        return Outcome(name, "CRASHED", "conform: " + (compared.stderr[-160:] if compared else ""))
+    (report,) = json.loads(compared.stdout)
+    if not report["passed"]:
+        bad = [f"{r['loader']}: {r['message']}" for r in report["rows"] if r["passed"] is False]
+        return Outcome(name, "wrong", "; ".join(bad))
+    card = json.loads((folder / "card.json").read_text(encoding="utf-8"))
+    shutil.rmtree(folder)
+    return Outcome(name, "imported", f"{card['links']} links, {card['dof']} DoF")
+
+
+def _run(arguments: list[str]) -> subprocess.CompletedProcess[str] | None:
+    """Run a morphgen command; None if it does not answer in time."""
+    command = [sys.executable, "-m", "morphgen.cli", *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return None
 
 
 def _is_fragment(path: Path) -> bool:

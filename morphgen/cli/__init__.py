@@ -94,7 +94,7 @@ def _run(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:
         raise
     except OSError as error:
-        return _refused(error, f"{error.filename}: {error.strerror}", args)
+        return _refused(error, f"{error.filename or 'output'}: {error.strerror}", args)
 
 
 def _refused(error: Exception, text: str, args: argparse.Namespace) -> int:

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 def _checked(path: Path, fix_into: Path | None) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """What is wrong with a robot, and what was before its repair into a folder, if any."""
     from morphgen.checks import check, fix
-    from morphgen.formats.bundle import CARD, bundle_folder, read_robot, write_bundle
+    from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_robot, write_bundle
     from morphgen.formats.urdf import UnsoundError
 
     try:
@@ -63,8 +63,10 @@ def _checked(path: Path, fix_into: Path | None) -> tuple[tuple[Finding, ...], tu
     except UnsoundError as error:
         return error.findings, ()
     is_bundle = (path / CARD).is_file() or (path.parent / CARD).is_file()
+    folder = path if path.is_dir() else path.parent
+    files = file_findings(folder) if is_bundle else ()
     if fix_into is None:
-        return check(robot, tool_required=is_bundle), ()
+        return (*check(robot, tool_required=is_bundle), *files), ()
     robot, repaired = fix(robot)
     findings = check(robot, tool_required=is_bundle)
     write_bundle(robot, bundle_folder(fix_into, robot.name), findings)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import trimesh
 from trimesh.exchange.obj import export_obj
@@ -92,8 +93,15 @@ def read_bundle(folder: Path) -> Robot:
     """Read a bundle back.
 
     Raises:
-        FormatError: If it is no bundle, or its files do not agree.
+        FormatError: If it is no bundle, or broken. That a file is not the one that the card was
+            written for is no error here: ``file_findings`` tells.
     """
+    card = _read_card(folder)
+    place = str(folder / CARD)
+    return apply_card(with_frames(read_urdf(folder / URDF), card_frames(card, place)), card, place)
+
+
+def _read_card(folder: Path) -> dict[str, Any]:
     card_path = folder / CARD
     if not card_path.is_file():
         raise FormatError(f"{folder} is no bundle: it has no {CARD}")
@@ -101,8 +109,32 @@ def read_bundle(folder: Path) -> Robot:
         card = json.loads(card_path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{card_path}: no valid JSON: {error}") from error
-    frames = card_frames(card, str(card_path))
-    return apply_card(with_frames(read_urdf(folder / URDF), frames), card, str(card_path))
+    if not isinstance(card, dict):
+        raise FormatError(f"{card_path}: expected an object, not {type(card).__name__}")
+    return card
+
+
+def file_findings(folder: Path) -> tuple[Finding, ...]:
+    """Files of a bundle that are not as its card says: changed since, or missing.
+
+    Raises:
+        FormatError: If the folder has no readable card.
+    """
+    found = []
+    hashes = _read_card(folder).get("hashes")
+    if not isinstance(hashes, dict):
+        raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
+    for name, expected in hashes.items():
+        path = folder / name
+        if not path.is_file():
+            code, why = "file-missing", "the card names it, but it is not there"
+        elif hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+            code, why = "file-changed", "its content is not what the card was written for"
+        else:
+            continue
+        fix = "compose or import the robot again, or read the URDF alone"
+        found.append(Finding(code, "warning", f"file {name}", why, fix))
+    return tuple(found)
 
 
 def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
@@ -204,7 +236,7 @@ def _swap(folder: Path, partial: Path) -> None:
         folder.rename(old)
         partial.rename(folder)
     except BaseException:
-        if not folder.exists():
+        if old.exists() and not folder.exists():
             old.rename(folder)
         shutil.rmtree(aside)
         raise

@@ -152,6 +152,14 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
     raise FormatError(f"{base}: {uri!r} names no file: looked for {_listed(missing)}")
 
 
+def file_stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file does: its time and size; zeros if there is none."""
+    if not path.is_file():
+        return (0, 0)
+    status = path.stat()
+    return (status.st_mtime_ns, status.st_size)
+
+
 def portable_uri(path: Path) -> str:
     """The ``package://`` URI of a file in a ROS package, which names it on any machine.
 

@@ -34,6 +34,9 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     Args:
         robot: The body.
         mesh_uri: File name to write for a mesh.
+
+    Raises:
+        FormatError: If a slide has no limits.
     """
     root = etree.Element("robot", name=robot.name)
     etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", MUJOCO_COMPILER_ATTRIBUTES)
@@ -127,7 +130,9 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
     limit = {"effort": number(effort), "velocity": number(velocity)}
     if kind != "continuous":
-        lower, upper = joint.bounds
+        if joint.limits is None:
+            raise FormatError(f"joint {joint.name!r} slides without limits; a URDF must name them")
+        lower, upper = joint.limits
         limit = {"lower": number(lower), "upper": number(upper)} | limit
     etree.SubElement(element, "limit", limit)
     if joint.damping or joint.friction:

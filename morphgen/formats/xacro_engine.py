@@ -91,7 +91,16 @@ def _compiled(expression: str) -> CodeType:
         name = getattr(node, "attr", None) or getattr(node, "id", None) or ""
         if name.startswith("__") or name in _FRAMES:
             raise NameError(f"{name!r} is not allowed in an expression")
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and _is_huge(node.right):
+            raise ValueError("an exponent is beyond 1000")
     return compile(tree, "<expression>", "eval")
+
+
+def _is_huge(exponent: ast.expr) -> bool:
+    """Whether an exponent holds numbers that no robot needs and that would take for ever."""
+    numbers = [node.value for node in ast.walk(exponent) if isinstance(node, ast.Constant)]
+    tower = any(isinstance(node, ast.Pow) for node in ast.walk(exponent))
+    return tower or any(isinstance(n, int | float) and abs(n) > 1000 for n in numbers)
 
 
 def _yaml_loader(engine: Engine) -> Callable[[str], object]:

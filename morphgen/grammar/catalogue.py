@@ -9,7 +9,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Kind, PackageSource
 from morphgen.grammar.part import Part, load_part
 from morphgen.model.kinematics import reach
-from morphgen.model.robot import Frame
+from morphgen.model.robot import Frame, Joint, Link
 
 
 def catalogue(library: Library, kind: str | None = None) -> list[dict[str, object]]:
@@ -40,8 +40,13 @@ def _row(part: Part) -> dict[str, object]:
 def _reach(part: Part) -> float:
     """Distance from the mount to the farthest port or tool, the largest over configurations."""
     ends = [*part.ports.values(), *([part.tool] if part.tool else [])]
-    body = replace(
-        part.body,
+    body = part.body
+    T_mount_root = part.T_root_mount.inverse()
+    stand = Joint("mount_joint", "fixed", "mount_frame", body.root.name, T_mount_root)
+    stood = replace(
+        body,
+        links=(Link("mount_frame"), *body.links),
+        joints=(stand, *body.joints),
         frames=tuple(Frame(f"end{i}", e.link, e.T_link_frame) for i, e in enumerate(ends)),
     )
-    return max((reach(body, frame.name) for frame in body.frames), default=0.0)
+    return max((reach(stood, frame.name) for frame in stood.frames), default=0.0)

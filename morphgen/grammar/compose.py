@@ -16,6 +16,9 @@ from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_pair
 from morphgen.model.rotation import from_rpy
 
+TOUCH = 2e-3
+"""Depth to which links that are not neighbours may touch at home, metres."""
+
 
 @dataclass(frozen=True)
 class Placed:
@@ -190,19 +193,27 @@ def _provenance(placed: Iterable[Placed]) -> list[dict[str, object]]:
 def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Survey:
     """Which contacts of a joined robot are no self-collision.
 
-    Those of each real part, as it is made, are known from before; all others are tested.
+    Those of each real part, as it is made, are known from before; all others are tested. Parts
+    that overlap at home by more than ``TOUCH`` are not ignored: that is a faulty composition,
+    which ``check`` reports.
     """
     owner: dict[str, str] = {}
+    tested: set[str] = set()
     known: list[Pair] = []
     for here in place(derivation, library).values():
         manifest = here.part.manifest
-        if manifest.is_template:
-            continue
-        pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(load_part(manifest))]
-        known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
-        if not manifest.scaling:
-            owner |= {here.scoped(link.name): here.label for link in here.part.body.links}
-    return survey(robot, known=known, check=lambda a, b: a not in owner or owner[a] != owner.get(b))
+        names = [here.scoped(link.name) for link in here.part.body.links]
+        owner |= dict.fromkeys(names, here.label)
+        if manifest.is_template or manifest.scaling:
+            tested.update(names)
+        if not manifest.is_template:
+            pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(load_part(manifest))]
+            known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
+    found = survey(robot, known=known, check=lambda a, b: owner[a] != owner[b] or a in tested)
+    faulty = {
+        (a, b) for (a, b), depth in found.at_home.items() if owner[a] != owner[b] and depth > TOUCH
+    }
+    return Survey(tuple(pair for pair in found.ignored if pair not in faulty), found.at_home)
 
 
 @lru_cache(maxsize=256)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from importlib.resources import files
 from pathlib import Path
 
 from morphgen.errors import PartError, nearest
+from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.manifest import KINDS, Kind, Manifest, read_manifest
 
 ENVIRONMENT = "MORPHGEN_LIBRARY"
@@ -75,14 +76,15 @@ def default_library(extra: Iterable[Path] = ()) -> Library:
     users = [Path(entry) for entry in environment.split(os.pathsep) if entry]
     given = (folder.absolute() for folder in (*users, *extra))
     own = [Path(str(files(package))) for package in ("morphgen.templates", "morphgen.robots_real")]
-    return _library(tuple(dict.fromkeys((*own, *given))))
+    return Library(dict.fromkeys((*own, *given)))
 
 
-@lru_cache(maxsize=8)
-def _library(folders: tuple[Path, ...]) -> Library:
-    return Library(folders)
-
-
-@cache
 def _manifest(path: Path) -> Manifest:
+    return _read(path, file_stamp(path))
+
+
+@lru_cache(maxsize=1024)
+def _read(path: Path, stamp: tuple[int, int]) -> Manifest:
+    """The manifest of a file as it is at its stamp."""
+    del stamp
     return read_manifest(path)

@@ -275,8 +275,8 @@ def _texts(data: object, where: str) -> dict[str, str]:
 def _float(value: object, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise PartError(f"{where}: {value!r} is not a number")
-    if not math.isfinite(value):
-        raise PartError(f"{where}: {value} is not finite")
+    if abs(value) > 1e12 or math.isnan(value):
+        raise PartError(f"{where}: {value:.6} is no number of a robot")
     return float(value)
 
 

@@ -20,7 +20,9 @@ UNITS: Mapping[str, tuple[str, float]] = {
     name: (unit, scale) for unit, scales in _SCALES.items() for name, scale in scales.items()
 }
 """Every unit that can be written: the SI unit it stands for, and its factor."""
-_VALUE = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[a-zA-Z]*)")
+_VALUE = re.compile(
+    r"(?P<number>[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>[a-zA-Z]*)"
+)
 
 
 @dataclass(frozen=True)

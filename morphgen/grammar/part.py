@@ -11,7 +11,7 @@ from weakref import WeakSet
 
 from morphgen.checks.names import safe_names
 from morphgen.errors import FormatError, MorphgenError, PartError, RobotError, nearest
-from morphgen.formats.resolve import PackageFinder, distribution_file
+from morphgen.formats.resolve import PackageFinder, distribution_file, file_stamp
 from morphgen.formats.urdf import read_urdf, robot_from_xml
 from morphgen.formats.urdf_text import number
 from morphgen.formats.xacro import evaluate, expand
@@ -56,7 +56,7 @@ def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> 
         FormatError: If the source cannot be read.
     """
     complete = resolve_values(values or {}, manifest.parameters, manifest.name)
-    return _load(manifest.path, _Frozen(manifest, complete))
+    return _load(_Frozen(manifest, complete))
 
 
 class _Frozen:
@@ -64,7 +64,9 @@ class _Frozen:
 
     def __init__(self, manifest: Manifest, values: Mapping[str, float]) -> None:
         self.manifest, self.values = manifest, values
-        self.key = (manifest.path, tuple(values.items()))
+        xacro = manifest.source if isinstance(manifest.source, Path) else manifest.path
+        stamps = (file_stamp(manifest.path), file_stamp(xacro))
+        self.key = (manifest.path, stamps, tuple(values.items()))
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -74,7 +76,7 @@ class _Frozen:
 
 
 @lru_cache(maxsize=256)
-def _load(path: Path, frozen: _Frozen) -> Part:
+def _load(frozen: _Frozen) -> Part:
     manifest, values = frozen.manifest, frozen.values
     try:
         body = subtree(_read_source(manifest, values), manifest.root, manifest.without)
@@ -92,7 +94,7 @@ def _load(path: Path, frozen: _Frozen) -> Part:
         values,
         replace(body, frames=()),
         T_root_mount,
-        {port.name: port for port in body.frames[has_tool:]},
+        {frame.name: frame for frame in body.frames if frame.name in manifest.ports},
         body.frames[0] if has_tool else None,
     )
 

@@ -9,7 +9,16 @@ from morphgen.errors import GrammarError, nearest
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value
-from morphgen.grammar.syntax import Alternative, Expression, Item, Let, Place, Production
+from morphgen.grammar.syntax import (
+    Alternative,
+    Expression,
+    Item,
+    Let,
+    Place,
+    Production,
+    parse_condition,
+)
+from morphgen.grammar.values import Scope, evaluate, no_draw
 
 
 def pin(grammar: Grammar, words: Sequence[str], library: Library) -> Grammar:
@@ -83,10 +92,11 @@ def _with_parameter(
 
 
 def _with_let(grammar: Grammar, name: str, value: str) -> Grammar:
-    try:
-        number = _number(float(value))
-    except ValueError as error:
-        raise GrammarError(f"{name}={value}: not a number (SI units)") from error
+    number = parse_condition(value, f"{name}={value}")
+    unsigned = number.operands[0] if number.operator == "negative" else number
+    if unsigned.operator != "number":
+        raise GrammarError(f"{name}={value}: not a number, such as 0.02 or 20mm")
+    evaluate(number, Scope({}, no_draw, name))
     lets = tuple(
         Let(let.name, number, let.place) if let.name == name else let for let in grammar.lets
     )

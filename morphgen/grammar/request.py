@@ -51,7 +51,7 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
         return derivation, default_name(derivation, library)
     grammar = load_grammar(find_grammar(words[0], library.folders), library.folders)
     derivation = derive(pin(grammar, words[1:], library), library, First())
-    return derivation, "-".join([grammar.name, *([derivation.digest[:6]] if words[1:] else [])])
+    return derivation, "-".join([grammar.name, *([derivation.digest[:8]] if words[1:] else [])])
 
 
 def parse_request(words: Sequence[str], library: Library) -> Derivation:
@@ -81,6 +81,8 @@ def parse_request(words: Sequence[str], library: Library) -> Derivation:
     base_manifest = library.manifest(base.part, "base")
     for port, child in children:
         _require_port(base_manifest, port, child.label)
+    ports = list(base_manifest.ports)
+    children.sort(key=lambda limb: ports.index(limb[0]))
     return _node(base, base_manifest, tuple(children))
 
 
@@ -88,15 +90,17 @@ def default_name(derivation: Derivation, library: Library) -> str:
     """A name for a robot: its parts, and a short hash if a parameter is not at its default."""
     words = []
     changed = False
+    labels = {node.label for node in derivation.walk()}
     for node in derivation.walk():
         defaults = {p.name: p.default for p in library.manifest(node.part).parameters.values()}
         changed |= dict(node.parameters) != defaults
         if node.part in ("fixed", "none"):
             continue
-        limb = node.label.removesuffix("_arm").removesuffix("arm")
-        words.append(f"{limb}-{node.part}" if limb and node.label.endswith("arm") else node.part)
+        limb, _, kind = node.label.rpartition("_")
+        begins = limb and (kind == "arm" or f"{limb}_arm" not in labels)
+        words.append(f"{limb}-{node.part}" if begins else node.part)
     if changed:
-        words.append(derivation.digest[:6])
+        words.append(derivation.digest[:8])
     return "-".join(words)
 
 
@@ -113,7 +117,7 @@ def _slots(words: Sequence[str]) -> dict[str, _Slot]:
                 raise CompositionError(f"{key} is given twice")
             values[key] = value
             continue
-        if len(port) > 1 or (port and last == "base"):
+        if len(port) > 1 or port == [""] or (port and last == "base"):
             raise CompositionError(
                 f"{key}: a part is named base, arm, ee, PORT.arm or PORT.ee, such as left.arm"
             )

@@ -11,7 +11,7 @@ import numpy as np
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.card import rounded
-from morphgen.grammar.compose import join, survey_of
+from morphgen.grammar.compose import TOUCH, join, survey_of
 from morphgen.grammar.conditions import Properties, clauses, holds
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import Random, Recorded, derive
@@ -23,8 +23,6 @@ from morphgen.model.robot import Robot
 
 MAX_ATTEMPTS = 500
 """Draws for one robot before its conditions are taken to be too hard."""
-TOUCH = 2e-3
-"""Depth to which links that are not neighbours may touch at home, metres."""
 
 
 class SamplingError(MorphgenError):

@@ -107,9 +107,3 @@ def to_rpy(q: Quat) -> Vec3:
     if cos_pitch > _GIMBAL:
         return (math.atan2(h, i), pitch, math.atan2(d, a))
     return (math.copysign(1.0, -g) * math.atan2(b, e), pitch, 0.0)
-
-
-def from_axis_angle(axis: Vec3, angle: float) -> Quat:
-    """Quaternion of a turn by ``angle`` (rad) about a unit axis."""
-    s = math.sin(angle / 2)
-    return normalized((math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s))

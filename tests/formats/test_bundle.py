@@ -11,7 +11,7 @@ from robots import arm
 
 from morphgen.errors import FormatError
 from morphgen.formats import bundle
-from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.bundle import file_findings, read_bundle, write_bundle
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.robot import Link, Robot
 
@@ -122,3 +122,12 @@ def test_the_card_says_what_the_robot_is(tmp_path):
     assert card["movable"] == 5
     assert set(card["hashes"]) == {"robot.urdf", "robot.xml"}
     assert set(card["actuation"]) == {"shoulder", "elbow", "extend", "left"}
+
+
+def test_a_file_that_was_changed_or_lost_is_told(tmp_path):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    assert file_findings(folder) == ()
+    (folder / "robot.urdf").write_text((folder / "robot.urdf").read_text() + "<!-- mine -->")
+    (folder / "robot.xml").unlink()
+    found = {finding.code: finding.where for finding in file_findings(folder)}
+    assert found == {"file-changed": "file robot.urdf", "file-missing": "file robot.xml"}

@@ -352,11 +352,35 @@ def test_a_derivation_of_an_unknown_part_is_refused():
         compose(Derivation("arm", "ur55"), LIBRARY, "robot")
 
 
+OVERLAPPING = {
+    ("jaco2", "so101_jaw"),
+    ("lwr", "so101_jaw"),
+    ("yumi_right", "so101_jaw"),
+    ("yumi_right", "panda_hand"),
+}
+"""Hands whose shapes reach behind the flange, into the arm: the card says so."""
+
+
+def test_parts_that_overlap_are_told_and_not_ignored():
+    words = "base=pedestal base.spread=0 left.arm=lwr right.arm=lwr"
+    robot = compose(derive(words), LIBRARY, "robot")
+    findings = [finding for finding in check(robot) if finding.severity != "info"]
+    assert {finding.code for finding in findings} == {"self-collision"}
+    assert any("left_arm" in f.where and "right_arm" in f.where for f in findings)
+
+
+def test_the_order_of_words_changes_nothing():
+    words = "left.arm=ur5 left.ee=stick right.arm=lwr right.ee=plane"
+    turned = "right.ee=plane right.arm=lwr left.ee=stick left.arm=ur5"
+    assert derive(words) == derive(turned)
+
+
 def conforms(arm, ee, tmp_path, samples):
     derivation = derive(f"arm={arm} ee={ee}")
     robot = compose(derivation, LIBRARY, default_name(derivation, LIBRARY))
     findings = check(robot)
-    assert Counter(f.severity for f in findings if f.severity != "info") == {}
+    told = {finding.code for finding in findings if finding.severity != "info"}
+    assert told == ({"self-collision"} if (arm, ee) in OVERLAPPING else set())
     report = conformance(
         write_bundle(robot, tmp_path / robot.name, findings, picture=False), samples
     )

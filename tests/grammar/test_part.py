@@ -213,3 +213,12 @@ def test_a_file_that_the_data_package_lacks_is_named(tmp_path):
     manifest = read_manifest(write_part(tmp_path, source=source, **gone))
     with pytest.raises(PartError, match=r"rtb-data 1\.1\.0 has no file .*nowhere\.urdf"):
         load_part(manifest)
+
+
+def test_a_part_that_was_edited_is_read_again(tmp_path):
+    manifest = write_part(tmp_path, density=1000)
+    library = default_library([tmp_path])
+    name = manifest.stem
+    light = load_part(library.manifest(name)).body.mass
+    write_part(tmp_path, density=3000)
+    assert load_part(library.manifest(name)).body.mass == pytest.approx(3 * light)

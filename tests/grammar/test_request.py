@@ -47,6 +47,16 @@ def test_an_end_effector_may_stand_on_the_base(library):
     assert default_name(derive(library, "base=gantry ee=plane"), library) == "gantry-plane"
 
 
+def test_different_robots_have_different_names(library):
+    texts = ("arm=yumi left.ee=stick", "arm=yumi right.ee=stick")
+    texts += (
+        "base=pedestal left.ee=stick",
+        "base=pedestal right.ee=stick",
+        "base=pedestal ee=stick",
+    )
+    assert len({default_name(derive(library, text), library) for text in texts}) == len(texts)
+
+
 def test_name_tells_that_a_parameter_was_changed(library):
     plain = default_name(derive(library, "arm=ur5 ee=plane"), library)
     small = default_name(derive(library, "arm=ur5 ee=plane ee.size=80mm"), library)

@@ -1,0 +1,161 @@
+"""What a grammar can make is counted, listed, and found faulty before a robot is drawn."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
+
+from morphgen.errors import GrammarError
+from morphgen.grammar.analysis import count, enumerate_structures, faults, variables
+from morphgen.grammar.derive import Random, derive
+
+
+def structures(found, limit=None):
+    return [str(d) for d in itertools.islice(enumerate_structures(found, LIBRARY), limit)]
+
+
+@pytest.mark.parametrize("name", CATEGORIES)
+def test_shipped_grammars_are_sound(name):
+    assert faults(shipped(name), LIBRARY) == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["robot -> fixed urr5"], "g:1:16: 'urr5' is neither a symbol nor a part; did you mean"),
+        (["robot -> fixed a(x=1)", "a -> ur5"], "g:1:16: 'a' is a symbol and takes no parameters"),
+        (["robot -> gantry plane(sise=1)"], "g:1:28: 'plane' has no parameter 'sise'"),
+        (["robot -> gantry plane(size=1kg)"], "g:1:28: size is in m, 1kg in kg"),
+        (["robot -> gantry plane(size=1inch)"], "g:1:28: unknown unit 'inch'"),
+        (["robot -> gantry plane(size=uniform(0.1, 2))"], "g:1:28: plane.size=2: out of range"),
+        (["robot -> gantry plane(size=uniform(0, 1))"], "g:1:28: plane.size=0: out of range"),
+        (["robot -> gantry plane(size=choice(0.1, 9, 0.2))"], "plane.size=9: out of range"),
+        (["let s = uniform(1, 4)", "robot -> gantry plane(size=s/2)"], "plane.size=1.25: out of"),
+        (["robot -> slides hand(palm=0, fingers=uniform(2, 4))"], "hand.fingers=2.76393: not a wh"),
+        (["let s = uniform(2, 1)", "robot -> cubes(size=s)"], "g:1:9: uniform(2, 1): low is above"),
+        (["robot -> slides bead robot"], "g:1:1: 'robot' never ends: it always holds itself"),
+        (["robot -> slides a", "a -> bead b", "b -> bead a"], "g:2:1: 'a' never ends"),
+        (["robot -> gantry a", "a -> plane | a"], "g:2:1: 'a' can be rewritten to itself alone"),
+        (["robot -> cubes", "a -> cubes"], "g:2:1: 'a' cannot be reached from 'robot'"),
+        (["let r = 1", "robot -> cubes"], "g:1:5: 'r' is never used"),
+        (["robot -> pedestal up:ur5"], "g:1:22: 'pedestal' has no port 'up'"),
+        (["robot -> gantry plane cube"], "g:1:23: nothing can go on 'plane': it has no port"),
+        (["robot -> gantry a ur5", "a -> beam{1,9} | plane"], "nothing can go on 'plane'"),
+        (["robot -> cubes | ur5(mount_yaw=1)"], "'ur5' stands on no port: it has no mount_yaw"),
+        (["robot -> @weight(0) cubes"], "g:1:1: all weights of 'robot' are zero"),
+    ],
+)
+def test_a_fault_is_told_with_its_place(lines, message):
+    found = faults(grammar(*lines), LIBRARY)
+    assert found
+    assert any(message in fault for fault in found)
+    assert all(fault.startswith("g:") and "\n" not in fault for fault in found)
+
+
+def test_all_faults_are_told_at_once():
+    found = faults(
+        grammar("let r = 1", "robot -> gantri plane(sise=1)", "a -> ur55"),
+        LIBRARY,
+    )
+    assert [fault.split(": ")[0] for fault in found] == [
+        "g:2:10",
+        "g:2:28",
+        "g:3:6",
+        "g:3:1",
+        "g:1:5",
+    ]
+
+
+def test_what_is_used_by_a_weight_or_another_value_is_used():
+    lines = "let a = 1", "let b = a", "robot -> @weight(b) cubes | cartpole"
+    assert faults(grammar(*lines), LIBRARY) == []
+
+
+def test_a_recursion_that_can_end_is_sound():
+    assert faults(grammar("robot -> slides tail", "tail -> bead tail | bead"), LIBRARY) == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "number"),
+    [
+        (["robot -> cubes"], 1),
+        (["robot -> cubes | cartpole | post"], 3),
+        (["robot -> post beam{2,5}"], 4),
+        (["robot -> post beam{3}"], 1),
+        (["robot -> post link{1,3}", "link -> beam | bead"], 2 + 4 + 8),
+        (["robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw"], 24),
+        (
+            [
+                "robot -> base arm ee",
+                "base -> fixed | post",
+                "arm -> ur5 | ur3 | beam",
+                "ee -> jaw",
+            ],
+            6,
+        ),
+        (["robot -> pedestal left:l right:l", "l -> a e", "a -> ur5 | ur3", "e -> jaw | claw"], 16),
+        (["robot -> gantry ee", "ee -> @weight(0) plane | cube | jaw"], 2),
+    ],
+)
+def test_the_count_is_that_of_the_list_and_nothing_is_listed_twice(lines, number):
+    found = grammar(*lines)
+    listed = structures(found)
+    assert count(found) == number == len(listed) == len(set(listed))
+
+
+def test_the_list_is_all_that_can_be_drawn():
+    found = grammar("robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw")
+    rng = np.random.default_rng(0)
+    drawn = {str(derive(found, LIBRARY, Random(rng))) for _ in range(600)}
+    assert drawn == set(structures(found))
+
+
+def test_an_alternative_written_twice_is_listed_once():
+    found = grammar("robot -> gantry ee", "ee -> plane | plane | cube")
+    assert count(found) == 3
+    assert len(structures(found)) == 2
+
+
+def test_a_recursion_has_infinitely_many_listed_by_size():
+    found = grammar("robot -> slides tail", "tail -> bead | beam tail")
+    assert math.isinf(count(found))
+    listed = structures(found, 6)
+    assert [text.count("=bead") + text.count("=beam") for text in listed] == [1, 2, 3, 4, 5, 6]
+    assert len(set(listed)) == 6
+
+
+def test_a_structure_that_cannot_be_is_told_when_its_turn_comes():
+    listed = enumerate_structures(
+        grammar("robot -> gantry ee", "ee -> plane | plane cube"), LIBRARY
+    )
+    assert next(listed).part == "gantry"
+    with pytest.raises(GrammarError, match="g:2:21: nothing can go on 'plane'"):
+        next(listed)
+
+
+def test_shipped_grammars_have_as_many_structures_as_they_say():
+    counts = {name: count(shipped(name)) for name in CATEGORIES}
+    assert counts["chain"] == 6
+    assert counts["nlink"] == 4
+    assert counts["planar_arm"] == 8
+    assert counts["prims"] == 4
+    assert counts["arm3"] == 1
+
+
+def test_all_that_is_drawn_is_named_with_its_distribution():
+    found = variables(
+        grammar(
+            "let r = uniform(1cm, 2cm)",
+            "let n = 3",
+            "robot -> slides(radius=r) link{2,3}",
+            "link -> bead(radius=r, rod=choice(2cm, r) + uniform(0, 5*r))",
+        )
+    )
+    assert [(v.where, v.text, v.distribution.is_continuous) for v in found] == [
+        ("let r", "uniform(1cm, 2cm)", True),
+        ("link: bead.rod", "choice(2cm, r)", False),
+        ("link: bead.rod", "uniform(0, (5 * r))", True),
+    ]
+    assert found[2].distribution.bounds == pytest.approx((0, 0.075))

@@ -1,0 +1,247 @@
+"""A grammar and a chooser make a derivation: labels, ports, and an end."""
+
+import itertools
+
+import numpy as np
+import pytest
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
+
+from morphgen.errors import GrammarError
+from morphgen.grammar.derive import MAX_PARTS, EndlessError, First, Random, Recorded, derive
+
+
+def first(*lines):
+    return derive(grammar(*lines), LIBRARY, First())
+
+
+def draw(found, seed=0):
+    return derive(found, LIBRARY, Random(np.random.default_rng(seed)))
+
+
+def labels(derivation):
+    return [node.label for node in derivation.walk()]
+
+
+def places(derivation):
+    """Where every part but the first is attached: its label, the part below it and the port."""
+    return [(c.label, node.label, port) for node in derivation.walk() for port, c in node.children]
+
+
+def test_a_symbol_that_becomes_one_part_gives_it_its_name():
+    tree = first("robot -> base arm ee", "base -> fixed", "arm -> any", "any -> ur5", "ee -> stick")
+    assert labels(tree) == ["base", "arm", "ee"]
+    assert [node.part for node in tree.walk()] == ["fixed", "ur5", "stick"]
+
+
+def test_a_symbol_that_becomes_several_parts_leaves_them_their_names():
+    tree = first("robot -> fixed limb", "limb -> ur5 ee", "ee -> stick")
+    assert labels(tree) == ["fixed", "ur5", "ee"]
+
+
+def test_copies_are_numbered_even_if_there_is_but_one():
+    assert labels(first("robot -> post beam{3} plane")) == ["post"] + [
+        "beam1",
+        "beam2",
+        "beam3",
+        "plane",
+    ]
+    assert labels(first("robot -> post beam{1}")) == ["post", "beam1"]
+
+
+def test_copies_of_several_parts_each_have_their_number_before():
+    tree = first("robot -> post pair{2}", "pair -> beam bead")
+    assert labels(tree) == ["post", "pair1_beam", "pair1_bead", "pair2_beam", "pair2_bead"]
+
+
+def test_a_name_that_is_taken_gets_a_number():
+    assert labels(first("robot -> post beam beam beam")) == ["post", "beam", "beam_2", "beam_3"]
+
+
+def test_limbs_carry_the_name_of_their_port():
+    tree = first(
+        "robot -> pedestal left:limb right:limb", "limb -> arm ee", "arm -> ur5", "ee -> stick"
+    )
+    assert places(tree) == [
+        ("left_arm", "pedestal", "left"),
+        ("right_arm", "pedestal", "right"),
+        ("left_ee", "left_arm", "flange"),
+        ("right_ee", "right_arm", "flange"),
+    ]
+
+
+def test_what_has_no_port_goes_on_from_the_trunk_and_not_from_a_limb():
+    tree = first("robot -> pedestal left:ur5 panda stick")
+    assert places(tree) == [
+        ("left_ur5", "pedestal", "left"),
+        ("panda", "pedestal", "top"),
+        ("stick", "panda", "flange"),
+    ]
+
+
+def test_ports_of_a_part_inside_a_symbol_are_named_in_it():
+    tree = first("robot -> fixed torso", "torso -> yumi left:yumi_gripper right:none")
+    assert places(tree)[1:] == [
+        ("left_yumi_gripper", "yumi", "left"),
+        ("right_none", "yumi", "right"),
+    ]
+
+
+def test_parameters_are_complete_and_the_turn_of_a_mount_only_if_there_is_one():
+    tree = first("let r = 3cm", "robot -> gantry plane(size=2*r) ")
+    assert dict(tree.children[0][1].parameters) == {"size": 0.06, "thickness": 0.01}
+    turned = first("robot -> gantry plane(mount_yaw=90deg)")
+    assert dict(turned.children[0][1].parameters)["mount_yaw"] == pytest.approx(np.pi / 2)
+    assert "mount_yaw" not in str(first("robot -> gantry plane(mount_yaw=0)"))
+
+
+def test_a_full_turn_is_in_range_although_it_is_written_with_12_digits():
+    assert "mount_yaw=6.28318530718" in str(first("robot -> gantry plane(mount_yaw=360deg)"))
+
+
+def test_a_let_is_drawn_once_and_an_argument_for_every_copy():
+    shared = draw(grammar("let r = uniform(0.1, 0.5)", "robot -> post beam(length=r){4}"))
+    own = draw(grammar("robot -> post beam(length=uniform(0.1, 0.5)){4}"))
+    lengths = [[n.parameters[0][1] for n in tree.walk()][1:] for tree in (shared, own)]
+    assert len(set(lengths[0])) == 1
+    assert len(set(lengths[1])) == 4
+
+
+def test_two_distributions_in_one_expression_are_drawn_apart():
+    recorded = Recorded(Random(np.random.default_rng(0)))
+    found = grammar("robot -> gantry plane(size=uniform(0.1, 0.2) + uniform(0.1, 0.2))")
+    derive(found, LIBRARY, recorded)
+    assert list(recorded.made) == ["robot/1.plane.size", "robot/1.plane.size~2"]
+
+
+def test_first_takes_the_first_possible_alternative_and_the_smallest_count():
+    tree = first(
+        "robot -> post links ee",
+        "links -> beam(length=uniform(0.1, 0.5)){2,5}",
+        "ee -> @weight(0) jaw | claw(size=choice(0.03, 0.05)) | plane",
+    )
+    assert labels(tree) == ["post", "beam1", "beam2", "ee"]
+    assert dict(tree.children[0][1].parameters)["length"] == pytest.approx(0.3)
+    assert [node.part for node in tree.walk()][-1] == "claw"
+
+
+def test_weights_are_shares():
+    found = grammar(
+        "robot -> @weight(3) cubes | @weight(2*0.5) cartpole | @weight(0) gantry | post"
+    )
+    rng = np.random.default_rng(0)
+    parts = [derive(found, LIBRARY, Random(rng)).part for _ in range(2000)]
+    shares = [parts.count(part) / 2000 for part in ("cubes", "cartpole", "gantry", "post")]
+    assert shares == pytest.approx([0.6, 0.2, 0, 0.2], abs=0.04)
+    assert shares[2] == 0
+
+
+def test_a_weight_may_be_drawn():
+    found = grammar(
+        "let w = choice(0, 1)",
+        "robot -> @weight(w) cubes | @weight(1 - w) cartpole | @weight(0) post",
+    )
+    for seed in range(20):
+        recorded = Recorded(Random(np.random.default_rng(seed)))
+        part = derive(found, LIBRARY, recorded).part
+        assert part == ("cubes" if recorded.made["let w"] else "cartpole")
+
+
+def test_counts_of_a_repetition_are_equally_likely():
+    found = grammar("robot -> post beam{2,4}")
+    rng = np.random.default_rng(0)
+    counts = [len(labels(derive(found, LIBRARY, Random(rng)))) - 1 for _ in range(900)]
+    assert [counts.count(n) / 900 for n in (2, 3, 4)] == pytest.approx([1 / 3] * 3, abs=0.05)
+
+
+@pytest.mark.parametrize("name", CATEGORIES)
+def test_recorded_choices_make_the_same_derivation_again(name):
+    found = shipped(name)
+    for seed in range(5):
+        recorded = Recorded(Random(np.random.default_rng(seed)))
+        tree = derive(found, LIBRARY, recorded)
+        written = {key: float(f"{value:.12g}") for key, value in recorded.made.items()}
+        again = Recorded(First(), written)
+        assert derive(found, LIBRARY, again) == tree
+        assert again.made == recorded.made
+
+
+def test_choices_that_do_not_fit_are_made_by_the_other():
+    found = grammar("robot -> post links", "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw")
+    given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
+    assert derive(found, LIBRARY, Recorded(First(), given)) == derive(found, LIBRARY, First())
+
+
+def test_a_recursion_may_end():
+    found = grammar("robot -> slides tail", "tail -> bead | bead tail")
+    sizes = {sum(1 for _ in draw(found, seed).walk()) for seed in range(30)}
+    assert {2, 3, 4} <= sizes
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("robot -> slides tail", "tail -> bead tail"),
+        ("robot -> slides tail", "tail -> tail"),
+        ("robot -> slides a", "a -> bead b", "b -> bead a"),
+    ],
+)
+def test_a_recursion_without_end_is_given_up(lines):
+    with pytest.raises(EndlessError, match=r"^g:2:9: "):
+        first(*lines)
+
+
+def test_no_robot_has_more_parts_than_allowed():
+    found = grammar("robot -> slides bead{199}")
+    assert sum(1 for _ in derive(found, LIBRARY, First()).walk()) == MAX_PARTS == 200
+    with pytest.raises(EndlessError, match="more than 200 parts: does it end"):
+        first("robot -> slides bead{200}")
+    with pytest.raises(EndlessError, match="more than 3 parts"):
+        derive(found, LIBRARY, First(), max_parts=3)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (
+            ["robot -> fixed urr5"],
+            "g:1:16: 'urr5' is neither a symbol nor a part; did you mean 'ur5'",
+        ),
+        (["robot -> fixed a(x=1)", "a -> ur5"], "g:1:16: 'a' is a symbol and takes no parameters"),
+        (
+            ["robot -> gantry plane(sise=1)"],
+            "1:28: 'plane' has no parameter 'sise'; did you mean 'si",
+        ),
+        (
+            ["robot -> gantry plane(size=9)"],
+            "1:28: plane.size=9: out of range; expected 0.02 to 1 m",
+        ),
+        (["robot -> gantry plane(size=1deg)"], "1:28: size is in m, 1deg in rad"),
+        (["robot -> fixed hand(fingers=2.5)"], "1:29: hand.fingers=2.5: not a whole number"),
+        (["robot -> fixed hand(fingers=3m)"], "1:29: fingers is in pure numbers, 3m in m"),
+        (["robot -> plane cube"], "g:1:16: nothing can go on 'plane': it has no port"),
+        (["robot -> pedestal up:ur5"], "g:1:22: 'pedestal' has no port 'up'; did you mean 'top'?"),
+        (["robot -> fixed yumi stick"], "1:21: say on which port of 'yumi', such as left:stick"),
+        (["robot -> pedestal left:ur5 left:ur3"], "1:33: port 'left' of 'pedestal' is taken alre"),
+        (["robot -> ur5(mount_yaw=90deg)"], "g:1:1: 'ur5' stands on no port: it has no mount_yaw"),
+        (["robot -> @weight(-1) ur5 | panda"], "g:1:18: a weight is negative: -1"),
+        (["robot -> @weight(0) ur5"], "g:1:1: all weights of 'robot' are zero"),
+        (["let r = q", "robot -> cubes"], "g:1:9: unknown value 'q'"),
+        (["let r = r", "robot -> cubes"], "g:1:9: unknown value 'r'"),
+    ],
+)
+def test_what_cannot_be_derived_is_refused_with_its_place(lines, message):
+    with pytest.raises(GrammarError, match=r"^g:[^\n]*$") as caught:
+        first(*lines)
+    assert message in str(caught.value)
+
+
+def test_labels_are_unique_whatever_is_drawn():
+    found = grammar(
+        "robot -> pedestal left:limb right:limb limb",
+        "limb -> beam{1,3} | beam2 beam1 | limb beam",
+        "beam1 -> beam",
+        "beam2 -> beam",
+    )
+    for seed in itertools.islice(itertools.count(), 50):
+        names = labels(draw(found, seed))
+        assert len(set(names)) == len(names)

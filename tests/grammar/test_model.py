@@ -1,0 +1,160 @@
+"""Grammars are files that include each other; printed, they are the same grammar."""
+
+import pytest
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
+
+from morphgen.errors import GrammarError
+from morphgen.grammar.derive import First, derive
+from morphgen.grammar.model import (
+    find_grammar,
+    grammar_from_text,
+    grammar_names,
+    grammar_text,
+    load_grammar,
+)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a grammar file of some lines; return its path."""
+
+    def written(name, *lines):
+        path = tmp_path / f"{name}.grammar"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    return written
+
+
+def first(grammar):
+    return str(derive(grammar, LIBRARY, First()))
+
+
+def test_there_is_a_grammar_for_each_category():
+    assert grammar_names() == [
+        "arm3",
+        "arm5",
+        "arm_ed",
+        "cartpole",
+        "chain",
+        "cubes",
+        "multi_finger",
+        "nlink",
+        "panda_variations",
+        "planar_arm",
+        "prims",
+        "stick",
+        "tongs",
+    ]
+
+
+@pytest.mark.parametrize("name", CATEGORIES)
+def test_a_printed_grammar_is_the_same_grammar(name):
+    text = grammar_text(shipped(name))
+    again = grammar_from_text(text, name)
+    assert grammar_text(again) == text
+    assert again.start == shipped(name).start
+    assert first(again) == first(shipped(name))
+
+
+def test_printing_keeps_all_that_a_grammar_can_say():
+    lines = [
+        "let r = (0.1 * uniform(3.141592653589793mm, 1e-05m))",
+        "robot -> base left:limb right:limb | @weight((r / 2)) body(size=-(r + 1), x=r){2,7}",
+        "limb -> ur5",
+        "where not ((mass < 3kg) or (dof == 2))",
+        "where ((0.3 < reach) and (reach <= 1))",
+    ]
+    assert grammar_text(grammar(*lines)).splitlines() == lines
+
+
+def test_the_start_is_the_first_symbol_of_the_file_itself(write):
+    write("limbs", "limb -> arm plane", "arm -> ur5 | panda")
+    path = write("mine", "include limbs", "include limbs", "robot -> fixed limb")
+    found = load_grammar(path, [path.parent])
+    assert (found.name, found.start) == ("mine", "robot")
+    assert grammar_text(found).startswith("robot -> ")
+    assert "arm=ur5" in first(found)
+
+
+def test_a_file_that_only_includes_starts_where_the_included_one_does(write):
+    write("body", "robot -> gantry ee", "ee -> plane")
+    assert load_grammar(write("mine", 'include "body.grammar"', "let r = 1")).start == "robot"
+
+
+def test_a_file_says_anew_what_an_included_one_says(write):
+    write("body", "let r = 5cm", "robot -> gantry ee", "ee -> plane(size=r)", "where dof > 2")
+    path = write("mine", 'include "body.grammar"', "let r = 8cm", "ee -> cube(size=r)")
+    found = load_grammar(path)
+    assert grammar_text(found).splitlines() == [
+        "let r = 8cm",
+        "ee -> cube(size=r)",
+        "robot -> gantry ee",
+        "where (dof > 2)",
+    ]
+
+
+def test_shipped_grammars_can_be_included_by_name(write):
+    path = write("mine", "include nlink", "robot -> post links jaw")
+    assert "end: jaw=jaw" in first(load_grammar(path))
+
+
+def test_a_library_comes_before_the_shipped_grammars(write, tmp_path):
+    own = write("cubes", "robot -> cartpole")
+    assert find_grammar("cubes", [tmp_path]) == own
+    assert find_grammar("cubes") != own
+    with pytest.raises(GrammarError, match="unknown grammar 'kubes'; did you mean 'cubes'"):
+        find_grammar("kubes", [tmp_path])
+
+
+@pytest.mark.parametrize("target", ["a.grammar", "../{}/a.grammar", "./a.grammar"])
+def test_grammars_that_include_each_other_are_refused(write, tmp_path, target):
+    target = target.format(tmp_path.name)
+    path = write("a", 'include "b.grammar"', "robot -> cubes")
+    write("b", f'include "{target}"', "x -> cubes")
+    with pytest.raises(GrammarError, match=r"include each other: a\.grammar -> b\.grammar -> a"):
+        load_grammar(path)
+
+
+def test_two_files_may_include_the_same_third(write):
+    write("ends", "ee -> plane")
+    write("a", 'include "ends.grammar"', "x -> cubes")
+    write("b", 'include "ends.grammar"', "y -> cubes")
+    path = write("c", 'include "a.grammar"', 'include "b.grammar"', "robot -> gantry ee")
+    assert "plane" in first(load_grammar(path))
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["robot -> a", "robot -> b"], "2:1: 'robot' is defined at g:1:1 already"),
+        (["let r = 1", "let r = 2", "robot -> a"], "2:5: 'r' is defined at g:1:5 already"),
+        (["let r = 1"], "g: no production, such as: robot -> base arm ee"),
+        ([""], "g: no production"),
+        (["robot -> a", "where size > 3"], "2:7: unknown property 'size'"),
+        (["include nlink", "robot -> a"], "1:9: a grammar given as text includes no other"),
+    ],
+)
+def test_a_grammar_that_contradicts_itself_is_refused(lines, message):
+    with pytest.raises(GrammarError) as caught:
+        grammar(*lines)
+    assert message in str(caught.value)
+
+
+def test_an_include_that_leads_nowhere_is_told_where_it_stands(write):
+    path = write("mine", "robot -> cubes", "include nlnk")
+    with pytest.raises(GrammarError) as caught:
+        load_grammar(path)
+    assert str(caught.value).startswith(f"{path}:2:9: unknown grammar 'nlnk'; did you mean 'nlink'")
+    with pytest.raises(GrammarError, match="no such file"):
+        find_grammar(str(path.with_name("other.grammar")))
+
+
+def test_the_digest_is_that_of_all_texts(write):
+    write("body", "ee -> plane")
+    path = write("mine", 'include "body.grammar"', "robot -> gantry ee")
+    before = load_grammar(path).digest
+    assert load_grammar(path).digest == before
+    write("body", "ee -> cube")
+    assert load_grammar(path).digest != before

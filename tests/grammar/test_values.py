@@ -1,0 +1,160 @@
+"""Arithmetic with units, and distributions whose figures are what their names say."""
+
+import math
+import statistics
+
+import numpy as np
+import pytest
+
+from morphgen.errors import GrammarError
+from morphgen.grammar.syntax import parse_condition
+from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
+
+LOG_MEAN = 99 / math.log(100)
+NAMES = {"r": (0.02, "m"), "k": (3.0, ""), "turn": (1.0, "rad")}
+
+
+def value(text, draw=no_draw):
+    return evaluate(parse_condition(text, "g"), Scope(NAMES, draw, ""))
+
+
+def drawn(text, n=4000):
+    """Values of a distribution, always the same ones."""
+    rng = np.random.default_rng(0)
+    return [value(text, lambda _, d: d.draw(rng.random, rng.standard_normal))[0] for _ in range(n)]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("3", (3.0, "")),
+        ("30mm", (0.03, "m")),
+        ("3cm + 5mm", (0.035, "m")),
+        ("180deg", (math.pi, "rad")),
+        ("200g", (0.2, "kg")),
+        ("r + 0.01", (0.03, "m")),
+        ("2*r - 1cm", (0.03, "m")),
+        ("r / 1mm", (20.0, "")),
+        ("1 / k", (1 / 3, "")),
+        ("-(r + r)", (-0.04, "m")),
+        ("k * turn", (3.0, "rad")),
+        ("1 + 2 * k", (7.0, "")),
+        ("2 - 1 - 1", (0.0, "")),
+    ],
+)
+def test_arithmetic_keeps_units(text, expected):
+    number, unit = value(text)
+    assert (number, unit) == (pytest.approx(expected[0]), expected[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1m + 1kg", "1:4: (1m + 1kg) mixes units m and kg"),
+        ("r - turn", "1:3: (r - turn) mixes units m and rad"),
+        ("uniform(1m, 2kg)", "1:1: uniform(1m, 2kg) mixes units kg and m"),
+        ("3inch", "1:1: unknown unit 'inch'; valid: cm, deg, g, kg, m, mm, rad"),
+        ("q + 1", "1:1: unknown value 'q'; valid: k, r, turn"),
+        ("1 / 0", "1:3: (1 / 0) divides by zero"),
+        ("1e300 * 1e300", "1:7: (1e+300 * 1e+300) is not finite"),
+        ("(1 < 2) + 1", "1:4: (1 < 2) is a condition, not a value"),
+        ("uniforn(1, 2)", "1:1: unknown distribution 'uniforn'; did you mean 'uniform'?"),
+        ("uniform(1)", "1:1: uniform(1) does not fit uniform(low, high)"),
+        ("uniform(2, 1)", "1:1: uniform(2, 1): low is above high in uniform(low, high)"),
+        ("loguniform(0, 1)", "1:1: loguniform(0, 1): low must be above zero"),
+        ("normal(1, 2)", "does not fit normal(mean, deviation, low, high)"),
+        ("normal(1, -1, 0, 2)", "the deviation is negative"),
+        ("normal(1, 1, 2, 0)", "low is above high"),
+        ("choice()", "1:1: choice() does not fit choice(value, ...)"),
+        ("randint(1, 2.5)", "randint needs whole numbers"),
+    ],
+)
+def test_what_means_nothing_is_refused_with_its_place(text, message):
+    with pytest.raises(GrammarError, match=r"^g:[^\n]*$") as caught:
+        value(text)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high"),
+    [
+        ("uniform(1, 3)", 1, 3),
+        ("loguniform(1, 100)", 1, 100),
+        ("normal(0, 1, -0.5, 2)", -0.5, 2),
+        ("randint(2, 5)", 2, 5),
+        ("choice(3, 1, 2)", 1, 3),
+        ("uniform(2, 2)", 2, 2),
+    ],
+)
+def test_no_value_leaves_the_bounds_and_the_bounds_are_reached(text, low, high):
+    values = drawn(text)
+    assert low <= min(values) <= max(values) <= high
+    assert min(values) <= low + 0.02 * (high - low)
+    assert max(values) >= high - 0.02 * (high - low)
+
+
+@pytest.mark.parametrize(
+    ("text", "mean", "deviation"),
+    [
+        ("uniform(1, 3)", 2, 2 / math.sqrt(12)),
+        ("loguniform(1, 100)", LOG_MEAN, math.sqrt(9999 / math.log(1e4) - LOG_MEAN**2)),
+        ("normal(5, 2, -100, 100)", 5, 2),
+        ("randint(1, 6)", 3.5, math.sqrt(35 / 12)),
+        ("choice(0, 10)", 5, 5),
+    ],
+)
+def test_mean_and_deviation_are_those_of_the_distribution(text, mean, deviation):
+    values = drawn(text)
+    assert statistics.fmean(values) == pytest.approx(mean, abs=4 * deviation / math.sqrt(4000))
+    assert statistics.pstdev(values) == pytest.approx(deviation, rel=0.05)
+
+
+def test_factors_of_a_loguniform_are_equally_likely():
+    values = drawn("loguniform(1, 16)")
+    shares = [sum(2**k <= x < 2 ** (k + 1) for x in values) / len(values) for k in range(4)]
+    assert shares == pytest.approx([0.25] * 4, abs=0.03)
+
+
+def test_a_normal_is_clipped_and_not_drawn_again():
+    values = drawn("normal(0, 1, 0, 1)")
+    assert values.count(0.0) / len(values) == pytest.approx(0.5, abs=0.03)
+    assert values.count(1.0) / len(values) == pytest.approx(0.159, abs=0.03)
+
+
+def test_whole_numbers_and_choices_are_equally_likely():
+    for text, options in (("randint(2, 5)", (2, 3, 4, 5)), ("choice(7, 1, 4, 1)", (7, 4))):
+        values = drawn(text)
+        assert [values.count(o) / len(values) for o in options] == pytest.approx(
+            [0.25] * len(options), abs=0.03
+        )
+
+
+@pytest.mark.parametrize(
+    ("text", "typical"),
+    [
+        ("uniform(1, 3)", 2),
+        ("loguniform(1, 100)", 10),
+        ("normal(9, 1, 0, 5)", 5),
+        ("choice(7, 1)", 7),
+        ("randint(2, 5)", 2),
+    ],
+)
+def test_the_typical_value_is_the_middle_or_the_first(text, typical):
+    assert value(text)[0] == pytest.approx(typical)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "asked", "given"),
+    [
+        (Distribution("choice", (math.pi / 6, math.pi / 3)), 1.0471975512, math.pi / 3),
+        (Distribution("choice", (0.0, 1.0)), 0.5, None),
+        (Distribution("normal", (0.0, 1.0, 0.0, 2 / 3)), 0.666666666667, 2 / 3),
+        (Distribution("uniform", (0.0, 1.0)), 0.25, 0.25),
+        (Distribution("uniform", (0.0, 1.0)), 1.1, None),
+        (Distribution("randint", (2.0, 5.0)), 3.0, 3),
+        (Distribution("randint", (2.0, 5.0)), 2.5, None),
+        (Distribution("randint", (2.0, 5.0)), 6.0, None),
+    ],
+)
+def test_a_value_that_was_rounded_for_a_file_is_found_again(distribution, asked, given):
+    assert distribution.nearest(asked) == given

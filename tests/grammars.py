@@ -1,0 +1,80 @@
+"""Grammars that tests write as text, and what the benchmark's categories must have."""
+
+import math
+
+from morphgen.grammar.library import default_library
+from morphgen.grammar.model import find_grammar, grammar_from_text, grammar_names, load_grammar
+
+LIBRARY = default_library()
+CATEGORIES = grammar_names()
+
+
+def grammar(*lines, name="g"):
+    """The grammar of some lines."""
+    return grammar_from_text("\n".join(lines) + "\n", name)
+
+
+def shipped(name):
+    """A grammar that comes with morphgen."""
+    return load_grammar(find_grammar(name))
+
+
+def benchmark_counts(category, derivation):
+    """Links and movable joints that the benchmark's table gives a robot of a category."""
+    nodes = list(derivation.walk())
+    parts = [node.part for node in nodes]
+    values = {node.part: dict(node.parameters) for node in nodes}
+    beams, beads = parts.count("beam"), parts.count("bead")
+    match category:
+        case "nlink":
+            return beams + 2, beams
+        case "chain":
+            return 3 * beads + 4, 2 * beads + 3
+        case "planar_arm":
+            return (beams + 4, beams + 2) if "jaw" in parts else (beams + 5, beams + 4)
+        case "tongs":
+            return (12, 9) if values["tongs"]["hinges"] == 2 else (10, 7)
+        case "multi_finger":
+            hand = values["hand"]
+            phalanges = int(hand["fingers"] * hand["phalanges"])
+            still = int(hand["fingers"] * (1 - hand["knuckles"]))
+            if "arm3" in parts:
+                return 6 + phalanges, 4 + phalanges
+            return 4 + phalanges, 3 + phalanges - still
+        case _:
+            return FIXED_COUNTS[category]
+
+
+FIXED_COUNTS = {
+    "arm3": (10, 9),
+    "arm5": (23, 8),
+    "arm_ed": (19, 8),
+    "cartpole": (3, 2),
+    "cubes": (3, 2),
+    "panda_variations": (11, 9),
+    "prims": (7, 5),
+    "stick": (5, 3),
+}
+"""Links and movable joints of categories whose robots all have the same."""
+
+
+def unphysical(robot):
+    """What no body can be: a line for every link and joint that is so."""
+    found = []
+    for link in robot.links:
+        if link.inertial is None:
+            continue
+        xx, _, _, yy, _, zz = link.inertial.inertia
+        moments = sorted((xx, yy, zz))
+        if not (link.inertial.mass > 0 and math.isfinite(link.inertial.mass)):
+            found.append(f"{link.name}: mass {link.inertial.mass}")
+        if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - 1e-9)):
+            found.append(f"{link.name}: inertia {moments}")
+    for joint in robot.joints:
+        if joint.limits is not None and not joint.limits[0] < joint.limits[1]:
+            found.append(f"{joint.name}: limits {joint.limits}")
+    for k, q in zip(robot.independent, robot.home, strict=True):
+        low, high = robot.joints[k].limits or (-math.inf, math.inf)
+        if not low <= q <= high:
+            found.append(f"{robot.joints[k].name}: home {q} outside of {low}, {high}")
+    return found
