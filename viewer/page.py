@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import numpy as np
 import viser
 from viser.extras import ViserUrdf
 
+from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import URDF, read_bundle
 from morphgen.model.kinematics import bounds, movable_positions
 from morphgen.model.robot import Robot
@@ -26,8 +28,14 @@ def serve(folder: Path, host: str = "127.0.0.1", port: int = 8080) -> viser.Vise
 
     Raises:
         FormatError: If the folder is no bundle.
+        MorphgenError: If the address is none of this machine's.
     """
     robot = read_bundle(folder)
+    try:
+        with socket.socket() as probe:
+            probe.bind((host, 0))
+    except OSError as error:
+        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
     server = viser.ViserServer(host=host, port=port, verbose=False)
     server.gui.set_panel_label(robot.name)
     server.scene.add_grid("/grid", width=4.0, height=4.0, cell_size=0.1, section_size=1.0)

@@ -6,7 +6,7 @@ import pytest
 from morphgen.viewer.page import serve
 from robots import arm
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import write_bundle
 
 
@@ -18,6 +18,12 @@ def test_a_bundle_is_served(tmp_path):
         assert b"<html" in page.read().lower()
     finally:
         server.stop()
+
+
+@pytest.mark.parametrize("host", ["8.8.8.8", "nosuch.invalid"])
+def test_an_address_of_another_machine_is_refused(tmp_path, host):
+    with pytest.raises(MorphgenError, match="cannot serve at"):
+        serve(write_bundle(arm(), tmp_path / "arm", picture=False), host=host)
 
 
 def test_what_is_no_bundle_is_refused_before_anything_is_served(tmp_path):
