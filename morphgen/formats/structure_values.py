@@ -28,7 +28,7 @@ class Numbers:
     """Whether commas between the numbers are understood all the same."""
 
 
-LARGEST = 1e9
+LARGEST = 1e20
 """Largest number that a URDF may hold: beyond, simulators overflow."""
 SMALLEST = 1e-6
 """Smallest length of a primitive, metres: below, simulators round it to nothing."""

@@ -25,6 +25,8 @@ from morphgen.grammar.values import Distribution, Scope, distribution_of, evalua
 
 CHECKED_STRUCTURES = 500
 """Structures that ``faults`` builds, at most, to see whether their ports fit."""
+CHECKED_ENDLESS = 40
+"""The same, of a grammar that has infinitely many."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,9 @@ def faults(grammar: Grammar, library: Library) -> list[str]:
     never end; values that are never used; ports that do not exist.
     """
     found = [*_item_faults(grammar, library), *_endless(grammar), *_circular(grammar)]
-    found += [*_unreached(grammar), *_unused(grammar)]
     if not found:
         found += _structure_faults(grammar, library)
-    return found
+    return [*found, *_unreached(grammar), *_unused(grammar)]
 
 
 def count(grammar: Grammar) -> float:
@@ -126,7 +127,7 @@ def _structures(grammar: Grammar, library: Library, max_parts: int) -> Iterator[
 
 def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     symbols = {production.symbol for production in grammar.productions}
-    for draw in (_lowest, no_draw, _inner, _highest):
+    for draw in (_lowest, _highest, no_draw, _inner):
         names: dict[str, tuple[float, str]] = {}
         reported: set[str] = set()
         try:
@@ -224,7 +225,7 @@ def _unused(grammar: Grammar) -> Iterator[str]:
 def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     structures = enumerate_structures(grammar, library)
     try:
-        for _ in range(CHECKED_STRUCTURES):
+        for _ in range(CHECKED_ENDLESS if math.isinf(count(grammar)) else CHECKED_STRUCTURES):
             if next(structures, None) is None:
                 return
     except GrammarError as error:

@@ -18,8 +18,8 @@ from morphgen.grammar.parameters import MOUNT_YAW, Parameter, require_range
 from morphgen.grammar.syntax import Alternative, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
 
-MAX_PARTS = 200
-"""Parts of one robot beyond which a recursion is taken to be endless."""
+MAX_PARTS = 100
+"""Parts of one robot beyond which a recursion is taken to be endless; loaders hold fewer."""
 MAIN_PORTS = ("top", "flange", "end")
 """Ports where the next part goes when none is named."""
 

