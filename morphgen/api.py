@@ -59,12 +59,11 @@ def sample(
         GrammarError: If the grammar or condition is malformed.
         SamplingError: If the conditions can hardly be met.
     """
-    folders = tuple(library)
-    found = load_grammar(find_grammar(str(grammar), folders), folders)
+    parts = default_library(library)
+    found = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
     conditions = [parse_condition(where)] if where else []
     for condition in conditions:
         require_condition(condition)
-    parts = default_library(folders)
     return (drawn.robot for drawn in draw_samples(found, parts, n, seed=seed, where=conditions))
 
 

@@ -87,7 +87,9 @@ def run_mutate(args: argparse.Namespace) -> int:
         grammar, library_of(args), choices, args.n, seed=args.seed, name=args.robot.name
     )
     report = []
-    for found in tqdm(neighbours, total=args.n, unit="robot", file=sys.stderr, disable=args.json):
+    for found in tqdm(
+        neighbours, total=args.n, unit="robot", file=sys.stderr, disable=args.json or None
+    ):
         where = write_bundle(
             found.robot, out / found.robot.name, found.findings, picture=not args.no_picture
         )

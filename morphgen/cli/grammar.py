@@ -103,4 +103,5 @@ def run_print(args: argparse.Namespace) -> int:
 def _load(args: argparse.Namespace) -> Grammar:
     from morphgen.grammar.model import find_grammar, load_grammar
 
-    return load_grammar(find_grammar(args.grammar, args.library), args.library)
+    folders = library_of(args).folders
+    return load_grammar(find_grammar(args.grammar, folders), folders)

@@ -63,8 +63,9 @@ def run(args: argparse.Namespace) -> int:
             f"-n {args.n} --jobs {args.jobs} --seed {args.seed}: "
             "-n and --jobs start at 1, --seed at 0"
         )
-    grammar = load_grammar(find_grammar(args.grammar, args.library), args.library)
-    wrong = faults(grammar, library_of(args))
+    library = library_of(args)
+    grammar = load_grammar(find_grammar(args.grammar, library.folders), library.folders)
+    wrong = faults(grammar, library)
     if wrong:
         raise GrammarError(wrong[0] + (f" (and {len(wrong) - 1} more)" if wrong[1:] else ""))
     for text in args.where:
@@ -85,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         work = make_on_ray(args.ray or None)
     elif args.jobs > 1:
         work = make_in_processes(args.jobs)
-    with tqdm(total=args.n, unit="robot", file=sys.stderr, disable=args.json) as bar:
+    with tqdm(total=args.n, unit="robot", file=sys.stderr, disable=args.json or None) as bar:
 
         def show(done: int) -> None:
             bar.n = min(done, args.n)

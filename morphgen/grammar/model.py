@@ -64,11 +64,12 @@ def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
         if not path.is_file():
             raise GrammarError(f"{path}: no such file")
         return path
-    for folder in (*folders, _shipped()):
-        found = sorted(folder.rglob(f"{name}{SUFFIX}"))
-        if found:
-            return found[0]
-    raise GrammarError(f"unknown grammar {name!r}{nearest(name, grammar_names())}")
+    users = [folder for folder in folders if not _shipped().is_relative_to(folder)]
+    found = [path for folder in (*users, _shipped()) for path in sorted(folder.rglob(f"*{SUFFIX}"))]
+    for path in found:
+        if path.stem == name:
+            return path
+    raise GrammarError(f"unknown grammar {name!r}{nearest(name, {path.stem for path in found})}")
 
 
 def load_grammar(path: Path, folders: Iterable[Path] = ()) -> Grammar:

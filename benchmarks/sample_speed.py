@@ -1,0 +1,171 @@
+"""How fast robots are sampled, with one process and with two, and where the time goes.
+
+    python benchmarks/sample_speed.py [--grammar arm3] [--n 2000]
+
+Light sets (URDF and derivation) in fresh temporary folders, which are compared byte for byte. Each
+run is a process of its own, so that its memory is its own. With one job the time begins when a
+first small set is made; with two it holds the start of the workers. The shares are of one process,
+in a run of its own with clocks around the steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import wraps
+from multiprocessing import get_context
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+from tabulate import tabulate
+
+from morphgen.grammar import compose, conditions, robot_set, sampling
+from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
+from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
+from morphgen.grammar.workers import make_in_processes
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+STEPS = (
+    (sampling, "derive", "derive"),
+    (compose, "load_part", "xacro fill + parse"),
+    (sampling, "join", "join"),
+    (sampling, "survey_of", "collision survey"),
+    (sampling, "check", "check"),
+    (conditions, "reach", "reach"),
+    (robot_set, "_write_light", "write"),
+)
+"""Function by module and name, and the step that it is. A step within a step counts for itself."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run took."""
+
+    seconds: float
+    memory_early: float
+    """Peak of the process that hands out the work after a tenth of the robots, MiB."""
+    memory_end: float
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--grammar", default="arm3")
+    parser.add_argument("--n", type=int, default=2000)
+    args = parser.parse_args()
+    grammar = load_grammar(find_grammar(args.grammar))
+    text = grammar_text(grammar)
+    runs = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        plan = SetPlan(Path(scratch), grammar.name, text, 0, (), True, False, ())
+        for jobs in (1, 2):
+            own = replace(plan, folder=Path(scratch) / f"{jobs}")
+            runs[jobs] = _apart(_measure, own, args.n, jobs)
+        same = _content(Path(scratch) / "1") == _content(Path(scratch) / "2")
+        shares = _apart(_shares, replace(plan, folder=Path(scratch) / "s"), max(args.n // 4, 50))
+    rows = [
+        (
+            jobs,
+            f"{run.seconds:.1f}",
+            f"{args.n / run.seconds:.1f}",
+            run.memory_early,
+            run.memory_end,
+        )
+        for jobs, run in runs.items()
+    ]
+    print(f"{args.n} robots of {grammar.name}, light")
+    print(tabulate(rows, ["jobs", "s", "robots/s", "MiB at 10%", "MiB at the end"], floatfmt=".0f"))
+    print(f"speed-up with 2 jobs: {runs[1].seconds / runs[2].seconds:.2f}")
+    print(f"the same bytes: {'yes' if same else 'NO'}")
+    print(tabulate(shares, ["step", "ms a robot", "share"], floatfmt=".2f"))
+    return int(not same)
+
+
+def _apart(measure: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+    """Call a function in a fresh process."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(measure, *arguments, **options).result()
+
+
+def _measure(plan: SetPlan, n: int, jobs: int) -> Run:
+    early = 0.0
+
+    def progress(done: int) -> None:
+        nonlocal early
+        if not early and done >= n / 10:
+            early = _peak()
+
+    if jobs == 1:
+        _warm(plan)
+    start = time.perf_counter()
+    make_set(plan, n, make_serially if jobs == 1 else make_in_processes(jobs), progress)
+    return Run(time.perf_counter() - start, early, _peak())
+
+
+def _shares(plan: SetPlan, n: int) -> list[tuple[str, float, str]]:
+    """Time by step: name, ms a robot and share."""
+    clock = _Clock()
+    for module, name, step in STEPS:
+        setattr(module, name, clock.around(getattr(module, name), step))
+    _warm(plan)
+    clock.spent.clear()
+    start = time.perf_counter()
+    make_set(plan, n, make_serially)
+    total = time.perf_counter() - start
+    clock.spent["everything else"] = total - sum(clock.spent.values())
+    return [
+        (step, 1e3 * seconds / n, f"{100 * seconds / total:.0f}%")
+        for step, seconds in sorted(clock.spent.items(), key=lambda entry: -entry[1])
+    ]
+
+
+class _Clock:
+    """Time spent in steps, without that of the steps inside them."""
+
+    def __init__(self) -> None:
+        self.spent: defaultdict[str, float] = defaultdict(float)
+        self._inside = [0.0]
+
+    def around(self, function: Callable[P, T], step: str) -> Callable[P, T]:
+        """The function, its time counted."""
+
+        @wraps(function)
+        def timed(*args: P.args, **options: P.kwargs) -> T:
+            self._inside.append(0.0)
+            start = time.perf_counter()
+            try:
+                return function(*args, **options)
+            finally:
+                whole = time.perf_counter() - start
+                self.spent[step] += whole - self._inside.pop()
+                self._inside[-1] += whole
+
+        return timed
+
+
+def _warm(plan: SetPlan) -> None:
+    make_set(replace(plan, folder=plan.folder.with_name(f"{plan.folder.name}w")), 3, make_serially)
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def _peak() -> float:
+    """Largest memory of this process so far, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,308 @@
+"""``morphgen sample``, ``grammar``, ``derive``, ``mutate`` and grammars in ``compose``."""
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import start, tree
+from grammars import CATEGORIES
+from parts import PINCER, write_part
+
+from morphgen.formats.bundle import read_bundle
+from morphgen.grammar.library import ENVIRONMENT
+
+GRAMMAR = """\
+# a plate or a cube on a gantry
+robot -> gantry ee
+ee -> plane(size=uniform(5cm, 15cm)) | cube
+"""
+
+
+def records(folder):
+    """The lines of a set's index."""
+    return [json.loads(line) for line in Path(folder, "index.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture
+def mine():
+    """A grammar of the user's own, in the folder where the command runs."""
+    path = Path("mine.grammar")
+    path.write_text(GRAMMAR)
+    return path
+
+
+@pytest.fixture
+def cubes(run):
+    """A light set of four cubes: its folder."""
+    assert run("sample", "cubes", "-n", 4, "--light", "--out", "set")[0] == 0
+    return Path("set")
+
+
+def test_sample_makes_a_set_and_says_how_many(run, tmp_path):
+    code, out, err = run("sample", "cubes", "-n", 3, "--light")
+    assert (code, out, err) == (0, "robots/cubes: 3 made, 0 were there\n", "")
+    assert len(list((tmp_path / "robots" / "cubes").glob("cubes-*"))) == 3
+    code, out, _ = run("sample", "cubes", "-n", 4, "--light")
+    assert (code, out) == (0, "robots/cubes: 1 made, 3 were there\n")
+
+
+def test_sample_reads_a_grammar_file(run, mine):
+    assert run("sample", mine, "-n", 2, "--light")[0] == 0
+    assert [record["name"] for record in records("robots/mine")] == [
+        "mine-000000",
+        "mine-000001",
+    ]
+
+
+def test_sample_writes_bundles_with_a_picture_unless_told_otherwise(run):
+    assert run("sample", "cubes", "-n", 1, "--out", "a")[0] == 0
+    assert run("sample", "cubes", "-n", 1, "--out", "b", "--no-picture")[0] == 0
+    assert Path("a/cubes-000000/preview.png").is_file()
+    assert not Path("b/cubes-000000/preview.png").exists()
+    assert read_bundle(Path("a/cubes-000000")).dof == 2
+
+
+def test_sample_counts_the_draws_that_it_rejected(run):
+    code, out, _ = run("sample", "cubes", "-n", 5, "--light", "--where", "mass < 0.5")
+    assert code == 0
+    assert out.splitlines()[1].endswith(" draws rejected: where (mass < 0.5)")
+
+
+def test_sample_tells_robots_that_are_the_same(run):
+    Path("one.grammar").write_text("robot -> cubes\n")
+    code, out, _ = run("sample", "one.grammar", "-n", 2, "--light")
+    assert code == 0
+    assert out.splitlines()[1] == "  one-000001 has the same body as one-000000"
+
+
+def test_sample_prints_its_report_as_json_and_nothing_else():
+    process = start("sample", "cubes", "-n", "2", "--light", "--json", "--where", "mass < 9")
+    out, err = process.communicate()
+    assert (process.returncode, err) == (0, "")
+    assert json.loads(out) == {
+        "folder": "robots/cubes",
+        "made": 2,
+        "kept": 0,
+        "rejected": {},
+        "duplicates": [],
+    }
+
+
+def test_sample_is_the_same_with_two_jobs(run, cubes):
+    assert run("sample", "cubes", "-n", 4, "--light", "--jobs", 2, "--out", "two")[0] == 0
+    assert tree(cubes) == tree(Path("two"))
+
+
+def test_several_conditions_all_hold(run):
+    words = ("--where", "mass > 0.1", "--where", "mass < 0.9")
+    assert run("sample", "cubes", "-n", 5, "--light", *words)[0] == 0
+    masses = [record["mass"] for record in records("robots/cubes")]
+    assert all(0.1 < mass < 0.9 for mass in masses)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("sample cubse", "unknown grammar 'cubse'; did you mean 'cubes'? valid: arm3, arm5"),
+        ("sample nowhere.grammar", "nowhere.grammar: no such file"),
+        ("sample cubes -n 0", "-n 0 --jobs 1 --seed 0: -n and --jobs start at 1, --seed at 0"),
+        ("sample cubes --jobs 0", "-n and --jobs start at 1"),
+        ("sample cubes --seed -1", "--seed at 0"),
+        ("sample cubes --where mas<3", "--where:1:1: unknown property 'mas'; did you mean 'mass'"),
+        ("sample cubes --where mass<", "--where:1:6: found the end, expected '('"),
+        ("sample cubes --library nowhere", "nowhere does not exist"),
+        ("grammar check cubse", "unknown grammar 'cubse'"),
+        ("grammar count nowhere.grammar", "nowhere.grammar: no such file"),
+        ("derive nowhere", "nowhere is no robot: it has neither card.json nor derivation.txt"),
+        ("mutate nowhere/robot", "is in no set made by morphgen sample (no grammar.grammar)"),
+        ("compose chain beads=9", "beads=9: expected 2 to 7"),
+        ("compose chain baeds=5", "no symbol 'baeds'; did you mean 'beads'?"),
+        ("compose chain bead.radius=2m", "bead.radius=2: out of range; expected 0.005 to 0.05 m"),
+        ("compose chian beads=5", "unknown grammar 'chian'; did you mean 'chain'?"),
+    ],
+)
+def test_a_mistake_is_refused_in_one_line(refused, words, message):
+    assert message in refused(*words.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("robot -> gantry plane(", "my.grammar:1:23: found the end, expected ')' or a name"),
+        ("robot -> gantry plnae", "my.grammar:1:17: 'plnae' is neither a symbol nor a part"),
+        ("robot -> cubes\nx -> cubes\ny -> cubes", "'x' cannot be reached from 'robot' (and 1 mo"),
+        ("include robot", "my.grammar:1:9: unknown grammar 'robot'"),
+    ],
+)
+def test_a_faulty_grammar_is_refused_before_anything_is_drawn(refused, text, message):
+    Path("my.grammar").write_text(text)
+    assert message in refused("sample", "my.grammar")
+
+
+def test_a_set_made_otherwise_is_refused(refused, cubes):
+    assert "set holds another set: its seed is 0, not 1" in refused(
+        "sample", "cubes", "--light", "--seed", 1, "--out", cubes
+    )
+
+
+def test_ray_without_ray_is_refused(refused, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    assert "--ray needs the package ray: pip install 'morphgen[ray]'" in refused(
+        "sample", "cubes", "--ray"
+    )
+
+
+def test_grammar_list_names_the_categories(run):
+    assert run("grammar", "list") == (0, "".join(f"{name}\n" for name in CATEGORIES), "")
+    assert json.loads(run("grammar", "list", "--json")[1]) == CATEGORIES
+
+
+def test_grammar_check_says_sound_or_what_is_wrong(run, mine):
+    assert run("grammar", "check", mine) == (0, "mine: sound\n", "")
+    assert json.loads(run("grammar", "check", mine, "--json")[1]) == []
+    mine.write_text("robot -> cubes\nx -> cubes\nlet r = 1\n")
+    code, out, err = run("grammar", "check", mine)
+    assert (code, err) == (1, "")
+    assert out.splitlines() == [
+        "mine.grammar:2:1: 'x' cannot be reached from 'robot'",
+        "mine.grammar:3:5: 'r' is never used",
+    ]
+    code, out, _ = run("grammar", "check", mine, "--json")
+    assert (code, len(json.loads(out))) == (1, 2)
+
+
+def test_grammar_count_says_how_many_and_what_is_drawn(run, mine):
+    code, out, _ = run("grammar", "count", mine)
+    assert (code, out.splitlines()) == (
+        0,
+        [
+            "mine: 2 structures, 1 values drawn",
+            "  continuous  ee: plane.size = uniform(5cm, 15cm)",
+        ],
+    )
+    assert json.loads(run("grammar", "count", mine, "--json")[1]) == {
+        "structures": 2,
+        "variables": [
+            {"where": "ee: plane.size", "draw": "uniform(5cm, 15cm)", "continuous": True}
+        ],
+    }
+
+
+def test_grammar_count_of_a_recursion(run, mine):
+    mine.write_text("robot -> slides tail\ntail -> bead | bead tail\n")
+    assert run("grammar", "count", mine)[1].startswith("mine: infinitely many structures")
+    assert json.loads(run("grammar", "count", mine, "--json")[1])["structures"] is None
+    assert len(run("grammar", "enumerate", mine, "--limit", 4)[1].splitlines()) == 4
+
+
+def test_grammar_enumerate_prints_derivations_that_compose(run, mine):
+    code, out, _ = run("grammar", "enumerate", mine)
+    assert code == 0
+    assert [line.split("ee=")[1] for line in out.splitlines()] == [
+        "plane(size=0.1, thickness=0.01)]",
+        "cube(size=0.1)]",
+    ]
+    assert json.loads(run("grammar", "enumerate", mine, "--limit", 1, "--json")[1]) == [
+        out.splitlines()[0]
+    ]
+
+
+def test_grammar_print_is_a_grammar_without_includes(run, mine):
+    Path("more.grammar").write_text('include "mine.grammar"\nrobot -> slides down:ee\n')
+    code, out, _ = run("grammar", "print", "more.grammar")
+    assert (code, out.splitlines()) == (
+        0,
+        ["robot -> slides down:ee", "ee -> plane(size=uniform(5cm, 15cm)) | cube"],
+    )
+    assert json.loads(run("grammar", "print", "more.grammar", "--json")[1]) == out
+    mine.write_text(out)
+    assert run("grammar", "print", mine)[1] == out
+
+
+def test_derive_prints_a_line_a_part(run, cubes):
+    code, out, _ = run("derive", cubes / "cubes-000001")
+    assert (code, out.count("\n"), out.startswith("cubes=cubes(size=")) == (0, 1, True)
+    text = json.loads(run("derive", cubes / "cubes-000001", "--json")[1])
+    assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
+
+
+@pytest.mark.parametrize("light", [True, False])
+@pytest.mark.parametrize("category", ["chain", "panda_variations"])
+def test_derive_replays_to_the_same_bytes(run, light, category):
+    words = ("--light",) if light else ("--no-picture",)
+    assert run("sample", category, "-n", 2, "--out", "set", *words)[0] == 0
+    folder = Path("set") / f"{category}-000001"
+    assert run("derive", folder, "--replay") == (0, f"{folder}/robot.urdf: the same bytes\n", "")
+    text = (folder / "robot.urdf").read_text()
+    (folder / "robot.urdf").write_text(text.replace("<link", "<link ", 1))
+    assert run("derive", folder, "--replay") == (1, f"{folder}/robot.urdf: other bytes\n", "")
+    code, out, _ = run("derive", folder, "--replay", "--json")
+    assert (code, json.loads(out)) == (1, {"same": False})
+
+
+def test_derive_tells_what_differs(run, cubes):
+    a, b = cubes / "cubes-000000", cubes / "cubes-000001"
+    assert run("derive", a, "--diff", a) == (0, "the same\n", "")
+    code, out, _ = run("derive", a, "--diff", b)
+    assert code == 1
+    assert [line[:15] for line in out.splitlines()] == ["- cubes.size = ", "+ cubes.size = "]
+    assert json.loads(run("derive", a, "--diff", b, "--json")[1]) == out.splitlines()
+
+
+def test_mutate_writes_neighbours_and_says_what_changed(run, cubes):
+    words = ("mutate", cubes / "cubes-000002", "-n", 2, "--seed", 1, "--no-picture")
+    code, out, _ = run(*words)
+    assert code == 0
+    for index, line in enumerate(out.splitlines()):
+        folder, what = line.split(": ")
+        assert folder.endswith(f"set-mutants/cubes-000002-m{index:04d}")
+        assert what.startswith("- cubes.size = ")
+        assert read_bundle(Path(folder)).dof == 2
+    code, again, _ = run(*words, "--json", "--out", "other")
+    assert [lines[0] + "; " + lines[1] for lines in json.loads(again).values()] == [
+        line.split(": ")[1] for line in out.splitlines()
+    ]
+
+
+def test_mutate_refuses_what_is_not_in_the_index(refused, cubes):
+    assert "'cubes-000009' is not in the index of" in refused("mutate", cubes / "cubes-000009")
+
+
+def test_compose_follows_a_grammar(run):
+    code, out, _ = run("compose", "chain", "beads=5", "bead.radius=0.02", "--no-picture")
+    assert (code, out.splitlines()[0].split(": ")[1][:16]) == (0, "19 links, 13 DoF")
+    (folder,) = Path("robots").iterdir()
+    assert folder.name.startswith("chain-")
+    assert read_bundle(folder).dof == 13
+    card = json.loads((folder / "card.json").read_text())
+    assert card["derivation"].count("radius=0.02") == 5
+
+
+def test_compose_follows_a_grammar_file(run, mine):
+    assert run("compose", mine, "ee=cube", "--no-picture", "--name", "x")[0] == 0
+    assert "ee_cube" in read_bundle(Path("robots/x")).link_index
+
+
+@pytest.mark.parametrize("by_environment", [True, False])
+def test_parts_and_grammars_of_a_users_folder(run, monkeypatch, by_environment):
+    folder = Path("library")
+    write_part(folder)
+    (folder / "held.grammar").write_text("robot -> fixed ur5 pincer(length=uniform(0.15, 0.3))\n")
+    words = ("--library", folder)
+    if by_environment:
+        monkeypatch.setenv(ENVIRONMENT, str(folder))
+        words = ()
+    assert run("grammar", "check", "held", *words) == (0, "held: sound\n", "")
+    assert run("sample", "held", "-n", 2, "--light", *words)[0] == 0
+    derivation = Path("robots/held/held-000001/derivation.txt").read_text()
+    assert "flange: pincer=pincer(length=0." in derivation
+    assert run("derive", "robots/held/held-000001", "--replay", *words)[0] == 0
+
+
+def test_a_template_that_decides_by_a_number_can_be_sampled(run):
+    wide = 'size="${0.02 if length > 0.2 else 0.03} 0.02'
+    xacro = PINCER.replace('size="0.02 0.02', wide)
+    assert wide in xacro
+    write_part(Path("library"), xacro=xacro)
+    Path("held.grammar").write_text("robot -> fixed ur5 pincer(length=uniform(0.15, 0.25))\n")
+    assert run("sample", "held.grammar", "-n", 2, "--light", "--library", "library")[0] == 0

@@ -1,0 +1,166 @@
+"""A xacro that is compiled and filled in gives the bytes of expanding it."""
+
+import os
+
+import numpy as np
+import pytest
+
+from morphgen.errors import FormatError
+from morphgen.formats.resolve import PackageFinder
+from morphgen.formats.urdf_text import number
+from morphgen.formats.xacro import expand
+from morphgen.formats.xacro_compile import compile_xacro
+from morphgen.grammar.library import default_library
+
+TEMPLATES = [manifest for manifest in default_library().manifests() if manifest.is_template]
+FINDER = PackageFinder()
+HEAD = (
+    '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="x">'
+    '<xacro:arg name="x" default="0.1"/><xacro:property name="x" value="$(arg x)"/>'
+)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a xacro with an argument x around a body; return its path."""
+
+    def written(body):
+        path = tmp_path / "x.xacro"
+        path.write_text(f"{HEAD}{body}</robot>")
+        return path
+
+    return written
+
+
+def values_of(manifest, rng):
+    """Counts and numbers of a template, drawn from their ranges, as xacro arguments."""
+    constants, numbers = {}, {}
+    for name, parameter in manifest.parameters.items():
+        if parameter.integer:
+            drawn = rng.integers(int(parameter.minimum), int(parameter.maximum) + 1)
+            constants[name] = number(float(drawn))
+        else:
+            numbers[name] = number(rng.uniform(parameter.minimum, parameter.maximum))
+    return constants, numbers
+
+
+@pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
+def test_every_template_is_compiled_and_filled_to_the_bytes_of_its_expansion(manifest):
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        constants, numbers = values_of(manifest, rng)
+        compiled = compile_xacro(manifest.source, constants, numbers, FINDER)
+        assert compiled is not None
+        whole = expand(manifest.source, constants | numbers, FINDER)
+        assert compiled.fill(numbers) == whole
+
+
+@pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
+def test_ends_and_whole_numbers_are_filled_in_alike(manifest):
+    constants, _ = values_of(manifest, np.random.default_rng(1))
+    for pick in (min, max):
+        numbers = {
+            name: number(pick(p.minimum, p.maximum))
+            for name, p in manifest.parameters.items()
+            if not p.integer
+        }
+        compiled = compile_xacro(manifest.source, constants, numbers, FINDER)
+        assert compiled.fill(numbers) == expand(manifest.source, constants | numbers, FINDER)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<a v="$(arg x)"/>',
+        '<a v="${x}"/>',
+        '<a v="${2*x + 1 - x/3 + x**2}" w="${-x} 0 ${+x}"/>',
+        '<a v="${sqrt(x) + sin(x) * cos(2*x) - tan(x/2) + atan2(x, 1)}"/>',
+        '<a v="${max(x, 0.5, 2) + min(1, x) + fabs(-x) + radians(x) + degrees(x) + pi}"/>',
+        '<xacro:property name="y" value="${x*3}"/><a v="${y*2}">${y}</a>',
+        '<xacro:macro name="m" params="s"><b v="${s*2}"/></xacro:macro><xacro:m s="${x*3}"/>',
+        '<xacro:if value="${1 > 0}"><a v="${x}"/></xacro:if>',
+        '<link name="part_${x}"/>',
+        "<a>&lt;${x}&amp;</a>",
+    ],
+)
+@pytest.mark.parametrize("value", ["0.3", "2", "1e-05", "123456789012", "0.123456789012", "0"])
+def test_arithmetic_is_compiled(write, body, value):
+    path = write(body)
+    compiled = compile_xacro(path, {}, {"x": "0.7"}, FINDER)
+    assert compiled is not None
+    assert compiled.fill({"x": value}) == expand(path, {"x": value}, FINDER)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<xacro:if value="${x > 1}"><a/></xacro:if>',
+        '<xacro:unless value="${x}"><a/></xacro:unless>',
+        '<a v="${1 if x else 2}"/>',
+        '<a v="${x % 2}"/>',
+        '<a v="${x // 2}"/>',
+        '<a v="${int(x) + round(x, 1) + ceil(x)}"/>',
+        '<a v="${min([x, 1])}"/>',
+        '<a v="${hypot(x, 1)}"/>',
+        "<a v=\"${'%.2f' % x}\"/>",
+        '<a v="$(eval x * 2)"/>',
+        '<xacro:property name="y" value="-${x}"/><a v="${y*2}"/>',
+        '<xacro:property name="y" value="-${x}"/><a v="${y+1}"/>',
+        '<xacro:property name="y" value="${-x} ${2*x}"/><a v="${y.split()[1]}"/>',
+        '<xacro:macro name="m" params="s"><b v="${s*2}"/></xacro:macro><xacro:m s="-${x}"/>',
+        "<a v=\"${'a' if str(x) == '0.3' else 'b'}\"/>",
+    ],
+)
+def test_what_is_more_than_arithmetic_is_left_to_the_expansion(write, body):
+    path = write(body)
+    assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
+    assert b"<robot" in expand(path, {"x": "0.3"}, FINDER)
+
+
+@pytest.mark.parametrize("body", ['<a v="${nothing}"/>', '<a v="${1/(x-0.3)}"/>', "<a>", "<a b=/>"])
+def test_what_cannot_be_expanded_is_left_to_the_expansion_to_tell(write, body):
+    path = write(body)
+    assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
+    with pytest.raises(FormatError, match=r"x\.xacro"):
+        expand(path, {"x": "0.3"}, FINDER)
+
+
+def test_a_value_for_which_an_expression_fails_is_told(write):
+    compiled = compile_xacro(write('<a v="${1/(x-0.3)}"/>'), {}, {"x": "1"}, FINDER)
+    assert compiled.fill({"x": "2"}) == b'<robot name="x"><a v="0.5882352941176471"></a></robot>'
+    with pytest.raises(FormatError, match=r"fails for \{'x': '0.3'\}: float division by zero"):
+        compiled.fill({"x": "0.3"})
+
+
+def test_a_constant_decides_the_structure(write, tmp_path):
+    body = '<xacro:arg name="n" default="1"/><xacro:if value="${n > 1}"><a v="${x}"/></xacro:if>'
+    path = write(body.replace("n >", "$(arg n) >"))
+    for n in ("1", "2"):
+        compiled = compile_xacro(path, {"n": n}, {"x": "0.3"}, FINDER)
+        assert compiled.fill({"x": "0.4"}) == expand(path, {"n": n, "x": "0.4"}, FINDER)
+
+
+def test_a_file_is_compiled_once_whatever_the_values(write):
+    path = write('<a v="${x}"/>')
+    first = compile_xacro(path, {}, {"x": "0.3"}, FINDER)
+    assert compile_xacro(path, {}, {"x": "0.4"}, FINDER) is first
+
+
+def test_a_file_that_changed_is_compiled_again(write):
+    path = write('<a v="${x}"/>')
+    before = compile_xacro(path, {}, {"x": "0.3"}, FINDER)
+    write('<a v="${2*x}"/>')
+    later = path.stat().st_mtime_ns + 10**9
+    os.utime(path, ns=(later, later))
+    after = compile_xacro(path, {}, {"x": "0.3"}, FINDER)
+    assert (before.fill({"x": "2"}), after.fill({"x": "2"})) == (
+        b'<robot name="x"><a v="2"></a></robot>',
+        b'<robot name="x"><a v="4"></a></robot>',
+    )
+
+
+def test_compiling_leaves_nothing_behind_for_an_expansion(write):
+    path = write('<a v="${max(x, 1)}"/>')
+    plain = expand(path, {"x": "3"}, FINDER)
+    compile_xacro(path, {}, {"x": "0.3"}, FINDER)
+    assert expand(path, {"x": "3"}, FINDER) == plain

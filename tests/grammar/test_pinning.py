@@ -1,0 +1,115 @@
+"""``key=value`` words make some of a grammar's choices."""
+
+import pytest
+from grammars import LIBRARY, grammar, shipped
+
+from morphgen.errors import MorphgenError
+from morphgen.grammar.derive import First, derive
+from morphgen.grammar.pinning import pin
+from morphgen.grammar.request import parse_words
+from morphgen.grammar.sampling import sample
+
+
+def parts(found, *words):
+    return [node.part for node in derive(pin(found, words, LIBRARY), LIBRARY, First()).walk()]
+
+
+def values(found, *words):
+    tree = derive(pin(found, words, LIBRARY), LIBRARY, First())
+    return {node.label: dict(node.parameters) for node in tree.walk()}
+
+
+@pytest.fixture(scope="module")
+def found():
+    return grammar(
+        "let r = uniform(1cm, 2cm)",
+        "robot -> base links ee",
+        "base -> slides | gantry",
+        "links -> bead(radius=r, rod=uniform(3cm, 5cm)){2,4} | beam",
+        "ee -> plane | stick(length=uniform(0.1, 0.2))",
+    )
+
+
+def test_nothing_pinned_is_the_first_of_all(found):
+    assert parts(found) == ["slides", "bead", "bead", "plane"]
+
+
+def test_a_symbol_is_pinned_to_an_alternative(found):
+    assert parts(found, "base=gantry", "links=beam", "ee=stick") == ["gantry", "beam", "stick"]
+
+
+def test_a_count_is_pinned(found):
+    assert parts(found, "links=4").count("bead") == 4
+
+
+def test_a_parameter_is_pinned_wherever_the_part_stands(found):
+    pinned = values(found, "bead.rod=80mm", "slides.low=0.3")
+    assert [pinned[bead]["rod"] for bead in ("bead1", "bead2")] == [0.08, 0.08]
+    assert pinned["bead1"]["radius"] == pytest.approx(0.015)
+    assert pinned["base"]["low"] == 0.3
+
+
+def test_a_turn_of_the_mount_is_pinned(found):
+    assert values(found, "plane.mount_yaw=90deg")["ee"]["mount_yaw"] == pytest.approx(1.57079632679)
+
+
+@pytest.mark.parametrize("text", ["r=0.02", "r=20mm", "r=+2cm"])
+def test_a_let_is_pinned_with_or_without_a_unit(found, text):
+    assert values(found, text)["bead1"]["radius"] == pytest.approx(0.02)
+
+
+def test_the_order_of_words_does_not_matter(found):
+    words = ["links=3", "bead.rod=80mm", "ee=stick", "r=2cm"]
+    assert values(found, *words) == values(found, *reversed(words))
+
+
+def test_what_is_pinned_is_the_same_in_every_sample(found):
+    drawn = list(sample(pin(found, ["links=2", "r=2cm"], LIBRARY), LIBRARY, 3))
+    assert {str(d.derivation).count("=bead") for d in drawn} == {2}
+    assert all("radius=0.02" in str(d.derivation) for d in drawn)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("links", "'links' is not of the form key=value, such as beads=5"),
+        ("links=", "is not of the form key=value"),
+        ("=3", "is not of the form key=value"),
+        ("linsk=3", "linsk=3: no symbol 'linsk'; did you mean 'links'? valid: base, ee, links, r"),
+        ("links=7", "links=7: expected 2 to 4"),
+        ("base=2", "base=2: 'base' has 0 repetitions to pin, not one"),
+        ("ee=spoon", "ee=spoon: no such alternative; valid: plane, stick"),
+        ("bead.rood=1cm", "'bead' has no parameter 'rood'; did you mean 'rod'? valid: mount_yaw"),
+        ("baed.rod=1cm", "baed.rod: no part 'baed' in 'g'; did you mean 'bead'?"),
+        ("ee.length=1cm", "ee.length: no part 'ee' in 'g'"),
+        ("bead.rod=1kg", "bead.rod=1kg: wrong unit 'kg'"),
+        ("bead.rod=9", "bead.rod=9: out of range"),
+        ("r=wide", "r=wide: not a number, such as 0.02 or 20mm"),
+        ("r=2inch", "r=2inch:1:1: unknown unit 'inch'"),
+        ("r=uniform(1cm,2cm)", "not a number, such as 0.02 or 20mm"),
+        ("r=2cm+", "r=2cm+:1:5: found the end, expected"),
+    ],
+)
+def test_a_word_that_names_nothing_is_refused(found, word, message):
+    with pytest.raises(MorphgenError, match=r"^[^\n]*$") as caught:
+        pin(found, [word], LIBRARY)
+    assert message in str(caught.value)
+
+
+def test_a_value_of_another_unit_is_refused_where_it_is_used(found):
+    with pytest.raises(MorphgenError, match="radius is in m, r in rad"):
+        values(found, "r=2deg")
+
+
+def test_words_may_begin_with_a_grammar():
+    derivation, name = parse_words(["chain", "beads=5", "bead.radius=0.02"], LIBRARY)
+    assert [node.part for node in derivation.walk()] == ["slides", *["bead"] * 5]
+    assert name.startswith("chain-")
+    assert parse_words(["chain"], LIBRARY)[1] == "chain"
+
+
+def test_only_a_repetition_that_is_open_can_be_counted():
+    two = grammar("robot -> post links", "links -> beam{1,2} bead{1,2} | jaw")
+    with pytest.raises(MorphgenError, match="'links' has 2 repetitions to pin, not one"):
+        parts(two, "links=2")
+    assert parts(shipped("nlink"), "links=3").count("beam") == 3

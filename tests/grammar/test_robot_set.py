@@ -1,0 +1,301 @@
+"""A set on disk has the same bytes however it was made, and however often it was interrupted."""
+
+import json
+import shutil
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from commands import start, tree
+from grammars import shipped
+
+from morphgen.errors import FormatError, MorphgenError
+from morphgen.grammar.model import grammar_text
+from morphgen.grammar.robot_set import (
+    GRAMMAR,
+    INDEX,
+    JOURNAL,
+    SETTINGS,
+    SetPlan,
+    make_serially,
+    make_set,
+    read_index,
+)
+from morphgen.grammar.sampling import SamplingError
+from morphgen.grammar.workers import make_in_processes
+
+
+def plan(folder, category="cubes", **changes):
+    text = grammar_text(shipped(category))
+    made = SetPlan(folder, category, text, 0, (), light=True, picture=False, library=())
+    return replace(made, **changes)
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A set of eight cubes."""
+    made = plan(tmp_path / "whole")
+    make_set(made, 8, make_serially)
+    return made.folder
+
+
+def interrupted(plan, n, done):
+    """Make a set that stops like a killed process after some robots."""
+
+    class Killed(BaseException):
+        pass
+
+    def work(plan, indices):
+        yield from make_serially(plan, indices[:done])
+        raise Killed
+
+    with pytest.raises(Killed):
+        make_set(plan, n, work)
+
+
+def test_a_light_set_has_a_folder_a_robot_an_index_and_its_grammar(whole):
+    names = [f"cubes-{i:06d}" for i in range(8)]
+    assert sorted(path.name for path in whole.iterdir()) == sorted(
+        [*names, GRAMMAR, INDEX, SETTINGS]
+    )
+    assert sorted(p.name for p in (whole / names[0]).iterdir()) == ["derivation.txt", "robot.urdf"]
+    assert [record["name"] for record in read_index(whole)] == names
+    assert (whole / GRAMMAR).read_text() == grammar_text(shipped("cubes"))
+
+
+def test_the_index_is_a_line_of_json_a_robot(whole):
+    for line in (whole / INDEX).read_text().splitlines():
+        record = json.loads(line)
+        written = (whole / record["name"] / "derivation.txt").read_text().strip()
+        assert record["derivation"] == written
+        assert (record["dof"], record["links"], record["movable"]) == (2, 3, 2)
+        assert record["mass"] > 0
+        assert record["choices"].keys() == {"robot/0.cubes.size"}
+
+
+def test_the_index_can_be_read_with_pandas(whole):
+    pandas = pytest.importorskip("pandas")
+    table = pandas.read_json(whole / INDEX, lines=True)
+    assert list(table["index"]) == list(range(8))
+    assert table["mass"].dtype == float
+
+
+def test_a_whole_set_holds_bundles(tmp_path):
+    make_set(plan(tmp_path / "s", light=False), 1, make_serially)
+    files = {path.name for path in (tmp_path / "s" / "cubes-000000").iterdir()}
+    assert {"card.json", "robot.urdf", "robot.xml"} <= files
+
+
+def test_progress_counts_up_to_all_of_them(tmp_path):
+    seen = []
+    make_set(plan(tmp_path / "s"), 3, make_serially, seen.append)
+    assert seen == [0, 1, 2, 3]
+    seen.clear()
+    make_set(plan(tmp_path / "s"), 5, make_serially, seen.append)
+    assert seen == [3, 4, 5]
+
+
+@pytest.mark.parametrize("light", [True, False])
+def test_two_processes_make_the_same_bytes_as_one(tmp_path, light):
+    one = plan(tmp_path / "one", "chain", light=light)
+    two = replace(one, folder=tmp_path / "two")
+    n = 20 if light else 3
+    make_set(one, n, make_serially)
+    make_set(two, n, make_in_processes(2))
+    assert tree(one.folder) == tree(two.folder)
+
+
+def test_the_order_in_which_robots_are_made_does_not_matter(tmp_path, whole):
+    def backwards(plan, indices):
+        return make_serially(plan, indices[::-1])
+
+    make_set(plan(tmp_path / "s"), 8, backwards)
+    assert tree(tmp_path / "s") == tree(whole)
+
+
+def test_a_larger_set_holds_the_smaller(tmp_path, whole):
+    own = plan(tmp_path / "s")
+    assert make_set(own, 3, make_serially).made == 3
+    report = make_set(own, 8, make_serially)
+    assert (report.made, report.kept) == (5, 3)
+    assert tree(own.folder) == tree(whole)
+    assert make_set(own, 2, make_serially).made == 0
+    assert tree(own.folder) == tree(whole)
+
+
+@pytest.mark.parametrize("done", [0, 1, 7, 8])
+def test_what_was_done_before_an_interruption_is_kept(tmp_path, whole, done):
+    own = plan(tmp_path / "s")
+    interrupted(own, 8, done)
+    assert not (own.folder / INDEX).exists()
+    report = make_set(own, 8, make_serially)
+    assert (report.made, report.kept) == (8 - done, done)
+    assert tree(own.folder) == tree(whole)
+
+
+def test_robots_that_were_deleted_are_made_again(tmp_path, whole):
+    before = tree(whole)
+    shutil.rmtree(whole / "cubes-000003")
+    (whole / "cubes-000005" / "robot.urdf").unlink()
+    report = make_set(plan(whole), 8, make_serially)
+    assert (report.made, report.kept) == (2, 6)
+    assert tree(whole) == before
+
+
+def test_without_its_journal_or_index_all_is_made_again(tmp_path, whole):
+    before = tree(whole)
+    (whole / INDEX).unlink()
+    assert make_set(plan(whole), 8, make_serially).made == 8
+    assert tree(whole) == before
+
+
+@pytest.mark.parametrize("cut", [1, 40, -1])
+def test_a_journal_that_was_cut_short_costs_one_robot(tmp_path, whole, cut):
+    own = plan(tmp_path / "s")
+    interrupted(own, 8, 5)
+    lines = (own.folder / JOURNAL).read_text().splitlines()
+    (own.folder / JOURNAL).write_text("".join(f"{line}\n" for line in lines[:4]) + lines[4][:cut])
+    interrupted(own, 8, 2)
+    report = make_set(own, 8, make_serially)
+    assert report.made in (2, 3)
+    assert tree(own.folder) == tree(whole)
+
+
+def test_half_written_robots_are_swept_away(tmp_path, whole):
+    own = plan(tmp_path / "s")
+    interrupted(own, 8, 2)
+    (own.folder / ".cubes-000002.x1y2").mkdir()
+    (own.folder / ".cubes-000002.x1y2" / "robot.urdf").write_text("<robot")
+    make_set(own, 8, make_serially)
+    assert tree(own.folder) == tree(whole)
+
+
+@pytest.mark.parametrize("left", [[], [f".{GRAMMAR}.partial"], [GRAMMAR, f".{SETTINGS}.partial"]])
+def test_an_interruption_before_the_first_robot_is_no_foreign_folder(tmp_path, whole, left):
+    own = plan(tmp_path / "s")
+    own.folder.mkdir()
+    for name in left:
+        (own.folder / name).write_text(own.grammar_text if name == GRAMMAR else "{")
+    make_set(own, 8, make_serially)
+    assert tree(own.folder) == tree(whole)
+
+
+def test_an_index_is_whole_or_not_there(tmp_path, whole):
+    own = plan(tmp_path / "s")
+    interrupted(own, 8, 3)
+    with pytest.raises(FormatError, match=r"is no finished set: it has no index\.jsonl"):
+        read_index(own.folder)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path, jobs):
+    words = ("sample", "chain", "-n", 32, "--seed", 3, "--light", "--jobs", jobs)
+    process = start(*words, "--out", tmp_path / "killed")
+    journal = tmp_path / "killed" / JOURNAL
+    wait_for(lambda: journal.exists() and len(journal.read_bytes().splitlines()) > 3, process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=30)  # ends when no worker holds the pipe any more
+    assert not (tmp_path / "killed" / INDEX).exists()
+    again = start(*words, "--out", tmp_path / "killed")
+    out, err = again.communicate(timeout=60)
+    assert (again.returncode, "32 made" in out) == (0, False), err
+    make_set(plan(tmp_path / "whole", "chain", seed=3), 32, make_serially)
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
+def wait_for(happened, process):
+    for _ in range(1200):
+        if happened():
+            return
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    raise AssertionError("nothing happened for 24 s")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 1}, "holds another set: its seed is 0, not 1; name another folder"),
+        ({"light": False}, "its light is True, not False"),
+        ({"where": ("mass < 1",)}, "its where is [], not ['mass < 1']"),
+        ({"grammar_name": "dice"}, "its grammar is 'cubes', not 'dice'"),
+        ({"grammar_text": "robot -> cubes\n"}, "holds a set of another grammar"),
+    ],
+)
+def test_a_set_is_only_continued_as_it_was_begun(whole, change, message):
+    before = tree(whole)
+    with pytest.raises(FormatError) as caught:
+        make_set(plan(whole, **change), 9, make_serially)
+    assert message in str(caught.value)
+    assert tree(whole) == before
+
+
+@pytest.mark.parametrize("name", ["notes.txt", GRAMMAR])
+def test_a_folder_with_something_else_is_refused(tmp_path, name):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / name).write_text("mine")
+    with pytest.raises(FormatError, match=r"exists and is no set \(no set\.json\); name another"):
+        make_set(plan(tmp_path / "s"), 1, make_serially)
+    assert tree(tmp_path / "s") == {name: b"mine"}
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "s").write_text("mine")
+    with pytest.raises(FormatError):
+        make_set(plan(tmp_path / "s"), 1, make_serially)
+    assert (tmp_path / "s").read_text() == "mine"
+
+
+def test_broken_settings_are_told(whole):
+    (whole / SETTINGS).write_text("{")
+    with pytest.raises(FormatError, match=r"set\.json: no valid JSON"):
+        make_set(plan(whole), 8, make_serially)
+
+
+def test_robots_with_the_same_body_are_told(tmp_path):
+    made = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
+    report = make_set(made, 3, make_serially)
+    assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
+    hashes = {record["hash"] for record in read_index(made.folder)}
+    assert len(hashes) == 1
+
+
+def test_robots_with_other_bodies_are_no_duplicates(whole):
+    assert make_set(plan(whole), 8, make_serially).duplicates == []
+
+
+def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
+    own = plan(tmp_path / "s", where=("mass < 0.5 and dof == 2",))
+    report = make_set(own, 8, make_serially)
+    counted = sum(sum(record["rejected"].values()) for record in read_index(own.folder))
+    assert report.rejected == {"where (mass < 0.5)": counted}
+    assert counted > 0
+    assert make_set(own, 8, make_serially).rejected == report.rejected
+
+
+@pytest.mark.parametrize("work", [make_serially, make_in_processes(2)], ids=["1 job", "2 jobs"])
+def test_a_condition_that_cannot_be_met_stops_the_set(tmp_path, work):
+    with pytest.raises(SamplingError, match=r"500 failed at: where \(mass > 900\)"):
+        make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, work)
+
+
+def test_a_worker_that_dies_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr("morphgen.grammar.workers._start", _die)
+    with pytest.raises(MorphgenError, match=r"a worker died .*what is done is kept: run again"):
+        make_set(plan(tmp_path / "s"), 2, make_in_processes(1))
+
+
+def _die(plan):
+    import os
+
+    os._exit(3)
+
+
+def test_meshes_of_a_light_robot_are_named_where_their_package_has_them(tmp_path):
+    made = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
+    make_set(made, 1, make_serially)
+    text = (made.folder / "g-000000" / "robot.urdf").read_text()
+    assert 'filename="package://' in text
+    assert str(Path.home()) not in text

@@ -1,0 +1,92 @@
+"""A scaled link is the same thing, larger, with all that is on it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robots import arm
+
+from morphgen.errors import RobotError
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.inertia import inertial_of
+from morphgen.model.kinematics import forward_kinematics, frame_pose
+from morphgen.model.robot import Link
+from morphgen.model.scaling import scaled
+
+STRAIGHT = np.zeros(4)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.3, 2.0])
+def test_mass_goes_with_the_third_power_and_inertia_with_the_fifth(factor):
+    before, after = (
+        arm().link("upper").inertial,
+        scaled(arm(), {"upper": factor}).link("upper").inertial,
+    )
+    assert after.mass == pytest.approx(factor**3 * before.mass)
+    assert after.inertia == pytest.approx([factor**5 * value for value in before.inertia])
+    assert after.com == pytest.approx([factor * value for value in before.com])
+
+
+def test_a_scaled_body_is_that_of_its_scaled_shapes():
+    link = scaled(arm(), {"upper": 1.7}).link("upper")
+    solid = inertial_of(link.collisions, 1000.0)
+    assert link.inertial.mass == pytest.approx(solid.mass)
+    assert link.inertial.inertia == pytest.approx(solid.inertia, abs=1e-9)
+    assert link.inertial.com == pytest.approx(solid.com)
+
+
+def test_joints_and_frames_on_a_link_move_out_and_those_it_hangs_on_do_not():
+    larger = scaled(arm(), {"upper": 2.0})
+    before, after = forward_kinematics(arm(), STRAIGHT), forward_kinematics(larger, STRAIGHT)
+    upper, lower, slider = (arm().link_index[name] for name in ("upper", "lower", "slider"))
+    assert after[upper] == pytest.approx(before[upper])
+    assert after[lower, 2, 3] == pytest.approx(before[lower, 2, 3] + 0.3)
+    assert after[slider, 2, 3] == pytest.approx(before[slider, 2, 3] + 0.3)
+    tool = scaled(arm(), {"slider": 0.5})
+    gap = frame_pose(arm(), STRAIGHT) - frame_pose(tool, STRAIGHT)
+    assert gap[2, 3] == pytest.approx(0.14)
+    assert gap[:3, :3] == pytest.approx(np.zeros((3, 3)))
+
+
+def test_a_robot_scaled_in_every_link_is_the_same_robot_larger():
+    q = np.array([0.4, -0.7, 0.0, 0.0])
+    larger = scaled(arm(), {link.name: 1.5 for link in arm().links})
+    before, after = forward_kinematics(arm(), q), forward_kinematics(larger, q)
+    assert after[:, :3, :3] == pytest.approx(before[:, :3, :3])
+    assert after[:, :3, 3] == pytest.approx(1.5 * before[:, :3, 3])
+    assert larger.mass == pytest.approx(1.5**3 * arm().mass)
+
+
+def test_all_kinds_of_shapes_grow_in_all_directions():
+    mesh = Mesh(Path("a.stl"), (0.001, 0.001, -0.001), 2)
+    kinds = (Box((1, 2, 3)), Sphere(1.0), Cylinder(1.0, 2.0), Capsule(1.0, 2.0), mesh)
+    shapes = tuple(Shape(kind, Pose((1.0, 0.0, 2.0))) for kind in kinds)
+    robot = replace(arm(), links=(Link("base", visuals=shapes), *arm().links[1:]))
+    grown = scaled(robot, {"base": 2.0}).link("base").visuals
+    assert [shape.geometry for shape in grown] == [
+        Box((2, 4, 6)),
+        Sphere(2.0),
+        Cylinder(2.0, 4.0),
+        Capsule(2.0, 4.0),
+        Mesh(Path("a.stl"), (0.002, 0.002, -0.002), 2),
+    ]
+    assert {shape.T_link_shape.position for shape in grown} == {(2.0, 0.0, 4.0)}
+
+
+def test_links_that_are_not_named_stay_as_they_are():
+    larger = scaled(arm(), {"upper": 2.0})
+    assert [a == b for a, b in zip(larger.links, arm().links, strict=True)].count(False) == 1
+    for same in (scaled(arm(), {}), scaled(arm(), {"upper": 1.0})):
+        assert (same.links, same.joints, same.frames) == (arm().links, arm().joints, arm().frames)
+
+
+def test_limits_axes_and_names_stay():
+    larger = scaled(arm(), {link.name: 3.0 for link in arm().links})
+    for a, b in zip(larger.joints, arm().joints, strict=True):
+        assert (a.name, a.axis, a.limits, a.mimic) == (b.name, b.axis, b.limits, b.mimic)
+
+
+def test_a_link_that_does_not_exist_is_refused():
+    with pytest.raises(RobotError, match="uper"):
+        scaled(arm(), {"uper": 2.0})
