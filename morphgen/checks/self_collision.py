@@ -24,7 +24,7 @@ from morphgen.formats.mjcf_elements import (
     joint_attributes,
     pose_attributes,
 )
-from morphgen.formats.mujoco_urdf import BOUND_INERTIA, BOUND_MASS
+from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
 
@@ -229,14 +229,7 @@ def _model(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
     """Collision shapes and joints only: what it takes to place and intersect shapes."""
     meshes = Meshes(None)
     root = etree.Element("mujoco")
-    etree.SubElement(
-        root,
-        "compiler",
-        angle="radian",
-        inertiafromgeom="false",
-        boundmass=f"{BOUND_MASS:g}",
-        boundinertia=f"{BOUND_INERTIA:g}",
-    )
+    etree.SubElement(root, "compiler", MJCF_COMPILER_ATTRIBUTES)
     etree.SubElement(root, "size", memory=_MEMORY)
     etree.SubElement(etree.SubElement(root, "option"), "flag", filterparent="disable")
     asset = etree.SubElement(root, "asset")

@@ -15,7 +15,7 @@ from morphgen.formats.mjcf_elements import (
     joint_attributes,
     pose_attributes,
 )
-from morphgen.formats.mujoco_urdf import BOUND_INERTIA, BOUND_MASS
+from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
 from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, Actuation, actuation
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Joint, Link, Robot
@@ -82,14 +82,7 @@ def to_spec(robot: Robot, mesh_file: MeshFile | None = None) -> mujoco.MjSpec:
 
 def _document(robot: Robot, meshes: Meshes) -> etree._Element:
     root = etree.Element("mujoco", model=robot.name)
-    etree.SubElement(
-        root,
-        "compiler",
-        angle="radian",
-        inertiafromgeom="false",
-        boundmass=f"{BOUND_MASS:g}",
-        boundinertia=f"{BOUND_INERTIA:g}",
-    )
+    etree.SubElement(root, "compiler", MJCF_COMPILER_ATTRIBUTES)
     etree.SubElement(root, "option", timestep=f"{TIMESTEP:g}", integrator="implicitfast")
     default = etree.SubElement(root, "default")
     visual = etree.SubElement(default, "default", {"class": "visual"})

@@ -7,6 +7,14 @@ BOUND_MASS = 1e-12
 BOUND_INERTIA = 1e-14
 """Smallest principal inertia MuJoCo lets a link have, kg m^2."""
 
+MJCF_COMPILER_ATTRIBUTES: dict[str, str] = {
+    "angle": "radian",
+    "inertiafromgeom": "false",
+    "boundmass": f"{BOUND_MASS:g}",
+    "boundinertia": f"{BOUND_INERTIA:g}",
+}
+"""Attributes of ``<compiler/>`` in MJCF: inertias as written, links without mass legal."""
+
 MUJOCO_COMPILER_ATTRIBUTES: dict[str, str] = {
     "strippath": "false",
     "fusestatic": "false",
