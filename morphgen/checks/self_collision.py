@@ -6,7 +6,6 @@ that these robots run in.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations, product
@@ -74,10 +73,14 @@ class SelfCollision:
             ValueError: If ``q`` has another shape.
             RobotError: If the contacts of one configuration do not fit into memory.
         """
+        return list(self.each(q))
+
+    def each(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
+        """What ``penetrations`` returns, one configuration at a time."""
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2:
             raise ValueError(f"q has shape {q.shape}; {self._robot.name} needs (n, dof)")
-        return [self._test(positions) for positions in movable_positions(self._robot, q)]
+        return (self._test(positions) for positions in movable_positions(self._robot, q))
 
     def _test(self, positions: NDArray[np.float64]) -> dict[Pair, float]:
         model, data = self._model, self._data
@@ -182,9 +185,26 @@ def survey(
     left = {pair for pair in left - ignored if check is None or check(*pair)}
     if left and robot.dof:
         q = random_configurations(robot, samples, np.random.default_rng(seed))
-        counts = Counter(pair for pairs in tested.penetrations(q) for pair in pairs)
-        ignored.update(pair for pair in left if counts[pair] >= MOSTLY * samples)
+        ignored.update(_mostly_penetrating(tested, q, left))
     return Survey(tuple(sorted(ignored)), at_home)
+
+
+def _mostly_penetrating(
+    tested: SelfCollision, q: NDArray[np.float64], pairs: set[Pair]
+) -> set[Pair]:
+    """Those of the pairs that penetrate in at least ``MOSTLY`` of the configurations.
+
+    Most pairs part at once, so the rest of the configurations is seldom needed.
+    """
+    apart = dict.fromkeys(pairs, 0)
+    for found in tested.each(q):
+        for pair in apart.keys() - found.keys():
+            apart[pair] += 1
+            if len(q) - apart[pair] < MOSTLY * len(q):
+                del apart[pair]
+        if not apart:
+            break
+    return set(apart)
 
 
 def attached_pairs(robot: Robot) -> tuple[Pair, ...]:

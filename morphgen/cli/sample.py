@@ -54,9 +54,10 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.grammar.analysis import faults
     from morphgen.grammar.conditions import require_condition
     from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
+    from morphgen.grammar.ray_workers import make_on_ray
     from morphgen.grammar.robot_set import SetPlan, Work, make_serially, make_set
     from morphgen.grammar.syntax import parse_condition
-    from morphgen.grammar.workers import make_in_processes, make_on_ray
+    from morphgen.grammar.workers import make_in_processes
 
     if args.n < 1 or args.jobs < 1 or args.seed < 0:
         raise GrammarError(

@@ -12,10 +12,14 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import URDF, replacing_folder, write_bundle
@@ -33,6 +37,7 @@ SETTINGS = "set.json"
 GRAMMAR = "grammar.grammar"
 DERIVATION = "derivation.txt"
 JOURNAL = ".journal.jsonl"
+LOCK = ".lock"
 
 Record = dict[str, Any]
 """A line of the index."""
@@ -95,20 +100,19 @@ def make_set(
         SamplingError: If a robot's conditions cannot be met.
     """
     _prepare(plan)
-    done = {record["index"]: record for record in _finished(plan)}
-    kept = len(done)
-    missing = [i for i in range(n) if i not in done]
-    progress(n - len(missing))
-    with (plan.folder / JOURNAL).open("a", encoding="utf-8") as journal:
-        for record in work(plan, missing):
-            journal.write(json.dumps(record) + "\n")
-            journal.flush()
-            done[record["index"]] = record
-            progress(n - len(missing) + len(done) - kept)
-    records = [done[i] for i in sorted(done)]
-    _write_atomic(plan.folder / INDEX, "".join(json.dumps(r) + "\n" for r in records))
-    (plan.folder / JOURNAL).unlink()
-    return _report(records, len(missing), kept)
+    with _alone(plan.folder):
+        done = _finished(plan)
+        missing = [i for i in range(n) if i not in done]
+        progress(n - len(missing))
+        with (plan.folder / JOURNAL).open("a", encoding="utf-8") as journal:
+            journal.write("\n")  # ends a line that an interruption cut short
+            for made, record in enumerate(work(plan, missing), 1):
+                journal.write(json.dumps(record) + "\n")
+                journal.flush()
+                progress(n - len(missing) + made)
+        report = _write_index(plan, len(missing), len(done))
+        (plan.folder / JOURNAL).unlink()
+    return report
 
 
 def make_serially(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
@@ -137,6 +141,10 @@ class Maker:
         else:
             write_bundle(drawn.robot, folder, drawn.findings, picture=plan.picture)
         return _record(drawn)
+
+    def make_all(self, indices: Sequence[int]) -> list[Record]:
+        """Draw and write several robots."""
+        return [self.make(index) for index in indices]
 
 
 def read_index(folder: Path) -> list[Record]:
@@ -217,35 +225,71 @@ def _is_barely_begun(plan: SetPlan) -> bool:
     return plan.folder.is_dir() and own >= set(plan.folder.iterdir())
 
 
-def _finished(plan: SetPlan) -> Iterator[Record]:
-    """Records of robots that are there; a line cut short by an interruption counts for nothing."""
-    for name in (INDEX, JOURNAL):
-        path = plan.folder / name
+def _finished(plan: SetPlan) -> dict[int, tuple[Path, int]]:
+    """Where the records of the robots that are there stand: file and offset, by number.
+
+    A line cut short by an interruption counts for nothing. Records themselves stay on disk, so that
+    the size of a set is not bounded by memory.
+    """
+    places = {}
+    for path in (plan.folder / INDEX, plan.folder / JOURNAL):
         if not path.is_file():
             continue
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                record = json.loads(line)
-            except ValueError:
-                continue
-            if (plan.folder / record["name"] / URDF).is_file():
-                yield record
+        offset = 0
+        with path.open("rb") as lines:
+            for line in lines:
+                try:
+                    record = json.loads(line)
+                except ValueError:
+                    record = None
+                if record and (plan.folder / record["name"] / URDF).is_file():
+                    places[record["index"]] = (path, offset)
+                offset += len(line)
     for leftover in plan.folder.glob(".*.*"):
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
+    return places
 
 
-def _report(records: Iterable[Record], made: int, kept: int) -> SetReport:
-    rejected: dict[str, int] = {}
+def _write_index(plan: SetPlan, made: int, kept: int) -> SetReport:
+    """Write all records in order of their numbers, and sum them up."""
+    rejected: Counter[str] = Counter()
     first: dict[str, str] = {}
     duplicates = []
-    for record in records:
-        for reason, times in record["rejected"].items():
-            rejected[reason] = rejected.get(reason, 0) + times
-        earlier = first.setdefault(record["hash"], record["name"])
-        if earlier != record["name"]:
-            duplicates.append((record["name"], earlier))
-    return SetReport(made, kept, rejected, duplicates)
+    partial = _partial(plan.folder / INDEX)
+    places = _finished(plan)
+    with ExitStack() as stack:
+        files = {path: stack.enter_context(path.open("rb")) for path, _ in places.values()}
+        index = stack.enter_context(partial.open("wb"))
+        for number in sorted(places):
+            path, offset = places[number]
+            files[path].seek(offset)
+            line = files[path].readline()
+            index.write(line)
+            record = json.loads(line)
+            rejected.update(record["rejected"])
+            earlier = first.setdefault(record["hash"], record["name"])
+            if earlier != record["name"]:
+                duplicates.append((record["name"], earlier))
+    partial.replace(plan.folder / INDEX)
+    return SetReport(made, kept, dict(rejected), duplicates)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a folder against a second run; a killed one holds nothing."""
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise FormatError(f"{folder} is being written by another run; wait for its end") from error
+    except OSError as error:
+        raise FormatError(f"cannot write to {folder}: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+        (folder / LOCK).unlink(missing_ok=True)
 
 
 def _write_atomic(path: Path, text: str) -> None:

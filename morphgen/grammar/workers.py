@@ -1,4 +1,4 @@
-"""Make the robots of a set in several processes, or on a Ray cluster."""
+"""Make the robots of a set in several processes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from multiprocessing import get_context, parent_process
 from threading import Thread
 
-from morphgen.errors import MissingDependencyError, MorphgenError
+from morphgen.errors import MorphgenError
 from morphgen.grammar.robot_set import Maker, Record, SetPlan, Work
 
 CHUNK = 8
@@ -34,32 +34,6 @@ def make_in_processes(jobs: int) -> Work:
                     running |= {pool.submit(_make, c) for c in itertools.islice(chunks, 1)}
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-    return work
-
-
-def make_on_ray(address: str | None) -> Work:
-    """Work on the Ray cluster at an address; without one, on a local Ray.
-
-    Raises:
-        MissingDependencyError: If ray is not installed.
-    """
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingDependencyError(
-            "--ray needs the package ray: pip install 'morphgen[ray]'"
-        ) from error
-
-    def work(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
-        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
-        remote = ray.remote(_make_alone)
-        chunks = [indices[i : i + 2 * CHUNK] for i in range(0, len(indices), 2 * CHUNK)]
-        running = [remote.remote(plan, list(chunk)) for chunk in chunks]
-        while running:
-            finished, running = ray.wait(running)
-            for done in finished:
-                yield from ray.get(done)
 
     return work
 
@@ -94,10 +68,4 @@ def _end_with_parent() -> None:
 def _make(indices: Sequence[int]) -> list[Record]:
     if _maker is None:
         raise RuntimeError("the worker was not prepared")
-    return [_maker.make(index) for index in indices]
-
-
-def _make_alone(plan: SetPlan, indices: Sequence[int]) -> list[Record]:
-    """Make robots on a machine that shares the set's folder."""
-    maker = Maker(plan)
-    return [maker.make(index) for index in indices]
+    return _maker.make_all(indices)

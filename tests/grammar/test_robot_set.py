@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import pandas
 import pytest
 from commands import start, tree
 from grammars import shipped
@@ -76,7 +77,6 @@ def test_the_index_is_a_line_of_json_a_robot(whole):
 
 
 def test_the_index_can_be_read_with_pandas(whole):
-    pandas = pytest.importorskip("pandas")
     table = pandas.read_json(whole / INDEX, lines=True)
     assert list(table["index"]) == list(range(8))
     assert table["mass"].dtype == float
@@ -299,3 +299,15 @@ def test_meshes_of_a_light_robot_are_named_where_their_package_has_them(tmp_path
     text = (made.folder / "g-000000" / "robot.urdf").read_text()
     assert 'filename="package://' in text
     assert str(Path.home()) not in text
+
+
+def test_a_second_run_into_the_same_folder_is_refused(tmp_path):
+    made = plan(tmp_path / "set")
+
+    def work(plan, indices):
+        with pytest.raises(FormatError, match="is being written by another run"):
+            make_set(plan, 8, make_serially)
+        yield from make_serially(plan, indices)
+
+    make_set(made, 2, work)
+    assert len(read_index(made.folder)) == 2
