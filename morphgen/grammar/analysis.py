@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from morphgen.errors import GrammarError
+from morphgen.errors import CompositionError, GrammarError
+from morphgen.grammar.compose import own_values, require_root
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
     MAX_PARTS,
@@ -20,6 +21,7 @@ from morphgen.grammar.derive import (
 )
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
+from morphgen.grammar.part import load_part
 from morphgen.grammar.syntax import Alternative, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, distribution_of, evaluate, no_draw
 
@@ -224,10 +226,18 @@ def _unused(grammar: Grammar) -> Iterator[str]:
 
 def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     structures = enumerate_structures(grammar, library)
+    roots: set[str] = set()
     try:
         for _ in range(CHECKED_ENDLESS if math.isinf(count(grammar)) else CHECKED_STRUCTURES):
-            if next(structures, None) is None:
+            structure = next(structures, None)
+            if structure is None:
                 return
+            if structure.part not in roots:
+                roots.add(structure.part)
+                require_root(load_part(library.manifest(structure.part), own_values(structure)))
+    except CompositionError as error:
+        start = grammar.production(grammar.start)
+        yield f"{start.place if start else grammar.name}: {error}"
     except GrammarError as error:
         yield str(error)
 

@@ -117,10 +117,7 @@ class _Assembly:
         part = here.part
         root = here.scoped(part.body.root.name)
         if parent is None:
-            if not part.T_root_mount.is_identity:
-                raise CompositionError(
-                    f"{part.manifest.name!r} needs a base: its mount is not its root"
-                )
+            require_root(part)
             self.links.append(replace(part.body.root, name=root))
             return
         T_port_mount = Pose(quaternion=from_rpy((0.0, 0.0, here.mount_yaw)))
@@ -154,16 +151,31 @@ class _Assembly:
         )
 
 
+def require_root(part: Part) -> None:
+    """Require that a part can stand on its own.
+
+    Raises:
+        CompositionError: If it hangs from its mount.
+    """
+    if not part.T_root_mount.is_identity:
+        raise CompositionError(f"{part.manifest.name!r} needs a base: its mount is not its root")
+
+
 def place(derivation: Derivation, library: Library) -> dict[str, Placed]:
     """Load every part of a derivation; by label, parents first."""
     placed: dict[str, Placed] = {}
     for node in derivation.walk():
         if node.label in placed:
             raise CompositionError(f"two parts are labelled {node.label!r}")
-        values = dict(node.parameters)
-        yaw = values.pop(MOUNT_YAW.name, 0.0)
-        placed[node.label] = Placed(node.label, load_part(library.manifest(node.part), values), yaw)
+        part = load_part(library.manifest(node.part), own_values(node))
+        yaw = dict(node.parameters).get(MOUNT_YAW.name, 0.0)
+        placed[node.label] = Placed(node.label, part, yaw)
     return placed
+
+
+def own_values(node: Derivation) -> dict[str, float]:
+    """The parameters of a part itself, without those of how it is mounted."""
+    return {name: value for name, value in node.parameters if name != MOUNT_YAW.name}
 
 
 def _tool_frames(tools: list[tuple[str, Frame]]) -> tuple[Frame, ...]:

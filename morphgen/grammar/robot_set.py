@@ -259,7 +259,8 @@ def _write_index(plan: SetPlan, made: int, kept: int) -> SetReport:
     partial = _partial(plan.folder / INDEX)
     places = _finished(plan)
     with ExitStack() as stack:
-        files = {path: stack.enter_context(path.open("rb")) for path, _ in places.values()}
+        sources = {path for path, _ in places.values()}
+        files = {path: stack.enter_context(path.open("rb")) for path in sources}
         index = stack.enter_context(partial.open("wb"))
         for number in sorted(places):
             path, offset = places[number]

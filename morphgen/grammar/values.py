@@ -192,11 +192,21 @@ def _arithmetic(
                 )
             return (a + b if expression.operator == "+" else a - b), a_unit or b_unit
         case "*":
-            return a * b, "" if a_unit and b_unit else a_unit or b_unit
+            if a_unit and b_unit:
+                raise GrammarError(
+                    f"{expression.place}: {expression} multiplies {a_unit} by {b_unit}; "
+                    "values are lengths, angles, masses or pure numbers"
+                )
+            return a * b, a_unit or b_unit
         case _:
             if b == 0:
                 raise GrammarError(f"{expression.place}: {expression} divides by zero")
-            return a / b, a_unit if not b_unit else ""
+            if b_unit and a_unit != b_unit:
+                raise GrammarError(
+                    f"{expression.place}: {expression} divides {a_unit or 'a pure number'} by "
+                    f"{b_unit}; values are lengths, angles, masses or pure numbers"
+                )
+            return a / b, "" if b_unit else a_unit
 
 
 def _require_arguments(distribution: Distribution, expression: Expression) -> None:
