@@ -128,30 +128,38 @@ def _structures(grammar: Grammar, library: Library, max_parts: int) -> Iterator[
 
 
 def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
-    symbols = {production.symbol for production in grammar.productions}
     for draw in (_lowest, _highest, no_draw, _inner):
         names: dict[str, tuple[float, str]] = {}
-        reported: set[str] = set()
         try:
             for let in grammar.lets:
                 names[let.name] = evaluate(let.expression, Scope(names, draw, ""))
         except GrammarError as error:
             yield str(error)
             return
-        for production in grammar.productions:
-            for item in _items(production):
-                try:
-                    if item.name in symbols:
-                        _require_bare(item)
-                        continue
-                    parameters = attached_parameters(require_part(item, grammar, library))
-                    for name, expression in item.arguments:
-                        argument(item, name, expression, parameters, Scope(names, draw, ""))
-                except GrammarError as error:
-                    reported.add(str(error))
-        yield from sorted(reported)
+        scope = Scope(names, draw, "")
+        items = (item for production in grammar.productions for item in _items(production))
+        reported = {
+            fault: None for item in items for fault in _faults_of(item, grammar, library, scope)
+        }
+        yield from reported
         if reported:
             return
+
+
+def _faults_of(item: Item, grammar: Grammar, library: Library, scope: Scope) -> Iterator[str]:
+    try:
+        if grammar.production(item.name):
+            _require_bare(item)
+            return
+        parameters = attached_parameters(require_part(item, grammar, library))
+    except GrammarError as error:
+        yield str(error)
+        return
+    for name, expression in item.arguments:
+        try:
+            argument(item, name, expression, parameters, scope)
+        except GrammarError as error:
+            yield str(error)
 
 
 def _require_bare(item: Item) -> None:
