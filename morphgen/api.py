@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from os import PathLike
 from pathlib import Path
+from typing import Literal
 
 from morphgen.checks import check, fix
+from morphgen.fitting.dressed import as_primitives
 from morphgen.formats.bundle import read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
@@ -20,13 +22,20 @@ from morphgen.model.robot import Robot
 __all__ = ["check", "compose", "fix", "read", "sample", "write"]
 
 
-def compose(request: str, *, name: str | None = None, library: Iterable[Path] = ()) -> Robot:
+def compose(
+    request: str,
+    *,
+    name: str | None = None,
+    geometry: Literal["mesh", "primitive"] = "mesh",
+    library: Iterable[Path] = (),
+) -> Robot:
     """Join parts into a robot.
 
     Args:
         request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``, or a grammar and
             what is pinned in it, such as ``chain beads=5``.
         name: The robot's name; by default from its parts.
+        geometry: Collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres.
         library: Folders of your own parts.
 
     Raises:
@@ -35,7 +44,8 @@ def compose(request: str, *, name: str | None = None, library: Iterable[Path] = 
     """
     parts = default_library(library)
     derivation, own = parse_words(request.split(), parts)
-    return compose_derivation(derivation, parts, name or own)
+    robot = compose_derivation(derivation, parts, name or own)
+    return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 
 
 def sample(

@@ -28,6 +28,10 @@ class PartError(MorphgenError):
     """A part, its manifest or one of its parameters is unknown or wrong."""
 
 
+class FitError(MorphgenError):
+    """Shapes that no primitive can stand for."""
+
+
 class GrammarError(MorphgenError):
     """A grammar, a condition or a derivation is malformed or means nothing."""
 

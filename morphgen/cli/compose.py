@@ -23,7 +23,12 @@ def add_parser(commands: Subparsers) -> None:
         metavar="[GRAMMAR] KEY=VALUE",
         help="arm=ur5, ee=plane, ee.size=0.1, left.arm=panda, ee.mount_yaw=45deg ...",
     )
-    parser.add_argument("--geometry", choices=["mesh"], default="mesh", help="shapes of real parts")
+    parser.add_argument(
+        "--geometry",
+        choices=["mesh", "primitive"],
+        default="mesh",
+        help="collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres",
+    )
     add_out(parser)
     add_library(parser)
     add_json(parser)
@@ -39,4 +44,8 @@ def run(args: argparse.Namespace) -> int:
     library = library_of(args)
     derivation, name = parse_words(args.words, library)
     robot = compose(derivation, library, name if args.name is None else args.name)
+    if args.geometry == "primitive":
+        from morphgen.fitting.dressed import as_primitives
+
+        robot = as_primitives(robot, library.folders)
     return write_and_report(robot, args)

@@ -105,11 +105,22 @@ def run_mutate(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace, derivation: Derivation) -> int:
     import tempfile
 
+    from morphgen.errors import FormatError
+    from morphgen.fitting.dressed import as_primitives
     from morphgen.formats.bundle import CARD, URDF, write_bundle
     from morphgen.grammar.compose import compose
     from morphgen.grammar.robot_set import light_urdf
 
-    robot = compose(derivation, library_of(args), args.robot.resolve().name)
+    library = library_of(args)
+    robot = compose(derivation, library, args.robot.resolve().name)
+    primitives = _card(args.robot).get("primitives")
+    if primitives is not None:
+        if "links" in primitives:
+            raise FormatError(
+                f"{args.robot} carries primitives of morphgen fit, of which its derivation knows "
+                "nothing: replay the robot that was fitted"
+            )
+        robot = as_primitives(robot, library.folders)
     if (args.robot / CARD).is_file():
         with tempfile.TemporaryDirectory() as scratch:
             folder = write_bundle(robot, Path(scratch) / robot.name, picture=False)
@@ -135,10 +146,22 @@ def _derivation(folder: Path) -> Derivation:
         return parse_derivation(light.read_text(encoding="utf-8"), str(light))
     if not card.is_file():
         raise FormatError(f"{folder} is no robot: it has neither {CARD} nor {DERIVATION}")
-    try:
-        content: Any = json.loads(card.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{card}: no valid JSON: {error}") from error
+    content = _card(folder)
     if "derivation" not in content:
         raise FormatError(f"{card} has no derivation: the robot was imported, not composed")
     return parse_derivation(content["derivation"], str(card))
+
+
+def _card(folder: Path) -> dict[str, Any]:
+    """A bundle's card; empty for a robot of a light set."""
+    from morphgen.errors import FormatError
+    from morphgen.formats.bundle import CARD
+
+    card = folder / CARD
+    if not card.is_file():
+        return {}
+    try:
+        content: dict[str, Any] = json.loads(card.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{card}: no valid JSON: {error}") from error
+    return content

@@ -106,7 +106,7 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
     Raises:
         FormatError: If the card lacks a key, or a value is of the wrong type.
     """
-    keys = ("derivation", "source", "choices", "repairs", "parts", "accepted")
+    keys = ("derivation", "source", "choices", "repairs", "parts", "accepted", "primitives")
     try:
         home = card["home"]
         return replace(

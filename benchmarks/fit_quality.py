@@ -1,0 +1,197 @@
+"""How well primitives stand for links, beside trimesh's tightest bound and scikit-robot.
+
+    python benchmarks/fit_quality.py [--only ur5,panda] [--jobs 2] [--json rows.json]
+
+Every link of every real arm, the same solid and the same measure for all, that of
+`morphgen.fitting.quality`. A row an arm, means over its links (links with the same meshes
+are fitted once):
+
+- IoU of one primitive: trimesh's tightest of oriented box, cylinder and sphere (what AnyBody uses),
+  scikit-robot's, ours; ours with up to four primitives, and how many these are.
+- Enclosing: volume over the solid's volume, and least coverage, of scikit-robot's and ours.
+- Seconds a link, on one core: scikit-robot's; ours with one primitive and with up to four.
+
+scikit-robot comes with `pip install morphgen[bench]`; without it its columns are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.fitting.dressed import link_shapes
+from morphgen.fitting.link import FitOptions, fit_solid
+from morphgen.fitting.quality import Array, quality
+from morphgen.fitting.solid import Solid, solid_of
+from morphgen.fitting.stored import shapes_key
+from morphgen.grammar.library import default_library
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
+
+FOUR = ("ur5", "panda", "xarm7", "jaco2")
+"""The arms that the targets speak of."""
+OPTIONS = {
+    "one": FitOptions(),
+    "four": FitOptions(max_primitives=4, iou=1.0),
+    "enclose": FitOptions(enclose=True),
+}
+COLUMNS: dict[str, Callable[[Sequence[dict[str, float]], str], float]] = {
+    "iou trimesh": lambda rows, key: _mean(rows, key),
+    "iou skrobot": lambda rows, key: _mean(rows, key),
+    "iou one": lambda rows, key: _mean(rows, key),
+    "iou four": lambda rows, key: _mean(rows, key),
+    "n four": lambda rows, key: _mean(rows, key),
+    "volume skrobot": lambda rows, key: _mean(rows, key),
+    "volume enclose": lambda rows, key: _mean(rows, key),
+    "coverage skrobot": lambda rows, key: min(row[key] for row in rows),
+    "coverage enclose": lambda rows, key: min(row[key] for row in rows),
+    "s skrobot": lambda rows, key: _mean(rows, key),
+    "s one": lambda rows, key: _mean(rows, key),
+    "s four": lambda rows, key: _mean(rows, key),
+}
+"""Columns of the table, and how links are summed up."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A link of an arm."""
+
+    arm: str
+    link: str
+    shapes: tuple[Shape, ...]
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="arms, separated by commas")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="also write a row a link here")
+    args = parser.parse_args()
+    peer = find_spec("skrobot") is not None
+    tasks = _tasks({name for name in args.only.split(",") if name})
+    found: dict[str, list[dict[str, float]]] = defaultdict(list)
+    lines = []
+    unique = {shapes_key(task.shapes): task for task in tasks}
+    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
+        measured = pool.map(partial(_measure, peer=peer), unique.values())
+        row_of = dict(zip(unique, tqdm(measured, total=len(unique), unit="link"), strict=True))
+    for task in tasks:
+        row = row_of[shapes_key(task.shapes)]
+        found[task.arm].append(row)
+        lines.append({"arm": task.arm, "link": task.link, **row})
+    if args.json:
+        args.json.write_text(json.dumps(lines, indent=1) + "\n", encoding="utf-8")
+    columns = [name for name in COLUMNS if peer or "skrobot" not in name]
+    rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
+    table = [*rows, *_means("mean of all arms", rows)]
+    table += _means(f"mean of {', '.join(FOUR)}", [row for row in rows if row[0] in FOUR])
+    print(tabulate(table, ["arm", *columns], floatfmt=".3f"))
+    if not peer:
+        print("scikit-robot is not installed: no peer in this run (pip install 'morphgen[bench]')")
+    return 0
+
+
+def _tasks(only: set[str]) -> list[Task]:
+    return [
+        Task(manifest.name, link.name, link_shapes(link))
+        for manifest in default_library().manifests("arm")
+        if not manifest.is_template and not manifest.scaling
+        if not only or manifest.name in only
+        for link in load_part(manifest).body.links
+        if link_shapes(link)
+    ]
+
+
+def _measure(task: Task, *, peer: bool) -> dict[str, float]:
+    solid = solid_of(task.shapes)
+    row = {"iou trimesh": quality(solid, [_tightest(solid)]).iou}
+    if peer:
+        shape, seconds = _timed(lambda: _scikit_robot(solid))
+        worth = quality(solid, [shape])
+        row |= {
+            "iou skrobot": worth.iou,
+            "volume skrobot": worth.volume_ratio,
+            "coverage skrobot": worth.coverage,
+            "s skrobot": seconds,
+        }
+    fits = {name: fit_solid(solid, options) for name, options in OPTIONS.items()}
+    return row | {
+        "iou one": fits["one"].quality.iou,
+        "iou four": fits["four"].quality.iou,
+        "n four": float(len(fits["four"].primitives)),
+        "volume enclose": fits["enclose"].quality.volume_ratio,
+        "coverage enclose": fits["enclose"].quality.coverage,
+        "s one": fits["one"].seconds,
+        "s four": fits["four"].seconds,
+    }
+
+
+def _tightest(solid: Solid) -> Shape:
+    """The least of trimesh's bounding primitives."""
+    T_box, extents = trimesh.bounds.oriented_bounds(solid.mesh)
+    cylinder = trimesh.bounds.minimum_cylinder(solid.mesh)
+    centre, radius = trimesh.nsphere.minimum_nsphere(solid.mesh)
+    T_sphere = trimesh.transformations.translation_matrix(centre)
+    x, y, z = (float(extent) for extent in extents)
+    options: list[tuple[float, Box | Cylinder | Sphere, Array]] = [
+        (x * y * z, Box((x, y, z)), np.linalg.inv(T_box)),
+        (
+            np.pi * cylinder["radius"] ** 2 * cylinder["height"],
+            Cylinder(float(cylinder["radius"]), float(cylinder["height"])),
+            cylinder["transform"],
+        ),
+        (4 / 3 * np.pi * radius**3, Sphere(float(radius)), T_sphere),
+    ]
+    _, geometry, T_link_shape = min(options, key=lambda option: float(option[0]))
+    return Shape(geometry, Pose.from_matrix(np.asarray(T_link_shape)))
+
+
+def _scikit_robot(solid: Solid) -> Shape:
+    from skrobot.utils.primitive_fitting import fit_primitive_to_mesh, primitive_params_to_origin
+
+    found = fit_primitive_to_mesh(solid.mesh)
+    xyz, rpy = (tuple(float(v) for v in part) for part in primitive_params_to_origin(found))
+    geometry: Box | Cylinder | Sphere
+    match found["type"]:
+        case "box":
+            x, y, z = (float(extent) for extent in found["extents"])
+            geometry = Box((x, y, z))
+        case "cylinder":
+            geometry = Cylinder(float(found["radius"]), float(found["height"]))
+        case _:
+            geometry = Sphere(float(found["radius"]))
+    return Shape(geometry, Pose.from_xyz_rpy((xyz[0], xyz[1], xyz[2]), (rpy[0], rpy[1], rpy[2])))
+
+
+def _timed(fit: Callable[[], Shape]) -> tuple[Shape, float]:
+    start = time.perf_counter()
+    return fit(), time.perf_counter() - start
+
+
+def _mean(rows: Sequence[dict[str, float]], key: str) -> float:
+    return float(np.mean([row[key] for row in rows]))
+
+
+def _means(label: str, rows: Sequence[list[Any]]) -> list[list[Any]]:
+    return [[label, *np.mean([row[1:] for row in rows], axis=0).tolist()]] if rows else []
+
+
+if __name__ == "__main__":
+    sys.exit(main())

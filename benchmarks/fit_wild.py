@@ -1,0 +1,119 @@
+"""How well primitives stand for meshes that the fitter was not tuned on.
+
+    python benchmarks/fit_wild.py [--only talos,icub] [--jobs 2]
+
+Every link with meshes of every URDF of example-robot-data (arms, hands, legged robots, humanoids),
+links with the same meshes once; one primitive, and up to four where they are needed for an
+intersection over union of 0.9. Prints the distribution, how solids were made, what was refused,
+and the ten worst with the two figures that explain most: what share of its bounding box a solid
+fills, and what share of its convex hull.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from importlib.metadata import files
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.errors import MorphgenError
+from morphgen.fitting.dressed import are_primitives, link_shapes
+from morphgen.fitting.link import FitOptions, fit_solid
+from morphgen.fitting.solid import solid_of
+from morphgen.fitting.stored import shapes_key
+from morphgen.formats.bundle import read_robot
+from morphgen.model.geometry import Shape
+
+QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
+WORST = 10
+PROBES = 2**14
+
+Row = tuple[str, str, float, float, int, float, float, float]
+"""Link, solid, IoU of one and of several, how many, share of box, share of hull, seconds."""
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="parts of file names, separated by commas")
+    parser.add_argument("--jobs", type=int, default=1)
+    args = parser.parse_args()
+    links, refused = _links([word for word in args.only.split(",") if word])
+    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
+        measured = tqdm(pool.map(_measure, links.items()), total=len(links), unit="link")
+        found = list(measured)
+    rows = [row for row in found if not isinstance(row, str)]
+    refused += [row for row in found if isinstance(row, str)]
+    print(f"{len(rows)} links; solids: {dict(Counter(row[1] for row in rows))}")
+    spread = [
+        (label, float(np.mean(values)), *np.quantile(values, QUANTILES).tolist())
+        for label, values in (
+            ("one primitive", [row[2] for row in rows]),
+            ("up to four", [row[3] for row in rows]),
+        )
+    ]
+    print(tabulate(spread, ["IoU", "mean", *(f"{q:.0%}" for q in QUANTILES)], floatfmt=".3f"))
+    print(f"seconds a link: median {np.median([row[7] for row in rows]):.1f}")
+    worst = sorted(rows, key=lambda row: row[3])[:WORST]
+    heads = ["link", "solid", "one", "up to four", "n", "of its box", "of its hull", "s"]
+    print(tabulate(worst, heads, floatfmt=".3f"))
+    for reason in refused:
+        print(f"refused: {reason}")
+    return 0
+
+
+def _links(words: list[str]) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
+    """Shapes by robot and link, the same meshes once; and what cannot be read."""
+    urdfs = sorted(
+        Path(str(entry.locate()))
+        for entry in files("example-robot-data") or []
+        if entry.suffix == ".urdf" and (not words or any(word in entry.name for word in words))
+    )
+    found: dict[str, tuple[Shape, ...]] = {}
+    seen: set[str] = set()
+    refused = []
+    for path in tqdm(urdfs, unit="robot"):
+        try:
+            robot = read_robot(path)
+        except MorphgenError as error:
+            refused.append(f"{path.name}: {str(error).removeprefix(str(path))}")
+            continue
+        for link in robot.links:
+            shapes = link_shapes(link)
+            if not are_primitives(shapes) and (key := shapes_key(shapes)) not in seen:
+                seen.add(key)
+                found[f"{path.stem}:{link.name}"] = shapes
+    return found, refused
+
+
+def _measure(named: tuple[str, tuple[Shape, ...]]) -> Row | str:
+    name, shapes = named
+    try:
+        solid = solid_of(shapes)
+        one, several = (fit_solid(solid, FitOptions(max_primitives=k)) for k in (1, 4))
+    except MorphgenError as error:
+        return f"{name}: {error}"
+    low, high = solid.mesh.bounds
+    probes = np.random.default_rng(0).uniform(low, high, (PROBES, 3))
+    filled = float(solid.contains(probes).mean())
+    return (
+        name,
+        solid.method,
+        one.quality.iou,
+        several.quality.iou,
+        len(several.primitives),
+        filled,
+        filled * float(np.prod(high - low) / solid.hull.volume),
+        several.seconds,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

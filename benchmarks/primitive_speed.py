@@ -1,0 +1,393 @@
+"""How much faster simulators step a robot whose collision meshes became primitives.
+
+    python benchmarks/primitive_speed.py [--only panda,ur5] [--steps 4000] [--blocks 7] [--seed 0]
+
+Every real arm that collides with meshes, without a tool, its base fixed: with the meshes, which
+both simulators take for their convex hulls, and with the stored fits of up to four primitives a
+link (fitted now where none is stored). Pairs of links that either robot ignores are tested on
+neither. Position targets lead from home through random configurations without self-collision, one
+a second, the same for both robots; steps of 5 ms; no weight; no visuals. Two scenes: the arm alone,
+tested against itself, and above a table, a box right below all that the arm is at home, on which
+every second configuration presses.
+
+A row an arm for every scene: links with collision shapes, vertices of their hulls, primitives; and
+for each simulator the share of steps with a contact (meshes, primitives), 1000 steps/s with meshes
+and with primitives, and how many times faster primitives are. The last row is the geometric mean
+of these ratios, without those of simulations that became unstable. Steps/s are the median of the
+blocks, each from home, after one to warm up; meshes and primitives take turns, so that what else
+the machine does hits both. PyBullet makes hulls of cylinders, too, unless told not to, and here it
+is (URDF_USE_IMPLICIT_CYLINDER); it is left out, and told, where it is not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from tabulate import tabulate
+from tqdm import tqdm
+
+import morphgen
+from morphgen.checks.self_collision import SelfCollision
+from morphgen.fitting.dressed import are_primitives, as_primitives
+from morphgen.formats.bundle import URDF, write_bundle
+from morphgen.formats.mjcf import TIMESTEP, to_spec
+from morphgen.formats.picture import quiet
+from morphgen.grammar.library import Library, default_library
+from morphgen.model.inertia import bounding_box
+from morphgen.model.kinematics import (
+    forward_kinematics,
+    movable_positions,
+    random_configurations,
+)
+from morphgen.model.robot import DEFAULT_EFFORT, Robot, sorted_pair
+
+Array = NDArray[np.float64]
+
+LEG = 200
+"""Steps from one random configuration to the next."""
+HOLD = 10
+"""Steps that a target on the way is held."""
+TRIES = 32
+"""Configurations that are drawn for each that is needed."""
+TABLE_SIZE = (3.0, 3.0, 0.5)
+"""Edges of the table, centred below the root, metres."""
+PRESS = 0.05
+"""How far below the table the lowest joint is when it is to press on it, metres."""
+CLEARANCE = 0.005
+"""Height of the arm at home above the table, metres."""
+
+
+class World(Protocol):
+    """A robot in a simulator."""
+
+    def reset(self) -> None:
+        """Put the robot home, at rest."""
+
+    def hold(self, target: Array, steps: int) -> None:
+        """Step with a target position of every independent joint, shape (dof,)."""
+
+    def touches(self) -> bool:
+        """Whether there is a contact."""
+
+    def is_stable(self) -> bool:
+        """Whether nothing has exploded since the reset."""
+
+    def close(self) -> None:
+        """Free the simulator."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm in two forms that ignore the same pairs."""
+
+    name: str
+    meshes: Robot
+    primitives: Robot
+
+    @property
+    def table_top(self) -> float:
+        """Height of the table, metres."""
+        return min(_lowest(self.meshes), _lowest(self.primitives)) - CLEARANCE
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """An arm in a simulator; pairs are with meshes and with primitives."""
+
+    contacts: tuple[float, float]
+    """Share of the steps with a contact."""
+    steps: tuple[float, float]
+    """Steps per second."""
+    stable: bool
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster primitives are."""
+        return self.steps[1] / self.steps[0]
+
+
+Table = dict[str, dict[str, Speeds]]
+"""What a scene gave, by arm and simulator."""
+Make = Callable[..., World]
+"""Makes a world of a robot, with the height of the table's top; None for no table."""
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", help="names of arms, separated by commas")
+    parser.add_argument("--steps", type=int, default=4000, help="steps of a block")
+    parser.add_argument("--blocks", type=int, default=7)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    library = default_library()
+    makers: dict[str, Make] = {"MuJoCo": _Mujoco}
+    if find_spec("pybullet") is not None:
+        makers["PyBullet"] = _Pybullet
+    sizes: dict[str, tuple[int, int, int]] = {}
+    scenes: dict[str, Table] = {"alone": {}, "above a table": {}}
+    left_out = []
+    for name in tqdm(_names(library, args.only), unit="arm", file=sys.stderr):
+        arm = _arm(name, library)
+        if arm is None:
+            left_out.append(name)
+            continue
+        sizes[name] = _sizes(arm)
+        for scene, table in scenes.items():
+            top = None if scene == "alone" else arm.table_top
+            targets = _targets(arm, top, args.steps, args.seed)
+            table[name] = {
+                simulator: _measure(partial(make, table_top=top), arm, targets, args)
+                for simulator, make in makers.items()
+            }
+    for scene, table in scenes.items():
+        print(f"{scene}:\n{_text(table, sizes, list(makers))}\n")
+    if left_out:
+        print(f"left out, for they have no collision meshes: {', '.join(left_out)}")
+    if "PyBullet" not in makers:
+        print("PyBullet is not installed: it is not in this run")
+    return 0
+
+
+class _Mujoco:
+    """A robot as its MJCF says, in MuJoCo."""
+
+    def __init__(self, robot: Robot, table_top: float | None) -> None:
+        spec = to_spec(robot)
+        if table_top is not None:
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=[edge / 2 for edge in TABLE_SIZE],
+                pos=[0, 0, table_top - TABLE_SIZE[2] / 2],
+            )
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+
+    def reset(self) -> None:
+        mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
+
+    def hold(self, target: Array, steps: int) -> None:
+        self._data.ctrl[:] = target
+        mujoco.mj_step(self._model, self._data, nstep=steps)
+
+    def touches(self) -> bool:
+        return bool(self._data.ncon > 0)
+
+    def is_stable(self) -> bool:
+        return not self._data.warning.number.any()
+
+    def close(self) -> None:
+        del self._data, self._model
+
+
+class _Pybullet:
+    """A robot as its URDF says, in PyBullet, less the pairs that it ignores."""
+
+    def __init__(self, robot: Robot, table_top: float | None) -> None:
+        with quiet(), tempfile.TemporaryDirectory() as scratch:
+            import pybullet
+
+            self._bullet, self._robot = pybullet, robot
+            self._client = {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
+            folder = write_bundle(robot, Path(scratch) / robot.name, picture=False)
+            self._body = pybullet.loadURDF(
+                str(folder / URDF),
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_IMPLICIT_CYLINDER,
+                **self._client,
+            )
+        pybullet.setTimeStep(TIMESTEP, **self._client)
+        count = pybullet.getNumJoints(self._body, **self._client)
+        infos = [pybullet.getJointInfo(self._body, i, **self._client) for i in range(count)]
+        joints = {info[1].decode(): info[0] for info in infos}
+        links = {robot.root.name: -1} | {info[12].decode(): info[0] for info in infos}
+        movable = [robot.joints[k] for k in robot.movable]
+        self._joints = [joints[joint.name] for joint in movable]
+        self._efforts = [joint.effort or DEFAULT_EFFORT for joint in movable]
+        for a, b in robot.ignore_pairs:
+            self._ignore(links[a], self._body, links[b])
+        if table_top is not None:
+            half = [edge / 2 for edge in TABLE_SIZE]
+            box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
+            centre = [0, 0, table_top - half[2]]
+            # MuJoCo does not test what stands still against it either.
+            self._ignore(
+                -1, pybullet.createMultiBody(0, box, basePosition=centre, **self._client), -1
+            )
+
+    def reset(self) -> None:
+        home = movable_positions(self._robot, self._robot.home).tolist()
+        for joint, position in zip(self._joints, home, strict=True):
+            self._bullet.resetJointState(self._body, joint, position, **self._client)
+
+    def hold(self, target: Array, steps: int) -> None:
+        self._bullet.setJointMotorControlArray(
+            self._body,
+            self._joints,
+            self._bullet.POSITION_CONTROL,
+            targetPositions=movable_positions(self._robot, target).tolist(),
+            forces=self._efforts,
+            **self._client,
+        )
+        for _ in range(steps):
+            self._bullet.stepSimulation(**self._client)
+
+    def touches(self) -> bool:
+        normal_force = 9
+        points = self._bullet.getContactPoints(**self._client)
+        return any(point[normal_force] > 0 for point in points)
+
+    def is_stable(self) -> bool:
+        states = self._bullet.getJointStates(self._body, self._joints, **self._client)
+        return bool(np.isfinite([state[:2] for state in states]).all())
+
+    def close(self) -> None:
+        self._bullet.disconnect(**self._client)
+
+    def _ignore(self, link: int, other_body: int, other_link: int) -> None:
+        self._bullet.setCollisionFilterPair(
+            self._body, other_body, link, other_link, 0, **self._client
+        )
+
+
+def _names(library: Library, only: str | None) -> list[str]:
+    if only:
+        return [library.manifest(name, "arm").name for name in only.split(",")]
+    return [m.name for m in library.manifests("arm") if not m.is_template and not m.scaling]
+
+
+def _arm(name: str, library: Library) -> Arm | None:
+    """The two forms of an arm; None if it has no collision meshes."""
+    robot = morphgen.compose(f"arm={name}")
+    if all(are_primitives(link.collisions) for link in robot.links):
+        return None
+    fitted = as_primitives(robot, library.folders)
+    ignored = tuple(sorted({sorted_pair(*p) for p in (*robot.ignore_pairs, *fitted.ignore_pairs)}))
+    return Arm(name, _bare(robot, ignored), _bare(fitted, ignored))
+
+
+def _bare(robot: Robot, ignored: tuple[tuple[str, str], ...]) -> Robot:
+    links = tuple(replace(link, visuals=()) for link in robot.links)
+    return replace(robot, links=links, ignore_pairs=ignored)
+
+
+def _lowest(robot: Robot) -> float:
+    """Height of the lowest point of the links' bounding boxes at home, metres."""
+    heights = []
+    for T, link in zip(forward_kinematics(robot, robot.home), robot.links, strict=True):
+        if link.collisions:
+            low, high = bounding_box(link.collisions)
+            corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1)
+            heights.append(float((T[2, :3] @ corners + T[2, 3]).min()))
+    return min(heights)
+
+
+def _targets(arm: Arm, table_top: float | None, steps: int, seed: int) -> Array:
+    """A path from home through random configurations, shape (n, dof), a row to hold at a time.
+
+    Raises:
+        RuntimeError: If hardly a configuration is free of self-collision.
+    """
+    legs = -(-steps // LEG)
+    free = random_configurations(arm.meshes, TRIES * legs, np.random.default_rng(seed))
+    for robot in (arm.meshes, arm.primitives):
+        free = free[[not pairs for pairs in SelfCollision(robot).each(free)]]
+    if len(free) < legs:
+        raise RuntimeError(f"{arm.name} collides with itself nearly everywhere")
+    corners = free[:legs].copy()
+    if table_top is not None:
+        lowest = forward_kinematics(arm.meshes, free)[..., 2, 3].min(axis=-1)
+        pressing = np.argsort(np.abs(lowest - (table_top - PRESS)))
+        corners[::2] = free[pressing[: -(-legs // 2)]]
+    path = np.concatenate([np.reshape(arm.meshes.home, (1, -1)), corners])
+    moments = np.arange(1, -(-steps // HOLD) + 1) * HOLD / LEG
+    return np.stack([np.interp(moments, range(legs + 1), joint) for joint in path.T], axis=1)
+
+
+def _measure(
+    make: Callable[[Robot], World], arm: Arm, targets: Array, args: argparse.Namespace
+) -> Speeds:
+    with ExitStack() as stack:
+        worlds = [stack.enter_context(closing(make(r))) for r in (arm.meshes, arm.primitives)]
+        first, second = (_contacts(world, targets, args.steps) for world in worlds)
+        seconds: tuple[list[float], list[float]] = ([], [])
+        stable = True
+        for block in range(args.blocks):
+            for i in (0, 1) if block % 2 == 0 else (1, 0):
+                seconds[i].append(_block(worlds[i], targets, args.steps))
+                stable &= worlds[i].is_stable()
+    meshes, primitives = (args.steps / statistics.median(times) for times in seconds)
+    return Speeds((first, second), (meshes, primitives), stable)
+
+
+def _block(world: World, targets: Array, steps: int) -> float:
+    """Time that the steps of a block take, s."""
+    world.reset()
+    start = time.perf_counter()
+    for i, target in enumerate(targets):
+        world.hold(target, min(HOLD, steps - i * HOLD))
+    return time.perf_counter() - start
+
+
+def _contacts(world: World, targets: Array, steps: int) -> float:
+    """Share of the steps of a block with a contact."""
+    world.reset()
+    touching = 0
+    for step in range(steps):
+        world.hold(targets[step // HOLD], 1)
+        touching += world.touches()
+    return touching / steps
+
+
+def _sizes(arm: Arm) -> tuple[int, int, int]:
+    """Links with collision shapes, vertices of their hulls, primitives."""
+    model = to_spec(arm.meshes).compile()
+    hulls = model.geom_dataid[model.geom_type == mujoco.mjtGeom.mjGEOM_MESH]
+    links = sum(1 for link in arm.meshes.links if link.collisions)
+    primitives = sum(len(link.collisions) for link in arm.primitives.links)
+    return links, int(model.mesh_vertnum[hulls].sum()), primitives
+
+
+def _text(table: Table, sizes: dict[str, tuple[int, int, int]], simulators: list[str]) -> str:
+    headers = ["arm", "links", "hull\nvertices", "primitives"]
+    for simulator in simulators:
+        headers += [
+            f"{simulator}:\ncontacts",
+            "meshes\nk steps/s",
+            "primitives\nk steps/s",
+            "ratio",
+        ]
+    rows: list[list[object]] = []
+    for name, speeds in table.items():
+        cells = (cell for simulator in simulators for cell in _cells(speeds[simulator]))
+        rows.append([name, *sizes[name], *cells])
+    mean: list[object] = ["geometric mean", "", "", ""]
+    for simulator in simulators:
+        found = [speeds[simulator].ratio for speeds in table.values() if speeds[simulator].stable]
+        mean += ["", "", "", f"{statistics.geometric_mean(found):.2f}" if found else ""]
+    align = ("left", *["right"] * (len(headers) - 1))
+    return tabulate([*rows, mean], headers, disable_numparse=True, colalign=align)
+
+
+def _cells(speeds: Speeds) -> tuple[str, ...]:
+    contacts = " ".join(f"{share:.0%}" for share in speeds.contacts)
+    ratio = f"{speeds.ratio:.2f}" if speeds.stable else "unstable"
+    return (contacts, *(f"{steps / 1000:.1f}" for steps in speeds.steps), ratio)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,152 @@
+"""Draw every real arm beside the same arm made of its fitted primitives.
+
+    python docs/fit_pictures.py [--only panda,ur5] [--out docs/images/fit]
+
+Left the visuals, right up to four primitives in place of each link's collision meshes, one colour
+for each link; both at home, by the same camera. The mean intersection over union is that of links
+with collision meshes; links that the source itself gives primitives keep them. Fits come from
+beside the parts' manifests, and are made now where none is stored.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
+
+import morphgen
+from morphgen.fitting.dressed import are_primitives, stored_primitives, with_primitives
+from morphgen.fitting.parts import COLLISION
+from morphgen.fitting.robot import fit_links
+from morphgen.fitting.stored import read_stored, shapes_key
+from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
+from morphgen.formats.picture import render
+from morphgen.grammar.library import Library, default_library
+from morphgen.model.geometry import Mesh, Rgba, Shape
+from morphgen.model.inertia import solid_mesh
+from morphgen.model.robot import Robot
+
+SIZE = (900, 450)
+TITLE = 40
+"""Height of the title, pixels."""
+PALETTE = 128
+"""Colours of a file."""
+COLOURS: tuple[Rgba, ...] = (
+    (0.12, 0.47, 0.71, 1.0),
+    (1.00, 0.50, 0.05, 1.0),
+    (0.17, 0.63, 0.17, 1.0),
+    (0.84, 0.15, 0.16, 1.0),
+    (0.58, 0.40, 0.74, 1.0),
+    (0.95, 0.80, 0.15, 1.0),
+    (0.09, 0.75, 0.81, 1.0),
+    (0.89, 0.47, 0.76, 1.0),
+)
+
+
+def main() -> int:
+    """Draw and say where."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", help="names of arms, separated by commas")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images" / "fit")
+    args = parser.parse_args()
+    library = default_library()
+    names = _names(library, args.only)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in tqdm(names, unit="arm", file=sys.stderr):
+        picture = _picture(name, library)
+        picture.quantize(PALETTE, kmeans=1, dither=Image.Dither.NONE).save(
+            args.out / f"{name}.png", optimize=True
+        )
+        tqdm.write(str(args.out / f"{name}.png"))
+    return 0
+
+
+def _names(library: Library, only: str | None) -> list[str]:
+    if only:
+        return [library.manifest(name, "arm").name for name in only.split(",")]
+    return [m.name for m in library.manifests("arm") if not m.is_template and not m.scaling]
+
+
+def _picture(name: str, library: Library) -> Image.Image:
+    robot = morphgen.compose(f"arm={name}")
+    primitives, ious = _fitted(robot, library)
+    fitted = _coloured(with_primitives(robot, primitives))
+    sheet = Image.new("RGB", SIZE, "white")
+    size = (SIZE[0] // 2, SIZE[1] - TITLE)
+    for i, half in enumerate(_halves(robot, fitted, size)):
+        sheet.paste(half, (i * size[0], TITLE))
+    count = sum(len(link.visuals) for link in fitted.links)
+    worth = f"mean IoU {sum(ious) / len(ious):.2f}" if ious else "as in its source"
+    draw = ImageDraw.Draw(sheet)
+    for i, text in enumerate((name, f"{count} primitives, {worth}")):
+        draw.text(
+            ((i + 0.5) * size[0], TITLE / 2),
+            text,
+            fill="black",
+            anchor="mm",
+            font=ImageFont.load_default(20),
+        )
+    return sheet
+
+
+def _fitted(robot: Robot, library: Library) -> tuple[dict[str, tuple[Shape, ...]], list[float]]:
+    """Primitives by link, and the intersection over union of links that have meshes."""
+    stored = read_stored(library.folders)
+    found, missing = stored_primitives(robot, stored)
+    ious = [
+        stored[shapes_key(link.collisions)].collision_iou
+        for link in robot.links
+        if link.name in found and not are_primitives(link.collisions)
+    ]
+    report = fit_links(robot, COLLISION, only=missing)
+    for finding in report.findings:
+        tqdm.write(f"{robot.name}: {finding.where}: {finding.why}")
+    found |= {row.link: row.fit.primitives for row in report.links}
+    return found, ious + [row.fit.quality.iou for row in report.links]
+
+
+def _coloured(robot: Robot) -> Robot:
+    """The robot drawn as it collides, with one colour for each link, another than its parent's."""
+    links, depths = [], {-1: -1}
+    for i, link in enumerate(robot.links):
+        depths[i] = depths[robot.parents[i]] + bool(link.collisions)
+        rgba = COLOURS[depths[i] % len(COLOURS)]
+        shapes = tuple(replace(shape, rgba=rgba) for shape in link.collisions)
+        links.append(replace(link, visuals=shapes))
+    return robot.with_links(links)
+
+
+def _halves(left: Robot, right: Robot, size: tuple[int, int]) -> list[Image.Image]:
+    """Both robots, by a camera that holds either."""
+    framed = left.with_links(
+        replace(a, visuals=(*a.visuals, *b.visuals))
+        for a, b in zip(left.links, right.links, strict=True)
+    )
+    pictures = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for i, robot in enumerate((left, _meshed(right, Path(scratch)))):
+            folder = write_bundle(split_colours(robot), Path(scratch) / str(i), picture=False)
+            pictures.append(render(framed, folder / URDF, folder / MJCF, size=size))
+    return pictures
+
+
+def _meshed(robot: Robot, scratch: Path) -> Robot:
+    """The robot with fine meshes for its visual primitives, which PyBullet draws coarsely."""
+    links = []
+    for i, link in enumerate(robot.links):
+        visuals = []
+        for k, shape in enumerate(link.visuals):
+            path = scratch / f"primitive_{i}_{k}.stl"
+            solid_mesh(shape.geometry).export(path)
+            visuals.append(replace(shape, geometry=Mesh(path)))
+        links.append(replace(link, visuals=tuple(visuals)))
+    return robot.with_links(links)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,270 @@
+"""``morphgen fit``: meshes to boxes, cylinders and spheres."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+
+if TYPE_CHECKING:
+    from morphgen.fitting.agreement import Agreement
+    from morphgen.fitting.link import FitOptions, LinkFit
+    from morphgen.fitting.quality import Quality
+    from morphgen.fitting.robot import FitReport
+    from morphgen.model.robot import Robot
+
+MESHES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
+HEADERS = (
+    "link",
+    "primitives",
+    "solid",
+    "IoU",
+    "coverage",
+    "volume ratio",
+    "protrusion mm",
+    "p95",
+    "gap mm",
+    "p95",
+    "Hausdorff mm",
+    "s",
+)
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "fit",
+        help="fit boxes, cylinders and spheres to meshes, and say how good they are",
+        description="Fit boxes, cylinders and spheres to the meshes of a part, a robot or a file, "
+        "and say how good they are. With --out, write the robot with primitives as its collision "
+        "shapes.",
+        epilog="examples: morphgen fit panda; morphgen fit robots/ur5-plane --max-primitives 4 "
+        "--out robots/ur5-plane-prims; morphgen fit link.stl --max-primitives 3",
+    )
+    parser.add_argument(
+        "target", nargs="?", help="a part, a bundle's folder, a URDF or xacro, or a mesh file"
+    )
+    parser.add_argument("--all", action="store_true", help="fit and store every part with meshes")
+    parser.add_argument(
+        "--missing", action="store_true", help="with --all: only what is not stored"
+    )
+    parser.add_argument(
+        "--max-primitives", type=int, metavar="K", help="the most of a link (default: 1)"
+    )
+    parser.add_argument(
+        "--iou",
+        type=float,
+        default=0.9,
+        help="take the fewest primitives that reach it (default: 0.9)",
+    )
+    parser.add_argument(
+        "--enclose", action="store_true", help="hold every point of the link, for safe collisions"
+    )
+    parser.add_argument("--visual", action="store_true", help="replace the visuals, too")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="write the robot's bundle here")
+    parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
+    parser.add_argument(
+        "--configurations",
+        type=int,
+        default=1000,
+        metavar="N",
+        help="compare collisions in so many configurations (default: 1000; with --out)",
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    parser.add_argument("--seed", type=int, default=0)
+    add_library(parser)
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, print the table, write."""
+    from morphgen.errors import MorphgenError
+    from morphgen.fitting.link import FitOptions
+
+    if args.jobs < 1 or args.configurations < 1:
+        raise MorphgenError(
+            f"--jobs {args.jobs} --configurations {args.configurations}: both start at 1"
+        )
+    if args.all == bool(args.target):
+        raise MorphgenError("name a part, a robot or a mesh file, or say --all")
+    try:
+        options = FitOptions(args.max_primitives or 1, args.iou, args.enclose, args.seed)
+    except ValueError as error:
+        raise MorphgenError(str(error)) from error
+    if args.missing and not args.all:
+        raise MorphgenError("--missing goes with --all")
+    if args.all:
+        return _store_all(args)
+    if Path(args.target).suffix.lower() in MESHES:
+        return _mesh(args, options)
+    return _robot(args, options)
+
+
+def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
+    from morphgen.errors import FitError, MorphgenError
+    from morphgen.fitting.link import fit_shapes
+    from morphgen.model.geometry import Mesh, Shape
+
+    path = Path(args.target)
+    if args.out:
+        raise MorphgenError(f"--out writes a robot, and {path} is a mesh; use --json")
+    try:
+        fit = fit_shapes([Shape(Mesh(path))], options)
+    except FitError as error:
+        raise MorphgenError(f"{path}: {error}") from error
+    if args.json:
+        print(json.dumps({"mesh": str(path), **fit.as_dict()}))
+        return 0
+    _print_table([_row(path.name, fit)])
+    for shape in fit.primitives:
+        pose = shape.T_link_shape
+        print(f"{shape.geometry} at {pose.position}, quaternion {pose.quaternion}")
+    return 0
+
+
+def _robot(args: argparse.Namespace, options: FitOptions) -> int:
+    from dataclasses import replace
+
+    from morphgen.errors import FormatError
+    from morphgen.fitting.agreement import agreement
+    from morphgen.fitting.dressed import with_primitives
+    from morphgen.formats.bundle import bundle_folder
+
+    robot, is_part = _target(args)
+    if args.out and args.out.resolve() == Path(args.target).resolve():
+        raise FormatError(f"--out {args.out} is the robot itself; name another folder")
+    folder = bundle_folder(args.out.parent, args.out.name) if args.out else None
+    report = _fit(robot, options, args)
+    data = report.as_dict()
+    if not args.json:
+        _print_report(report)
+    if folder is not None:
+        primitives = {row.link: row.fit.primitives for row in report.links}
+        made = replace(
+            with_primitives(robot, primitives, visual=args.visual),
+            name=folder.name,
+            provenance={**robot.provenance, "primitives": data},
+        )
+        compared, hulls = agreement(robot, made, args.configurations, args.seed)
+        data |= {"agreement": compared.as_dict(), "agreement_of_hulls": hulls.as_dict()}
+        _write(made, folder, is_part, args)
+        if not args.json:
+            _print_agreement(compared, hulls, args.configurations)
+            print(folder)
+    if args.json:
+        print(json.dumps(data))
+    return 0
+
+
+def _write(robot: Robot, folder: Path, is_part: bool, args: argparse.Namespace) -> None:
+    from morphgen.checks import check
+    from morphgen.formats.bundle import write_bundle
+
+    findings = check(robot, tool_required=not is_part)
+    write_bundle(robot, folder, findings, picture=not args.no_picture)
+
+
+def _target(args: argparse.Namespace) -> tuple[Robot, bool]:
+    """The robot that is meant, and whether it is a part."""
+    from morphgen.errors import FormatError, nearest
+    from morphgen.formats.bundle import read_robot
+    from morphgen.grammar.part import load_part
+
+    path = Path(args.target)
+    if path.exists():
+        return read_robot(path), False
+    library = library_of(args)
+    if args.target in library.paths:
+        return load_part(library.manifest(args.target)).body, True
+    raise FormatError(
+        f"{args.target!r} is no file, folder or part{nearest(args.target, library.paths)}"
+    )
+
+
+def _fit(robot: Robot, options: FitOptions, args: argparse.Namespace) -> FitReport:
+    from tqdm import tqdm
+
+    from morphgen.errors import FitError
+    from morphgen.fitting.dressed import link_shapes
+    from morphgen.fitting.robot import fit_links
+
+    links = sum(1 for link in robot.links if link_shapes(link))
+    if not links:
+        raise FitError(f"{args.target}: no link has a shape")
+    quiet = args.json or None
+    with tqdm(total=links, unit="link", file=sys.stderr, disable=quiet, leave=False) as bar:
+        report = fit_links(robot, options, jobs=args.jobs, progress=lambda link: bar.update())
+    return report
+
+
+def _store_all(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from morphgen.errors import MorphgenError
+    from morphgen.fitting.parts import parts_with_meshes, store_parts
+
+    if args.out or args.enclose or args.visual or args.max_primitives:
+        raise MorphgenError(
+            "--all stores one primitive and up to four for every part: it takes no --out, "
+            "--enclose, --visual or --max-primitives"
+        )
+    library = library_of(args)
+    parts = parts_with_meshes(library, missing=args.missing)
+    stored = store_parts(parts, jobs=args.jobs)
+    for path in tqdm(stored, total=len(parts), unit="part", file=sys.stderr):
+        tqdm.write(str(path))
+    return 0
+
+
+def _print_report(report: FitReport) -> None:
+    rows = [_row(each.link, each.fit, each.same_as) for each in report.links]
+    if report.mean is not None:
+        seconds = sum(each.fit.seconds for each in report.links)
+        rows.append(("mean", "", "", *_figures(report.mean), seconds))
+    _print_table(rows)
+    for finding in report.findings:
+        print(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")
+
+
+def _print_agreement(primitives: Agreement, hulls: Agreement, n: int) -> None:
+    from tabulate import tabulate
+
+    rows = [
+        (name, found.accuracy, found.precision, found.recall)
+        for name, found in (("primitives", primitives), ("convex hulls of meshes", hulls))
+    ]
+    print(f"collisions in {n} random configurations, compared with the meshes' triangles:")
+    print(tabulate(rows, ("", "agree", "precision", "recall"), floatfmt=".3f"))
+
+
+def _print_table(rows: list[tuple[object, ...]]) -> None:
+    from tabulate import tabulate
+
+    formats = ("", "", "", ".3f", ".3f", ".2f", ".1f", ".1f", ".1f", ".1f", ".1f", ".1f")
+    print(tabulate(rows, HEADERS, floatfmt=formats))
+
+
+def _row(link: str, fit: LinkFit, same_as: str | None = None) -> tuple[object, ...]:
+    kinds = Counter(type(shape.geometry).__name__.lower() for shape in fit.primitives)
+    named = ", ".join(f"{n} {kind}" if n > 1 else kind for kind, n in sorted(kinds.items()))
+    solid = f"as {same_as}" if same_as else fit.solid
+    return (link, named, solid, *_figures(fit.quality), fit.seconds)
+
+
+def _figures(quality: Quality) -> tuple[float, ...]:
+    """Figures of a row; distances in millimetres."""
+    distances = (
+        quality.protrusion_mean,
+        quality.protrusion_p95,
+        quality.gap_mean,
+        quality.gap_p95,
+        quality.hausdorff,
+    )
+    shares = (quality.iou, quality.coverage, quality.volume_ratio)
+    return (*shares, *(1e3 * distance for distance in distances))

@@ -1,0 +1,100 @@
+"""Fit the real parts of a library and store the result beside their manifests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+from morphgen.errors import FormatError
+from morphgen.fitting.dressed import link_shapes
+from morphgen.fitting.link import FitOptions
+from morphgen.fitting.robot import fit_links
+from morphgen.fitting.stored import SUFFIX, StoredFit, read_stored, shapes_key, stored_text
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import Manifest
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import Mesh
+
+TOKEN = FitOptions(max_primitives=1)
+COLLISION = FitOptions(max_primitives=4, iou=0.9)
+
+
+def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
+    """Parts that have meshes, but for those that are scaled ones of another.
+
+    Args:
+        library: Where they are.
+        missing: Leave out those of which every link is stored.
+    """
+    stored = read_stored(library.folders) if missing else {}
+    return [
+        manifest
+        for manifest in library.manifests()
+        if not manifest.is_template and not manifest.scaling and _keys(manifest) - stored.keys()
+    ]
+
+
+def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
+    """Fit and store several parts; gives every file that is done.
+
+    Args:
+        manifests: The parts.
+        jobs: Processes, each of which takes a part at a time.
+
+    Raises:
+        FormatError: If a file cannot be written.
+        MeshError: If a mesh cannot be read.
+    """
+    if jobs == 1:
+        yield from map(store_part, manifests)
+        return
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        futures = [pool.submit(store_part, manifest) for manifest in manifests]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def store_part(manifest: Manifest) -> Path:
+    """Fit a part's links and write them beside its manifest.
+
+    Raises:
+        FormatError: If the file cannot be written.
+        MeshError: If a mesh cannot be read.
+    """
+    body = load_part(manifest).body
+    tokens = {row.link: row.fit for row in fit_links(body, TOKEN).links}
+    found = {row.link: row.fit for row in fit_links(body, COLLISION).links}
+    fits = {
+        shapes_key(link_shapes(link)): StoredFit(
+            link.name,
+            tokens[link.name].primitives[0],
+            found[link.name].primitives,
+            tokens[link.name].quality.iou,
+            found[link.name].quality.iou,
+        )
+        for link in body.links
+        if link.name in found
+    }
+    path = manifest.path.with_name(manifest.path.stem + SUFFIX)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(stored_text(fits), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+    return path
+
+
+def _keys(manifest: Manifest) -> set[str]:
+    """Keys of links with meshes."""
+    links = (link_shapes(link) for link in load_part(manifest).body.links)
+    return {
+        shapes_key(shapes)
+        for shapes in links
+        if any(isinstance(shape.geometry, Mesh) for shape in shapes)
+    }

@@ -1,0 +1,156 @@
+"""The primitives that overlap a solid best: guesses, gradient ascent, and a choice by counting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from morphgen.errors import FitError
+from morphgen.fitting.guess import FEWEST, around, by_pieces
+from morphgen.fitting.soft_iou import KINDS, Array, Candidates, ascend, overlaps
+from morphgen.fitting.solid import Solid
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
+from morphgen.model.rotation import normalized
+
+COARSE_POINTS = 2**11
+NEAR_POINTS, FAR_POINTS = 2**14, 2**12
+NEAR, FAR = 0.02, 0.35
+"""How far beyond the bounding box these points are drawn, in sizes of it."""
+CLUSTERINGS = 6
+"""Ways of cutting a solid from which several primitives start."""
+KEPT = 2
+"""Candidates that are refined."""
+DIGITS = 6
+"""Decimals of dimensions and positions, metres; quaternions have three more."""
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A solid as points, in units of its size about the middle of its bounding box."""
+
+    solid: Solid
+    points: Array
+    """Shape (n, 3), spread over the solid and its surroundings, in no order."""
+    inside: NDArray[np.bool_]
+    weights: Array
+    """The volume that each stands for, shape (n,); points far from the solid are sparse."""
+
+    @cached_property
+    def middle(self) -> Array:
+        """Origin of the points, in the link frame, metres."""
+        return np.asarray(self.solid.mesh.bounds.mean(axis=0))
+
+    def shapes(self, candidates: Candidates, row: int) -> tuple[Shape, ...]:
+        """One of the candidates as shapes in the link frame, rounded."""
+        size = self.solid.size
+        found = []
+        for kind, centre, quaternion, halves in zip(
+            candidates.kinds[row],
+            candidates.centres[row] * size + self.middle,
+            candidates.quaternions[row],
+            np.round(candidates.halves[row] * size, DIGITS),
+            strict=True,
+        ):
+            x, y, z = np.maximum(halves, 10.0**-DIGITS).tolist()
+            geometry: Box | Cylinder | Sphere
+            match KINDS[kind]:
+                case "box":
+                    geometry = Box((2 * x, 2 * y, 2 * z))
+                case "cylinder":
+                    geometry = Cylinder(x, 2 * z)
+                case "sphere":
+                    geometry = Sphere(x)
+            a, b, c = np.round(centre, DIGITS).tolist()
+            if isinstance(geometry, Sphere):
+                found.append(Shape(geometry, Pose((a, b, c))))
+                continue
+            w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
+            found.append(Shape(geometry, Pose((a, b, c), normalized((w, i, j, k)))))
+        return tuple(found)
+
+
+def sampled(solid: Solid, seed: int) -> Sampled:
+    """Draw the points that a search looks at.
+
+    Raises:
+        FitError: If next to none of them lie inside: the solid is too thin.
+    """
+    middle, extents = solid.mesh.bounds.mean(axis=0), solid.mesh.extents / solid.size
+    near, far = extents / 2 + NEAR, extents / 2 + FAR
+    rng = np.random.default_rng(seed)
+    close = near * (2 * qmc.Sobol(3, rng=rng).random(NEAR_POINTS) - 1)
+    beyond = far * (2 * qmc.Sobol(3, rng=rng).random(FAR_POINTS) - 1)
+    beyond = beyond[np.any(np.abs(beyond) > near, axis=1)]
+    points = np.concatenate([close, beyond])
+    counts = np.repeat(
+        [np.prod(near) / NEAR_POINTS, np.prod(far) / FAR_POINTS], [len(close), len(beyond)]
+    )
+    order = rng.permutation(len(points))
+    points, counts = points[order], counts[order]
+    inside = solid.contains(points * solid.size + middle)
+    if inside[:COARSE_POINTS].sum() < 2 * FEWEST:
+        raise FitError(f"the solid is too thin: it fills {inside.mean():.2%} of its bounding box")
+    return Sampled(solid, points, inside, counts / counts.mean())
+
+
+def best_single(target: Sampled) -> tuple[tuple[Shape, ...], float]:
+    """The one primitive that overlaps most, and its overlap as the search saw it."""
+    with _one_thread():
+        start = around(target.points[target.inside], thorough=True)
+        return _climb(target, start, (0.03, 0.008))
+
+
+def best_several(target: Sampled, k: int, seed: int) -> tuple[tuple[Shape, ...], float]:
+    """The ``k`` primitives that overlap most together; none if the solid has too few points."""
+    seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(CLUSTERINGS)]
+    some = slice(4 * COARSE_POINTS)
+    points, inside, weights = target.points[some], target.inside[some], target.weights[some]
+    with _one_thread():
+        start = by_pieces(points, inside, weights, k, seeds)
+        return ((), 0.0) if start is None else _climb(target, start, (0.02, 0.006))
+
+
+def _climb(
+    target: Sampled, start: Candidates, tau: tuple[float, float]
+) -> tuple[tuple[Shape, ...], float]:
+    points, inside, weights = target.points, target.inside, target.weights
+    rough = ascend(
+        start,
+        points[:COARSE_POINTS],
+        inside[:COARSE_POINTS],
+        weights=weights[:COARSE_POINTS],
+        steps=100,
+        tau=tau,
+        rate=(0.01, 0.003),
+    )
+    kept = np.argsort(-overlaps(rough, points, inside, weights), kind="stable")[:KEPT]
+    fine = ascend(
+        rough.take(kept),
+        points,
+        inside,
+        weights=weights,
+        steps=60,
+        tau=(0.006, 0.0015),
+        rate=(0.004, 0.0004),
+    )
+    score = overlaps(fine, points, inside, weights)
+    best = int(np.argmax(score))
+    return target.shapes(fine, best), float(score[best])
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """The order of a sum depends on the number of threads, and the result on the order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,406 @@
+"""``morphgen fit``: what it prints, what it writes, and what it refuses."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+from commands import tree
+from parts import write_part
+from robots import arm
+
+from morphgen.formats import bundle
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.library import default_library
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.inertia import with_inertia
+from morphgen.model.robot import Link
+
+FIGURES = {
+    "iou",
+    "coverage",
+    "volume_ratio",
+    "protrusion_mean",
+    "protrusion_p95",
+    "gap_mean",
+    "gap_p95",
+    "hausdorff",
+}
+
+
+@pytest.fixture
+def box(tmp_path):
+    """``link.stl``, a box about (1, 2, 3)."""
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh.apply_translation((1.0, 2.0, 3.0))
+    mesh.export(tmp_path / "link.stl")
+    return Path("link.stl")
+
+
+@pytest.fixture
+def angle(tmp_path):
+    """``angle.stl``, an L of two boxes that touch."""
+    tall, wide = trimesh.creation.box((0.1, 0.1, 0.4)), trimesh.creation.box((0.2, 0.1, 0.1))
+    tall.apply_translation((0.05, 0.05, 0.2))
+    wide.apply_translation((0.2, 0.05, 0.05))
+    trimesh.boolean.union([tall, wide]).export(tmp_path / "angle.stl")
+    return Path("angle.stl")
+
+
+@pytest.fixture
+def meshed(tmp_path):
+    """A bundle in ``source``: the arm with a box's mesh on its base and on both fingers."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    block, finger = trimesh.creation.box((0.1, 0.1, 0.04)), trimesh.creation.box((0.02, 0.01, 0.08))
+    block.export(folder / "block.stl")
+    finger.export(folder / "finger.stl")
+    red = (1.0, 0.0, 0.0, 1.0)
+    on_base = Shape(Mesh(folder / "block.stl"), rgba=red)
+    on_finger = Shape(Mesh(folder / "finger.stl"), Pose((0.0, 0.0, 0.05)), red)
+    shapes = {"base": on_base, "left": on_finger, "right": on_finger}
+    made = [
+        with_inertia(Link(name, visuals=(shape,), collisions=(shape,)), 2000.0)
+        for name, shape in shapes.items()
+    ]
+    return write_bundle(arm().with_links(made), tmp_path / "source", picture=False).relative_to(
+        tmp_path
+    )
+
+
+def meshes_of(folder, kind):
+    """File names of meshes in a bundle's URDF: ``collision`` or ``visual``."""
+    root = ElementTree.parse(folder / "robot.urdf").getroot()
+    return [mesh.get("filename") for mesh in root.findall(f"link/{kind}/geometry/mesh")]
+
+
+def assert_same_inertials(made, source):
+    """Masses and inertias of the links, up to the digits of a URDF."""
+    assert [link.name for link in made.links] == [link.name for link in source.links]
+    for link, before in zip(made.links, source.links, strict=True):
+        if before.inertial is None:
+            assert link.inertial is None or link.inertial.mass == 0
+            continue
+        assert link.inertial.mass == pytest.approx(before.inertial.mass, rel=1e-9)
+        np.testing.assert_allclose(link.inertial.com, before.inertial.com, atol=1e-9)
+        np.testing.assert_allclose(
+            link.inertial.inertia, before.inertial.inertia, rtol=1e-6, atol=1e-12
+        )
+
+
+def test_a_mesh_gives_a_table_and_the_primitive(run, box, tmp_path):
+    before = tree(tmp_path)
+    code, out, err = run("fit", box)
+    assert (code, err) == (0, "")
+    header, rule, row, shape = out.splitlines()
+    for word in ("link", "primitives", "solid", "IoU", "Hausdorff mm"):
+        assert word in header
+    assert set(rule) == {"-", " "}
+    assert row.split()[:3] == ["link.stl", "box", "watertight"]
+    assert float(row.split()[3]) > 0.97
+    assert shape.startswith("Box(size=(")
+    assert tree(tmp_path) == before
+
+
+def test_a_mesh_as_json_is_data_in_metres(run, box):
+    code, out, err = run("fit", box, "--json", "--seed", "3")
+    assert (code, err) == (0, "")
+    data = json.loads(out)
+    assert out.count("\n") == 1
+    assert (data["mesh"], data["solid"], data["decimated_from"]) == ("link.stl", "watertight", None)
+    (found,) = data["primitives"]
+    np.testing.assert_allclose(sorted(found["box"]), (0.1, 0.2, 0.3), rtol=0.02)
+    np.testing.assert_allclose(found["xyz"], (1.0, 2.0, 3.0), atol=2e-3)
+    assert np.linalg.norm(found["quaternion"]) == pytest.approx(1.0)
+    assert set(data["quality"]) == FIGURES
+    assert data["quality"]["iou"] > 0.97
+    again = json.loads(run("fit", box, "--json", "--seed", "3")[1])
+    assert {**again, "seconds": 0} == {**data, "seconds": 0}
+
+
+def test_more_primitives_are_fitted_where_one_does_not_do(run, angle):
+    code, out, err = run("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json")
+    assert (code, err) == (0, "")
+    data = json.loads(out)
+    assert [set(each) & {"box", "cylinder", "sphere"} for each in data["primitives"]] == [
+        {"box"}
+    ] * 2
+    assert data["quality"]["iou"] > 0.95
+    code, out, err = run("fit", angle, "--max-primitives", "3", "--iou", "0.3", "--json")
+    assert len(json.loads(out)["primitives"]) == 1
+
+
+def test_primitives_that_enclose_hold_every_corner(run, angle):
+    code, out, err = run("fit", angle, "--enclose", "--json")
+    assert (code, err) == (0, "")
+    data = json.loads(out)
+    assert data["quality"]["coverage"] == 1.0
+    assert data["quality"]["gap_p95"] < 1e-8
+    assert data["quality"]["iou"] < 0.8
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "STL"])
+def test_every_format_of_meshes_is_read(run, tmp_path, suffix):
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / f"link.{suffix}")
+    code, out, err = run("fit", f"link.{suffix}", "--json", "--enclose")
+    assert (code, err) == (0, "")
+    (found,) = json.loads(out)["primitives"]
+    np.testing.assert_allclose(sorted(found["box"]), (0.1, 0.2, 0.3), atol=1e-5)
+
+
+def test_a_part_of_primitives_keeps_them(run):
+    code, out, err = run("fit", "plane")
+    assert (code, err) == (0, "")
+    _, _, plate, mean = out.splitlines()
+    assert plate.split()[:4] == ["plate", "box", "primitives", "1.000"]
+    assert mean.split()[:2] == ["mean", "1.000"]
+    data = json.loads(run("fit", "plane", "--json")[1])
+    (collision,) = load_part(default_library().manifest("plane")).body.link("plate").collisions
+    (link,) = data["links"]
+    assert data["robot"] == "plane"
+    assert link["primitives"][0]["box"] == list(collision.geometry.size)
+    assert link["primitives"][0]["xyz"] == list(collision.T_link_shape.position)
+    assert data["findings"] == []
+
+
+def test_a_part_s_bundle_may_have_the_name_of_the_part(run, tmp_path):
+    code, out, err = run("fit", "plane", "--out", "plane", "--no-picture")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1] == "plane"
+    assert run("check", "plane")[0] == 0
+
+
+def test_a_users_part_is_found_in_the_library_that_is_named(run, tmp_path):
+    write_part(tmp_path / "mine")
+    code, out, err = run("fit", "pincer", "--library", "mine", "--json")
+    assert (code, err) == (0, "")
+    names = {"palm", "left", "right", "disc"}
+    assert {link["link"] for link in json.loads(out)["links"]} == names
+
+
+def test_a_real_part_is_written_without_collision_meshes(run, tmp_path):
+    """The Fetch's gripper: a palm and two fingers that are each other's copies."""
+    words = ("fit", "fetch_gripper", "--out", "made/gripper", "--no-picture", "--json")
+    code, out, err = run(*words, "--configurations", "50")
+    assert (code, err) == (0, "")
+    data = json.loads(out)
+    fits = {link["link"]: link for link in data["links"]}
+    assert fits["l_gripper_finger_link"]["same_as"] == "r_gripper_finger_link"
+    assert all(link["quality"]["iou"] > 0.9 for link in fits.values())
+    assert {"precision", "recall", "accuracy"} <= set(data["agreement"])
+    folder = tmp_path / "made" / "gripper"
+    assert [path.name for path in folder.parent.iterdir()] == ["gripper"]
+    assert meshes_of(folder, "collision") == []
+    assert meshes_of(folder, "visual") != []
+    made, source = read_bundle(folder), load_part(default_library().manifest("fetch_gripper")).body
+    assert made.name == "gripper"
+    assert_same_inertials(made, source)
+    assert [joint.name for joint in made.joints] == [joint.name for joint in source.joints]
+    for link in made.links:
+        kinds = {type(shape.geometry) for shape in link.collisions}
+        assert kinds <= {Box, Cylinder, Sphere}
+        assert bool(kinds) == bool(source.link(link.name).collisions)
+    code, out, err = run("check", folder, "--json")
+    (found,) = json.loads(out).values()
+    assert code == 0
+    assert not [f for f in found["findings"] if f["severity"] == "error"]
+
+
+def test_a_bundle_is_fitted_link_by_link(run, meshed, tmp_path):
+    code, out, err = run("fit", meshed, "--out", "made", "--no-picture", "--configurations", "50")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    rows = {line.split()[0]: line.split() for line in lines[2:9]}
+    assert list(rows) == ["base", "upper", "lower", "slider", "left", "right", "mean"]
+    assert rows["base"][1:3] == ["box", "watertight"]
+    assert rows["upper"][1:3] == ["cylinder", "primitives"]
+    assert rows["right"][1:4] == ["box", "as", "left"]
+    assert "collisions in 50 random configurations" in out
+    assert lines[-1] == "made"
+    made, source = read_bundle(tmp_path / "made"), read_bundle(tmp_path / meshed)
+    assert meshes_of(tmp_path / "made", "collision") == []
+    assert len(meshes_of(tmp_path / "made", "visual")) == 3
+    assert_same_inertials(made, source)
+    assert (made.name, made.home, made.frames) == ("made", source.home, source.frames)
+    assert replace(made, name="x").joints == source.joints
+    assert run("check", "made")[0] == 0
+    assert run("check", meshed)[0] == 0
+    card = json.loads((tmp_path / "made" / "card.json").read_text())
+    assert {link["link"] for link in card["primitives"]["links"]} == set(rows) - {"mean"}
+
+
+def test_visuals_are_replaced_where_asked_and_keep_their_colour(run, meshed, tmp_path):
+    words = ("fit", meshed, "--visual", "--out", "made", "--no-picture", "--configurations", "1")
+    assert run(*words)[0] == 0
+    assert meshes_of(tmp_path / "made", "visual") == []
+    assert not (tmp_path / "made" / "meshes").exists()
+    base = read_bundle(tmp_path / "made").link("base")
+    assert [shape.rgba for shape in base.visuals] == [(1.0, 0.0, 0.0, 1.0)]
+    assert [shape.geometry for shape in base.visuals] == [
+        shape.geometry for shape in base.collisions
+    ]
+
+
+def test_the_same_words_write_the_same_bytes(run, meshed, tmp_path):
+    words = ("--no-picture", "--configurations", "20")
+    assert run("fit", meshed, "--out", "a/robot", *words)[0] == 0
+    assert run("fit", meshed, "--out", "b/robot", *words)[0] == 0
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+def test_a_bundle_that_is_there_is_replaced(run, tmp_path):
+    words = ("--out", "made", "--no-picture", "--configurations", "1")
+    assert run("fit", "plane", *words)[0] == 0
+    assert run("fit", "cylinder", *words)[0] == 0
+    (link,) = read_bundle(tmp_path / "made").links
+    assert [type(shape.geometry) for shape in link.collisions] == [Cylinder]
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_picture_is_drawn_unless_it_is_unwanted(run, tmp_path):
+    assert run("fit", "plane", "--out", "made", "--configurations", "1")[0] == 0
+    assert (tmp_path / "made" / "preview.png").is_file()
+
+
+def test_a_urdf_is_fitted(run, robot_urdf):
+    code, out, err = run("fit", robot_urdf(arm()), "--json")
+    assert (code, err) == (0, "")
+    assert [link["solid"] for link in json.loads(out)["links"]] == ["primitives"] * 6
+
+
+def flat(path):
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
+    return path
+
+
+def test_a_link_that_is_flat_is_told_and_the_others_are_fitted(run, tmp_path):
+    leaf = Shape(Mesh(flat(tmp_path / "leaf.obj")))
+    robot = arm().with_links([replace(arm().link("left"), visuals=(leaf,), collisions=(leaf,))])
+    (tmp_path / "robot.urdf").write_text(
+        urdf_text(replace(robot, frames=()), lambda m: m.path.name)
+    )
+    code, out, err = run("fit", "robot.urdf")
+    assert (code, err) == (0, "")
+    assert "warning no-primitive at link left: " in out
+    assert [line.split()[0] for line in out.splitlines()[2:7]] == [
+        link.name for link in robot.links if link.name != "left"
+    ]
+    (found,) = json.loads(run("fit", "robot.urdf", "--json")[1])["findings"]
+    assert (found["code"], found["where"]) == ("no-primitive", "link left")
+
+
+MESHES = {
+    "empty.stl": b"",
+    "text.stl": b"Dear diary,\nthis is no mesh.\n",
+    "noise.stl": b"\x00\xff" * 300,
+    "none.obj": b"v 0 0 0\n",
+    "nan.obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
+    "inf.obj": b"v 1e999 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
+    "flat.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n",
+    "point.obj": b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n",
+}
+
+
+@pytest.mark.parametrize("name", list(MESHES))
+def test_a_mesh_that_is_none_is_refused_by_name(refused, tmp_path, name):
+    (tmp_path / name).write_bytes(MESHES[name])
+    assert name in refused("fit", name)
+
+
+def test_a_binary_stl_of_nans_is_refused_by_name(refused, tmp_path):
+    mesh = trimesh.creation.box((1, 1, 1))
+    data = bytearray(mesh.export(file_type="stl"))
+    data[84 + 12 : 84 + 16] = np.float32(np.nan).tobytes()
+    (tmp_path / "nan.stl").write_bytes(data)
+    assert "nan.stl" in refused("fit", "nan.stl")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("", "name a part, a robot or a mesh file, or say --all"),
+        ("plane --all", "name a part, a robot or a mesh file, or say --all"),
+        ("plnae", "did you mean 'plane'?"),
+        ("lost.stl", "lost.stl: no such file"),
+        ("lost.urdf", "lost.urdf"),
+        (".", "is no bundle: it has no card.json"),
+        ("plane --missing", "--missing goes with --all"),
+        ("plane --max-primitives 0", "0 primitives: expected 1 to 32"),
+        ("plane --max-primitives -1", "-1 primitives: expected 1 to 32"),
+        ("plane --max-primitives 33", "33 primitives: expected 1 to 32"),
+        ("plane --iou 2", "IoU 2.0: expected more than 0, at most 1"),
+        ("plane --iou 0", "IoU 0.0: expected"),
+        ("plane --iou nan", "IoU nan: expected"),
+        ("plane --seed -1", "seed -1: expected 0 or more"),
+        ("plane --jobs 0", "--jobs 0"),
+        ("plane --out made --configurations 0", "--configurations 0"),
+        ("--all --out made", "--all"),
+        ("--all --max-primitives 2", "--all"),
+        ("--all --max-primitives 0", "--all"),
+        ("--all --enclose", "--all"),
+        ("--all --visual", "--all"),
+        ("plane --library nowhere", "nowhere does not exist"),
+        ("plane --out ..", "name"),
+        ("plane --out made/.hidden", "name '.hidden': use letters"),
+    ],
+)
+def test_a_wrong_request_is_refused(refused, words, message):
+    assert message in refused("fit", *words.split())
+
+
+def test_a_mesh_is_not_written_as_a_robot(refused, box):
+    message = refused("fit", box, "--out", "made")
+    assert "link.stl is a mesh" in message
+    assert "--out" in message
+
+
+@pytest.mark.parametrize("source", ["plane", "robot"])
+def test_a_folder_that_is_no_bundle_is_never_replaced_nor_anything_fitted(
+    refused, robot_urdf, tmp_path, source
+):
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "thesis.txt").write_text("years of work")
+    target = robot_urdf(arm()) if source == "robot" else "plane"
+    words = ("--out", "made", "--no-picture", "--configurations", "1")
+    assert "made exists and is no bundle" in refused("fit", target, *words)
+
+
+@pytest.mark.parametrize("named", ["source", "source/", "./source", "source/robot.urdf"])
+def test_a_bundle_is_not_replaced_by_its_own_fit(refused, meshed, named):
+    assert "is the robot itself" in refused("fit", named, "--out", "source", "--no-picture")
+
+
+def test_a_robot_without_shapes_is_refused(refused, tmp_path):
+    (tmp_path / "bare.urdf").write_text('<robot name="r"><link name="a"/></robot>')
+    assert "bare.urdf: no link has a shape" in refused("fit", "bare.urdf")
+
+
+def test_a_robot_with_a_mesh_that_is_none_is_refused_by_name(refused, tmp_path):
+    (tmp_path / "empty.stl").write_bytes(b"")
+    shape = '<visual><geometry><mesh filename="empty.stl"/></geometry></visual>'
+    (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
+    assert "empty.stl" in refused("fit", "r.urdf", "--out", "made")
+
+
+def test_an_error_is_json_for_who_asks_for_it(run, tmp_path):
+    (tmp_path / "flat.obj").write_bytes(MESHES["flat.obj"])
+    code, out, err = run("fit", "flat.obj", "--json")
+    assert code == 2
+    assert "flat" in json.loads(out)["message"]
+    assert err == f"morphgen: {json.loads(out)['message']}\n"
+
+
+@pytest.mark.parametrize("step", ["urdf_text", "card_text"])
+def test_an_interrupted_fit_leaves_no_half_bundle(run, tmp_path, monkeypatch, step):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bundle, step, interrupt)
+    code, _, err = run("fit", "plane", "--out", "made", "--no-picture", "--configurations", "1")
+    assert (code, err) == (130, "morphgen: interrupted; nothing half-written is left\n")
+    assert tree(tmp_path) == {}

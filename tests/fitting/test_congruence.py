@@ -1,0 +1,231 @@
+"""Meshes of real links, moved, mirrored and spoilt."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from morphgen.fitting.congruence import congruence, moved, representatives
+from morphgen.fitting.quality import signed_distance
+from morphgen.grammar.library import default_library
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.mesh import load_mesh
+
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+KINDS = [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]
+
+
+def links(robot: str) -> dict[str, trimesh.Trimesh]:
+    body = load_part(default_library(()).manifest(robot)).body
+    return {
+        link.name: load_mesh(link.collisions[0].geometry)
+        for link in body.links
+        if link.collisions and isinstance(link.collisions[0].geometry, Mesh)
+    }
+
+
+@pytest.fixture(scope="module")
+def base() -> trimesh.Trimesh:
+    return links("ur5")["base_link"]
+
+
+def motion(seed: int, mirrored: bool = False) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    T[:3, 3] = rng.uniform(-1, 1, 3)
+    return T @ MIRROR if mirrored else T
+
+
+def shuffled(mesh: trimesh.Trimesh, T: np.ndarray, seed: int = 0) -> trimesh.Trimesh:
+    """The mesh moved, its vertices and faces in another order, rounded as files round them."""
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(mesh.vertices))
+    vertices = trimesh.transform_points(mesh.vertices, T)[order].astype(np.float32)
+    faces = rng.permutation(np.argsort(order)[mesh.faces])
+    return trimesh.Trimesh(vertices.astype(float), faces, process=False)
+
+
+def farthest(a: trimesh.Trimesh, b: trimesh.Trimesh, T: np.ndarray) -> float:
+    return float(b.kdtree.query(trimesh.transform_points(a.vertices, T))[0].max())
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_motions_and_mirrorings_of_a_link_are_found(base, seed, mirrored):
+    T = motion(seed, mirrored)
+    np.testing.assert_allclose(congruence(base, shuffled(base, T)), T, atol=1e-6)
+
+
+def test_equal_meshes_give_the_identity_and_shifted_ones_do_not_turn(base):
+    assert np.array_equal(congruence(base, base.copy()), np.eye(4))
+    shift = trimesh.transformations.translation_matrix([0.1, 0.2, 0.3])
+    found = congruence(base, shuffled(base, shift))
+    assert np.array_equal(found[:3, :3], np.eye(3))
+    np.testing.assert_allclose(found, shift, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.cylinder(0.1, 0.3, sections=48),
+        trimesh.creation.box((0.1, 0.2, 0.3)),
+        trimesh.creation.box((0.2, 0.2, 0.2)),
+        trimesh.creation.icosahedron(),
+        trimesh.creation.annulus(0.1, 0.2, 0.1),
+    ],
+    ids=["cylinder", "box", "cube", "icosahedron", "annulus"],
+)
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_symmetric_bodies_are_found_by_a_rotation(mesh, mirrored):
+    other = shuffled(mesh, motion(5, mirrored))
+    found = congruence(mesh, other)
+    assert farthest(mesh, other, found) < 1e-6
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+
+
+def test_noise_within_the_tolerance_is_averaged_out(base):
+    T = motion(7)
+    noisy = shuffled(base, T)
+    size = 2 * np.linalg.norm(base.vertices - base.vertices.mean(axis=0), axis=1).max()
+    noisy.vertices += np.random.default_rng(8).uniform(-2e-4, 2e-4, (len(noisy.vertices), 3)) * size
+    assert congruence(base, noisy) is None
+    np.testing.assert_allclose(congruence(base, noisy, tolerance=5e-4), T, atol=2e-4)
+
+
+@pytest.mark.parametrize("moved_by", [0.01, -0.01])
+def test_one_vertex_elsewhere_is_another_mesh(base, moved_by):
+    other = base.copy()
+    size = np.linalg.norm(base.extents)
+    vertices = np.array(base.vertices)
+    vertices[100] += moved_by * size * base.vertex_normals[100]
+    other.vertices = vertices
+    assert congruence(base, other) is None
+    assert congruence(base, shuffled(other, motion(1))) is None
+    vertices[100] += (1e-5 - moved_by) * size * base.vertex_normals[100]
+    other.vertices = vertices
+    assert congruence(base, other) is not None
+
+
+def test_other_counts_sizes_and_proportions_are_other_meshes(base):
+    assert congruence(base, links("ur5")["shoulder_link"]) is None
+    scaled = base.copy().apply_scale(1.001)
+    assert congruence(base, scaled) is None
+    sheared = base.copy()
+    sheared.vertices = base.vertices * (1, 1, 1.01)
+    assert congruence(base, sheared) is None
+    flipped = trimesh.creation.box((0.1, 0.2, 0.3))
+    flipped.vertices = flipped.vertices * (1, 1, 0.999)
+    assert congruence(trimesh.creation.box((0.1, 0.2, 0.3)), flipped) is None
+
+
+def test_vertices_at_equal_distances_but_elsewhere_are_another_mesh(base):
+    other = base.copy()
+    vertices = np.array(base.vertices) - base.vertices.mean(axis=0)
+    far = np.argsort(-np.linalg.norm(vertices, axis=1))[:2]
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.3]).as_matrix()
+    vertices[far] = [turn @ vertices[far[0]], turn.T @ vertices[far[1]]]
+    other.vertices = vertices
+    assert congruence(base, other, tolerance=5e-3) is None
+
+
+def test_the_same_vertices_under_another_surface_are_another_mesh():
+    corners = np.array([[0, 0, 0], [2, 0, 0], [2, 3, 0.5], [0, 3, 0], [0.7, 1.2, 4]], dtype=float)
+    sides = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
+    one = trimesh.Trimesh(corners, [*sides, [0, 2, 1], [0, 3, 2]], process=False)
+    other = trimesh.Trimesh(corners, [*sides, [0, 3, 1], [1, 3, 2]], process=False)
+    assert congruence(one, other) is None
+    assert congruence(one, trimesh.Trimesh(corners, one.faces[::-1], process=False)) is not None
+
+
+def test_a_vertex_without_a_partner_makes_another_mesh():
+    ends = np.concatenate([np.eye(3), -np.eye(3)])
+    sides = [[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)]
+    doubled = [[0, 0, 1], [0, 0, -1]]
+    apart = np.array([[1, 1, 1], [-1, -1, -1]]) / np.sqrt(3)
+    one, other = (
+        trimesh.Trimesh(np.concatenate([ends, more]), sides, process=False)
+        for more in (doubled, apart)
+    )
+    assert congruence(one, other) is None
+    assert congruence(other, one) is None
+    assert congruence(one, shuffled(one, motion(3))) is not None
+
+
+def test_landmarks_closer_than_the_tolerance_do_no_harm():
+    def needle(angles: np.ndarray) -> trimesh.Trimesh:
+        ring = 0.018 * np.stack([0 * angles, np.cos(angles), np.sin(angles)], axis=1)
+        vertices = np.concatenate([[[1, 0.01, 0], [1, -0.01, 0]], ring])
+        faces = [[0, 2, 3], [0, 3, 1], [1, 3, 4], [1, 4, 5], [1, 5, 0], [0, 5, 2], [2, 4, 3]]
+        return trimesh.Trimesh(vertices, faces, process=False)
+
+    cross, line = np.arange(4) * math.pi / 2, np.array([1, 1, 5, 5]) * math.pi / 4
+    tolerance = 0.0101 / (2 * 0.667)
+    found = congruence(needle(cross), shuffled(needle(cross), motion(2)), tolerance)
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+    assert congruence(needle(cross), shuffled(needle(line), motion(2)), tolerance) is None
+
+
+@pytest.mark.parametrize("geometry", KINDS)
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_moved_primitive_is_as_far_from_moved_points(geometry, mirrored):
+    shape = Shape(geometry, Pose.from_xyz_rpy((0.1, 0.2, -0.3), (0.5, 0.6, 0.7)), (1, 0, 0, 1))
+    points = np.random.default_rng(0).normal((0.1, 0.2, -0.3), 0.2, (500, 3))
+    before = signed_distance([shape], points)
+    assert (before < 0).sum() > 5
+    for seed in range(5):
+        T = motion(seed, mirrored)
+        there = moved(shape, T)
+        after = signed_distance([there], trimesh.transform_points(points, T))
+        np.testing.assert_allclose(after, before, atol=1e-12)
+        assert there.geometry == geometry
+        assert there.rgba == shape.rgba
+        assert there.T_link_shape.quaternion[0] >= 0
+        assert np.linalg.norm(there.T_link_shape.quaternion) == pytest.approx(1)
+
+
+def test_moving_refuses_meshes_and_what_is_no_motion(tmp_path):
+    with pytest.raises(ValueError, match="primitive"):
+        moved(Shape(Mesh(tmp_path / "a.stl")), np.eye(4))
+    with pytest.raises(ValueError, match="neither a rotation nor a mirroring"):
+        moved(Shape(Sphere(1.0)), np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
+def test_representatives_are_the_first_of_their_kind(base):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    moves = [motion(1), motion(2, mirrored=True)]
+    meshes = [
+        base,
+        box,
+        shuffled(base, moves[0]),
+        shuffled(base, moves[1]),
+        shuffled(box, moves[0]),
+    ]
+    found = representatives(meshes)
+    assert [first for first, _ in found] == [0, 1, 0, 0, 1]
+    for mesh, (first, T) in zip(meshes, found, strict=True):
+        assert farthest(meshes[first], mesh, T) < 1e-6
+    np.testing.assert_allclose(found[3][1], moves[1], atol=1e-6)
+    assert representatives([]) == []
+
+
+def test_the_arms_of_yumi_share_their_links():
+    left, right = links("yumi_left"), links("yumi_right")
+    found = representatives([*left.values(), *right.values()])
+    assert [first for first, _ in found] == 2 * list(range(8))
+    assert all(np.array_equal(T, np.eye(4)) for _, T in found)
+
+
+def test_jacos_halves_and_wrists_are_turned_copies_and_ur5s_wrists_are_not():
+    jaco = links("jaco2")
+    for one, other in (("link_2", "link_3"), ("link_5", "link_6")):
+        a, b = (jaco[f"j2s7s300_{name}"] for name in (one, other))
+        T = congruence(a, b)
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+        assert farthest(a, b, T) < 1e-4 * np.linalg.norm(a.extents)
+    wrists = links("ur5")
+    assert wrists["wrist_1_link"].faces.shape == wrists["wrist_2_link"].faces.shape
+    assert congruence(wrists["wrist_1_link"], wrists["wrist_2_link"], tolerance=2e-3) is None

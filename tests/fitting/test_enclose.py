@@ -1,0 +1,254 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from morphgen.errors import FitError
+from morphgen.fitting.enclose import enclose
+from morphgen.fitting.soft_iou import KINDS, Kind
+from morphgen.fitting.solid import solid_of
+from morphgen.grammar.library import default_library
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import Box, Cylinder, Shape, Sphere, dimensions, volume
+
+Array = NDArray[np.float64]
+GEOMETRY: dict[Kind, type] = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
+CUBE = np.array(list(itertools.product((0.0, 0.1), repeat=3)))
+ROUNDING = 1.001
+
+
+def outside(shape: Shape, points: Array) -> float:
+    """Largest signed distance of points to a shape, metres."""
+    T = shape.T_link_shape.matrix
+    local = (points - T[:3, 3]) @ T[:3, :3]
+    match shape.geometry:
+        case Sphere(radius):
+            beyond = np.linalg.norm(local, axis=1)[:, None] - radius
+        case Box(size):
+            beyond = np.abs(local) - np.array(size) / 2
+        case Cylinder(radius, length):
+            radial = np.hypot(local[:, 0], local[:, 1])
+            beyond = np.stack([radial - radius, np.abs(local[:, 2]) - length / 2], axis=1)
+    distance = np.linalg.norm(beyond.clip(0), axis=1) + beyond.max(axis=1).clip(None, 0)
+    return float(distance.max())
+
+
+def size(shape: Shape) -> float:
+    assert isinstance(shape.geometry, (Box, Cylinder, Sphere))
+    return volume(shape.geometry)
+
+
+def surface(kind: Kind, rng: np.random.Generator) -> tuple[Array, float]:
+    """Points of a randomly placed primitive of random size, and its volume."""
+    a, b, c = np.exp(rng.uniform(-3, -0.5, 3))
+    if kind == "box":
+        mesh, truth = trimesh.creation.box((a, b, c)).subdivide(), a * b * c
+    elif kind == "cylinder":
+        mesh, truth = trimesh.creation.cylinder(a, b, sections=60), math.pi * a**2 * b
+    else:
+        mesh, truth = trimesh.creation.icosphere(2, a), 4 / 3 * math.pi * a**3
+    turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
+    return mesh.vertices @ turn.T + rng.uniform(-1, 1, 3), truth
+
+
+def cloud(rng: np.random.Generator, n: int = 40) -> Array:
+    stretched = rng.normal(size=(n, 3)) * np.exp(rng.uniform(-3, 0, 3))
+    turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
+    return np.asarray(stretched @ turn.T + rng.uniform(-2, 2, 3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_turned_primitive_is_recovered(kind: Kind, seed: int) -> None:
+    points, truth = surface(kind, np.random.default_rng(seed))
+    shape = enclose(points)
+    assert isinstance(shape.geometry, GEOMETRY[kind])
+    assert size(shape) == pytest.approx(truth, rel=5e-3)
+    assert outside(shape, points) <= 1e-9
+
+
+def test_a_primitive_along_the_links_axes_keeps_them() -> None:
+    centre = np.array([0.5, 0.0, -0.2])
+    box = enclose(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices) + centre)
+    assert box.geometry == Box((0.1, 0.2, 0.3))
+    assert box.T_link_shape.position == (0.5, 0.0, -0.2)
+    assert box.T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
+
+    upright = np.asarray(trimesh.creation.cylinder(0.1, 0.5).vertices)
+    cylinder = enclose(upright + centre)
+    assert cylinder.geometry == Cylinder(0.1, 0.5)
+    assert cylinder.T_link_shape == box.T_link_shape
+    half = math.sqrt(0.5)
+    lying = enclose(upright[:, [2, 0, 1]] + centre)
+    assert lying.geometry == Cylinder(0.1, 0.5)
+    assert lying.T_link_shape.quaternion == pytest.approx((half, 0.0, half, 0.0))
+
+    sphere = enclose(np.asarray(trimesh.creation.icosphere(2, 0.1).vertices) + centre)
+    assert sphere == Shape(Sphere(0.1), box.T_link_shape)
+
+
+def test_noise_does_not_turn_a_box_away_from_the_links_axes() -> None:
+    points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
+    noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
+    box = enclose(points + noise)
+    assert box.T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
+    assert outside(box, points + noise) <= 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_holds_all_points_after_rounding(kind: Kind, seed: int) -> None:
+    points = cloud(np.random.default_rng(seed))
+    shape = enclose(points, [kind])
+    assert isinstance(shape.geometry, GEOMETRY[kind])
+    assert outside(shape, points) <= 1e-9
+    assert outside(shape, points) > -2e-6, "a point must touch it"
+    pose = shape.T_link_shape
+    for value in (*dimensions(shape.geometry), *pose.position):
+        assert value == round(value, 6)
+    assert np.linalg.norm(pose.quaternion) == pytest.approx(1.0, abs=1e-15)
+    assert pose.quaternion == pytest.approx(np.round(pose.quaternion, 9), abs=2e-9)
+    assert pose.quaternion[0] >= 0
+
+
+def test_rounding_up_is_all_that_a_small_thing_gains() -> None:
+    points = 1e-4 * cloud(np.random.default_rng(3))
+    for kind in KINDS:
+        shape = enclose(points, [kind])
+        assert -3e-6 < outside(shape, points) <= 1e-9
+
+
+@pytest.mark.parametrize("robot", ["ur5", "panda"])
+def test_no_link_gets_more_than_the_tightest_bound_of_trimesh(robot: str) -> None:
+    links = load_part(default_library(()).manifest(robot)).body.links
+    meshes = [solid_of(link.collisions).mesh for link in links if link.collisions]
+    assert len(meshes) >= 7
+    for mesh in meshes:
+        _, extents = trimesh.bounds.oriented_bounds(mesh)
+        cylinder = trimesh.bounds.minimum_cylinder(mesh)
+        _, radius = trimesh.nsphere.minimum_nsphere(mesh)
+        tightest = min(
+            volume(Box(tuple(extents))),
+            volume(Cylinder(cylinder["radius"], cylinder["height"])),
+            volume(Sphere(radius)),
+        )
+        shape = enclose(mesh.vertices)
+        assert size(shape) <= tightest * ROUNDING
+        assert outside(shape, np.asarray(mesh.vertices)) <= 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_cloud_gets_more_than_trimesh_gives_it(seed: int) -> None:
+    points = cloud(np.random.default_rng(seed), n=12)
+    _, extents = trimesh.bounds.oriented_bounds(points)
+    cylinder = trimesh.bounds.minimum_cylinder(points)
+    assert size(enclose(points, ["box"])) <= np.prod(extents) * ROUNDING
+    least = math.pi * cylinder["radius"] ** 2 * cylinder["height"]
+    assert size(enclose(points, ["cylinder"])) <= least * ROUNDING
+
+
+def test_the_cube_is_the_least_box_of_a_regular_tetrahedron() -> None:
+    corners = CUBE[[0, 3, 5, 6]]
+    turn = Rotation.from_rotvec([0.3, 1.1, -0.4]).as_matrix()
+    assert size(enclose(corners @ turn.T, ["box"])) == pytest.approx(1e-3, rel=1e-3)
+    sphere = enclose(corners @ turn.T, ["sphere"]).geometry
+    assert isinstance(sphere, Sphere)
+    assert sphere.radius == pytest.approx(0.05 * math.sqrt(3), abs=2e-6)
+
+
+def test_a_thin_rod_is_found_whichever_way_it_points() -> None:
+    rod = np.random.default_rng(0).uniform(-1, 1, (400, 3)) * (1, 0.003, 0.003)
+    along = math.pi * np.hypot(rod[:, 1], rod[:, 2]).max() ** 2 * np.ptp(rod[:, 0])
+    for turn in Rotation.random(3, random_state=0).as_matrix():
+        assert size(enclose(rod @ turn.T, ["cylinder"])) <= along * 1.005
+
+
+def smallest_sphere(points: Array) -> float:
+    """Radius by trying every sphere through two to four points."""
+    radii = []
+    for n in (2, 3, 4):
+        for some in itertools.combinations(range(len(points)), n):
+            spokes = points[list(some[1:])] - points[some[0]]
+            weights = np.linalg.lstsq(spokes @ spokes.T, (spokes**2).sum(axis=1) / 2, rcond=None)[0]
+            centre = points[some[0]] + weights @ spokes
+            radii.append(np.linalg.norm(points - centre, axis=1).max())
+    return float(min(radii))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_sphere_is_the_smallest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(8, 3))
+    if seed % 3 == 1:
+        points = points.round()
+    if seed % 3 == 2:
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    sphere = enclose(points, ["sphere"]).geometry
+    assert isinstance(sphere, Sphere)
+    assert sphere.radius == pytest.approx(smallest_sphere(points), abs=3e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_volume_does_not_depend_on_the_links_frame(kind: Kind) -> None:
+    points = cloud(np.random.default_rng(5))
+    turns = Rotation.random(3, random_state=1).as_matrix()
+    volumes = [size(enclose(points @ turn.T + 0.3, [kind])) for turn in turns]
+    assert max(volumes) <= min(volumes) * ROUNDING
+
+
+def test_of_several_kinds_the_least_is_taken() -> None:
+    points = cloud(np.random.default_rng(7))
+    alone = {kind: enclose(points, [kind]) for kind in KINDS}
+    assert enclose(points) == min(alone.values(), key=size)
+    rest = ("sphere", "box")
+    assert enclose(points, rest) == min((alone[kind] for kind in rest), key=size)
+
+
+def test_the_same_points_get_the_same_shape_and_inner_points_do_not_matter() -> None:
+    rng = np.random.default_rng(8)
+    points = cloud(rng)
+    shape = enclose(points)
+    assert enclose(points.copy()) == shape
+    inner = rng.dirichlet(np.ones(len(points)), 500) @ points
+    assert enclose(np.concatenate([points, inner, points])) == shape
+
+
+def test_a_dense_round_hull_is_held_as_tightly_as_a_coarse_one() -> None:
+    egg = np.asarray(trimesh.creation.icosphere(5).vertices) * (0.3, 0.2, 0.1)
+    assert len(egg) > 10_000
+    turn = Rotation.from_rotvec([0.5, 0.2, 1.0]).as_matrix()
+    shape = enclose(egg @ turn.T, ["box"])
+    assert outside(shape, egg @ turn.T) <= 1e-9
+    assert size(shape) <= 0.6 * 0.4 * 0.2 * ROUNDING
+
+
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        (np.zeros((0, 3)), "0 points"),
+        (np.ones((9, 3)), "1 points are distinct"),
+        (np.eye(3)[[0, 1, 2, 0, 1, 2]], "3 points are distinct"),
+        (np.stack([np.arange(5.0)] * 3, axis=1), "flat"),
+        (np.insert(np.random.default_rng(0).normal(size=(50, 2)), 1, 3.0, axis=1), "flat"),
+        (np.vstack([CUBE, [0.0, 0.0, np.nan]]), "not finite"),
+        (np.vstack([CUBE, [0.0, -np.inf, 0.0]]), "not finite"),
+    ],
+)
+def test_what_has_no_volume_is_refused(points: Array, reason: str) -> None:
+    with pytest.raises(FitError, match=reason):
+        enclose(points)
+
+
+def test_a_wrong_call_is_a_programming_error() -> None:
+    with pytest.raises(ValueError, match=r"\(8, 2\), not \(n, 3\)"):
+        enclose(CUBE[:, :2])
+    with pytest.raises(ValueError, match="valid: some of box, cylinder, sphere"):
+        enclose(CUBE, [])
+    with pytest.raises(ValueError, match="capsule"):
+        enclose(CUBE, ["box", "capsule"])  # type: ignore[list-item]

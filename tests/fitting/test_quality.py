@@ -1,0 +1,230 @@
+"""Measures of primitives whose answers are known in closed form."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.integrate import dblquad
+
+from morphgen.errors import FitError
+from morphgen.fitting.quality import Quality, quality, signed_distance
+from morphgen.fitting.solid import Solid, solid_of
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.inertia import solid_mesh
+
+BLOCK = Shape(Box((0.4, 0.2, 0.1)))
+CUBE = Shape(Box((0.2, 0.2, 0.2)))
+TILTED = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.4, -1.1, 2.0))
+KINDS = [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]
+DISTANCES = ("protrusion_mean", "protrusion_p95", "gap_mean", "gap_p95", "hausdorff")
+SHARES = ("iou", "coverage", "volume_ratio")
+
+
+def at(x: float, y: float = 0.0, z: float = 0.0) -> Pose:
+    return Pose((x, y, z))
+
+
+def solid(*pieces: tuple[Box, Pose]) -> Solid:
+    return solid_of([Shape(box, pose) for box, pose in pieces])
+
+
+def assert_perfect(found: Quality) -> None:
+    assert [getattr(found, name) for name in SHARES] == [1.0, 1.0, 1.0]
+    assert max(getattr(found, name) for name in DISTANCES) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("geometry", "point", "expected"),
+    [
+        (Box((2, 4, 6)), (0, 0, 0), -1),
+        (Box((2, 4, 6)), (0.5, 1.9, 0), -0.1),
+        (Box((2, 4, 6)), (4, 6, 0), 5),
+        (Box((2, 4, 6)), (-2, -4, -5), 3),
+        (Sphere(2), (0, 3, 4), 3),
+        (Sphere(2), (0, 0, 0.5), -1.5),
+        (Cylinder(1, 6), (0.6, 0.8, 2), 0),
+        (Cylinder(1, 6), (0, 0, 2.5), -0.5),
+        (Cylinder(1, 6), (0, 0.8, 1), -0.2),
+        (Cylinder(1, 6), (4, 0, -7), 5),
+        (Capsule(1, 6), (0, 0, 3.5), -0.5),
+        (Capsule(1, 6), (0.25, 0, 1), -0.75),
+        (Capsule(1, 6), (3, 0, 7), 4),
+    ],
+)
+@pytest.mark.parametrize("pose", [Pose(), TILTED])
+def test_signed_distances_of_one_primitive_are_exact(geometry, point, expected, pose):
+    found = signed_distance([Shape(geometry, pose)], np.array([pose.apply(point)]))
+    assert found == pytest.approx([expected], abs=1e-12)
+
+
+def test_the_signed_distance_of_a_union_is_to_the_nearest_and_within_a_bound():
+    pair = [Shape(Box((2, 2, 2)), at(-0.5)), Shape(Box((2, 2, 2)), at(0.5))]
+    found = signed_distance(pair, np.array([[3, 0, 0], [-4.5, 0, 5], [0, 0, 0], [0, 0, 0.9]]))
+    np.testing.assert_allclose(found, [1.5, 5, -0.5, -0.1], atol=1e-12)
+    crossed = [Shape(Box((2, 2, 2)), at(-0.8)), Shape(Box((2, 2, 2)), at(0.8))]
+    assert signed_distance(crossed, np.zeros((1, 3))) == pytest.approx([-0.2])
+
+
+@pytest.mark.parametrize("shape", [BLOCK, CUBE, Shape(Box((0.1, 0.2, 0.3)), TILTED)])
+def test_a_box_stands_for_itself(shape):
+    assert_perfect(quality(solid_of([shape]), [shape]))
+
+
+def test_a_box_a_tenth_too_long_protrudes_by_what_it_is_too_long():
+    found = quality(solid_of([BLOCK]), [Shape(Box((0.44, 0.2, 0.1)), at(0.02))])
+    assert found.iou == pytest.approx(1 / 1.1, abs=1e-4)
+    assert found.coverage == 1
+    assert found.volume_ratio == pytest.approx(1.1, abs=1e-4)
+    area = 2 * (0.44 * 0.2 + 0.2 * 0.1 + 0.1 * 0.44)
+    end, strips = 0.2 * 0.1 * 0.04, 2 * (0.2 + 0.1) * 0.04 * 0.02
+    assert found.protrusion_mean == pytest.approx((end + strips) / area, rel=5e-3)
+    assert found.protrusion_p95 == pytest.approx(0.04, abs=1e-9)
+    assert found.gap_mean == found.gap_p95 == 0
+    assert found.hausdorff == pytest.approx(0.04, abs=1e-9)
+
+
+def test_a_sphere_in_a_cube_leaves_the_corners():
+    found = quality(solid_of([CUBE]), [Shape(Sphere(0.1))])
+    assert found.iou == found.coverage == found.volume_ratio
+    assert found.iou == pytest.approx(math.pi / 6, abs=1e-3)
+    assert found.protrusion_mean == pytest.approx(0, abs=1e-9)
+    away, _ = dblquad(lambda y, x: math.sqrt(1 + x * x + y * y), 0, 1, 0, 1)
+    assert found.gap_mean == pytest.approx(0.1 * (away - 1), rel=0.02)
+    assert found.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-9)
+
+
+def test_a_cube_around_a_ball_protrudes_at_the_corners():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    found = quality(Solid(ball, "watertight"), [CUBE])
+    assert found.coverage == 1
+    assert found.iou == pytest.approx(math.pi / 6, abs=2e-3)
+    assert found.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-4)
+    assert found.gap_p95 == 0
+
+
+def test_a_cylinder_stands_for_its_tessellation_but_for_the_slivers():
+    shape = Shape(Cylinder(0.05, 0.2), TILTED)
+    found = quality(solid_of([shape]), [shape])
+    assert found.iou == pytest.approx(48 / math.tau * math.sin(math.tau / 48), abs=5e-4)
+    assert found.coverage == pytest.approx(1, abs=1e-4)
+    sagitta = 0.05 * (1 - math.cos(math.pi / 48))
+    assert found.hausdorff == pytest.approx(sagitta, rel=0.02)
+    assert 0 < found.protrusion_p95 <= sagitta + 1e-9
+    assert found.gap_mean < 1e-9
+
+
+@pytest.mark.parametrize("shift", [0.05, 0.1])
+def test_what_two_boxes_share_counts_once(shift):
+    pair = [Shape(Box((0.2, 0.2, 0.1)), at(-shift)), Shape(Box((0.2, 0.2, 0.1)), at(shift))]
+    assert_perfect(quality(solid((Box((0.2 + 2 * shift, 0.2, 0.1)), Pose())), pair))
+
+
+@pytest.mark.parametrize(
+    "idle",
+    [Shape(Sphere(0.09)), Shape(Box((0.2, 0.2, 0.1)), at(0, 0, 0.05)), CUBE],
+    ids=["within", "flush", "equal"],
+)
+def test_a_primitive_within_another_changes_nothing(idle):
+    small = solid((Box((0.04, 0.04, 0.04)), at(0, 0, -0.06)))
+    once = quality(small, [CUBE])
+    for both in ([CUBE, idle], [idle, CUBE]):
+        found = quality(small, both)
+        for name in SHARES + DISTANCES:
+            assert getattr(found, name) == pytest.approx(getattr(once, name), rel=5e-3, abs=1e-9)
+
+
+def test_a_skin_around_several_boxes_is_as_thin_as_it_is():
+    skin = 1e-4
+    pair = [
+        Shape(Box((0.3 + skin, 0.2 + 2 * skin, 0.1 + 2 * skin)), at(sign * (0.05 + skin / 2)))
+        for sign in (-1, 1)
+    ]
+    found = quality(solid_of([BLOCK]), pair)
+    assert found.coverage == 1
+    assert found.protrusion_mean == pytest.approx(skin, rel=0.01)
+    assert found.hausdorff == pytest.approx(math.sqrt(3) * skin, rel=1e-6)
+
+
+def test_shapes_apart_share_nothing():
+    found = quality(solid_of([CUBE]), [Shape(CUBE.geometry, at(0.5))])
+    assert found.iou == found.coverage == 0
+    assert found.volume_ratio == pytest.approx(1, rel=1e-3)
+    assert found.hausdorff == pytest.approx(0.5, abs=1e-9)
+    assert 0.3 < found.gap_mean == pytest.approx(found.protrusion_mean, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "primitives",
+    [
+        [CUBE],
+        [Shape(Box((0.11, 0.2, 0.2)), at(-0.045)), Shape(Box((0.12, 0.2, 0.2)), at(0.04))],
+    ],
+)
+def test_the_walls_of_a_slot_are_as_far_from_the_surface_as_it_is_deep(primitives):
+    slotted = solid(
+        (Box((0.096, 0.2, 0.2)), at(-0.052)),
+        (Box((0.096, 0.2, 0.2)), at(0.052)),
+        (Box((0.2, 0.2, 0.02)), at(0, 0, -0.09)),
+    )
+    found = quality(slotted, primitives)
+    assert found.iou == pytest.approx(1 - 0.008 * 0.18 / 0.04, abs=1e-3)
+    assert found.protrusion_p95 < 1e-9
+    assert found.protrusion_mean < 1e-4
+    assert found.hausdorff == pytest.approx(0.096, abs=2e-4)
+
+
+@pytest.mark.parametrize("geometry", KINDS)
+def test_surfaces_are_sampled_evenly(geometry):
+    kernel = Shape(Box((0.02, 0.05, 0.01)), TILTED @ at(0.05, 0.02, 0.03))
+    small = solid_of([kernel])
+    found = quality(small, [Shape(geometry, TILTED)])
+    mesh = solid_mesh(geometry).copy()
+    for _ in range(2 if isinstance(geometry, Sphere) else 0):
+        mesh = mesh.subdivide()
+    mesh.apply_transform(TILTED.matrix)
+    points, _ = trimesh.sample.sample_surface(mesh, 40_000, seed=3)
+    distance = small.distance(np.asarray(points))
+    assert found.protrusion_mean == pytest.approx(distance.mean(), rel=0.01)
+    assert found.protrusion_p95 == pytest.approx(np.percentile(distance, 95), rel=0.01)
+    assert found.coverage == 1
+
+
+def test_a_motion_of_both_changes_no_measure():
+    pieces = [Shape(Box((0.3, 0.1, 0.1))), Shape(Cylinder(0.06, 0.3), at(0.1, 0, 0.1))]
+    stand_ins = [Shape(Capsule(0.06, 0.2), at(0.1, 0, 0.08)), Shape(Box((0.3, 0.12, 0.08)))]
+    moved = [
+        [Shape(each.geometry, TILTED @ each.T_link_shape) for each in shapes]
+        for shapes in (pieces, stand_ins)
+    ]
+    before, after = quality(solid_of(pieces), stand_ins), quality(solid_of(moved[0]), moved[1])
+    for name in SHARES:
+        assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-3)
+    for name in DISTANCES:
+        assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-3)
+
+
+def test_the_seed_decides_and_errors_are_small():
+    ball = [Shape(Sphere(0.1))]
+    cube = solid_of([CUBE])
+    found = [quality(cube, ball, seed=seed) for seed in range(8)]
+    assert quality(cube, ball, seed=3) == found[3]
+    assert len({each.gap_mean for each in found}) == len(found)
+    error = np.array([each.iou for each in found]) - math.pi / 6
+    assert np.abs(error).max() < 2e-3
+    assert quality(cube, ball, volume_points=1000) == quality(cube, ball, volume_points=1024)
+
+
+def test_a_mesh_nothing_and_a_flat_box_are_no_primitives(tmp_path):
+    cube = solid_of([CUBE])
+    for wrong in ([], [CUBE, Shape(Mesh(tmp_path / "a.stl"))], [Shape(Box((1, 0, 1)))]):
+        with pytest.raises(ValueError, match="primitive"):
+            quality(cube, wrong)
+        with pytest.raises(ValueError, match="primitive"):
+            signed_distance(wrong, np.zeros((1, 3)))
+
+
+def test_a_solid_too_small_to_be_hit_is_refused():
+    speck = solid((Box((1e-3, 1e-3, 1e-3)), Pose()))
+    with pytest.raises(FitError, match="none of 64 sample points"):
+        quality(speck, [Shape(Sphere(1.0), at(5))], volume_points=64)

@@ -1,0 +1,234 @@
+"""Robots with primitives in place of meshes: what changes, what stays, what is told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+import morphgen
+from morphgen.checks.self_collision import SelfCollision
+from morphgen.errors import FitError
+from morphgen.fitting.agreement import agreement
+from morphgen.fitting.dressed import (
+    as_primitives,
+    link_shapes,
+    stored_primitives,
+    with_primitives,
+)
+from morphgen.fitting.link import FitOptions, fit_shapes
+from morphgen.fitting.parts import COLLISION, TOKEN, parts_with_meshes, store_part
+from morphgen.fitting.quality import quality, signed_distance
+from morphgen.fitting.robot import fit_links
+from morphgen.fitting.solid import solid_of
+from morphgen.fitting.stored import SUFFIX, read_stored, shapes_key
+from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import IDENTITY, Box, Mesh, Pose, Shape, Sphere
+from morphgen.model.robot import Joint, Link, Robot
+
+LIBRARY = default_library()
+
+
+def mesh_shape(folder, mesh, name="part.stl", pose=IDENTITY):
+    mesh.export(folder / name)
+    return Shape(Mesh(folder / name), pose)
+
+
+def arm(*links):
+    """A chain of links with those collision shapes, a hinge between each two."""
+    made = tuple(Link(f"l{i}", None, (), tuple(shapes)) for i, shapes in enumerate(links))
+    joints = tuple(
+        Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", Pose((0.0, 0.0, 0.5)), axis=(0, 0, 1))
+        for i in range(len(made) - 1)
+    )
+    return Robot("arm", made, joints, home=(0.0,) * len(joints))
+
+
+@pytest.fixture
+def wedge():
+    """A solid without any symmetry."""
+    points = [(0, 0, 0), (0.3, 0, 0), (0, 0.2, 0), (0, 0, 0.1), (0.3, 0.05, 0.02), (0.1, 0.2, 0.1)]
+    return trimesh.convex.convex_hull(np.array(points))
+
+
+def test_a_mirrored_link_shares_its_fit(tmp_path, wedge):
+    mirrored = wedge.copy()
+    mirrored.apply_transform(np.diag([1.0, -1, 1, 1]))
+    robot = arm(
+        [mesh_shape(tmp_path, wedge, "a.stl")],
+        [mesh_shape(tmp_path, mirrored, "b.stl", Pose((0.1, 0.0, 0.0)))],
+    )
+    first, second = fit_links(robot, FitOptions()).links
+    assert (first.same_as, second.same_as) == (None, "l0")
+    assert second.fit.quality.iou == pytest.approx(first.fit.quality.iou, abs=0.01)
+    assert second.fit.seconds == 0
+
+
+def test_the_result_does_not_depend_on_the_processes(tmp_path, wedge):
+    ball = trimesh.creation.icosphere(3, 0.1)
+    robot = arm([mesh_shape(tmp_path, wedge, "a.stl")], [mesh_shape(tmp_path, ball, "b.stl")])
+    one, two = (fit_links(robot, FitOptions(), jobs=jobs).links for jobs in (1, 2))
+    assert [row.fit.primitives for row in one] == [row.fit.primitives for row in two]
+
+
+def test_a_flat_link_gets_no_primitive_and_a_finding(tmp_path, wedge):
+    flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 1, 2), (0, 2, 3)])
+    robot = arm([mesh_shape(tmp_path, flat, "f.stl")], [mesh_shape(tmp_path, wedge, "w.stl")])
+    report = fit_links(robot, FitOptions())
+    assert [row.link for row in report.links] == ["l1"]
+    (finding,) = report.findings
+    assert (finding.code, finding.where) == ("no-primitive", "link l0")
+    made = with_primitives(robot, {row.link: row.fit.primitives for row in report.links})
+    assert made.links[0].collisions == ()
+
+
+def test_primitives_that_are_there_stay_as_they_are():
+    shapes = (Shape(Box((0.1, 0.2, 0.3)), Pose((0.0, 0.1, 0.0))), Shape(Sphere(0.1)))
+    kept = fit_shapes(shapes, FitOptions(max_primitives=2))
+    assert kept.primitives == shapes
+    assert kept.solid == "primitives"
+    assert kept.quality.iou > 0.99
+    assert len(fit_shapes(shapes, FitOptions(max_primitives=1)).primitives) == 1
+
+
+def test_enclosing_primitives_hold_every_vertex(tmp_path, wedge):
+    bent = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((0.4, 0.1, 0.1)),
+            trimesh.creation.box(
+                (0.1, 0.1, 0.4), trimesh.transformations.translation_matrix([0.15, 0, 0.15])
+            ),
+        ]
+    )
+    shape = mesh_shape(tmp_path, bent)
+    one, three = (
+        fit_shapes([shape], FitOptions(max_primitives=k, iou=0.95, enclose=True)) for k in (1, 3)
+    )
+    for fit in (one, three):
+        assert signed_distance(fit.primitives, np.asarray(bent.vertices)).max() <= 1e-9
+        assert fit.quality.coverage > 0.999
+    assert len(three.primitives) > 1
+    assert three.quality.volume_ratio < 0.7 * one.quality.volume_ratio
+
+
+def test_more_primitives_are_better_until_they_are_good_enough(tmp_path):
+    bent = trimesh.util.concatenate(
+        [
+            trimesh.creation.cylinder(0.05, 0.4),
+            trimesh.creation.box(
+                (0.3, 0.08, 0.08), trimesh.transformations.translation_matrix([0.15, 0, 0.2])
+            ),
+        ]
+    )
+    shape = mesh_shape(tmp_path, bent)
+    fits = [fit_shapes([shape], FitOptions(max_primitives=k)) for k in (1, 2, 8)]
+    scores = [fit.quality.iou for fit in fits]
+    assert scores[0] < 0.75
+    assert scores[1] > 0.9
+    assert len(fits[2].primitives) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_primitives": 0}, "0 primitives: expected 1 to 32"),
+        ({"iou": 1.5}, "IoU 1.5"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        FitOptions(**options)
+
+
+def test_a_robot_in_primitives_keeps_its_masses_and_joints():
+    meshes = morphgen.compose("arm=ur5 ee=plane")
+    made = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
+    assert made.joints == meshes.joints
+    assert [link.inertial for link in made.links] == [link.inertial for link in meshes.links]
+    assert [link.visuals for link in made.links] == [link.visuals for link in meshes.links]
+    assert not any(isinstance(s.geometry, Mesh) for link in made.links for s in link.collisions)
+    assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
+    assert SelfCollision(made).penetrations([made.home]) == [{}]
+    assert morphgen.check(made) == morphgen.check(meshes)
+
+
+def test_visuals_are_replaced_on_request(tmp_path, wedge):
+    shape = mesh_shape(tmp_path, wedge)
+    robot = arm([shape])
+    seen = dataclasses.replace(
+        robot.links[0], visuals=(dataclasses.replace(shape, rgba=(1, 0, 0, 1)),)
+    )
+    robot = dataclasses.replace(robot, links=(seen,))
+    box = (Shape(Box((0.1, 0.1, 0.1))),)
+    assert with_primitives(robot, {"l0": box}).links[0].visuals == seen.visuals
+    replaced = with_primitives(robot, {"l0": box}, visual=True).links[0]
+    assert replaced.visuals == (dataclasses.replace(box[0], rgba=(1, 0, 0, 1)),)
+
+
+def test_links_that_are_not_stored_are_fitted_now(tmp_path, wedge):
+    robot = arm([mesh_shape(tmp_path, wedge)])
+    assert stored_primitives(robot, read_stored(LIBRARY.folders)) == ({}, ["l0"])
+    made = as_primitives(robot, LIBRARY.folders)
+    worth = quality(solid_of(robot.links[0].collisions), made.links[0].collisions)
+    assert worth.iou > 0.7
+
+
+def test_a_link_that_nothing_can_stand_for_stops_composing(tmp_path):
+    flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (1, 1, 0)], [(0, 1, 2)])
+    with pytest.raises(FitError, match="link l0"):
+        as_primitives(arm([mesh_shape(tmp_path, flat)]), LIBRARY.folders)
+
+
+def test_primitives_agree_better_with_meshes_than_hulls_do():
+    meshes = load_part(LIBRARY.manifest("ur5")).body
+    found, _ = stored_primitives(meshes, read_stored(LIBRARY.folders))
+    primitives, hulls = agreement(meshes, with_primitives(meshes, found), 300)
+    for counts in (primitives, hulls):
+        assert counts.both + counts.neither + counts.only_meshes + counts.only_other == 300
+    assert primitives.accuracy > 0.9 > hulls.accuracy
+    assert hulls.recall == 1.0
+
+
+def test_a_robot_agrees_with_itself():
+    robot = morphgen.compose("chain beads=6")
+    same, _ = agreement(robot, robot, 200)
+    assert (same.precision, same.recall, same.accuracy) == (1, 1, 1)
+    assert same.both
+    assert same.neither
+
+
+def test_every_real_part_is_stored():
+    assert [m.name for m in parts_with_meshes(LIBRARY, missing=True)] == []
+
+
+def test_a_user_s_part_is_stored_beside_its_manifest(tmp_path):
+    source = LIBRARY.paths["so101_jaw"]
+    own = tmp_path / "my_jaw.yaml"
+    own.write_text(source.read_text().replace("name: so101_jaw", "name: my_jaw"))
+    library = Library([tmp_path])
+    (manifest,) = parts_with_meshes(library, missing=True)
+    assert store_part(manifest) == tmp_path / f"my_jaw{SUFFIX}"
+    assert parts_with_meshes(library, missing=True) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("ur5", TOKEN),
+        ("panda_hand", COLLISION),
+        pytest.param("ur5", COLLISION, marks=pytest.mark.slow),
+        pytest.param("xarm7", COLLISION, marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_stored_reproduces(name, options):
+    """To a hundredth: other processors round sums otherwise, and a search amplifies that."""
+    body = load_part(LIBRARY.manifest(name)).body
+    stored = read_stored(LIBRARY.folders)
+    for row in fit_links(body, options).links:
+        shapes = link_shapes(body.link(row.link))
+        fit = stored[shapes_key(shapes)]
+        kept = (fit.token,) if options == TOKEN else fit.collision
+        assert quality(solid_of(shapes), kept).iou == pytest.approx(row.fit.quality.iou, abs=0.01)
+        assert len(kept) == len(row.fit.primitives)

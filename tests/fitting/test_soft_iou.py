@@ -1,0 +1,270 @@
+"""Overlaps that geometry knows, and candidates that climb to where they belong."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from morphgen.fitting.soft_iou import KINDS, Candidates, ascend, overlaps
+
+BOX, CYLINDER, SPHERE = (KINDS.index(kind) for kind in ("box", "cylinder", "sphere"))
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+TILTED = (0.8, 0.2, -0.4, 0.4)
+HALVES = (0.3, 0.2, 0.1)
+EDGE = (np.arange(40) + 0.5) / 40 - 0.5
+GRID = np.stack(np.meshgrid(EDGE, EDGE, EDGE, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Middles of cells of 0.025 in the unit cube; boxes of whole cells are counted exactly."""
+POINTS = qmc.Sobol(3, rng=np.random.default_rng(0)).random(2**11) - 0.5
+CLIMB = {"steps": 80, "tau": (0.03, 0.002), "rate": (0.01, 0.0005)}
+
+
+def primitive(kind, centre=(0.0, 0.0, 0.0), quaternion=UPRIGHT, halves=HALVES):
+    """One guess of one primitive."""
+    arrays = (np.array(value, float)[None, None] for value in (centre, quaternion, halves))
+    return Candidates(np.array([[kind]]), *arrays)
+
+
+def turned(points, quaternion):
+    """Points in the frame of a quaternion of unit length."""
+    w, *axis = quaternion
+    return points - 2 * w * np.cross(axis, points) + 2 * np.cross(axis, np.cross(axis, points))
+
+
+def within(kind, points, halves):
+    """Which points lie in a primitive at the origin, by its definition."""
+    x, y, z = np.abs(points).T
+    if kind == BOX:
+        return (x <= halves[0]) & (y <= halves[1]) & (z <= halves[2])
+    if kind == CYLINDER:
+        return (np.hypot(x, y) <= halves[0]) & (z <= halves[2])
+    return np.linalg.norm(points, axis=1) <= halves[0]
+
+
+def iou(first, second):
+    return (first & second).sum() / (first | second).sum()
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+@pytest.mark.parametrize("quaternion", [UPRIGHT, TILTED])
+@pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE])
+def test_a_primitive_overlaps_itself_wholly(kind, quaternion, scale):
+    inside = within(kind, turned(GRID, quaternion), HALVES)
+    assert inside.sum() > 400
+    again = primitive(kind, quaternion=tuple(scale * q for q in quaternion))
+    np.testing.assert_allclose(overlaps(again, GRID, inside), [1.0], atol=1e-3)
+
+
+def test_the_frame_of_the_tilted_primitive_is_a_rotation():
+    np.testing.assert_allclose(
+        np.linalg.norm(turned(GRID, TILTED), axis=1), np.linalg.norm(GRID, axis=1)
+    )
+    quarter = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
+    np.testing.assert_allclose(
+        turned(np.array([[0.0, 1.0, 0.0]]), quarter), [[1, 0, 0]], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("shift", [0.05, 0.1])
+def test_the_overlap_of_shifted_boxes_is_that_of_geometry(axis, shift):
+    inside = within(BOX, GRID, HALVES)
+    centre = np.eye(3)[axis] * shift
+    edge = 2 * HALVES[axis]
+    expected = (edge - shift) / (edge + shift)
+    assert overlaps(primitive(BOX, centre), GRID, inside) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_box_turned_a_quarter_has_its_edges_swapped():
+    inside = within(BOX, GRID, (0.2, 0.3, 0.1))
+    quarter = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
+    assert overlaps(primitive(BOX, quaternion=quarter), GRID, inside) == pytest.approx(1.0)
+    assert overlaps(primitive(BOX), GRID, inside) == pytest.approx(0.04 / 0.08, abs=1e-6)
+
+
+def test_concentric_spheres_and_cylinders_overlap_by_their_volumes():
+    ball = within(SPHERE, GRID, (0.45,))
+    found = overlaps(primitive(SPHERE, halves=(0.36, 1, 1)), GRID, ball)
+    assert found == pytest.approx(0.8**3, rel=0.02)
+    can = within(CYLINDER, GRID, (0.4, 0.4, 0.4))
+    found = overlaps(primitive(CYLINDER, halves=(0.3, 9.0, 0.2)), GRID, can)
+    assert found == pytest.approx((0.3 / 0.4) ** 2 / 2, rel=0.03)
+    found = overlaps(primitive(CYLINDER, (0, 0, 0.1), halves=(0.4, 9.0, 0.4)), GRID, can)
+    assert found == pytest.approx(0.7 / 0.9, abs=1e-6)
+
+
+def test_what_misses_overlaps_nothing():
+    nothing = np.zeros(len(GRID), dtype=bool)
+    assert overlaps(primitive(BOX), GRID, nothing).tolist() == [0.0]
+    assert overlaps(primitive(BOX, (9, 9, 9)), GRID, nothing).tolist() == [0.0]
+    assert overlaps(primitive(BOX, (9, 9, 9)), GRID, ~nothing).tolist() == [0.0]
+
+
+def test_points_count_by_their_weights():
+    left = primitive(BOX, (-0.15, 0, 0), halves=(0.15, 0.2, 0.1))
+    inside = within(BOX, GRID, HALVES)
+    weights = np.where(GRID[:, 0] < 0, 3.0, 1.0)
+    assert overlaps(left, GRID, inside) == pytest.approx(1 / 2, abs=1e-6)
+    assert overlaps(left, GRID, inside, weights) == pytest.approx(3 / 4, abs=1e-6)
+    assert overlaps(left, GRID, inside, 7 * weights) == pytest.approx(3 / 4, abs=1e-6)
+    outside = GRID[:, 0] < -0.1
+    assert overlaps(left, GRID, outside, (~outside).astype(float)).tolist() == [0.0]
+
+
+PARTS = (
+    (BOX, (-0.3, 0.0, 0.0), (0.1, 0.2, 0.3)),
+    (CYLINDER, (0.0, 0.1, 0.1), (0.15, 0.15, 0.2)),
+    (SPHERE, (0.25, -0.1, 0.0), (0.2, 0.2, 0.2)),
+)
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_the_order_of_kinds_in_a_row_does_not_matter(order):
+    union = np.zeros(len(GRID), dtype=bool)
+    for kind, centre, halves in PARTS:
+        union |= within(kind, GRID - np.array(centre), halves)
+    rows = [primitive(kind, centre, halves=halves) for kind, centre, halves in PARTS]
+    row = Candidates.join([rows[i] for i in order])
+    assert row.kinds.tolist() == [list(order)]
+    assert overlaps(row, GRID, union) == pytest.approx(1.0, abs=1e-3)
+    inside = within(BOX, GRID, HALVES)
+    assert overlaps(row, GRID, inside) == pytest.approx(iou(union, inside), abs=1e-3)
+
+
+def test_rows_of_other_kinds_do_not_mix():
+    rows = [primitive(kind, centre, TILTED, halves) for kind, centre, halves in PARTS]
+    inside = within(BOX, GRID, HALVES)
+    alone = [overlaps(row, GRID, inside)[0] for row in rows]
+    assert len(set(alone)) == 3
+    for order in ([0, 1, 2], [2, 0, 1, 1], [1, 2, 0]):
+        stacked = Candidates.stack([rows[i] for i in order])
+        np.testing.assert_array_equal(overlaps(stacked, GRID, inside), [alone[i] for i in order])
+
+
+def test_overlapping_primitives_count_once():
+    halves = [primitive(BOX, (x, 0, 0), halves=(0.2, 0.2, 0.1)) for x in (-0.1, 0.1)]
+    inside = within(BOX, GRID, HALVES)
+    assert overlaps(Candidates.join(halves), GRID, inside) == pytest.approx(1.0)
+    assert overlaps(Candidates.join([halves[0]] * 2), GRID, inside) == pytest.approx(2 / 3)
+
+
+def test_more_candidates_than_are_evaluated_together_give_the_same():
+    rng = np.random.default_rng(0)
+    n = 200
+    many = Candidates(
+        rng.integers(0, 3, (n, 2)),
+        rng.uniform(-0.3, 0.3, (n, 2, 3)),
+        rng.normal(size=(n, 2, 4)),
+        rng.uniform(0.05, 0.3, (n, 2, 3)),
+    )
+    inside = within(BOX, POINTS, HALVES)
+    together = overlaps(many, POINTS, inside)
+    assert together.shape == (n,)
+    for i in (0, 11, 12, n - 1):
+        np.testing.assert_allclose(
+            overlaps(many.take(np.array([i])), POINTS, inside), together[i : i + 1]
+        )
+
+
+def test_candidates_are_taken_stacked_and_joined():
+    one, two = primitive(BOX), primitive(SPHERE, (0.1, 0.2, 0.3))
+    stacked = Candidates.stack([one, two])
+    assert stacked.kinds.tolist() == [[BOX], [SPHERE]]
+    joined = Candidates.join([stacked, stacked.take(np.array([1, 0]))])
+    assert joined.kinds.tolist() == [[BOX, SPHERE], [SPHERE, BOX]]
+    np.testing.assert_array_equal(joined.centres[0, 1], (0.1, 0.2, 0.3))
+    np.testing.assert_array_equal(joined.centres[1, 0], (0.1, 0.2, 0.3))
+    assert joined.halves.shape == (2, 2, 3)
+    assert joined.quaternions.shape == (2, 2, 4)
+
+
+TRUE = (0.35, 0.25, 0.15)
+
+
+@pytest.mark.parametrize("quaternion", [UPRIGHT, TILTED])
+def test_a_box_that_is_shifted_and_shrunk_climbs_onto_the_true_one(quaternion):
+    inside = within(BOX, turned(POINTS, quaternion), TRUE)
+    halves = tuple(0.8 * half for half in TRUE)
+    start = primitive(BOX, (0.05, -0.04, 0.03), quaternion, halves)
+    assert overlaps(start, POINTS, inside)[0] < 0.55
+    moved = ascend(start, POINTS, inside, **CLIMB)
+    assert overlaps(moved, GRID, within(BOX, turned(GRID, quaternion), TRUE))[0] > 0.97
+    np.testing.assert_allclose(moved.centres[0, 0], 0, atol=0.01)
+    np.testing.assert_allclose(moved.halves[0, 0], TRUE, atol=0.01)
+    assert np.linalg.norm(moved.quaternions) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "true", "start"),
+    [(CYLINDER, (0.3, 0.3, 0.4), (0.2, 0.2, 0.3)), (SPHERE, (0.4,) * 3, (0.25,) * 3)],
+)
+def test_cylinders_and_spheres_climb_too(kind, true, start):
+    inside = within(kind, POINTS, true)
+    moved = ascend(primitive(kind, (0.05, 0.05, -0.05), halves=start), POINTS, inside, **CLIMB)
+    assert overlaps(moved, GRID, within(kind, GRID, true))[0] > 0.97
+    assert moved.halves[0, 0, 0] == pytest.approx(true[0], abs=0.01)
+
+
+def test_a_tilt_is_turned_back():
+    inside = within(BOX, POINTS, TRUE)
+    moved = ascend(
+        primitive(BOX, quaternion=(1.0, 0.1, -0.05, 0.15), halves=TRUE), POINTS, inside, **CLIMB
+    )
+    assert overlaps(moved, GRID, within(BOX, GRID, TRUE))[0] > 0.97
+
+
+def test_several_candidates_of_several_primitives_climb_at_once():
+    left, right = (np.array((x, 0, 0)) for x in (-0.25, 0.25))
+    inside = within(BOX, POINTS - left, (0.15, 0.3, 0.2)) | within(SPHERE, POINTS - right, (0.2,))
+    pair = Candidates.join(
+        [
+            primitive(BOX, (-0.2, 0.05, 0), halves=(0.12, 0.25, 0.15)),
+            primitive(SPHERE, (0.2, -0.05, 0.05), halves=(0.15,) * 3),
+        ]
+    )
+    swapped = Candidates(
+        pair.kinds[:, ::-1], pair.centres[:, ::-1], pair.quaternions[:, ::-1], pair.halves[:, ::-1]
+    )
+    moved = ascend(Candidates.stack([pair, swapped]), POINTS, inside, **CLIMB)
+    fresh = within(BOX, GRID - left, (0.15, 0.3, 0.2)) | within(SPHERE, GRID - right, (0.2,))
+    assert overlaps(moved, GRID, fresh).min() > 0.96
+    assert moved.kinds.tolist() == [[BOX, SPHERE], [SPHERE, BOX]]
+    np.testing.assert_allclose(moved.centres[0], moved.centres[1, ::-1], atol=1e-3)
+
+
+def test_points_of_no_weight_are_not_missed():
+    """A solid of two boxes: a candidate spans both, or holds the one that its weights leave."""
+    halves = (0.125, 0.3, 0.2)
+    boxes = [within(BOX, POINTS - np.array((x, 0, 0)), halves) for x in (-0.25, 0.25)]
+    starts = [primitive(BOX, (x, 0, 0), halves=(0.2, 0.2, 0.15)) for x in (-0.05, 0.05, 0.0)]
+    care = np.stack([~boxes[1], ~boxes[0], np.ones(len(POINTS), bool)]).astype(float)
+    solid = boxes[0] | boxes[1]
+    moved = ascend(Candidates.stack(starts), POINTS, solid, weights=care, **CLIMB)
+    np.testing.assert_allclose(moved.centres[:, 0, 0], (-0.25, 0.25, 0), atol=0.01)
+    np.testing.assert_allclose(moved.halves[:, 0, 0], (0.125, 0.125, 0.375), atol=0.01)
+    np.testing.assert_allclose(moved.halves[:, 0, 1:], [halves[1:]] * 3, atol=0.01)
+    plain = ascend(Candidates.stack(starts), POINTS, solid, **CLIMB)
+    np.testing.assert_allclose(plain.halves[:, 0, 0], 0.375, atol=0.01)
+
+
+def test_the_start_is_left_alone_and_the_same_start_ends_the_same():
+    inside = within(BOX, turned(POINTS, TILTED), TRUE)
+    start = Candidates.stack([primitive(kind, (0.02, 0, 0)) for kind in (SPHERE, BOX, CYLINDER)])
+    before = [array.copy() for array in (start.centres, start.quaternions, start.halves)]
+    first, second = (ascend(start, POINTS, inside, **CLIMB) for _ in range(2))
+    for name, was in zip(("centres", "quaternions", "halves"), before, strict=True):
+        np.testing.assert_array_equal(getattr(start, name), was)
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        assert not np.array_equal(getattr(first, name), was)
+    np.testing.assert_array_equal(first.kinds, start.kinds)
+
+
+@pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE])
+def test_a_point_in_the_very_middle_spoils_no_gradient(kind):
+    points = np.concatenate([np.zeros((1, 3)), POINTS[:500]])
+    moved = ascend(primitive(kind), points, within(BOX, points, TRUE), **(CLIMB | {"steps": 5}))
+    assert all(
+        np.isfinite(array).all() for array in (moved.centres, moved.quaternions, moved.halves)
+    )
+    assert (moved.halves > 0).all()

@@ -1,0 +1,363 @@
+"""What is inside of meshes as they are found: open, nested, inside out, doubled, flat, enormous."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from morphgen.errors import FitError, MeshError
+from morphgen.fitting.solid import DECIMATED, MAX_FACES, solid_of, solid_of_mesh
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
+
+SIZE = (0.2, 0.3, 0.4)
+BOX_VOLUME = 0.024
+HALF = 0.25
+"""Half the edge of the cube in which volumes are counted."""
+TILTED = Pose.from_xyz_rpy((0.05, -0.02, 0.03), (0.3, 0.5, -0.4))
+
+
+AXIS = (np.arange(50) + 0.5) / 100 - HALF
+GRID = np.stack(np.meshgrid(AXIS, AXIS, AXIS, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Middles of cells of a centimetre; boxes of whole cells are counted exactly."""
+
+
+def counted(solid):
+    """The volume by counting."""
+    return solid.contains(GRID).mean() * (2 * HALF) ** 3
+
+
+def box(size=SIZE, at=(0.0, 0.0, 0.0), inverted=False):
+    mesh = trimesh.creation.box(size)
+    mesh.apply_translation(at)
+    if inverted:
+        mesh.invert()
+    return mesh
+
+
+def without(mesh, dropped):
+    """The mesh less the triangles that the mask names."""
+    kept = mesh.copy()
+    kept.update_faces(~dropped)
+    kept.remove_unreferenced_vertices()
+    return kept
+
+
+def soup(corners):
+    """Triangles, shape (n, 3, 3), that share no vertices."""
+    return trimesh.Trimesh(
+        corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
+    )
+
+
+def angle():
+    """An L-shaped prism of 0.014 cubic metres, so that its hull, of 0.023, is another solid."""
+    outline = np.array([(0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4)]) / 10 - 0.2
+    vertices = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (-0.1, 0.1)])
+    cap = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
+    sides = [(i, j, j + 6, i + 6) for i, j in zip(range(6), (1, 2, 3, 4, 5, 0), strict=True)]
+    walls = [three for a, b, c, d in sides for three in ((a, b, c), (a, c, d))]
+    return trimesh.Trimesh(vertices, [*cap[:, ::-1], *(cap + 6), *walls])
+
+
+def strip(angle, n=24):
+    """A strip bent around z by an angle, with a radius of 0.2 and a width of 0.4."""
+    turns = np.linspace(0, angle, n)
+    vertices = [(0.2 * math.cos(a), 0.2 * math.sin(a), z) for a in turns for z in (-0.2, 0.2)]
+    firsts = [2 * i for i in range(n - 1)]
+    faces = [three for i in firsts for three in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))]
+    return trimesh.Trimesh(vertices, faces)
+
+
+def test_a_closed_box_is_the_box():
+    solid = solid_of_mesh(box())
+    assert (solid.method, solid.decimated_from) == ("watertight", None)
+    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
+    assert solid.size == pytest.approx(math.hypot(*SIZE))
+    assert solid.hull.volume == pytest.approx(BOX_VOLUME)
+
+
+def test_what_is_inside_of_an_l_is_not_what_is_inside_of_its_hull():
+    solid = solid_of_mesh(angle())
+    assert solid.method == "watertight"
+    assert counted(solid) == pytest.approx(0.014, rel=1e-9)
+    assert solid.contains(np.array([(-0.15, 0.1, 0), (0, 0, 0)])).tolist() == [True, False]
+
+
+def test_points_beyond_the_bounding_box_are_outside():
+    assert not solid_of_mesh(box()).contains(np.array([(0.1001, 0, 0), (5, 5, 5)])).any()
+
+
+def test_a_box_that_is_inside_out_is_turned():
+    solid = solid_of_mesh(box(inverted=True))
+    assert solid.method == "repaired"
+    assert solid.mesh.volume == pytest.approx(BOX_VOLUME)
+    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
+
+
+@pytest.mark.parametrize("flipped", range(1, 12, 3))
+def test_triangles_that_are_turned_the_wrong_way_are_turned_back(flipped):
+    mesh = box()
+    faces = mesh.faces.copy()
+    faces[:flipped] = faces[:flipped, ::-1]
+    solid = solid_of_mesh(trimesh.Trimesh(mesh.vertices, faces, process=False))
+    assert solid.method == "repaired"
+    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
+
+
+@pytest.mark.parametrize("outer", [False, True])
+@pytest.mark.parametrize("inner", [False, True])
+def test_a_cavity_is_filled_whichever_way_its_triangles_face(inner, outer):
+    nested = [box(inverted=outer), box((0.1, 0.1, 0.1), inverted=inner)]
+    solid = solid_of_mesh(trimesh.util.concatenate(nested))
+    assert solid.method == ("repaired" if inner or outer else "watertight")
+    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
+
+
+@pytest.mark.parametrize("inverted", [(False, False), (False, True), (True, True)])
+def test_boxes_that_overlap_count_as_their_union(inverted):
+    first, second = inverted
+    boxes = [box((0.2,) * 3, (-0.06, 0, 0), first), box((0.2,) * 3, (0.06, 0, 0), second)]
+    solid = solid_of_mesh(trimesh.util.concatenate(boxes))
+    assert counted(solid) == pytest.approx(0.32 * 0.2 * 0.2, rel=1e-9)
+    assert solid.contains(np.array([(x, 0, 0) for x in (-0.1, 0, 0.1)])).all()
+
+
+@pytest.mark.parametrize("merged", [False, True])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_mesh_that_is_there_twice_counts_once(merged, inverted):
+    again = angle()
+    if inverted:
+        again.invert()
+    twice = trimesh.util.concatenate([angle(), again])
+    if merged:
+        twice.merge_vertices()
+    assert counted(solid_of_mesh(twice)) == pytest.approx(0.014, rel=1e-9)
+
+
+def test_boxes_that_share_the_vertices_of_a_face_are_one_body():
+    stacked = trimesh.util.concatenate([box((0.2,) * 3, (0, 0, z)) for z in (-0.1, 0.1)])
+    stacked.merge_vertices()
+    solid = solid_of_mesh(stacked)
+    assert counted(solid) == pytest.approx(0.016, rel=1e-9)
+    assert solid.contains(np.array([(0, 0, -0.01), (0, 0, 0.01)])).all()
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_box_without_a_face_is_filled(axis, side):
+    whole = box()
+    mesh = without(whole, whole.face_normals[:, axis] * side > 0.5)
+    assert len(mesh.faces) == 10
+    solid = solid_of_mesh(mesh)
+    assert solid.method in ("repaired", "winding")
+    assert solid.contains(np.zeros((1, 3))).all()
+    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_triangles_that_share_no_vertices_are_welded(size):
+    rng = np.random.default_rng(0)
+    corners = size * box().triangles
+    mesh = soup(corners + rng.uniform(-1e-7, 1e-7, corners.shape) * size)
+    solid = solid_of_mesh(mesh)
+    assert solid.method == "repaired"
+    assert solid.mesh.is_watertight
+    assert solid.mesh.volume == pytest.approx(BOX_VOLUME * size**3, rel=1e-5)
+
+
+def test_triangles_that_share_no_vertices_and_face_any_way_are_turned_outwards():
+    corners = box().triangles.copy()
+    corners[::3] = corners[::3, ::-1]
+    solid = solid_of_mesh(soup(corners))
+    assert solid.mesh.is_watertight
+    assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
+
+
+@pytest.mark.parametrize("gap", [1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("whole", [box(), angle()], ids=["box", "angle"])
+def test_faces_that_stand_apart_still_enclose(whole, gap):
+    mesh = soup(whole.triangles + gap * whole.face_normals[:, None])
+    mesh.merge_vertices()
+    solid = solid_of_mesh(mesh)
+    assert solid.method in ("repaired", "winding")
+    assert counted(solid) == pytest.approx(whole.volume, rel=0.05)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_sphere_with_holes_all_over_is_decided_by_its_winding_number(inverted):
+    ball = trimesh.creation.icosphere(3, 0.2)
+    if inverted:
+        ball.invert()
+    solid = solid_of_mesh(without(ball, np.random.default_rng(0).random(len(ball.faces)) < 0.2))
+    assert solid.method == "winding"
+    assert not solid.mesh.is_watertight
+    assert solid.contains(np.zeros((1, 3))).all()
+    assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.05)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_half_a_tube_holds_part_of_what_it_bends_around(turned):
+    mesh = strip(math.pi)
+    if turned:
+        mesh.invert()
+    solid = solid_of_mesh(mesh)
+    assert solid.method == "winding"
+    inside = GRID[solid.contains(GRID)]
+    assert inside[:, 1].min() > 0
+    assert np.linalg.norm(inside[:, :2], axis=1).max() < 0.2
+    assert 0.3 < counted(solid) / (math.pi * 0.2**2 / 2 * 0.4) < 1
+
+
+def test_a_sheet_that_encloses_next_to_nothing_is_its_hull():
+    axis = np.linspace(-0.2, 0.2, 20)
+    x, y = (each.ravel() for each in np.meshgrid(axis, axis, indexing="ij"))
+    corner = np.arange(400).reshape(20, 20)
+    a, b = corner[:-1, :-1].ravel(), corner[1:, :-1].ravel()
+    c, d = corner[1:, 1:].ravel(), corner[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    saddle = trimesh.Trimesh(np.stack([x, y, 5 * x * y], axis=1), faces)
+    solid = solid_of_mesh(saddle)
+    assert solid.method == "hull"
+    assert solid.mesh.is_watertight
+    assert counted(solid) == pytest.approx(saddle.convex_hull.volume, rel=0.02)
+
+
+def write(mesh, path):
+    mesh.export(path)
+    return Shape(Mesh(path))
+
+
+@pytest.mark.parametrize(
+    "pose", [Pose(), Pose((3.0, -2.0, 1.0)), TILTED], ids=["here", "off", "tilted"]
+)
+def test_what_is_flat_is_refused(tmp_path, pose):
+    square = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], [(0, 1, 2), (1, 3, 2)])
+    shape = Shape(write(square, tmp_path / "square.stl").geometry, pose)
+    with pytest.raises(FitError, match="flat"):
+        solid_of([shape])
+    with pytest.raises(FitError, match="flat"):
+        solid_of([shape, shape])
+    assert counted(solid_of([shape, Shape(Box(SIZE))])) == pytest.approx(BOX_VOLUME, rel=1e-9)
+
+
+def test_no_shapes_are_refused():
+    with pytest.raises(FitError, match="no shapes"):
+        solid_of([])
+
+
+def test_a_mesh_that_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(MeshError, match=r"lost\.stl"):
+        solid_of([Shape(Box(SIZE)), Shape(Mesh(tmp_path / "lost.stl"))])
+
+
+@pytest.mark.parametrize("pose", [Pose(), TILTED], ids=["here", "tilted"])
+@pytest.mark.parametrize(
+    "geometry",
+    [Box((0.14, 0.2, 0.24)), Cylinder(0.12, 0.3), Sphere(0.2), Capsule(0.1, 0.2)],
+    ids=lambda geometry: type(geometry).__name__,
+)
+def test_a_primitive_is_its_own_solid(geometry, pose):
+    solid = solid_of([Shape(geometry, pose)])
+    assert solid.method == "watertight"
+    assert counted(solid) == pytest.approx(volume(geometry), rel=0.02)
+    inside = GRID[solid.contains(GRID)]
+    np.testing.assert_allclose(inside.mean(axis=0), pose.position, atol=1e-3)
+
+
+def test_shapes_of_every_kind_are_one_solid_and_the_worst_names_its_method(tmp_path):
+    whole = box()
+    ball = trimesh.creation.icosphere(3, 0.1)
+    holes = np.random.default_rng(0).random(len(ball.faces)) < 0.2
+    closed = (
+        Shape(Box((0.1, 0.1, 0.1)), Pose((-0.2, 0, 0))),
+        Shape(Cylinder(0.05, 0.2), Pose.from_xyz_rpy((0, 0.2, 0), (0, math.pi / 2, 0))),
+        Shape(Sphere(0.05), Pose((0, -0.2, 0))),
+        Shape(Capsule(0.04, 0.1), Pose((0, 0, 0.15))),
+    )
+    opened = write(without(whole, whole.face_normals[:, 2] > 0.5), tmp_path / "box.stl")
+    ragged = write(without(ball, holes), tmp_path / "ball.stl")
+    assert solid_of(closed).method == "watertight"
+    assert counted(solid_of(closed)) == pytest.approx(
+        sum(volume(shape.geometry) for shape in closed), rel=0.03
+    )
+    ends = np.array([(-0.2, 0, 0), (0.09, 0.2, 0), (-0.09, 0.2, 0), (0, -0.2, 0), (0, 0, 0.23)])
+    assert solid_of(closed).contains(ends).all()
+    assert not solid_of(closed).contains(ends + np.array((0, 0, 0.1))).any()
+    assert solid_of([*closed, opened]).method == "repaired"
+    assert solid_of([opened, ragged, *closed]).method == "winding"
+
+
+def test_the_same_shape_twice_is_the_shape():
+    shape = Shape(Box(SIZE))
+    assert counted(solid_of([shape, shape])) == pytest.approx(BOX_VOLUME, rel=1e-9)
+
+
+def test_an_enormous_mesh_is_decimated_and_says_from_what(tmp_path):
+    ball = trimesh.creation.icosphere(7, 0.2)
+    assert len(ball.faces) > MAX_FACES
+    solid = solid_of_mesh(ball)
+    assert solid.method == "watertight"
+    assert solid.decimated_from == len(ball.faces)
+    assert len(solid.mesh.faces) <= 1.01 * DECIMATED
+    assert solid.mesh.volume == pytest.approx(ball.volume, rel=0.01)
+    assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.01)
+    several = solid_of([write(ball, tmp_path / "ball.stl"), Shape(Box(SIZE))])
+    assert several.decimated_from == len(ball.faces) + 12
+
+
+def test_distances_are_those_of_the_surface():
+    points = np.array([(0, 0, 0), (0.1, 0, 0), (0.3, 0, 0), (0.09, 0, 0), (0.2, 0.35, 0.2)])
+    far = [0.1, 0, 0.2, 0.01, math.hypot(0.1, 0.2)]
+    np.testing.assert_allclose(solid_of_mesh(box()).distance(points), far, atol=1e-12)
+
+
+def test_the_surface_of_a_box_is_sampled_evenly():
+    points = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
+    assert len(points) == pytest.approx(6000, rel=0.02)
+    beyond = np.abs(points) - np.array(SIZE) / 2
+    np.testing.assert_allclose(beyond.max(axis=1), 0, atol=1e-9)
+    x, y, z = SIZE
+    share = np.isclose(beyond, 0, atol=1e-9).mean(axis=0)
+    area = np.array([y * z, x * z, x * y])
+    np.testing.assert_allclose(share, area / area.sum(), atol=0.03)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_the_surface_leaves_out_what_is_within(inverted):
+    nested = [box(), box((0.15, 0.25, 0.35), inverted=inverted)]
+    solid = solid_of_mesh(trimesh.util.concatenate(nested))
+    points = solid.surface(4000, np.random.default_rng(0))
+    outer, inner = (mesh.area for mesh in nested)
+    assert len(points) == pytest.approx(4000 * outer / (outer + inner), rel=0.1)
+    beyond = np.abs(points) - np.array(SIZE) / 2
+    np.testing.assert_allclose(beyond.max(axis=1), 0, atol=1e-9)
+
+
+def test_the_surface_of_boxes_that_overlap_is_that_of_their_union():
+    boxes = [box((0.2, 0.2, 0.2), (-0.05, 0, 0)), box((0.2, 0.1, 0.1), (0.1, 0, 0))]
+    solid = solid_of_mesh(trimesh.util.concatenate(boxes))
+    points = solid.surface(4000, np.random.default_rng(0))
+    big, small = (
+        (np.abs(points - at) - np.array(size) / 2).max(axis=1)
+        for at, size in (((-0.05, 0, 0), (0.2, 0.2, 0.2)), ((0.1, 0, 0), (0.2, 0.1, 0.1)))
+    )
+    np.testing.assert_allclose(np.minimum(big, small), 0, atol=1e-9)
+    assert {"big": (big < small).any(), "small": (small < big).any()} == {
+        "big": True,
+        "small": True,
+    }
+
+
+def test_the_same_generator_draws_the_same_surface():
+    solid = solid_of_mesh(angle())
+    first, second = (solid.surface(100, np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_the_meshes_that_are_given_are_left_alone():
+    for mesh in (box(inverted=True), without(box(), np.arange(12) < 2)):
+        before = mesh.vertices.copy(), mesh.faces.copy()
+        solid_of_mesh(mesh)
+        np.testing.assert_array_equal(mesh.vertices, before[0])
+        np.testing.assert_array_equal(mesh.faces, before[1])

@@ -1,0 +1,268 @@
+"""Fits as they are kept on disk, and the keys by which they are found again."""
+
+import json
+import math
+import os
+import random
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from morphgen.errors import FormatError
+from morphgen.fitting.stored import (
+    SUFFIX,
+    VERSION,
+    StoredFit,
+    read_stored,
+    shape_data,
+    shapes_key,
+    stored_text,
+)
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+
+TILTED = Pose.from_xyz_rpy((0.1, -0.25, 1 / 3), (0.3, -0.5, 2.0))
+CAN = Shape(Cylinder(0.05, 0.3), TILTED)
+ARM = StoredFit(
+    "arm",
+    CAN,
+    (Shape(Box((0.1, 0.2, 1 / 7)), TILTED), CAN, Shape(Sphere(0.123456), Pose((0, 0, 1)))),
+    0.8125,
+    0.9375,
+)
+HAND = StoredFit("a hand \N{GREEK SMALL LETTER ALPHA}", CAN, (CAN,), 0.5, 0.5)
+
+
+def write(folder, text, name="robot"):
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}{SUFFIX}"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def changed(**changes):
+    """The file of the arm, keys of its link changed; those that become None are left out."""
+    data = json.loads(stored_text({"key": ARM}))
+    link = {k: v for k, v in (data["links"][0] | changes).items() if v is not None}
+    return json.dumps(data | {"links": [link]})
+
+
+def shape(**changes):
+    """Plain data of the can, keys changed; those that become None are left out."""
+    return {k: v for k, v in (shape_data(CAN) | changes).items() if v is not None}
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    fits = {"one": ARM, "two": HAND}
+    write(tmp_path, stored_text(fits))
+    assert read_stored([tmp_path]) == fits
+
+
+def test_overlaps_are_kept_to_four_decimals(tmp_path):
+    write(tmp_path, stored_text({"key": replace(ARM, token_iou=2 / 3, collision_iou=1 / 3)}))
+    fit = read_stored([tmp_path])["key"]
+    assert (fit.token_iou, fit.collision_iou) == (0.6667, 0.3333)
+
+
+def test_no_fits_are_a_file_too(tmp_path):
+    write(tmp_path, stored_text({}))
+    assert read_stored([tmp_path]) == {}
+
+
+def test_a_link_is_a_line_so_that_changes_show():
+    lines = stored_text({"one": ARM, "two": HAND}).splitlines()
+    assert len(lines) == 4
+    assert [name in line for line, name in zip(lines[1:3], ("one", "two"), strict=True)] == [
+        True
+    ] * 2
+    assert stored_text({"one": ARM, "two": HAND}) == stored_text({"one": ARM, "two": HAND})
+
+
+def test_plain_data_names_the_kind_and_where_it_is():
+    pose = Pose((1.0, 2.0, 3.0))
+    assert shape_data(Shape(Box((0.1, 0.2, 0.3)), pose)) == {
+        "box": [0.1, 0.2, 0.3],
+        "xyz": [1.0, 2.0, 3.0],
+        "quaternion": [1.0, 0.0, 0.0, 0.0],
+    }
+    assert shape_data(CAN)["cylinder"] == [0.05, 0.3]
+    assert shape_data(Shape(Sphere(0.1)))["sphere"] == [0.1]
+
+
+@pytest.mark.parametrize("geometry", [Capsule(0.1, 0.2), Mesh(Path("m.stl"))])
+def test_only_boxes_cylinders_and_spheres_are_stored(geometry):
+    with pytest.raises(ValueError, match=f"{type(geometry).__name__} is no box"):
+        shape_data(Shape(geometry))
+
+
+def test_all_files_of_all_folders_are_read_whatever_else_lies_there(tmp_path):
+    write(tmp_path / "a", stored_text({"one": ARM}))
+    write(tmp_path / "b" / "deep" / "deeper", stored_text({"two": HAND}))
+    (tmp_path / "a" / "robot.json").write_text("{")
+    (tmp_path / "a" / "robot.yaml").write_text("name: robot")
+    assert read_stored([tmp_path / "a", tmp_path / "b"]) == {"one": ARM, "two": HAND}
+    assert read_stored([tmp_path / "b"]) == {"two": HAND}
+    assert read_stored([tmp_path / "nowhere"]) == {}
+    assert read_stored([]) == {}
+
+
+@pytest.mark.parametrize("version", [VERSION - 1, VERSION + 1, None, "1"])
+def test_another_version_of_the_fitter_is_ignored(tmp_path, version):
+    data = json.loads(stored_text({"key": ARM}))
+    write(tmp_path, json.dumps(data | {"fitter": version}))
+    write(tmp_path, json.dumps({"fitter": version, "whatever": []}), "other")
+    assert read_stored([tmp_path]) == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "5",
+        "null",
+        "{}",
+        "[" * 100_000,
+        json.dumps({"fitter": VERSION}),
+        json.dumps({"fitter": VERSION, "links": 5}),
+        json.dumps({"fitter": VERSION, "links": [5]}),
+        json.dumps({"fitter": VERSION, "links": [{}]}),
+        changed(link=None),
+        changed(shapes=None),
+        changed(token=None),
+        changed(collision=None),
+        changed(token_iou=None),
+        changed(collision=5),
+        changed(token=[]),
+        changed(token=shape(cylinder=None)),
+        changed(token=shape(cylinder=[1])),
+        changed(token=shape(cylinder=[1, 2, 3])),
+        changed(token=shape(cylinder=None, box=[1, 2])),
+        changed(token=shape(cylinder=None, cone=[1, 2])),
+        changed(token=shape(cylinder=5)),
+        changed(token=shape(xyz=[1, 2])),
+        changed(token=shape(xyz=None)),
+        changed(token=shape(quaternion=[1, 0, 0])),
+        changed(token=shape(cylinder=["a", "b"])),
+        changed(token=shape(cylinder=[0.1, math.nan])),
+        changed(token=shape(cylinder=[0.1, -1.0])),
+        changed(token=shape(quaternion=[0, 0, 0, 0])),
+    ],
+)
+def test_a_malformed_file_is_named_in_one_line(tmp_path, text):
+    path = write(tmp_path, text)
+    with pytest.raises(FormatError) as caught:
+        read_stored([tmp_path])
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    path = tmp_path / f"robot{SUFFIX}"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="robot") as caught:
+        read_stored([tmp_path])
+    assert str(path) in str(caught.value)
+
+
+def test_a_file_is_read_again_when_it_changes(tmp_path):
+    path = write(tmp_path, stored_text({"one": ARM}))
+    assert read_stored([tmp_path]) == {"one": ARM}
+    path.write_text(stored_text({"one": HAND}), encoding="utf-8")
+    os.utime(path, ns=(1, 1))
+    assert read_stored([tmp_path]) == {"one": HAND}
+
+
+def test_what_is_read_can_be_changed_without_changing_what_is_read_next(tmp_path):
+    write(tmp_path, stored_text({"one": ARM}))
+    read_stored([tmp_path]).clear()
+    assert read_stored([tmp_path]) == {"one": ARM}
+
+
+@pytest.fixture
+def mesh(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
+    return Mesh(path)
+
+
+def test_a_key_is_short_hexadecimal(mesh):
+    key = shapes_key([Shape(mesh)])
+    assert len(key) == 32
+    assert set(key) <= set("0123456789abcdef")
+    assert shapes_key([Shape(mesh)]) == key
+
+
+def test_the_same_content_by_another_name_has_the_same_key(mesh, tmp_path):
+    (tmp_path / "deep").mkdir()
+    copy = Mesh(tmp_path / "deep" / "other.stl")
+    shutil.copy(mesh.path, copy.path)
+    os.utime(copy.path, ns=(1, 1))
+    assert shapes_key([Shape(copy, TILTED)]) == shapes_key([Shape(mesh, TILTED)])
+
+
+def test_another_content_has_another_key(mesh):
+    before = shapes_key([Shape(mesh)])
+    trimesh.creation.box((0.1, 0.2, 0.4)).export(mesh.path)
+    os.utime(mesh.path, ns=(1, 1))
+    assert shapes_key([Shape(mesh)]) != before
+
+
+def test_a_key_follows_the_working_directory(tmp_path, monkeypatch):
+    keys = set()
+    for name, size in (("a", 1.0), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        trimesh.creation.box((size,) * 3).export(tmp_path / name / "m.stl")
+        os.utime(tmp_path / name / "m.stl", ns=(1, 1))
+        monkeypatch.chdir(tmp_path / name)
+        keys.add(shapes_key([Shape(Mesh(Path("m.stl")))]))
+    assert len(keys) == 2
+
+
+def test_fits_follow_the_working_directory(tmp_path, monkeypatch):
+    for name, fit in (("a", ARM), ("b", replace(ARM, link="leg"))):
+        path = write(tmp_path / name / "parts", stored_text({"one": fit}))
+        os.utime(path, ns=(1, 1))
+        monkeypatch.chdir(tmp_path / name)
+        assert read_stored([Path("parts")]) == {"one": fit}
+
+
+def test_whatever_changes_the_solid_changes_the_key(mesh):
+    shapes = [
+        Shape(mesh),
+        Shape(replace(mesh, scale=(1.0, 1.0, -1.0))),
+        Shape(replace(mesh, scale=(0.001, 0.001, 0.001))),
+        Shape(replace(mesh, part=0)),
+        Shape(replace(mesh, part=1)),
+        Shape(mesh, Pose((0, 0, 1e-6))),
+        Shape(mesh, TILTED),
+        Shape(Box((0.1, 0.2, 0.3))),
+        Shape(Box((0.2, 0.1, 0.3))),
+        Shape(Sphere(0.1)),
+        Shape(Sphere(0.2)),
+        Shape(Cylinder(0.1, 0.2)),
+        Shape(Capsule(0.1, 0.2)),
+        Shape(Capsule(0.2, 0.1)),
+    ]
+    keys = [shapes_key([each]) for each in shapes]
+    keys += [shapes_key([]), shapes_key(shapes[:2]), shapes_key(shapes[:1] * 2)]
+    assert len(set(keys)) == len(keys)
+
+
+def test_neither_colour_nor_order_nor_the_sign_of_zero_changes_the_key(mesh):
+    shapes = [Shape(mesh), Shape(mesh, TILTED), Shape(Box((0.1, 0.2, 0.3))), Shape(Sphere(0.1))]
+    key = shapes_key(shapes)
+    rng = random.Random(0)
+    for _ in range(5):
+        assert shapes_key(rng.sample(shapes, len(shapes))) == key
+    assert shapes_key([replace(each, rgba=(1.0, 0.0, 0.0, 1.0)) for each in shapes]) == key
+    assert shapes_key([Shape(mesh, Pose((-0.0, 0.0, 0.0)))]) == shapes_key([Shape(mesh)])
+
+
+def test_a_missing_mesh_has_no_key(tmp_path):
+    with pytest.raises(FormatError, match=r"cannot read .*lost\.stl") as caught:
+        shapes_key([Shape(Sphere(0.1)), Shape(Mesh(tmp_path / "lost.stl"))])
+    assert "\n" not in str(caught.value)
