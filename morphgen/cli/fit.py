@@ -94,13 +94,17 @@ def run(args: argparse.Namespace) -> int:
     if args.all == bool(args.target):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     try:
-        options = FitOptions(args.max_primitives or 1, args.iou, args.enclose, args.seed)
+        most = 1 if args.max_primitives is None else args.max_primitives
+        options = FitOptions(most, args.iou, args.enclose, args.seed)
     except ValueError as error:
         raise MorphgenError(str(error)) from error
     if args.missing and not args.all:
         raise MorphgenError("--missing goes with --all")
     if args.all:
         return _store_all(args)
+    given = {"--visual": args.visual, "--no-picture": args.no_picture}
+    if idle := [name for name, value in given.items() if value and not args.out]:
+        raise MorphgenError(f"{' '.join(idle)}: only with --out")
     if Path(args.target).suffix.lower() in MESHES:
         return _mesh(args, options)
     return _robot(args, options)
@@ -131,15 +135,11 @@ def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
 def _robot(args: argparse.Namespace, options: FitOptions) -> int:
     from dataclasses import replace
 
-    from morphgen.errors import FormatError
     from morphgen.fitting.agreement import agreement
     from morphgen.fitting.dressed import with_primitives
-    from morphgen.formats.bundle import bundle_folder
 
     robot, is_part = _target(args)
-    if args.out and args.out.resolve() == Path(args.target).resolve():
-        raise FormatError(f"--out {args.out} is the robot itself; name another folder")
-    folder = bundle_folder(args.out.parent, args.out.name) if args.out else None
+    folder = _folder(args, is_part) if args.out else None
     report = _fit(robot, options, args)
     data = report.as_dict()
     if not args.json:
@@ -149,7 +149,7 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
         made = replace(
             with_primitives(robot, primitives, visual=args.visual),
             name=folder.name,
-            provenance={**robot.provenance, "primitives": data},
+            provenance={**robot.provenance, "primitives": report.without_times()},
         )
         compared, hulls = agreement(robot, made, args.configurations, args.seed)
         data |= {"agreement": compared.as_dict(), "agreement_of_hulls": hulls.as_dict()}
@@ -160,6 +160,20 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
     if args.json:
         print(json.dumps(data))
     return 0
+
+
+def _folder(args: argparse.Namespace, is_part: bool) -> Path:
+    """Where the bundle goes; refused before the long work if it cannot go there."""
+    from morphgen.errors import FormatError
+    from morphgen.formats.bundle import CARD, bundle_folder
+
+    folder = bundle_folder(args.out.parent, args.out.name)
+    target = Path(args.target).resolve()
+    if not is_part and folder.resolve() in (target, *target.parents[:1]):
+        raise FormatError(f"--out {args.out} is the robot itself; name another folder")
+    if folder.exists() and not (folder / CARD).is_file():
+        raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
+    return folder
 
 
 def _write(robot: Robot, folder: Path, is_part: bool, args: argparse.Namespace) -> None:
@@ -209,7 +223,7 @@ def _store_all(args: argparse.Namespace) -> int:
     from morphgen.errors import MorphgenError
     from morphgen.fitting.parts import parts_with_meshes, store_parts
 
-    if args.out or args.enclose or args.visual or args.max_primitives:
+    if args.out or args.enclose or args.visual or args.max_primitives is not None:
         raise MorphgenError(
             "--all stores one primitive and up to four for every part: it takes no --out, "
             "--enclose, --visual or --max-primitives"

@@ -29,7 +29,7 @@ def enclose_solid(
     between the centres of clusters, and every piece gets its own; of ``CLUSTERINGS`` cuts the best
     is taken. The number is the smallest that reaches ``iou``, or the best.
     """
-    points = target.points * target.solid.size + target.middle
+    points = target.link_points
     vertices = np.asarray(target.solid.mesh.vertices)
     best: tuple[Shape, ...] = (enclose(vertices),)
     score = _overlap(best, points, target)

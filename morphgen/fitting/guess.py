@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
@@ -25,18 +24,14 @@ _TURNS = (
 """Rotations that bring each axis in turn to z."""
 
 
-def around(points: Array, *, thorough: bool = False) -> Candidates:
+def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candidates:
     """Guesses of one primitive each around a cloud of points, shape (n, 3).
 
-    Boxes and cylinders along the principal axes and along those of the frame; ``thorough`` adds the
-    smallest bounding box's axes and a sphere.
+    Boxes and cylinders along the principal axes and along those given, each of shape (3, 3); and
+    a sphere on request.
     """
-    frames = [np.eye(3), _principal_axes(points)]
-    if thorough:
-        T_box_points, _ = trimesh.bounds.oriented_bounds(points)
-        frames.append(T_box_points[:3, :3].T)
-    guesses = [guess for R in frames for guess in _along(points, R)]
-    if thorough:
+    guesses = [guess for R in (*axes, _principal_axes(points)) for guess in _along(points, R)]
+    if sphere:
         middle = points.mean(axis=0)
         radius = np.sqrt(5 / 3 * np.square(points - middle).sum(axis=1).mean())
         guesses.append((_SPHERE, middle, np.eye(3), np.full(3, radius)))
@@ -82,7 +77,7 @@ def by_pieces(
 
 def _best_of_each_kind(piece: Array, counts: Array, outside: Array, others: Array) -> Candidates:
     """Three guesses around a piece: the best, the best box, the best cylinder."""
-    guesses = around(piece)
+    guesses = around(piece, [np.eye(3)])
     points = np.concatenate([piece, outside])
     weights = np.concatenate([counts, others])
     score = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)

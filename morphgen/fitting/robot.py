@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
+from typing import cast
 
 import numpy as np
 
@@ -57,6 +58,13 @@ class FitReport:
             for name in Quality.__dataclass_fields__
         }
         return Quality(**means | {"hausdorff": max(q.hausdorff for q in each)})
+
+    def without_times(self) -> dict[str, object]:
+        """Plain data for a card: the same for the same robot and seed."""
+        data = self.as_dict()
+        for link in cast(list[dict[str, object]], data["links"]):
+            del link["seconds"]
+        return data
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for JSON."""

@@ -9,7 +9,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from morphgen.errors import FitError
@@ -33,7 +35,10 @@ DIGITS = 6
 
 @dataclass(frozen=True)
 class Sampled:
-    """A solid as points, in units of its size about the middle of its bounding box."""
+    """A solid as points in a frame of its own: that of its smallest bounding box, in sizes of it.
+
+    So a thin solid at an angle is met by as many points as one along the axes of the link.
+    """
 
     solid: Solid
     points: Array
@@ -42,19 +47,26 @@ class Sampled:
     weights: Array
     """The volume that each stands for, shape (n,); points far from the solid are sparse."""
 
+    R_link_box: Array
+    """Axes of the smallest bounding box, shape (3, 3)."""
+    middle: Array
+    """Its middle, in the link frame, metres."""
+
     @cached_property
-    def middle(self) -> Array:
-        """Origin of the points, in the link frame, metres."""
-        return np.asarray(self.solid.mesh.bounds.mean(axis=0))
+    def link_points(self) -> Array:
+        """The points in the link frame, metres."""
+        return np.asarray(self.points * self.solid.size @ self.R_link_box.T + self.middle)
 
     def shapes(self, candidates: Candidates, row: int) -> tuple[Shape, ...]:
         """One of the candidates as shapes in the link frame, rounded."""
         size = self.solid.size
+        R_box_primitive = Rotation.from_quat(candidates.quaternions[row], scalar_first=True)
+        R_link_primitive = Rotation.from_matrix(self.R_link_box) * R_box_primitive
         found = []
         for kind, centre, quaternion, halves in zip(
             candidates.kinds[row],
-            candidates.centres[row] * size + self.middle,
-            candidates.quaternions[row],
+            candidates.centres[row] * size @ self.R_link_box.T + self.middle,
+            R_link_primitive.as_quat(scalar_first=True),
             np.round(candidates.halves[row] * size, DIGITS),
             strict=True,
         ):
@@ -82,7 +94,9 @@ def sampled(solid: Solid, seed: int) -> Sampled:
     Raises:
         FitError: If next to none of them lie inside: the solid is too thin.
     """
-    middle, extents = solid.mesh.bounds.mean(axis=0), solid.mesh.extents / solid.size
+    T_box_link, extents = trimesh.bounds.oriented_bounds(solid.hull)
+    T_link_box = np.linalg.inv(T_box_link)
+    R_link_box, middle, extents = T_link_box[:3, :3], T_link_box[:3, 3], extents / solid.size
     near, far = extents / 2 + NEAR, extents / 2 + FAR
     rng = np.random.default_rng(seed)
     close = near * (2 * qmc.Sobol(3, rng=rng).random(NEAR_POINTS) - 1)
@@ -94,16 +108,17 @@ def sampled(solid: Solid, seed: int) -> Sampled:
     )
     order = rng.permutation(len(points))
     points, counts = points[order], counts[order]
-    inside = solid.contains(points * solid.size + middle)
+    inside = solid.contains(points * solid.size @ R_link_box.T + middle)
     if inside[:COARSE_POINTS].sum() < 2 * FEWEST:
         raise FitError(f"the solid is too thin: it fills {inside.mean():.2%} of its bounding box")
-    return Sampled(solid, points, inside, counts / counts.mean())
+    return Sampled(solid, points, inside, counts / counts.mean(), R_link_box, middle)
 
 
 def best_single(target: Sampled) -> tuple[tuple[Shape, ...], float]:
     """The one primitive that overlaps most, and its overlap as the search saw it."""
     with _one_thread():
-        start = around(target.points[target.inside], thorough=True)
+        cloud = target.points[target.inside]
+        start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
         return _climb(target, start, (0.03, 0.008))
 
 

@@ -12,9 +12,9 @@ from commands import tree
 from parts import write_part
 from robots import arm
 
+from morphgen.fitting import parts as fitting_parts
 from morphgen.formats import bundle
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
@@ -31,6 +31,17 @@ FIGURES = {
     "gap_p95",
     "hausdorff",
 }
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_stored(monkeypatch):
+    """A test that gets as far as storing would write beside the library's own parts."""
+
+    def forbidden(*_, **__):
+        raise AssertionError("a test was about to store the fits of the library's parts")
+
+    monkeypatch.setattr(fitting_parts, "parts_with_meshes", forbidden)
+    monkeypatch.setattr(fitting_parts, "store_parts", forbidden)
 
 
 @pytest.fixture
@@ -246,10 +257,27 @@ def test_visuals_are_replaced_where_asked_and_keep_their_colour(run, meshed, tmp
     ]
 
 
-def test_the_same_words_write_the_same_bytes(run, meshed, tmp_path):
-    words = ("--no-picture", "--configurations", "20")
-    assert run("fit", meshed, "--out", "a/robot", *words)[0] == 0
-    assert run("fit", meshed, "--out", "b/robot", *words)[0] == 0
+def urdf_of(folder, *files):
+    """``robot.urdf``: links with one mesh each, side by side."""
+    links = "".join(
+        f'<link name="{path.stem}"><collision><geometry><mesh filename="{path.name}"/></geometry>'
+        "</collision></link>"
+        for path in files
+    )
+    joints = "".join(
+        f'<joint name="to_{path.stem}" type="fixed"><parent link="{files[0].stem}"/>'
+        f'<child link="{path.stem}"/></joint>'
+        for path in files[1:]
+    )
+    (folder / "robot.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    return "robot.urdf"
+
+
+def test_the_same_words_write_the_same_bytes(run, box, tmp_path):
+    urdf = urdf_of(tmp_path, box)
+    words = ("--no-picture", "--configurations", "1")
+    assert run("fit", urdf, "--out", "a/robot", *words)[0] == 0
+    assert run("fit", urdf, "--out", "b/robot", *words)[0] == 0
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
@@ -278,20 +306,20 @@ def flat(path):
     return path
 
 
-def test_a_link_that_is_flat_is_told_and_the_others_are_fitted(run, tmp_path):
-    leaf = Shape(Mesh(flat(tmp_path / "leaf.obj")))
-    robot = arm().with_links([replace(arm().link("left"), visuals=(leaf,), collisions=(leaf,))])
-    (tmp_path / "robot.urdf").write_text(
-        urdf_text(replace(robot, frames=()), lambda m: m.path.name)
-    )
-    code, out, err = run("fit", "robot.urdf")
+@pytest.mark.parametrize("output", [(), ("--json",)])
+def test_a_link_that_is_flat_is_told_and_the_others_are_fitted(run, box, tmp_path, output):
+    urdf = urdf_of(tmp_path, box, flat(tmp_path / "leaf.obj"))
+    code, out, err = run("fit", urdf, *output)
     assert (code, err) == (0, "")
-    assert "warning no-primitive at link left: " in out
-    assert [line.split()[0] for line in out.splitlines()[2:7]] == [
-        link.name for link in robot.links if link.name != "left"
-    ]
-    (found,) = json.loads(run("fit", "robot.urdf", "--json")[1])["findings"]
-    assert (found["code"], found["where"]) == ("no-primitive", "link left")
+    if output:
+        data = json.loads(out)
+        assert [link["link"] for link in data["links"]] == ["link"]
+        (found,) = data["findings"]
+        assert (found["code"], found["where"]) == ("no-primitive", "link leaf")
+    else:
+        _, _, row, _, finding = out.splitlines()
+        assert row.split()[:2] == ["link", "box"]
+        assert finding.startswith("warning no-primitive at link leaf: ")
 
 
 MESHES = {
@@ -341,7 +369,7 @@ def test_a_binary_stl_of_nans_is_refused_by_name(refused, tmp_path):
         ("plane --out made --configurations 0", "--configurations 0"),
         ("--all --out made", "--all"),
         ("--all --max-primitives 2", "--all"),
-        ("--all --max-primitives 0", "--all"),
+        ("--all --max-primitives 0", "0 primitives: expected 1 to 32"),
         ("--all --enclose", "--all"),
         ("--all --visual", "--all"),
         ("plane --library nowhere", "nowhere does not exist"),

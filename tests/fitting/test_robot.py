@@ -167,12 +167,12 @@ def test_visuals_are_replaced_on_request(tmp_path, wedge):
     assert replaced.visuals == (dataclasses.replace(box[0], rgba=(1, 0, 0, 1)),)
 
 
-def test_links_that_are_not_stored_are_fitted_now(tmp_path, wedge):
-    robot = arm([mesh_shape(tmp_path, wedge)])
+def test_links_that_are_not_stored_are_fitted_now(tmp_path):
+    robot = arm([mesh_shape(tmp_path, trimesh.creation.box((0.1, 0.2, 0.3)))])
     assert stored_primitives(robot, read_stored(LIBRARY.folders)) == ({}, ["l0"])
     made = as_primitives(robot, LIBRARY.folders)
     worth = quality(solid_of(robot.links[0].collisions), made.links[0].collisions)
-    assert worth.iou > 0.7
+    assert worth.iou > 0.95
 
 
 def test_a_link_that_nothing_can_stand_for_stops_composing(tmp_path):
@@ -203,6 +203,7 @@ def test_every_real_part_is_stored():
     assert [m.name for m in parts_with_meshes(LIBRARY, missing=True)] == []
 
 
+@pytest.mark.slow
 def test_a_user_s_part_is_stored_beside_its_manifest(tmp_path):
     source = LIBRARY.paths["so101_jaw"]
     own = tmp_path / "my_jaw.yaml"

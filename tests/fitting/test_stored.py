@@ -116,44 +116,44 @@ def test_another_version_of_the_fitter_is_ignored(tmp_path, version):
     assert read_stored([tmp_path]) == {}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "{",
-        "[]",
-        "5",
-        "null",
-        "{}",
-        "[" * 100_000,
-        json.dumps({"fitter": VERSION}),
-        json.dumps({"fitter": VERSION, "links": 5}),
-        json.dumps({"fitter": VERSION, "links": [5]}),
-        json.dumps({"fitter": VERSION, "links": [{}]}),
-        changed(link=None),
-        changed(shapes=None),
-        changed(token=None),
-        changed(collision=None),
-        changed(token_iou=None),
-        changed(collision=5),
-        changed(token=[]),
-        changed(token=shape(cylinder=None)),
-        changed(token=shape(cylinder=[1])),
-        changed(token=shape(cylinder=[1, 2, 3])),
-        changed(token=shape(cylinder=None, box=[1, 2])),
-        changed(token=shape(cylinder=None, cone=[1, 2])),
-        changed(token=shape(cylinder=5)),
-        changed(token=shape(xyz=[1, 2])),
-        changed(token=shape(xyz=None)),
-        changed(token=shape(quaternion=[1, 0, 0])),
-        changed(token=shape(cylinder=["a", "b"])),
-        changed(token=shape(cylinder=[0.1, math.nan])),
-        changed(token=shape(cylinder=[0.1, -1.0])),
-        changed(token=shape(quaternion=[0, 0, 0, 0])),
-    ],
-)
-def test_a_malformed_file_is_named_in_one_line(tmp_path, text):
-    path = write(tmp_path, text)
+MALFORMED = {
+    "empty": "",
+    "broken": "{",
+    "list": "[]",
+    "number": "5",
+    "null": "null",
+    "nothing": "{}",
+    "deep": "[" * 100_000,
+    "no links": json.dumps({"fitter": VERSION}),
+    "links a number": json.dumps({"fitter": VERSION, "links": 5}),
+    "link a number": json.dumps({"fitter": VERSION, "links": [5]}),
+    "link empty": json.dumps({"fitter": VERSION, "links": [{}]}),
+    "no name": changed(link=None),
+    "no key": changed(shapes=None),
+    "no token": changed(token=None),
+    "no collision": changed(collision=None),
+    "no overlap": changed(token_iou=None),
+    "collision a number": changed(collision=5),
+    "token a list": changed(token=[]),
+    "no kind": changed(token=shape(cylinder=None)),
+    "cylinder of one": changed(token=shape(cylinder=[1])),
+    "cylinder of three": changed(token=shape(cylinder=[1, 2, 3])),
+    "box of two": changed(token=shape(cylinder=None, box=[1, 2])),
+    "cone": changed(token=shape(cylinder=None, cone=[1, 2])),
+    "cylinder a number": changed(token=shape(cylinder=5)),
+    "xyz of two": changed(token=shape(xyz=[1, 2])),
+    "no xyz": changed(token=shape(xyz=None)),
+    "quaternion of three": changed(token=shape(quaternion=[1, 0, 0])),
+    "words": changed(token=shape(cylinder=["a", "b"])),
+    "nan": changed(token=shape(cylinder=[0.1, math.nan])),
+    "negative": changed(token=shape(cylinder=[0.1, -1.0])),
+    "quaternion zero": changed(token=shape(quaternion=[0, 0, 0, 0])),
+}
+
+
+@pytest.mark.parametrize("fault", list(MALFORMED))
+def test_a_malformed_file_is_named_in_one_line(tmp_path, fault):
+    path = write(tmp_path, MALFORMED[fault])
     with pytest.raises(FormatError) as caught:
         read_stored([tmp_path])
     assert str(caught.value).startswith(f"{path}: ")
