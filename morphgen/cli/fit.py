@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot import FitReport
     from morphgen.model.robot import Robot
 
-MESHES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 HEADERS = (
     "link",
     "primitives",
@@ -86,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit, print the table, write."""
     from morphgen.errors import MorphgenError
     from morphgen.fitting.link import FitOptions
+    from morphgen.model.mesh import SUFFIXES
 
     if args.jobs < 1 or args.configurations < 1:
         raise MorphgenError(
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     given = {"--visual": args.visual, "--no-picture": args.no_picture}
     if idle := [name for name, value in given.items() if value and not args.out]:
         raise MorphgenError(f"{' '.join(idle)}: only with --out")
-    if Path(args.target).suffix.lower() in MESHES:
+    if Path(args.target).suffix.lower() in SUFFIXES:
         return _mesh(args, options)
     return _robot(args, options)
 
@@ -165,14 +165,13 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
 def _folder(args: argparse.Namespace, is_part: bool) -> Path:
     """Where the bundle goes; refused before the long work if it cannot go there."""
     from morphgen.errors import FormatError
-    from morphgen.formats.bundle import CARD, bundle_folder
+    from morphgen.formats.bundle import bundle_folder, require_replaceable
 
     folder = bundle_folder(args.out.parent, args.out.name)
     target = Path(args.target).resolve()
     if not is_part and folder.resolve() in (target, *target.parents[:1]):
         raise FormatError(f"--out {args.out} is the robot itself; name another folder")
-    if folder.exists() and not (folder / CARD).is_file():
-        raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
+    require_replaceable(folder)
     return folder
 
 

@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
 from morphgen.fitting.soft_iou import KINDS, Kind
-from morphgen.fitting.solid import FLAT
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
+from morphgen.model.mesh import is_flat
 from morphgen.model.rotation import Quat
 
 Array = NDArray[np.float64]
@@ -85,8 +85,7 @@ def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
 def _check_solid(points: Array) -> None:
     if not np.isfinite(points).all():
         raise FitError("the points are not finite")
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) else [0.0]
-    if len(spread) == 3 and spread[2] > FLAT * spread[0]:
+    if not is_flat(points):
         return
     distinct = len(np.unique(points, axis=0))
     if distinct < 4:

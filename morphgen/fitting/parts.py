@@ -12,6 +12,7 @@ from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions
 from morphgen.fitting.robot import fit_links
 from morphgen.fitting.stored import SUFFIX, StoredFit, read_stored, shapes_key, stored_text
+from morphgen.formats.bundle import write_atomic
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
@@ -81,10 +82,8 @@ def store_part(manifest: Manifest) -> Path:
         if link.name in found
     }
     path = manifest.path.with_name(manifest.path.stem + SUFFIX)
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_text(stored_text(fits), encoding="utf-8")
-        partial.replace(path)
+        write_atomic(path, stored_text(fits))
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
     return path

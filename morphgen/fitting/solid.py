@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from morphgen.errors import FitError
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
-from morphgen.model.mesh import load_mesh
+from morphgen.model.mesh import FLAT, is_flat, load_mesh
 
 Array = NDArray[np.float64]
 Method = Literal["watertight", "repaired", "winding", "hull"]
@@ -37,8 +37,6 @@ DECIMATED = 100_000
 """Triangles that are left then."""
 HOLLOW = 0.02
 """Share of the convex hull's volume below which an open mesh encloses nothing."""
-FLAT = 1e-7
-"""Thickness below which a mesh is flat, relative to its size."""
 _WELD = 1e-5
 """Distance below which vertices are welded, relative to the size of the mesh."""
 _PROBES = 4096
@@ -127,8 +125,7 @@ def solid_of(shapes: Sequence[Shape]) -> Solid:
 
 def solid_of_mesh(mesh: trimesh.Trimesh) -> Solid | None:
     """The solid of triangles in metres; None if they are flat."""
-    spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
-    if len(spread) < 3 or spread[2] < FLAT * spread[0]:
+    if is_flat(np.asarray(mesh.vertices)):
         return None
     before = len(mesh.faces)
     if before > MAX_FACES:

@@ -52,6 +52,28 @@ def bundle_folder(parent: Path, name: str) -> Path:
     return parent / name
 
 
+def require_replaceable(folder: Path) -> None:
+    """Require that a bundle can be written to a folder: it is not there, or is a bundle.
+
+    Raises:
+        FormatError: If it is something else.
+    """
+    if folder.exists() and not (folder / CARD).is_file():
+        raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Write a file by way of ``partial_of`` it, so that it is never half there."""
+    partial = partial_of(path)
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def partial_of(path: Path) -> Path:
+    """Where a file is written before it takes its place."""
+    return path.with_name(f".{path.name}.partial")
+
+
 def write_bundle(
     robot: Robot, folder: Path, findings: Iterable[Finding] = (), *, picture: bool = True
 ) -> Path:
@@ -70,8 +92,7 @@ def write_bundle(
         FormatError: If the folder cannot be written, or is there and no bundle.
         MissingDependencyError: If a picture is wanted and nothing can draw it.
     """
-    if folder.exists() and not (folder / CARD).is_file():
-        raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
+    require_replaceable(folder)
     robot = split_colours(robot)
     with replacing_folder(folder) as partial:
         files = _write_meshes(robot, partial / MESHES)

@@ -22,7 +22,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from morphgen.errors import FormatError
-from morphgen.formats.bundle import URDF, replacing_folder, write_bundle
+from morphgen.formats.bundle import URDF, partial_of, replacing_folder, write_atomic, write_bundle
 from morphgen.formats.card import rounded
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.urdf_text import urdf_text
@@ -197,8 +197,8 @@ def _prepare(plan: SetPlan) -> None:
             raise FormatError(f"{plan.folder} exists and is no set (no {SETTINGS}); name another")
         try:
             plan.folder.mkdir(parents=True, exist_ok=True)
-            _write_atomic(plan.folder / GRAMMAR, plan.grammar_text)
-            _write_atomic(path, json.dumps(wanted, indent=2) + "\n")
+            write_atomic(plan.folder / GRAMMAR, plan.grammar_text)
+            write_atomic(path, json.dumps(wanted, indent=2) + "\n")
         except OSError as error:
             raise FormatError(f"cannot write to {plan.folder}: {error.strerror}") from error
         return
@@ -219,7 +219,7 @@ def _prepare(plan: SetPlan) -> None:
 def _is_barely_begun(plan: SetPlan) -> bool:
     """Whether a folder is empty, or what a run left that was interrupted before it made a set."""
     grammar = plan.folder / GRAMMAR
-    own = {_partial(grammar), _partial(plan.folder / SETTINGS)}
+    own = {partial_of(grammar), partial_of(plan.folder / SETTINGS)}
     if grammar.is_file() and grammar.read_bytes() == plan.grammar_text.encode():
         own.add(grammar)
     return plan.folder.is_dir() and own >= set(plan.folder.iterdir())
@@ -256,7 +256,7 @@ def _write_index(plan: SetPlan, made: int, kept: int) -> SetReport:
     rejected: Counter[str] = Counter()
     first: dict[str, str] = {}
     duplicates = []
-    partial = _partial(plan.folder / INDEX)
+    partial = partial_of(plan.folder / INDEX)
     places = _finished(plan)
     with ExitStack() as stack:
         sources = {path for path, _ in places.values()}
@@ -291,13 +291,3 @@ def _alone(folder: Path) -> Iterator[None]:
     finally:
         lock.release()
         (folder / LOCK).unlink(missing_ok=True)
-
-
-def _write_atomic(path: Path, text: str) -> None:
-    partial = _partial(path)
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
-
-
-def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial")

@@ -59,6 +59,8 @@ _Triangles: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 LARGEST_COORDINATE = 1e9
 """Coordinate beyond which a mesh file is taken to be broken, in its own unit or metres."""
+FLAT = 1e-7
+"""Thickness below which points are flat, relative to their size."""
 MAX_STL_FACES = 200_000
 """Triangles of the largest STL that MuJoCo reads."""
 
@@ -116,13 +118,20 @@ def hull(mesh: Mesh) -> trimesh.Trimesh:
     return _hull(str(mesh.path.absolute()), _stamp(mesh.path), mesh.scale, mesh.part)
 
 
+def is_flat(points: NDArray[np.float64]) -> bool:
+    """Whether points, shape (n, 3), lie in a plane or are fewer than four."""
+    if len(points) < 4:
+        return True
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[2] <= FLAT * spread[0])
+
+
 @lru_cache(maxsize=512)
 def _hull(
     path: str, stamp: tuple[int, int], scale: tuple[float, ...], part: int | None
 ) -> trimesh.Trimesh:
     vertices = _scaled(path, stamp, scale, part).vertices
-    spread = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
-    if len(vertices) < 4 or spread[2] < 1e-7 * spread[0]:
+    if is_flat(vertices):
         raise MeshError(f"{path}: is flat, so it has no convex hull")
     result: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
     return result
