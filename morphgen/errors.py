@@ -32,6 +32,10 @@ class FitError(MorphgenError):
     """Shapes that no primitive can stand for."""
 
 
+class BenchmarkError(MorphgenError):
+    """Tokens, a similarity or a split that cannot be made as asked."""
+
+
 class GrammarError(MorphgenError):
     """A grammar, a condition or a derivation is malformed or means nothing."""
 

@@ -15,6 +15,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from morphgen.fitting.canonical import canonical
 from morphgen.model.geometry import Mesh, Pose, Shape
 
 Array = NDArray[np.float64]
@@ -82,7 +83,7 @@ def moved(shape: Shape, T_b_a: Array) -> Shape:
         raise ValueError(f"{R.tolist()} is neither a rotation nor a mirroring")
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(R)), 1.0])
     T_b_shape = T_b_a @ shape.T_link_shape.matrix @ mirror
-    return replace(shape, T_link_shape=Pose.from_matrix(T_b_shape))
+    return canonical(replace(shape, T_link_shape=Pose.from_matrix(T_b_shape)))
 
 
 def representatives(meshes: Sequence[trimesh.Trimesh]) -> list[tuple[int, Array]]:

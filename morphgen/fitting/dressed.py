@@ -8,7 +8,7 @@ from pathlib import Path
 
 from morphgen.checks.self_collision import survey
 from morphgen.errors import FitError
-from morphgen.fitting.stored import VERSION, StoredFit, read_stored, shapes_key
+from morphgen.fitting.stored import VERSION, Stored, read_stored, stored_fit
 from morphgen.model.geometry import Box, Cylinder, Shape, Sphere
 from morphgen.model.robot import Link, Robot
 
@@ -59,7 +59,7 @@ def with_primitives(
 
 
 def stored_primitives(
-    robot: Robot, stored: Mapping[str, StoredFit]
+    robot: Robot, stored: Stored
 ) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
     """Primitives by link as they were fitted before, and the links of which nothing is stored."""
     found: dict[str, tuple[Shape, ...]] = {}
@@ -67,7 +67,7 @@ def stored_primitives(
     for link in robot.links:
         if not link.collisions or are_primitives(link.collisions):
             found[link.name] = link.collisions
-        elif fit := stored.get(shapes_key(link.collisions)):
+        elif fit := stored_fit(link.collisions, stored):
             found[link.name] = fit.collision
         else:
             missing.append(link.name)

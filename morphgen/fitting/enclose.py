@@ -10,7 +10,6 @@ also turns about one axis at a time, which keeps a side flush with a face.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -21,6 +20,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
+from morphgen.fitting.balls import smallest_balls
+from morphgen.fitting.canonical import least_rotation
 from morphgen.fitting.soft_iou import KINDS, Kind
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
@@ -48,10 +49,6 @@ _SIMPLER = 1e-5
 """Relative excess of volume at which the link's own axes are preferred."""
 _BUNCH = 100_000
 """Points times rotations that are evaluated together; bounds memory."""
-_ON_BALL = 1e-12
-"""Relative excess of squared distance at which a point is on a ball."""
-_PIVOTS = 100
-"""Most points that a ball is pivoted on."""
 
 
 def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
@@ -167,16 +164,7 @@ def _quaternion(kind: Kind, corners: _Corners) -> Quat:
     """Rotation of the least primitive on its link."""
     if kind == "sphere":
         return rotation.IDENTITY
-    R = _least(_SEARCHES[kind], corners)
-    if kind == "box":
-        alike = R @ _QUARTER_TURNS
-        R = alike[np.argmax(np.trace(alike, axis1=1, axis2=2).round(_QUATERNION_DECIMALS))]
-        x, y, z, w = Rotation.from_matrix(R).as_quat().tolist()
-        return (w, x, y, z)
-    x, y, z = R[:, 2].round(_QUATERNION_DECIMALS).tolist()
-    if (z, y, x) < (0.0, 0.0, 0.0):
-        x, y, z = -x, -y, -z
-    return (1 + z, -y, x, 0.0)
+    return least_rotation(kind, _least(_SEARCHES[kind], corners))
 
 
 def _rounded(quaternion: Quat) -> Quat:
@@ -187,10 +175,10 @@ def _rounded(quaternion: Quat) -> Quat:
 def _middle(kind: Kind, points: Array) -> Array:
     """Centre of the least primitive along the axes of points, shape (3,)."""
     if kind == "sphere":
-        return np.asarray(_smallest_balls(points.T[None])[0][0])
+        return np.asarray(smallest_balls(points.T[None])[0][0])
     middle: Array = (points.min(axis=0) + points.max(axis=0)) / 2
     if kind == "cylinder":
-        middle[:2] = _smallest_balls(points.T[None, :2])[0][0]
+        middle[:2] = smallest_balls(points.T[None, :2])[0][0]
     return middle
 
 
@@ -215,7 +203,7 @@ def _box_volumes(along: Array) -> Array:
 
 def _cylinder_volumes(along: Array) -> Array:
     """Volumes of cylinders along z around points, shape (n, 3, m)."""
-    _, radii = _smallest_balls(along[:, :2])
+    _, radii = smallest_balls(along[:, :2])
     return np.asarray(math.pi * radii**2 * np.ptp(along[:, 2], axis=1))
 
 
@@ -258,15 +246,6 @@ _SEARCHES: dict[Kind, _Search] = {
         _cylinder_volumes, slice(2, 3), freedom=2, spins=_spins(1), starts=12, moves=16, steps=24
     ),
 }
-_QUARTER_TURNS = np.array(
-    [
-        turn
-        for order in itertools.permutations(np.eye(3))
-        for signs in itertools.product((1, -1), repeat=3)
-        if np.linalg.det(turn := np.transpose(order) * signs) > 0
-    ]
-)
-"""The rotations of a box onto itself, shape (24, 3, 3)."""
 
 
 def _least(search: _Search, corners: _Corners) -> Array:
@@ -323,73 +302,3 @@ def _descend(rotations: Array, points: Array, search: _Search, steps: int) -> tu
         volumes = np.where(better, found[rows, best], volumes)
         reach = np.where(better, reach, reach * _SHRINK)
     return rotations, volumes
-
-
-def _smallest_balls(points: Array) -> tuple[Array, Array]:
-    """The smallest balls around ``n`` sets of ``m`` points.
-
-    Each ball is spanned by few points on its boundary; the farthest point outside is taken in and
-    the ball grows, until none is outside.
-
-    Args:
-        points: Shape (n, d, m).
-
-    Returns:
-        Centres, shape (n, d), and radii that reach every point, shape (n,).
-    """
-    n, d, _ = points.shape
-    live = np.arange(n)
-    centres = points[live, :, _squares(points - points[:, :, :1]).argmax(axis=1)]
-    squares = np.zeros(n)
-    support = np.repeat(centres[:, :, None], d + 1, axis=2)
-    for _ in range(_PIVOTS):
-        distances = _squares(points[live] - centres[live, :, None])
-        farthest = distances.argmax(axis=1)
-        outside = distances.max(axis=1) > squares[live] * (1 + _ON_BALL)
-        live, farthest = live[outside], farthest[outside]
-        if not len(live):
-            break
-        new = points[live, :, farthest]
-        offsets, grown, kept = _smallest_through(support[live] - new[:, :, None])
-        larger = np.isfinite(grown) & (grown > squares[live])
-        live, new, kept = live[larger], new[larger], kept[larger]
-        support[live, :, :d] = np.take_along_axis(support[live], kept[:, None], axis=2)
-        support[live, :, d] = new
-        centres[live] = new + offsets[larger]
-        squares[live] = grown[larger]
-    return centres, np.sqrt(_squares(points - centres[:, :, None]).max(axis=1))
-
-
-def _smallest_through(others: Array) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Smallest balls with the origin on their boundary around ``d + 1`` other points.
-
-    Args:
-        others: Shape (n, d, d + 1).
-
-    Returns:
-        Centres, shape (n, d), squared radii (infinite where none was found), and which points are
-        on the boundary, shape (n, d), some repeated.
-    """
-    d = others.shape[1]
-    centres, unique, chosen = [], [], []
-    for k in range(1, d + 1):
-        some = np.array(list(itertools.combinations(range(d + 1), k)))
-        chosen.append(some[:, np.arange(d) % k])
-        spokes = others[:, :, some].transpose(0, 2, 3, 1)
-        gram = spokes @ spokes.swapaxes(2, 3)
-        lengths = np.diagonal(gram, axis1=2, axis2=3)
-        unique.append(np.linalg.det(gram) > _ON_BALL * lengths.prod(axis=2))
-        gram = np.where(unique[-1][:, :, None, None], gram, np.eye(k))
-        centres.append((spokes * np.linalg.solve(gram, lengths[..., None] / 2)).sum(axis=2))
-    centre = np.concatenate(centres, axis=1).swapaxes(1, 2)
-    squares = _squares(centre)
-    farthest = _squares(others[:, :, None] - centre[..., None]).max(axis=2)
-    holds = np.concatenate(unique, axis=1) & (farthest <= squares * (1 + 100 * _ON_BALL))
-    squares = np.where(holds, squares, np.inf)
-    best, rows = squares.argmin(axis=1), np.arange(len(others))
-    return centre[rows, :, best], squares[rows, best], np.concatenate(chosen)[best]
-
-
-def _squares(vectors: Array) -> Array:
-    """Squared lengths along axis 1."""
-    return np.asarray(np.square(vectors).sum(axis=1))

@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
-from morphgen.fitting.soft_iou import KINDS, Array, Candidates, overlaps
+from morphgen.fitting.soft_iou import KINDS, Array, Candidates, covered, overlaps
 
 TRIM = 0.03
 """Share of a cloud's points that a guess leaves out at either end of an axis."""
 FEWEST = 8
 """Points that a piece must have."""
+_CUTS = (1, 2, 3)
+"""Numbers of clusters of what is left out that are tried as one primitive more."""
 _THINNEST = 1e-3
 """Half extent of the thinnest guess; points are in units of the solid's size."""
 _BOX, _CYLINDER, _SPHERE = (KINDS.index(kind) for kind in ("box", "cylinder", "sphere"))
@@ -72,6 +74,36 @@ def by_pieces(
             for j in range(k)
         ]
         rows.append(Candidates.join(pieces))
+    return Candidates.stack(rows) if rows else None
+
+
+def by_growth(
+    found: Candidates, points: Array, inside: NDArray[np.bool_], weights: Array, seed: int
+) -> Candidates | None:
+    """Guesses of one primitive more than found: where it leaves out a part of the solid.
+
+    Args:
+        found: One guess of ``k - 1`` primitives.
+        points: Shape (n, 3), over the solid and around it.
+        inside: Whether each lies in the solid.
+        weights: What each point counts.
+        seed: Of the clusterings of what is left out.
+
+    Returns:
+        The guesses; None if too few points are left out.
+    """
+    missed = inside & ~covered(found, points)[0]
+    cloud, outside = points[missed], (points[~inside], weights[~inside])
+    rows: list[Candidates] = []
+    for n in _CUTS:
+        if len(cloud) < n * FEWEST:
+            break
+        _, label = kmeans2(cloud, n, minit="++", seed=seed, iter=10)
+        for j in range(n):
+            if np.count_nonzero(label == j) >= FEWEST:
+                piece = cloud[label == j], weights[missed][label == j]
+                more = _best_of_each_kind(*piece, *outside)
+                rows.append(Candidates.join([found.take(np.zeros(3, np.intp)), more]))
     return Candidates.stack(rows) if rows else None
 
 

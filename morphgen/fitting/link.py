@@ -45,6 +45,8 @@ class LinkFit:
 
     primitives: tuple[Shape, ...]
     """Boxes, cylinders and spheres, in the link frame."""
+    single: Shape | None
+    """The one that overlaps most; None if it was not looked for."""
     solid: str
     """How the solid was made, see ``solid.Method``; ``primitives`` if the shapes were that."""
     quality: Quality
@@ -64,43 +66,57 @@ class LinkFit:
         }
 
 
-def fit_shapes(shapes: Sequence[Shape], options: FitOptions) -> LinkFit:
+def fit_shapes(
+    shapes: Sequence[Shape], options: FitOptions, *, solid: Solid | None = None
+) -> LinkFit:
     """Fit the shapes of one link.
 
     Args:
         shapes: In the link frame. Boxes, cylinders and spheres that are not too many stay as they
             are.
         options: What is wanted.
+        solid: The solid of the shapes, if it is known.
 
     Raises:
         FitError: If the shapes have no volume.
         MeshError: If a mesh cannot be read.
     """
     start = time.perf_counter()
-    solid = solid_of(shapes)
+    solid = solid or solid_of(shapes)
     if are_primitives(shapes) and len(shapes) <= options.max_primitives:
         plain = tuple(replace(shape, rgba=None) for shape in shapes)
-        return _measured(plain, solid, "primitives", start)
-    return fit_solid(solid, options, start)
+        single = plain[0] if len(plain) == 1 else None
+        return _measured(plain, single, solid, start, method="primitives")
+    return fit_solid(solid, options)
 
 
-def fit_solid(solid: Solid, options: FitOptions, start: float | None = None) -> LinkFit:
+def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     """Fit a solid; see ``fit_shapes``."""
-    start = time.perf_counter() if start is None else start
+    start = time.perf_counter()
     target = sampled(solid, options.seed)
     if options.enclose:
-        best, _ = enclose_solid(target, options.max_primitives, options.iou, options.seed)
-        return _measured(best, solid, solid.method, start)
-    best, score = best_single(target)
-    for k in range(2, options.max_primitives + 1):
-        if score >= options.iou:
+        shapes, _ = enclose_solid(target, options.max_primitives, options.iou, options.seed)
+        return _measured(shapes, None, solid, start)
+    best = latest = best_single(target)
+    (single,) = best.shapes
+    for _ in range(1, options.max_primitives):
+        if best.iou >= options.iou:
             break
-        more, its_score = best_several(target, k, options.seed)
-        if its_score > score:
-            best, score = more, its_score
-    return _measured(best, solid, solid.method, start)
+        more = best_several(target, latest, options.seed)
+        if more is None:
+            break
+        latest = more
+        best = max(best, latest, key=lambda found: found.iou)
+    return _measured(best.shapes, single, solid, start)
 
 
-def _measured(primitives: tuple[Shape, ...], solid: Solid, method: str, start: float) -> LinkFit:
+def _measured(
+    primitives: tuple[Shape, ...],
+    single: Shape | None,
+    solid: Solid,
+    start: float,
+    method: str | None = None,
+) -> LinkFit:
     seconds = time.perf_counter() - start
-    return LinkFit(primitives, method, quality(solid, primitives), seconds, solid.decimated_from)
+    worth = quality(solid, primitives)
+    return LinkFit(primitives, single, method or solid.method, worth, seconds, solid.decimated_from)

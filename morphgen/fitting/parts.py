@@ -9,14 +9,23 @@ from pathlib import Path
 
 from morphgen.errors import FormatError
 from morphgen.fitting.dressed import link_shapes
-from morphgen.fitting.link import FitOptions
+from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
+from morphgen.fitting.quality import quality
 from morphgen.fitting.robot import fit_links
-from morphgen.fitting.stored import SUFFIX, StoredFit, read_stored, shapes_key, stored_text
+from morphgen.fitting.solid import solid_of
+from morphgen.fitting.stored import (
+    SUFFIX,
+    StoredFit,
+    read_stored,
+    shapes_key,
+    shapes_scale,
+    stored_text,
+)
 from morphgen.formats.bundle import write_atomic
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Mesh
+from morphgen.model.geometry import Mesh, Shape
 
 TOKEN = FitOptions(max_primitives=1)
 COLLISION = FitOptions(max_primitives=4, iou=0.9)
@@ -68,25 +77,24 @@ def store_part(manifest: Manifest) -> Path:
         MeshError: If a mesh cannot be read.
     """
     body = load_part(manifest).body
-    tokens = {row.link: row.fit for row in fit_links(body, TOKEN).links}
-    found = {row.link: row.fit for row in fit_links(body, COLLISION).links}
-    fits = {
-        shapes_key(link_shapes(link)): StoredFit(
-            link.name,
-            tokens[link.name].primitives[0],
-            found[link.name].primitives,
-            tokens[link.name].quality.iou,
-            found[link.name].quality.iou,
-        )
-        for link in body.links
-        if link.name in found
-    }
+    fits = {}
+    for row in fit_links(body, COLLISION).links:
+        shapes = link_shapes(body.link(row.link))
+        fits[shapes_key(shapes)] = _stored(row.link, shapes, row.fit)
     path = manifest.path.with_name(manifest.path.stem + SUFFIX)
     try:
         write_atomic(path, stored_text(fits))
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
     return path
+
+
+def _stored(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
+    solid = solid_of(shapes)
+    single = fit.single or fit_shapes(shapes, TOKEN, solid=solid).primitives[0]
+    token_iou = quality(solid, [single]).iou
+    found = StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)
+    return found.scaled(1 / shapes_scale(shapes))
 
 
 def _keys(manifest: Manifest) -> set[str]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import partial
 from multiprocessing import get_context
 from typing import cast
 
@@ -111,7 +110,7 @@ def fit_links(
     found = [link for link in links if isinstance(solids[link.name], Solid)]
     first = representatives([_solid(solids[link.name]).mesh for link in found])
     unique = [link for i, link in enumerate(found) if first[i][0] == i]
-    fits = _fit_all(unique, options, jobs, progress)
+    fits = _fit_all(unique, solids, options, jobs, progress)
     reports, findings = [], []
     for i, link in enumerate(found):
         j, T_link_first = first[i]
@@ -124,7 +123,8 @@ def fit_links(
             continue
         shapes = tuple(moved(shape, T_link_first) for shape in fit.primitives)
         worth = quality(_solid(solids[link.name]), shapes)
-        taken = replace(fit, primitives=shapes, quality=worth, seconds=0.0)
+        single = fit.single and moved(fit.single, T_link_first)
+        taken = replace(fit, primitives=shapes, single=single, quality=worth, seconds=0.0)
         reports.append(LinkReport(link.name, taken, found[j].name))
     for link in links:
         solid = solids[link.name]
@@ -136,33 +136,39 @@ def fit_links(
 
 
 def _fit_all(
-    links: Sequence[Link], options: FitOptions, jobs: int, progress: Progress
+    links: Sequence[Link],
+    solids: Mapping[str, Solid | FitError],
+    options: FitOptions,
+    jobs: int,
+    progress: Progress,
 ) -> dict[str, Attempt]:
-    return {name: fit for name, fit in _attempts(links, options, jobs, progress)}
+    work = {link.name: (link_shapes(link), _solid(solids[link.name])) for link in links}
+    fits: dict[str, Attempt] = {}
+    for name, fit in _attempts(work, options, jobs):
+        fits[name] = fit
+        progress(name)
+    return fits
 
 
 def _attempts(
-    links: Sequence[Link], options: FitOptions, jobs: int, progress: Progress
+    work: Mapping[str, tuple[tuple[Shape, ...], Solid]], options: FitOptions, jobs: int
 ) -> Iterator[tuple[str, Attempt]]:
-    attempt = partial(_try_fit, options=options)
-    if jobs == 1 or len(links) < 2:
-        for link in links:
-            yield link.name, attempt(link_shapes(link))
-            progress(link.name)
+    if jobs == 1 or len(work) < 2:
+        for name, (shapes, solid) in work.items():
+            yield name, _try_fit(shapes, solid, options)
         return
-    with ProcessPoolExecutor(min(jobs, len(links)), get_context("spawn")) as pool:
-        futures = {pool.submit(attempt, link_shapes(link)): link.name for link in links}
+    with ProcessPoolExecutor(min(jobs, len(work)), get_context("spawn")) as pool:
+        futures = {pool.submit(_try_fit, *each, options): name for name, each in work.items()}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
-                progress(futures[future])
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _try_fit(shapes: Sequence[Shape], options: FitOptions) -> Attempt:
+def _try_fit(shapes: Sequence[Shape], solid: Solid, options: FitOptions) -> Attempt:
     try:
-        return fit_shapes(shapes, options)
+        return fit_shapes(shapes, options, solid=solid)
     except FitError as error:
         return error
 

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from morphgen.errors import FitError
-from morphgen.fitting.guess import FEWEST, around, by_pieces
+from morphgen.fitting.canonical import canonical
+from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
 from morphgen.fitting.soft_iou import KINDS, Array, Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
@@ -25,7 +26,7 @@ COARSE_POINTS = 2**11
 NEAR_POINTS, FAR_POINTS = 2**14, 2**12
 NEAR, FAR = 0.02, 0.35
 """How far beyond the bounding box these points are drawn, in sizes of it."""
-CLUSTERINGS = 6
+CLUSTERINGS = 4
 """Ways of cutting a solid from which several primitives start."""
 KEPT = 2
 """Candidates that are refined."""
@@ -80,12 +81,22 @@ class Sampled:
                 case "sphere":
                     geometry = Sphere(x)
             a, b, c = np.round(centre, DIGITS).tolist()
-            if isinstance(geometry, Sphere):
-                found.append(Shape(geometry, Pose((a, b, c))))
-                continue
             w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
-            found.append(Shape(geometry, Pose((a, b, c), normalized((w, i, j, k)))))
+            pose = Pose((a, b, c), normalized((w, i, j, k)))
+            found.append(canonical(Shape(geometry, pose)))
         return tuple(found)
+
+
+@dataclass(frozen=True)
+class Found:
+    """The end of a search."""
+
+    shapes: tuple[Shape, ...]
+    """In the link frame."""
+    iou: float
+    """As the search saw it."""
+    candidate: Candidates
+    """The same in the frame of the search, one row."""
 
 
 def sampled(solid: Solid, seed: int) -> Sampled:
@@ -114,27 +125,30 @@ def sampled(solid: Solid, seed: int) -> Sampled:
     return Sampled(solid, points, inside, counts / counts.mean(), R_link_box, middle)
 
 
-def best_single(target: Sampled) -> tuple[tuple[Shape, ...], float]:
-    """The one primitive that overlaps most, and its overlap as the search saw it."""
+def best_single(target: Sampled) -> Found:
+    """The one primitive that overlaps most."""
     with _one_thread():
         cloud = target.points[target.inside]
         start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
         return _climb(target, start, (0.03, 0.008))
 
 
-def best_several(target: Sampled, k: int, seed: int) -> tuple[tuple[Shape, ...], float]:
-    """The ``k`` primitives that overlap most together; none if the solid has too few points."""
+def best_several(target: Sampled, fewer: Found, seed: int) -> Found | None:
+    """The primitives that overlap most together, one more than found before.
+
+    None if the solid has too few points for them.
+    """
     seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(CLUSTERINGS)]
     some = slice(4 * COARSE_POINTS)
-    points, inside, weights = target.points[some], target.inside[some], target.weights[some]
+    cloud = target.points[some], target.inside[some], target.weights[some]
+    k = len(fewer.shapes) + 1
     with _one_thread():
-        start = by_pieces(points, inside, weights, k, seeds)
-        return ((), 0.0) if start is None else _climb(target, start, (0.02, 0.006))
+        starts = by_pieces(*cloud, k, seeds), by_growth(fewer.candidate, *cloud, seeds[0])
+        start = [guesses for guesses in starts if guesses is not None]
+        return _climb(target, Candidates.stack(start), (0.02, 0.006)) if start else None
 
 
-def _climb(
-    target: Sampled, start: Candidates, tau: tuple[float, float]
-) -> tuple[tuple[Shape, ...], float]:
+def _climb(target: Sampled, start: Candidates, tau: tuple[float, float]) -> Found:
     points, inside, weights = target.points, target.inside, target.weights
     rough = ascend(
         start,
@@ -157,7 +171,7 @@ def _climb(
     )
     score = overlaps(fine, points, inside, weights)
     best = int(np.argmax(score))
-    return target.shapes(fine, best), float(score[best])
+    return Found(target.shapes(fine, best), float(score[best]), fine.take(np.array([best])))
 
 
 @contextmanager

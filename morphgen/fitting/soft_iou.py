@@ -137,29 +137,32 @@ def overlaps(
         inside: Whether each lies in the solid, shape (m,).
         weights: What each point counts, shape (m,); by default 1.
     """
-    x = torch.from_numpy(points.astype(np.float32))
     target = torch.from_numpy(inside)
     weight = torch.from_numpy(np.ones(len(points)) if weights is None else weights)
     n, k = candidates.kinds.shape
     rows = max(_BUNCH * 1000 // (k * len(points)), 1)
     found = []
-    with torch.no_grad():
-        for start in range(0, n, rows):
-            some = candidates.take(np.arange(start, min(start + rows, n)))
-            member = (
-                _distance(
-                    x,
-                    torch.from_numpy(some.kinds),
-                    *(
-                        torch.from_numpy(array.astype(np.float32))
-                        for array in (some.centres, some.quaternions, some.halves)
-                    ),
-                )
-                <= 0
-            ).any(dim=1)
-            both, either = (count.double() @ weight for count in (member & target, member | target))
-            found.append(both / either.clamp(min=1e-12))
+    for start in range(0, n, rows):
+        member = _members(candidates.take(np.arange(start, min(start + rows, n))), points)
+        both, either = (count.double() @ weight for count in (member & target, member | target))
+        found.append(both / either.clamp(min=1e-12))
     return np.asarray(torch.cat(found).numpy())
+
+
+def covered(candidates: Candidates, points: Array) -> NDArray[np.bool_]:
+    """Which points (m, 3) lie in any primitive of each candidate, shape (n, m)."""
+    return np.asarray(_members(candidates, points).numpy())
+
+
+@torch.no_grad()
+def _members(candidates: Candidates, points: Array) -> torch.Tensor:
+    arrays = (candidates.centres, candidates.quaternions, candidates.halves)
+    distance = _distance(
+        torch.from_numpy(points.astype(np.float32)),
+        torch.from_numpy(candidates.kinds),
+        *(torch.from_numpy(array.astype(np.float32)) for array in arrays),
+    )
+    return (distance <= 0).any(dim=1)
 
 
 def _distance(

@@ -3,13 +3,15 @@
 A point is inside where the generalised winding number of the triangles is above one half (Jacobson,
 Kavan and Sorkine-Hornung, "Robust inside-outside segmentation using generalized winding numbers",
 2013; here libigl's fast evaluation of it). Every connected piece is first turned outwards, so a
-piece within another counts as filled: a link is a body, and nothing enters its cavities.
+piece within another counts as filled: a link is a body, and nothing enters its cavities. Meshes of
+covers are shells, thin walls around a room that opens where the next link begins; this room counts
+as filled, too, where few directions lead out of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, cast
 
@@ -20,16 +22,18 @@ import trimesh
 from numpy.typing import NDArray
 
 from morphgen.errors import FitError
+from morphgen.fitting.cavities import Cavities
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.mesh import FLAT, is_flat, load_mesh
 
 Array = NDArray[np.float64]
-Method = Literal["watertight", "repaired", "winding", "hull"]
+Method = Literal["watertight", "repaired", "winding", "filled", "hull"]
 """What made a solid of the triangles, from best to worst: nothing was needed; pieces were turned
-outwards, welded or their small holes filled; it is open, and the winding number decides; it
-encloses next to nothing, and its convex hull is taken."""
-METHODS: tuple[Method, ...] = ("watertight", "repaired", "winding", "hull")
+outwards, welded or their small holes filled; it is open, and the winding number decides; it is a
+hollow shell, and the room within was filled; it encloses next to nothing, and its convex hull is
+taken."""
+METHODS: tuple[Method, ...] = ("watertight", "repaired", "winding", "filled", "hull")
 
 MAX_FACES = 200_000
 """Triangles above which a mesh is decimated."""
@@ -37,10 +41,14 @@ DECIMATED = 100_000
 """Triangles that are left then."""
 HOLLOW = 0.02
 """Share of the convex hull's volume below which an open mesh encloses nothing."""
+ENCLOSED = 0.3
+"""Openness below which a point lies within a shell. Half-way down a cup as wide as deep: 0.15."""
+SHELL = 0.1
+"""Volume within a shell, relative to that of its walls, from which on it is filled."""
 _WELD = 1e-5
 """Distance below which vertices are welded, relative to the size of the mesh."""
 _PROBES = 4096
-"""Points that tell whether an open mesh encloses anything."""
+"""Points that tell whether an open mesh encloses anything, and whether there is room in a shell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +65,15 @@ class Solid:
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Whether points, shape (n, 3), lie inside."""
         low, high = self.mesh.bounds
-        inside = np.all((points >= low) & (points <= high), axis=1)
-        if inside.any():
-            winding = igl.fast_winding_number(self._vertices, self._faces, points[inside])
-            inside[inside] = winding > 0.5
-        return np.asarray(inside)
+        near = np.all((points >= low) & (points <= high), axis=1)
+        inside = np.zeros(len(points), dtype=bool)
+        if near.any():
+            winding = igl.fast_winding_number(self._vertices, self._faces, points[near])
+            inside[near] = winding > 0.5
+        if self.method == "filled":
+            unsure = near & ~inside
+            inside[unsure] = self._cavities.openness(points[unsure]) < ENCLOSED
+        return inside
 
     def distance(self, points: Array) -> Array:
         """Distance of points, shape (n, 3), to the triangles, metres."""
@@ -88,6 +100,10 @@ class Solid:
         return float(np.linalg.norm(self.mesh.extents))
 
     @cached_property
+    def _cavities(self) -> Cavities:
+        return Cavities(self.mesh)
+
+    @cached_property
     def _vertices(self) -> Array:
         return np.ascontiguousarray(self.mesh.vertices, dtype=np.float64)
 
@@ -112,8 +128,10 @@ def solid_of(shapes: Sequence[Shape]) -> Solid:
     bulky = [solid for solid in solids if solid is not None]
     if not bulky:
         raise FitError("the shapes are flat: they have no volume")
-    if len(bulky) == 1:
-        return bulky[0]
+    return _filled(bulky[0] if len(bulky) == 1 else _together(bulky))
+
+
+def _together(bulky: Sequence[Solid]) -> Solid:
     counts = [solid.decimated_from or len(solid.mesh.faces) for solid in bulky]
     together = trimesh.util.concatenate([solid.mesh for solid in bulky])
     return Solid(
@@ -206,6 +224,20 @@ def _closed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _is_hollow(solid: Solid) -> bool:
     low, high = solid.mesh.bounds
-    points = np.random.default_rng(0).uniform(low, high, (_PROBES, 3))
-    within = float(solid.contains(points).mean() * np.prod(high - low))
+    within = float(solid.contains(_probes(solid)).mean() * np.prod(high - low))
     return within < HOLLOW * float(solid.hull.volume)
+
+
+def _filled(solid: Solid) -> Solid:
+    """The solid with the room within filled, if it is a shell."""
+    if solid.method == "hull":
+        return solid
+    filled = replace(solid, method="filled")
+    points = _probes(solid)
+    walls, body = solid.contains(points).sum(), filled.contains(points).sum()
+    return filled if body > (1 + SHELL) * walls else solid
+
+
+def _probes(solid: Solid) -> Array:
+    low, high = solid.mesh.bounds
+    return np.random.default_rng(0).uniform(low, high, (_PROBES, 3))

@@ -1,4 +1,8 @@
-"""Fitted primitives on disk: beside every real part's manifest, by the content of its meshes."""
+"""Fitted primitives on disk: beside every real part's manifest, by the content of its meshes.
+
+Primitives grow with the shapes that they stand for, so they are kept for shapes at unit scale, and
+serve links that are scaled as a whole.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,15 +19,16 @@ from morphgen.errors import FormatError
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import number
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
+from morphgen.model.scaling import scaled_shape
 
 SUFFIX = ".primitives.json"
-VERSION = 1
+VERSION = 2
 """Rises when the fitter gives other primitives for the same meshes."""
 
 
 @dataclass(frozen=True)
 class StoredFit:
-    """What is kept of a link's fit."""
+    """What is kept of a link's fit: of its shapes at unit scale."""
 
     link: str
     token: Shape
@@ -33,18 +38,48 @@ class StoredFit:
     token_iou: float
     collision_iou: float
 
+    def scaled(self, factor: float) -> StoredFit:
+        """The fit of the shapes, larger or smaller."""
+        return replace(
+            self,
+            token=scaled_shape(self.token, factor),
+            collision=tuple(scaled_shape(shape, factor) for shape in self.collision),
+        )
+
 
 Stored = Mapping[str, StoredFit]
 """Fits by ``shapes_key``."""
 
 
-def shapes_key(shapes: Sequence[Shape]) -> str:
-    """A hash of shapes by their content: the same meshes at the same places, the same hash.
+def stored_fit(shapes: Sequence[Shape], stored: Stored) -> StoredFit | None:
+    """What is stored for shapes, or for the same ones at another scale.
 
     Raises:
         FormatError: If a mesh file cannot be read.
     """
-    text = "\n".join(sorted(_shape_text(shape) for shape in shapes))
+    fit = stored.get(shapes_key(shapes))
+    return fit and fit.scaled(shapes_scale(shapes))
+
+
+def shapes_scale(shapes: Sequence[Shape]) -> float:
+    """The scale of the first mesh; 1 if it is not the same in all directions, or there is none."""
+    for shape in shapes:
+        if isinstance(shape.geometry, Mesh):
+            x, y, z = shape.geometry.scale
+            return x if x == y == z and x > 0 else 1.0
+    return 1.0
+
+
+def shapes_key(shapes: Sequence[Shape]) -> str:
+    """A hash of shapes by their content: the same meshes at the same places, the same hash.
+
+    Shapes that are scaled as a whole have the hash of those at unit scale.
+
+    Raises:
+        FormatError: If a mesh file cannot be read.
+    """
+    factor = 1 / shapes_scale(shapes)
+    text = "\n".join(sorted(_shape_text(scaled_shape(shape, factor)) for shape in shapes))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -94,29 +129,12 @@ def shape_data(shape: Shape) -> dict[str, object]:
     return size | {"xyz": list(pose.position), "quaternion": list(pose.quaternion)}
 
 
-@lru_cache(maxsize=256)
-def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
-    """The fits of a file as it is at its stamp."""
-    del stamp
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data["fitter"] != VERSION:
-            return {}
-        return {
-            link["shapes"]: StoredFit(
-                link["link"],
-                _shape(link["token"]),
-                tuple(_shape(shape) for shape in link["collision"]),
-                link["token_iou"],
-                link["collision_iou"],
-            )
-            for link in data["links"]
-        }
-    except (KeyError, RecursionError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: no file of fitted primitives: {error!r}") from error
+def shape_of(data: dict[str, Any]) -> Shape:
+    """The shape of plain data, see ``shape_data``.
 
-
-def _shape(data: dict[str, Any]) -> Shape:
+    Raises:
+        KeyError, TypeError, ValueError: If it is none.
+    """
     geometry: Geometry
     (kind,) = {"box", "cylinder", "sphere"} & {*data}
     size = [float(value) for value in data[kind]]
@@ -133,6 +151,28 @@ def _shape(data: dict[str, Any]) -> Shape:
     else:
         geometry = Sphere(*size)
     return Shape(geometry, Pose((x, y, z), (w, a, b, c)))
+
+
+@lru_cache(maxsize=256)
+def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
+    """The fits of a file as it is at its stamp."""
+    del stamp
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["fitter"] != VERSION:
+            return {}
+        return {
+            link["shapes"]: StoredFit(
+                link["link"],
+                shape_of(link["token"]),
+                tuple(shape_of(shape) for shape in link["collision"]),
+                link["token_iou"],
+                link["collision_iou"],
+            )
+            for link in data["links"]
+        }
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
+        raise FormatError(f"{path}: no file of fitted primitives: {error!r}") from error
 
 
 def _shape_text(shape: Shape) -> str:

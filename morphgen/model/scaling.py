@@ -38,28 +38,29 @@ def scaled(robot: Robot, factors: Mapping[str, float]) -> Robot:
     )
 
 
+def scaled_shape(shape: Shape, factor: float) -> Shape:
+    """A shape larger or smaller in all directions, about the origin of its link."""
+    return replace(
+        shape,
+        geometry=_geometry(shape.geometry, factor),
+        T_link_shape=_pose(shape.T_link_shape, factor),
+    )
+
+
 def _link(link: Link, factor: float) -> Link:
     if factor == 1.0:
         return link
     return replace(
         link,
         inertial=link.inertial and _inertial(link.inertial, factor),
-        visuals=tuple(_shape(shape, factor) for shape in link.visuals),
-        collisions=tuple(_shape(shape, factor) for shape in link.collisions),
+        visuals=tuple(scaled_shape(shape, factor) for shape in link.visuals),
+        collisions=tuple(scaled_shape(shape, factor) for shape in link.collisions),
     )
 
 
 def _inertial(body: Inertial, factor: float) -> Inertial:
     xx, xy, xz, yy, yz, zz = (factor**5 * value for value in body.inertia)
     return Inertial(factor**3 * body.mass, _vector(body.com, factor), (xx, xy, xz, yy, yz, zz))
-
-
-def _shape(shape: Shape, factor: float) -> Shape:
-    return replace(
-        shape,
-        geometry=_geometry(shape.geometry, factor),
-        T_link_shape=_pose(shape.T_link_shape, factor),
-    )
 
 
 def _geometry(geometry: Geometry, factor: float) -> Geometry:

@@ -11,7 +11,16 @@ from morphgen.fitting.congruence import congruence, moved, representatives
 from morphgen.fitting.quality import signed_distance
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    Mesh,
+    Pose,
+    Shape,
+    Sphere,
+    dimensions,
+)
 from morphgen.model.mesh import load_mesh
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -181,7 +190,7 @@ def test_a_moved_primitive_is_as_far_from_moved_points(geometry, mirrored):
         there = moved(shape, T)
         after = signed_distance([there], trimesh.transform_points(points, T))
         np.testing.assert_allclose(after, before, atol=1e-12)
-        assert there.geometry == geometry
+        assert sorted(dimensions(there.geometry)) == sorted(dimensions(geometry))
         assert there.rgba == shape.rgba
         assert there.T_link_shape.quaternion[0] >= 0
         assert np.linalg.norm(there.T_link_shape.quaternion) == pytest.approx(1)

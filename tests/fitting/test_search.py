@@ -9,10 +9,10 @@ import torch
 import trimesh
 
 from morphgen.errors import FitError
-from morphgen.fitting.guess import FEWEST, around, by_pieces
+from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
 from morphgen.fitting.quality import quality
 from morphgen.fitting.search import DIGITS, best_several, best_single, sampled
-from morphgen.fitting.soft_iou import KINDS, overlaps
+from morphgen.fitting.soft_iou import KINDS, covered, overlaps
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, dimensions
 
@@ -31,7 +31,8 @@ def target_of(*shapes, seed=0):
 def fitted(geometry, pose=TILTED, seed=0):
     """The best single primitive of a primitive, its score, and the solid."""
     target = target_of(Shape(geometry, pose), seed=seed)
-    (shape,), score = best_single(target)
+    found = best_single(target)
+    (shape,), score = found.shapes, found.iou
     return shape, score, target.solid
 
 
@@ -99,23 +100,24 @@ def test_a_strut_is_found_however_it_lies(seed):
 
 def test_two_boxes_are_found_in_an_l():
     target = target_of(*ANGLE)
-    shapes, score = best_several(target, 2, 0)
+    one = best_single(target)
+    two = best_several(target, one, 0)
+    shapes = two.shapes
     assert len(shapes) == 2
     for shape in shapes:
         assert isinstance(shape.geometry, Box)
         assert_well_formed(shape)
     iou = quality(target.solid, shapes).iou
     assert iou > 0.95
-    assert score == pytest.approx(iou, abs=0.015)
-    (one,), single = best_single(target)
-    assert single < 0.8
-    assert quality(target.solid, [one]).iou == pytest.approx(single, abs=0.03)
+    assert two.iou == pytest.approx(iou, abs=0.015)
+    assert one.iou < 0.8
+    assert quality(target.solid, one.shapes).iou == pytest.approx(one.iou, abs=0.03)
 
 
 def test_a_cylinder_and_a_box_are_found_together():
     parts = (Shape(Cylinder(0.05, 0.3)), Shape(Box((0.4, 0.2, 0.06)), Pose((0, 0, 0.18))))
     target = target_of(*parts)
-    shapes, _ = best_several(target, 2, 0)
+    shapes = best_several(target, best_single(target), 0).shapes
     assert sorted(type(shape.geometry).__name__ for shape in shapes) == ["Box", "Cylinder"]
     assert quality(target.solid, shapes).iou > 0.95
 
@@ -133,7 +135,9 @@ def test_the_same_seed_gives_the_same_shapes_with_any_number_of_threads(threads)
     for n in (1, 3):
         threads(n)
         target = target_of(*ANGLE, seed=3)
-        found.append((best_single(target), best_several(target, 2, 3)))
+        one = best_single(target)
+        two = best_several(target, one, 3)
+        found.append((one.shapes, one.iou, two.shapes, two.iou))
         assert torch.get_num_threads() == n
     assert found[0] == found[1]
 
@@ -258,8 +262,27 @@ def test_a_solid_of_few_points_is_not_cut():
 
 def test_more_primitives_than_points_allow_are_none():
     target = target_of(Shape(Cylinder(0.02, 0.5), TILTED))
-    few = replace(target, inside=target.inside & (np.cumsum(target.inside) <= 3 * FEWEST))
-    assert best_several(few, 4, 0) == ((), 0.0)
+    one = best_single(target)
+    few = replace(target, inside=target.inside & (np.cumsum(target.inside) < FEWEST))
+    assert best_several(few, one, 0) is None
+
+
+def test_one_more_primitive_begins_where_those_found_leave_the_solid_out():
+    arms = [Shape(Box((0.5, 0.1, 0.1)), Pose((0.0, y, 0.0))) for y in (-0.4, 0.0, 0.4)]
+    spine = Shape(Box((0.1, 0.9, 0.1)), Pose((-0.2, 0.0, 0.0)))
+    target = target_of(spine, *arms)
+    found = best_single(target)
+    for _ in range(3):
+        found = best_several(target, found, 0)
+    assert len(found.shapes) == 4
+    assert quality(target.solid, found.shapes).iou > 0.93
+
+
+def test_nothing_left_out_gives_no_guess_of_one_more():
+    target = target_of(Shape(Box((0.1, 0.2, 0.3))))
+    one = best_single(target)
+    some = target.points[target.inside & covered(one.candidate, target.points)[0]]
+    assert by_growth(one.candidate, some, np.ones(len(some), bool), np.ones(len(some)), 0) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -267,6 +290,6 @@ def test_a_thin_solid_at_an_angle_is_met_by_points_too(seed):
     rod = Shape(Cylinder(0.005, 0.3), TILTED)
     plate = Shape(Box((0.3, 0.3, 0.006)), TILTED)
     for shape in (rod, plate):
-        (found,), score = best_single(target_of(shape, seed=seed))
-        assert score > 0.85
-        assert type(found.geometry) is type(shape.geometry)
+        found = best_single(target_of(shape, seed=seed))
+        assert found.iou > 0.85
+        assert type(found.shapes[0].geometry) is type(shape.geometry)

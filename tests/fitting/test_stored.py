@@ -19,9 +19,11 @@ from morphgen.fitting.stored import (
     read_stored,
     shape_data,
     shapes_key,
+    stored_fit,
     stored_text,
 )
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.scaling import scaled_shape
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.25, 1 / 3), (0.3, -0.5, 2.0))
 CAN = Shape(Cylinder(0.05, 0.3), TILTED)
@@ -234,7 +236,7 @@ def test_whatever_changes_the_solid_changes_the_key(mesh):
     shapes = [
         Shape(mesh),
         Shape(replace(mesh, scale=(1.0, 1.0, -1.0))),
-        Shape(replace(mesh, scale=(0.001, 0.001, 0.001))),
+        Shape(replace(mesh, scale=(0.001, 0.001, 0.002))),
         Shape(replace(mesh, part=0)),
         Shape(replace(mesh, part=1)),
         Shape(mesh, Pose((0, 0, 1e-6))),
@@ -250,6 +252,19 @@ def test_whatever_changes_the_solid_changes_the_key(mesh):
     keys = [shapes_key([each]) for each in shapes]
     keys += [shapes_key([]), shapes_key(shapes[:2]), shapes_key(shapes[:1] * 2)]
     assert len(set(keys)) == len(keys)
+
+
+def test_shapes_scaled_as_a_whole_have_the_same_key_and_their_fit_grows_with_them(mesh):
+    shapes = [Shape(mesh, TILTED), Shape(Box((0.1, 0.2, 0.3)), Pose((0.1, 0.0, 0.2)))]
+    larger = [scaled_shape(shape, 1.3) for shape in shapes]
+    assert shapes_key(larger) == shapes_key(shapes)
+    assert shapes_key([larger[0], shapes[1]]) != shapes_key(shapes)
+    stored = {shapes_key(shapes): ARM}
+    assert stored_fit(shapes, stored) == ARM
+    found = stored_fit(larger, stored)
+    assert found.token == scaled_shape(ARM.token, 1.3)
+    assert found.collision == tuple(scaled_shape(shape, 1.3) for shape in ARM.collision)
+    assert stored_fit([Shape(Sphere(0.1))], stored) is None
 
 
 def test_neither_colour_nor_order_nor_the_sign_of_zero_changes_the_key(mesh):

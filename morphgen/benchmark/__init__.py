@@ -1,0 +1,1 @@
+"""Bodies as data: tokens, similarity, and splits of train and test robots."""

@@ -1,0 +1,91 @@
+"""The one primitive that stands for each link in its token."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+from morphgen.errors import FitError, FormatError
+from morphgen.fitting.canonical import canonical
+from morphgen.fitting.dressed import are_primitives, link_shapes
+from morphgen.fitting.stored import (
+    VERSION,
+    read_stored,
+    shape_data,
+    shape_of,
+    shapes_key,
+    shapes_scale,
+    stored_fit,
+)
+from morphgen.formats.bundle import write_atomic
+from morphgen.model.geometry import Shape
+from morphgen.model.robot import Robot
+from morphgen.model.scaling import scaled_shape
+
+
+def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]:
+    """The box, cylinder or sphere that overlaps each link most.
+
+    A link that is a primitive keeps it, in its canonical pose; for meshes of the library's parts
+    the stored fit is taken; others are fitted, which takes about a second a link, and kept in the
+    user's cache.
+
+    Args:
+        robot: The body.
+        folders: Folders of parts, for their stored fits.
+
+    Returns:
+        By link; links without shapes, and those without volume, are not in it.
+
+    Raises:
+        FormatError: If a stored fit is malformed.
+        MeshError: If a mesh cannot be read.
+    """
+    stored = read_stored(folders)
+    found = {}
+    for link in robot.links:
+        shapes = link_shapes(link)
+        if not shapes:
+            continue
+        if len(shapes) == 1 and are_primitives(shapes):
+            found[link.name] = canonical(replace(shapes[0], rgba=None))
+        elif fit := stored_fit(shapes, stored):
+            found[link.name] = fit.token
+        elif shape := _cached_fit(shapes):
+            found[link.name] = shape
+    return found
+
+
+def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
+    """The fit of shapes that nothing is stored for; None if they have no volume."""
+    factor = shapes_scale(shapes)
+    path = user_cache_path("morphgen") / f"tokens-{VERSION}" / f"{shapes_key(shapes)}.json"
+    if path.is_file():
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            return None if data is None else scaled_shape(shape_of(data), factor)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FormatError(f"{path}: no fitted primitive: {error!r}; delete it") from error
+    shape = _fitted(shapes)
+    data = None if shape is None else shape_data(scaled_shape(shape, 1 / factor))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps(data))
+    except OSError as error:
+        warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=3)
+    return shape
+
+
+def _fitted(shapes: Sequence[Shape]) -> Shape | None:
+    # The search needs torch, which takes seconds to load.
+    from morphgen.fitting.link import FitOptions, fit_shapes
+
+    try:
+        return fit_shapes(shapes, FitOptions()).primitives[0]
+    except FitError:
+        return None

@@ -1,0 +1,90 @@
+"""The one primitive of each link, from wherever it is cheapest."""
+
+import json
+
+import pytest
+import trimesh
+
+import morphgen
+from morphgen.errors import FormatError
+from morphgen.fitting import token_shapes as module
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.library import default_library
+from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.robot import Joint, Link, Robot
+
+FOLDERS = default_library(()).folders
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    folder = tmp_path / "cache"
+    monkeypatch.setattr(module, "user_cache_path", lambda name: folder / name)
+    return folder
+
+
+@pytest.fixture
+def no_search(monkeypatch):
+    def search(shapes):
+        raise AssertionError("a fit was searched for")
+
+    monkeypatch.setattr(module, "_fitted", search)
+
+
+def robot_of(*shapes):
+    links = (Link("base"), Link("body", collisions=tuple(shapes)))
+    return Robot("r", links, (Joint("j", "fixed", "base", "body"),))
+
+
+def test_a_link_that_is_one_primitive_keeps_it(no_search):
+    can = Shape(Cylinder(0.1, 0.2), Pose((0.1, 0.0, 0.0)), rgba=(1.0, 0.0, 0.0, 1.0))
+    assert token_shapes(robot_of(can)) == {"body": Shape(can.geometry, can.T_link_shape)}
+
+
+def test_meshes_of_the_library_cost_no_search_also_scaled_ones(no_search):
+    arm = morphgen.compose("arm=panda")
+    larger = morphgen.compose("arm=panda_scaled arm.scale3=1.4")
+    plain, scaled = (token_shapes(robot, FOLDERS) for robot in (arm, larger))
+    assert len(plain) == len(scaled) > 7
+    same, other = (
+        [name for name in plain if (plain[name] != scaled[name]) == changed]
+        for changed in (False, True)
+    )
+    assert len(other) == 1
+    assert "link2" in other[0]
+    assert same
+    assert scaled[other[0]] == morphgen.model.scaling.scaled_shape(plain[other[0]], 1.4)
+
+
+def test_what_is_stored_nowhere_is_searched_once(monkeypatch, cache):
+    shapes = [Shape(Box((0.1, 0.1, 0.4))), Shape(Box((0.1, 0.1, 0.38)), Pose((0.0, 0.0, 0.02)))]
+    first = token_shapes(robot_of(*shapes))
+    assert isinstance(first["body"].geometry, Box)
+    assert max(first["body"].geometry.size) == pytest.approx(0.405, abs=0.01)
+    monkeypatch.setattr(module, "_fitted", lambda shapes: pytest.fail("searched again"))
+    assert token_shapes(robot_of(*shapes)) == first
+
+
+def test_a_flat_link_has_no_primitive_and_that_is_remembered(tmp_path, monkeypatch):
+    flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    flat.export(tmp_path / "flat.stl")
+    robot = robot_of(Shape(Mesh(tmp_path / "flat.stl")))
+    assert token_shapes(robot) == {}
+    monkeypatch.setattr(module, "_fitted", lambda shapes: pytest.fail("searched again"))
+    assert token_shapes(robot) == {}
+
+
+def test_a_broken_cache_is_named(cache):
+    shapes = [Shape(Sphere(0.1)), Shape(Sphere(0.1), Pose((0.05, 0.0, 0.0)))]
+    token_shapes(robot_of(*shapes))
+    (path,) = cache.rglob("*.json")
+    path.write_text(json.dumps({"box": [1, 2]}))
+    with pytest.raises(FormatError, match=path.name):
+        token_shapes(robot_of(*shapes))
+
+
+def test_a_cache_that_cannot_be_written_is_told(cache):
+    cache.write_text("a file")
+    shapes = [Shape(Sphere(0.1)), Shape(Sphere(0.1), Pose((0.05, 0.0, 0.0)))]
+    with pytest.warns(UserWarning, match="cannot keep a fit"):
+        assert token_shapes(robot_of(*shapes))
