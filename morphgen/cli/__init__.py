@@ -19,6 +19,8 @@ from morphgen.cli import (
     import_robot,
     list_parts,
     sample,
+    similarity,
+    tokens,
     view,
 )
 from morphgen.errors import MorphgenError
@@ -32,8 +34,10 @@ COMMANDS = (
     conform,
     import_robot,
     fit,
+    tokens,
     grammar,
     derive,
+    similarity,
     view,
 )
 

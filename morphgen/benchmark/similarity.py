@@ -1,0 +1,154 @@
+"""How alike two bodies are, measured in three ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.benchmark.token_layout import INDEX, MAX_LINKS, PARENT, POSITION
+from morphgen.benchmark.tokens import tokens
+from morphgen.benchmark.tree_distance import KinematicTree, kinematic_tree, normalised_distance
+from morphgen.benchmark.workspace import Workspace, overlap, workspace
+from morphgen.errors import BenchmarkError, nearest
+from morphgen.model.geometry import Shape
+from morphgen.model.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """All of a robot that comparing needs."""
+
+    name: str
+    tokens: Array
+    """Without the encoding of q, shape (n_links, 32). Indices are divided by 22 whatever the size
+    of the body, so that robots of every size can be compared; a longer one has some above 1."""
+    tree: KinematicTree
+    workspace: Workspace
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A way to compare two robots."""
+
+    name: str
+    function: Callable[[Features, Features], float]
+    """Symmetric."""
+    larger_is_more_alike: bool
+    meaning: str
+
+
+def features(robot: Robot, shapes: Mapping[str, Shape]) -> Features:
+    """What comparing needs of a robot.
+
+    Args:
+        robot: The body.
+        shapes: The primitive of every link that has geometry, as ``token_shapes`` gives them.
+
+    Raises:
+        BenchmarkError: If the robot has no tool or no joint that moves it, or no tokens.
+        RobotError: If an axis is zero.
+    """
+    table = _tokens(robot, shapes)
+    space = workspace(robot)
+    return Features(robot.name, table, kinematic_tree(robot, shapes, space.reach), space)
+
+
+def cosine(a: Features, b: Features) -> float:
+    """Cosine of the angle between the tokens, laid end to end, in [-1, 1]; 1 is the same body.
+
+    As in AnyBody (arXiv 2505.14986, section 4): the encoding of q left out, the smaller body
+    filled up with zeros.
+    """
+    n = min(len(a.tokens), len(b.tokens))
+    product = float((a.tokens[:n] * b.tokens[:n]).sum())
+    norms = np.linalg.norm(a.tokens) * np.linalg.norm(b.tokens)
+    return float(np.clip(product / norms, -1.0, 1.0))
+
+
+def tree_distance(a: Features, b: Features) -> float:
+    """Normalised edit distance of the kinematic trees, in [0, 1]; 0 is the same body."""
+    return normalised_distance(a.tree, b.tree)
+
+
+def workspace_overlap(a: Features, b: Features) -> float:
+    """Share of configurations whose tools are in the same place, in [0, 1]; 1 is the same body.
+
+    Places are about the shoulder and in units of reach.
+    """
+    return overlap(a.workspace, b.workspace)
+
+
+MEASURES: Mapping[str, Measure] = MappingProxyType(
+    {
+        measure.name: measure
+        for measure in (
+            Measure("cosine", cosine, True, "how parallel the tokens are, laid end to end"),
+            Measure("tree", tree_distance, False, "edit distance of the kinematic trees"),
+            Measure("workspace", workspace_overlap, True, "overlap of where the tools can go"),
+        )
+    }
+)
+"""Every measure by its name."""
+
+
+def matrix(
+    robots: Sequence[Features],
+    measure: str,
+    progress: Callable[[int], None] = lambda pairs: None,
+) -> Array:
+    """Compare all robots with each other, every pair once.
+
+    Args:
+        robots: Their features.
+        measure: A name in ``MEASURES``.
+        progress: Told how many pairs were compared since it was last told.
+
+    Returns:
+        Symmetric, shape (n, n).
+
+    Raises:
+        BenchmarkError: If there is no such measure.
+    """
+    function = measure_named(measure).function
+    values = np.empty((len(robots), len(robots)))
+    for i, robot in enumerate(robots):
+        for j in range(i + 1):
+            values[i, j] = values[j, i] = function(robot, robots[j])
+        progress(i + 1)
+    return values
+
+
+def distances(values: Array, measure: str) -> Array:
+    """A matrix of a measure as distances: 1 minus it where larger is more alike, (n, n).
+
+    Raises:
+        BenchmarkError: If there is no such measure.
+    """
+    apart = 1 - values if measure_named(measure).larger_is_more_alike else values.copy()
+    np.fill_diagonal(apart, 0.0)
+    return np.asarray(np.maximum(apart, 0.0))
+
+
+def measure_named(name: str) -> Measure:
+    """The measure of that name.
+
+    Raises:
+        BenchmarkError: If there is none.
+    """
+    if name not in MEASURES:
+        raise BenchmarkError(f"no measure {name!r}{nearest(name, MEASURES)}")
+    return MEASURES[name]
+
+
+def _tokens(robot: Robot, shapes: Mapping[str, Shape]) -> Array:
+    max_links = max(MAX_LINKS, len(robot.links))
+    made = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
+    for field in (INDEX, PARENT):
+        made[:, field.columns] *= (max_links - 1) / (MAX_LINKS - 1)
+    return made

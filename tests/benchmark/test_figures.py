@@ -1,0 +1,120 @@
+"""Pictures of similarity are the same bytes every time, and hold what was asked for."""
+
+import io
+import struct
+
+import matplotlib
+import numpy as np
+import pytest
+from PIL import Image
+
+from morphgen.benchmark.figures import NAMED, WRITTEN, MapPanel, Panel, heatmap_png, map_png
+from morphgen.benchmark.scaling_map import scaling_map
+
+
+def names(n):
+    return [f"arm-{i:06d}" if i % 3 else f"hand_{i}" for i in range(n)]
+
+
+def panel(n, title="tree", larger=False):
+    points = np.random.default_rng(0).random((n, 3))
+    return Panel(title, np.linalg.norm(points[:, None] - points, axis=-1), larger)
+
+
+def map_panel(n, title="tree"):
+    return MapPanel(title, scaling_map(panel(n).values))
+
+
+def drawings(n):
+    return heatmap_png(names(n), [panel(n)]), map_png(names(n), [map_panel(n)])
+
+
+def pixels(png):
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=int)
+
+
+def chunks(png):
+    """Names of a PNG's chunks."""
+    found, at = [], 8
+    while at < len(png):
+        (size,) = struct.unpack(">I", png[at : at + 4])
+        found.append(png[at + 4 : at + 8].decode())
+        at += size + 12
+    return found
+
+
+@pytest.mark.parametrize("n", [1, 2, WRITTEN, NAMED, NAMED + 1])
+def test_every_number_of_robots_can_be_drawn_twice_the_same(n):
+    first, second = drawings(n), drawings(n)
+    assert first == second
+    for png in first:
+        assert pixels(png).std() > 5
+        assert max(pixels(png).shape) < 2000
+
+
+def test_no_date_and_no_version_is_in_a_picture():
+    for png in drawings(5):
+        assert set(chunks(png)) == {"IHDR", "pHYs", "IDAT", "IEND"}
+        assert matplotlib.__version__.encode() not in png
+
+
+def test_the_users_settings_change_no_picture():
+    before = drawings(5)
+    with matplotlib.rc_context({"font.size": 20, "axes.facecolor": "red", "savefig.dpi": 30}):
+        assert drawings(5) == before
+        assert matplotlib.rcParams["font.size"] == 20
+
+
+def test_bright_is_alike_whichever_way_a_measure_counts():
+    n = NAMED + 20
+    half = np.arange(n) < n / 2
+    apart = (half[:, None] != half).astype(float)
+    for values, larger in ((apart, False), (1 - apart, True)):
+        picture = pixels(heatmap_png(names(n), [Panel("", values, larger)]))
+        height, width, _ = picture.shape
+        alike, different = picture[height // 4, width // 4], picture[height // 4, 3 * width // 4]
+        assert alike.sum() > 450
+        assert different.sum() < 250
+
+
+def test_names_are_written_up_to_a_number_of_robots():
+    few = pixels(heatmap_png(["a" * 20] * 20, [panel(20)]))
+    short = pixels(heatmap_png(["a"] * 20, [panel(20)]))
+    assert few.shape[0] > short.shape[0] + 50
+    assert few.shape[1] > short.shape[1] + 50
+    many = NAMED + 1
+    assert heatmap_png(["a" * 20] * many, [panel(many)]) == heatmap_png(["b"] * many, [panel(many)])
+
+
+def test_names_of_a_map_are_written_up_to_a_number_of_robots():
+    some = [f"robot{i}" for i in range(NAMED)]
+    others = [f"other{i}" for i in range(NAMED)]
+    assert map_png(some, [map_panel(NAMED)]) != map_png(others, [map_panel(NAMED)])
+    some, others = [*some, "robot"], [*others, "other"]
+    assert map_png(some, [map_panel(NAMED + 1)]) == map_png(others, [map_panel(NAMED + 1)])
+
+
+def test_names_are_no_formulas():
+    odd = ["$\\frac$", "a_b", "$", "\\alpha"]  # the first would be refused as one
+    assert heatmap_png(odd, [panel(4)])
+    assert map_png(odd, [map_panel(4)])
+
+
+def test_panels_stand_beside_each_other():
+    one = pixels(heatmap_png(names(5), [panel(5)]))
+    three = pixels(heatmap_png(names(5), [panel(5), panel(5, "cosine", True), panel(5)]))
+    assert three.shape[0] == one.shape[0]
+    assert three.shape[1] > 2 * one.shape[1]
+    assert pixels(map_png(names(5), [map_panel(5)] * 2)).shape[1] == 1500
+
+
+def test_families_have_colours_of_their_own():
+    points = map_panel(6)
+    grey = pixels(map_png(list("abcdef"), [points]))
+    coloured = pixels(map_png(["a-1", "a-2", "a-3", "b-1", "b-2", "c"], [points]))
+
+    def colourful(picture):
+        return int((np.ptp(picture, axis=-1) > 60).sum())
+
+    assert colourful(grey) == 0
+    assert colourful(coloured) > 100

@@ -1,0 +1,140 @@
+"""Comparing robots by name, every pair once."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import arm
+
+import morphgen
+from morphgen.benchmark import similarity
+from morphgen.benchmark.similarity import (
+    MEASURES,
+    Measure,
+    cosine,
+    distances,
+    features,
+    matrix,
+    measure_named,
+    tree_distance,
+    workspace_overlap,
+)
+from morphgen.benchmark.tokens import padded, tokens
+from morphgen.errors import BenchmarkError, RobotError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.model.geometry import Mesh, Shape
+
+REQUESTS = ("arm=lwr ee=plane", "arm=lwr ee=claw", "arm3", "chain beads=2", "cubes")
+
+
+def featured(request):
+    robot = morphgen.compose(request)
+    return features(robot, token_shapes(robot))
+
+
+@pytest.fixture(scope="module")
+def some():
+    return [featured(request) for request in REQUESTS]
+
+
+def test_the_measures_are_named():
+    assert tuple(MEASURES) == ("cosine", "tree", "workspace")
+    assert [measure.larger_is_more_alike for measure in MEASURES.values()] == [True, False, True]
+    assert all(name == measure.name for name, measure in MEASURES.items())
+
+
+def test_a_body_is_most_like_itself(some):
+    for one in some:
+        assert cosine(one, one) == pytest.approx(1)
+        assert tree_distance(one, one) == 0
+        assert workspace_overlap(one, one) == pytest.approx(1)
+    for one, other in itertools.permutations(some, 2):
+        assert -1 <= cosine(one, other) < 0.999
+        assert 0 < tree_distance(one, other) <= 1
+        assert 0 <= workspace_overlap(one, other) < 0.999
+
+
+def test_the_cosine_is_that_of_flattened_padded_tokens_without_q():
+    robots = [morphgen.compose(request) for request in REQUESTS[:3]]
+    flat = [padded(tokens(robot, token_shapes(robot)), 23)[0][:, :32].ravel() for robot in robots]
+    for (a, u), (b, v) in itertools.combinations(zip(robots, flat, strict=True), 2):
+        expected = u @ v / np.sqrt((u @ u) * (v @ v))
+        found = cosine(features(a, token_shapes(a)), features(b, token_shapes(b)))
+        assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_pose_changes_no_tokens_but_home_changes_the_tree():
+    robot = arm()
+    shapes = {link.name: link.collisions[0] for link in robot.links}
+    bent = replace(robot, home=(1.4, 0.5, 0.01, 0.02))
+    a, b = features(robot, shapes), features(bent, shapes)
+    assert cosine(a, b) == pytest.approx(1)
+    assert workspace_overlap(a, b) == pytest.approx(1)
+    assert tree_distance(a, b) > 0.01
+
+
+def test_bodies_of_more_than_23_links_can_be_compared():
+    long = featured("chain beads=7")
+    assert len(long.tokens) == 25
+    assert long.tokens[-1, 0] == pytest.approx(24 / 22)
+    assert long.tokens[0, 1] == pytest.approx(-1 / 22)
+    short = featured("chain beads=6")
+    assert 0.8 < cosine(long, short) < 1
+    np.testing.assert_allclose(long.tokens[:5, :2], short.tokens[:5, :2])
+
+
+@pytest.mark.parametrize("name", MEASURES)
+def test_a_matrix_is_symmetric_and_holds_what_the_measure_says(some, name):
+    values = matrix(some, name)
+    function = MEASURES[name].function
+    assert values.shape == (5, 5)
+    np.testing.assert_array_equal(values, values.T)
+    for i, j in itertools.product(range(5), repeat=2):
+        assert values[i, j] == pytest.approx(function(some[i], some[j]), abs=1e-15)
+
+
+def test_every_pair_is_compared_once(some, monkeypatch):
+    asked = []
+
+    def count(a, b):
+        asked.append(frozenset((a.name, b.name)))
+        return float(len(asked))
+
+    monkeypatch.setattr(similarity, "MEASURES", {"count": Measure("count", count, True, "")})
+    told = []
+    values = matrix(some, "count", told.append)
+    assert len(asked) == len(set(asked)) == sum(told) == 15
+    np.testing.assert_array_equal(values, values.T)
+    assert matrix([], "count").shape == (0, 0)
+
+
+def test_distances_are_zero_to_oneself_and_grow_as_bodies_differ(some):
+    for name in MEASURES:
+        values = matrix(some, name)
+        apart = distances(values, name)
+        assert (apart >= 0).all()
+        assert not apart.diagonal().any()
+        order = np.argsort(values[0, 1:] * (-1 if MEASURES[name].larger_is_more_alike else 1))
+        assert (np.diff(apart[0, 1:][order]) >= 0).all()
+
+
+def test_an_unknown_measure_is_told_the_valid_ones(some):
+    for ask in (lambda: matrix(some, "cosin"), lambda: measure_named("cosin")):
+        with pytest.raises(
+            BenchmarkError, match=r"'cosin'; did you mean 'cosine'\? valid: cosine, tree, workspace"
+        ):
+            ask()
+
+
+def test_what_has_no_features_is_refused(tmp_path):
+    robot = arm()
+    with pytest.raises(BenchmarkError, match="no frame 'tool'"):
+        features(replace(robot, frames=()), {})
+    with pytest.raises(BenchmarkError, match="no link"):
+        features(robot, {"nowhere": robot.links[0].collisions[0]})
+    with pytest.raises(BenchmarkError, match="a mesh has no token"):
+        features(robot, {"base": Shape(Mesh(tmp_path / "a.stl"))})
+    flat = replace(robot.joints[0], axis=(0.0, 0.0, 0.0))
+    with pytest.raises(RobotError, match="is zero"):
+        features(replace(robot, joints=(flat, *robot.joints[1:])), {})

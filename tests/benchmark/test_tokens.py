@@ -1,0 +1,504 @@
+"""Tokens say what the robot is, and what they say is read back."""
+
+import io
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import arm
+
+import morphgen
+from morphgen.benchmark.token_layout import decode_position, encode_position
+from morphgen.benchmark.tokens import (
+    LAYOUT,
+    MAX_LINKS,
+    TOKEN_SIZE,
+    joint_codes,
+    npz,
+    padded,
+    robot_of_tokens,
+    scaled_positions,
+    tokens,
+)
+from morphgen.errors import BenchmarkError, RobotError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.library import default_library
+from morphgen.model import rotation
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.kinematics import forward_kinematics, random_configurations
+from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+
+FIELDS = {field.name: field.columns for field in LAYOUT}
+COMPOSED = (
+    "arm=ur5 ee=plane",
+    "arm=kinova_gen3 ee=robotiq_2f85",
+    "base=planar arm=lwr ee=stick",
+    "base=pedestal left.arm=ur5 left.ee=stick right.arm=lwr right.ee=cube",
+    "chain beads=3",
+    "arm3",
+)
+
+
+def shapes_of(robot):
+    return {link.name: link.collisions[0] for link in robot.links if link.collisions}
+
+
+def arm_tokens(**changes):
+    robot = replace(arm(), **changes)
+    return tokens(robot, shapes_of(robot))
+
+
+def hinge(kind="revolute", limits=(-1.0, 1.0), **changes):
+    """A body of one joint."""
+    joint = Joint("j", kind, "a", "b", axis=(0, 0, 1), limits=limits, **changes)
+    home = () if kind == "fixed" else (0.0,)
+    return Robot("hinge", (Link("a"), Link("b")), (joint,), home=home)
+
+
+def field_of(made, name):
+    return made[..., FIELDS[name]]
+
+
+# ---- what is in a token
+
+
+def test_the_fields_are_the_papers_in_order_and_size():
+    sizes = [field.size for field in LAYOUT]
+    assert sizes == [1, 1, 4, 6, 7, 3, 7, 3, 16]
+    assert [field.start for field in LAYOUT] == [sum(sizes[:i]) for i in range(len(sizes))]
+    assert sum(sizes) == TOKEN_SIZE == 48
+    assert MAX_LINKS == 23
+
+
+def test_every_number_of_an_arm():
+    made = arm_tokens()
+    assert made.shape == (6, 48)
+    np.testing.assert_allclose(made[:, 0], np.arange(6) / 22)
+    np.testing.assert_allclose(made[:, 1], np.array([-1, 0, 1, 2, 3, 3]) / 22)
+    flags = np.zeros((6, 4))
+    flags[3] = 1
+    np.testing.assert_array_equal(made[:, 2:6], flags)
+    np.testing.assert_allclose(made[0, 6:12], [0, 0, 1, 0.1, 0.1, 0.04])
+    np.testing.assert_allclose(made[1, 6:12], [0, 1, 0, 0.02, 0.02, 0.24])
+    np.testing.assert_allclose(made[1, 12:19], [0, 0, 0.15, 1, 0, 0, 0])
+    axes = [(0, 0, 0), (0, 1, 0), (1, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 0)]
+    np.testing.assert_array_equal(made[:, 19:22], axes)
+    np.testing.assert_allclose(made[0, 22:29], [0, 0, 0, 1, 0, 0, 0])
+    np.testing.assert_allclose(made[5, 22:29], [0, -0.05, 0.2, 1, 0, 0, 0])
+    slide, turn, fixed = np.eye(3)
+    np.testing.assert_array_equal(made[:, 29:32], [fixed, turn, turn, slide, slide, slide])
+    # The home (0.4, 0.5, 0.01, 0.02) within (-2, 2), (-2, 2), (0, 0.04), (0, 0.04); "right"
+    # mimics "left" and stands at -0.02 within (-0.04, 0).
+    x = np.array([0.2, 0.25, -0.5, 0.0, 0.0])
+    angles = x[:, None] * math.pi / 2 * np.array([1, 2, 4, 8, 16, 32, 64, 128])
+    np.testing.assert_allclose(made[1:, 32:40], np.sin(angles), atol=1e-12)
+    np.testing.assert_allclose(made[1:, 40:48], np.cos(angles), atol=1e-12)
+    np.testing.assert_array_equal(made[0, 32:], np.zeros(16))
+
+
+@pytest.mark.parametrize(
+    ("geometry", "numbers"),
+    [
+        (Sphere(0.2), [1, 0, 0, 0.2, 0.2, 0.2]),
+        (Cylinder(0.2, 0.5), [0, 1, 0, 0.2, 0.2, 0.5]),
+        (Capsule(0.2, 0.5), [0, 1, 0, 0.2, 0.2, 0.9]),
+        (Box((0.1, 0.2, 0.3)), [0, 0, 1, 0.1, 0.2, 0.3]),
+    ],
+)
+def test_a_primitive_is_a_one_hot_and_its_sizes(geometry, numbers):
+    made = tokens(hinge(), {"b": Shape(geometry)})
+    np.testing.assert_allclose(field_of(made, "geometry")[1], numbers)
+    assert not field_of(made, "geometry")[0].any()
+    assert not field_of(made, "geometry pose")[0].any()
+
+
+def test_poses_have_quaternions_with_positive_w():
+    turned = Pose((1.0, 2.0, 3.0), (-0.5, 0.5, -0.5, 0.5))
+    made = tokens(hinge(T_parent_joint=turned), {"b": Shape(Sphere(0.1), turned)})
+    for name in ("geometry pose", "joint origin"):
+        np.testing.assert_allclose(field_of(made, name)[1], [1, 2, 3, 0.5, -0.5, 0.5, -0.5])
+
+
+def test_axes_have_unit_length_and_fixed_joints_none():
+    made = tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(3, 0, 4)),)), {})
+    np.testing.assert_allclose(field_of(made, "joint axis"), [[0, 0, 0], [0.6, 0, 0.8]])
+    made = tokens(hinge("fixed"), {})
+    assert not field_of(made, "joint axis").any()
+    assert not field_of(made, "joint position").any()
+    np.testing.assert_array_equal(field_of(made, "joint type"), [[0, 0, 1]] * 2)
+
+
+def test_the_flag_is_on_the_link_of_the_frame_tool_alone():
+    frames = (Frame("left_tool", "left"), Frame("tool", "right"), Frame("camera", "base"))
+    flags = field_of(arm_tokens(frames=frames), "end-effector")
+    assert flags.tolist() == [[0] * 4] * 5 + [[1] * 4]
+    assert not field_of(arm_tokens(frames=frames[:1]), "end-effector").any()
+
+
+def test_indices_are_divided_by_the_largest_that_there_can_be():
+    robot = arm()
+    made = tokens(robot, {}, max_links=6)
+    np.testing.assert_allclose(made[:, 0], [0, 0.2, 0.4, 0.6, 0.8, 1])
+    np.testing.assert_allclose(made[:, 1], [-0.2, 0, 0.2, 0.4, 0.6, 0.6])
+
+
+# ---- q
+
+
+@pytest.mark.parametrize(
+    ("robot", "q", "x"),
+    [
+        (hinge(limits=(-0.5, 1.5)), [-0.5, 0.5, 1.0, 1.5, 2.5], [-1, 0, 0.5, 1, 2]),
+        (hinge("prismatic", (0.0, 0.04)), [0.0, 0.01, 0.04], [-1, -0.5, 1]),
+        (hinge("prismatic", None), [-0.5, 0.5, 2.0], [-0.5, 0.5, 2]),
+        (hinge("continuous", None), [0.5 * math.pi, 1.5 * math.pi, -7 * math.pi], [0.5, -0.5, 1]),
+        (hinge("continuous", (-9.0, 9.0)), [math.pi, -math.pi, 0.0], [1, 1, 0]),
+        (hinge("revolute", None), [-0.25 * math.pi, 4.25 * math.pi], [-0.25, 0.25]),
+        (hinge("revolute", (-6.4, 6.4)), [6.4, -3.2], [1, -0.5]),
+    ],
+)
+def test_q_is_scaled_by_the_joints_range(robot, q, x):
+    found = scaled_positions(robot, np.array(q)[:, None])
+    np.testing.assert_allclose(found[:, 0], x, atol=1e-12)
+
+
+def test_mimic_joints_follow_their_leader():
+    robot = arm()
+    q = random_configurations(robot, 20, np.random.default_rng(0))
+    x = scaled_positions(robot, q)
+    np.testing.assert_allclose(x[:, 3], (q[:, 3] - 0.02) / 0.02)
+    np.testing.assert_allclose(x[:, 4], (-q[:, 3] + 0.02) / 0.02)
+
+
+def test_every_position_has_a_code_of_its_own():
+    x = np.linspace(-1, 1, 2001)
+    code = encode_position(x)
+    assert len({tuple(row) for row in code.round(6).tolist()}) == len(x)
+    np.testing.assert_allclose([decode_position(row) for row in code], x, atol=1e-12)
+    assert np.abs(code[0] - code[-1]).max() > 1
+
+
+def test_tokens_are_batched_over_q():
+    robot = arm()
+    q = random_configurations(robot, 12, np.random.default_rng(0)).reshape(3, 4, 4)
+    made = tokens(robot, shapes_of(robot), q)
+    assert made.shape == (3, 4, 6, 48)
+    assert joint_codes(robot, q).shape == (3, 4, 6, 16)
+    np.testing.assert_array_equal(made[..., 32:], joint_codes(robot, q))
+    np.testing.assert_array_equal(made[2, 1], tokens(robot, shapes_of(robot), q[2, 1]))
+    np.testing.assert_array_equal(arm_tokens(), tokens(robot, shapes_of(robot), robot.home))
+    assert tokens(robot, {}, np.zeros((0, 4))).shape == (0, 6, 48)
+
+
+def test_a_robot_of_one_link_has_one_token():
+    made = tokens(Robot("r", (Link("a"),)), {"a": Shape(Sphere(0.1))})
+    assert made.shape == (1, 48)
+    back, shapes = robot_of_tokens(made, "r")
+    assert (back.dof, shapes) == (0, {"link0": Shape(Sphere(0.1))})
+
+
+# ---- what cannot be one
+
+
+@pytest.mark.parametrize(
+    ("robot", "shapes", "options", "message"),
+    [
+        (arm(), {}, {"max_links": 5}, "robot 'arm' has 6 links, more than max_links 5"),
+        (hinge(), {}, {"max_links": 1}, "max_links 1: expected 2 or more"),
+        (arm(), {"uper": Shape(Sphere(1.0))}, {}, "for 'uper', no link; did you mean 'upper'?"),
+        (hinge(), {"b": Shape(Mesh(Path("x.stl")))}, {}, "link 'b': a mesh has no token"),
+        (hinge(), {"b": Shape(Sphere(0.0))}, {}, "link 'b': sizes [0, 0, 0] are not all positive"),
+        (hinge(), {"b": Shape(Box((1.0, math.inf, 1.0)))}, {}, "link 'b': sizes [1, inf, 1]"),
+        (
+            hinge(),
+            {"b": Shape(Sphere(1.0), Pose((0.0, math.nan, 0.0)))},
+            {},
+            "link 'b': geometry pose: [0, nan, 0, 1, 0, 0, 0] is not finite",
+        ),
+        (
+            hinge(T_parent_joint=Pose((math.inf, 0.0, 0.0))),
+            {},
+            {},
+            "link 'b': joint origin: [inf, 0, 0, 1, 0, 0, 0] is not finite",
+        ),
+        (hinge(T_parent_joint=Pose(quaternion=(0, 0, 0, 0))), {}, {}, "link 'b': (0, 0, 0, 0) is"),
+        (hinge(limits=(1.0, -1.0)), {}, {}, "joint 'j': limits (1, -1) leave no range"),
+        (hinge(limits=(1.0, 1.0)), {}, {}, "joint 'j': limits (1, 1) leave no range"),
+        (hinge(limits=(-math.inf, math.inf)), {}, {}, "joint 'j': limits (-inf, inf) leave no"),
+        (hinge(), {}, {"q": [[0.0], [math.nan]]}, "robot 'hinge': joint 'j': q is not finite"),
+    ],
+)
+def test_what_has_no_token_is_refused(robot, shapes, options, message):
+    with pytest.raises(BenchmarkError, match=re.escape(message)):
+        tokens(robot, shapes, **options)
+
+
+def test_a_zero_axis_and_a_q_of_another_robot_are_refused():
+    with pytest.raises(RobotError, match="joint 'j': its axis"):
+        tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(0, 0, 0)),)), {})
+    with pytest.raises(ValueError, match=r"needs \(\.\.\., 1\)"):
+        tokens(hinge(), {}, [0.0, 0.0])
+
+
+# ---- and back
+
+NUMBERS = st.floats(-2, 2)
+SIZES = st.floats(1e-4, 3)
+UNIT3 = st.tuples(NUMBERS, NUMBERS, NUMBERS).filter(lambda v: math.hypot(*v) > 0.1)
+QUATERNIONS = (
+    st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS)
+    .filter(lambda q: math.hypot(*q) > 0.1)
+    .map(rotation.normalized)
+)
+POSES = st.builds(Pose, st.tuples(NUMBERS, NUMBERS, NUMBERS), QUATERNIONS)
+SHAPES = st.builds(
+    Shape,
+    st.one_of(
+        st.builds(Sphere, SIZES),
+        st.builds(Cylinder, SIZES, SIZES),
+        st.builds(Capsule, SIZES, SIZES),
+        st.builds(Box, st.tuples(SIZES, SIZES, SIZES)),
+    ),
+    POSES,
+)
+LIMITS = st.none() | st.tuples(st.floats(-7, 3), st.floats(0.01, 4)).map(
+    lambda pair: (pair[0], pair[0] + pair[1])
+)
+KINDS = st.sampled_from(["revolute", "continuous", "prismatic", "fixed"])
+
+
+@st.composite
+def bodies(draw):
+    """A small robot, shapes of some of its links, and two configurations."""
+    n = draw(st.integers(1, 7))
+    joints = []
+    for i in range(1, n):
+        mimic = None
+        leaders = [joint.name for joint in joints if joint.is_movable]
+        if leaders and draw(st.booleans()):
+            mimic = draw(st.builds(Mimic, st.sampled_from(leaders), NUMBERS, NUMBERS))
+        joints.append(
+            Joint(
+                f"j{i}",
+                draw(KINDS),
+                f"l{draw(st.integers(0, i - 1))}",
+                f"l{i}",
+                draw(POSES),
+                draw(UNIT3),
+                draw(LIMITS),
+                mimic=mimic,
+            )
+        )
+    links = tuple(Link(f"l{i}") for i in range(n))
+    tool = draw(st.none() | st.integers(0, n - 1))
+    frames = () if tool is None else (Frame("tool", f"l{tool}", draw(POSES)),)
+    dof = sum(joint.is_independent for joint in joints)
+    q = draw(st.lists(st.floats(-4, 4), min_size=2 * dof, max_size=2 * dof))
+    robot = Robot("r", links, tuple(joints), frames, tuple(q[:dof]))
+    shapes = {link.name: draw(SHAPES) for link in links if draw(st.booleans())}
+    return robot, shapes, np.reshape(q, (2, dof))
+
+
+def assert_read_back(made, **options):
+    back, shapes = robot_of_tokens(made, "back", **options)
+    again = tokens(back, shapes, **options)
+    np.testing.assert_allclose(again, made, rtol=0, atol=1e-9)
+    assert shapes == shapes_of(back)
+    return back
+
+
+@settings(deadline=None)
+@given(bodies())
+def test_tokens_of_the_robot_of_tokens_are_the_tokens(body):
+    robot, shapes, q = body
+    for made in tokens(robot, shapes, q):
+        back = assert_read_back(made)
+        assert back.parents == robot.parents
+        assert back.movable == robot.movable
+        assert {frame.link[4:] for frame in back.frames} == {f.link[1:] for f in robot.frames}
+        assert {name[4:] for name in shapes_of(back)} == {name[1:] for name in shapes}
+        for name in ("geometry pose", "joint origin"):
+            assert (field_of(made, name)[:, 3] >= 0).all()
+
+
+@settings(deadline=None)
+@given(bodies())
+def test_the_robot_of_tokens_has_the_same_links_at_zero(body):
+    robot, shapes, _ = body
+    joints = tuple(replace(joint, mimic=None) for joint in robot.joints)
+    robot = replace(robot, joints=joints, home=(0.0,) * sum(j.is_movable for j in joints))
+    back, _ = robot_of_tokens(tokens(robot, shapes), "back")
+    ours, theirs = (forward_kinematics(body, np.zeros(body.dof)) for body in (robot, back))
+    np.testing.assert_allclose(theirs, ours, atol=1e-9)
+
+
+@pytest.mark.parametrize("request_", COMPOSED)
+def test_composed_robots_are_read_back(request_):
+    robot = morphgen.compose(request_)
+    shapes = token_shapes(robot, default_library().folders)
+    q = random_configurations(robot, 5, np.random.default_rng(0))
+    for made in (*tokens(robot, shapes, q, max_links=40), tokens(robot, shapes, max_links=40)):
+        back = assert_read_back(made, max_links=40)
+        assert back.dof == len(robot.movable)
+        assert len(back.frames) == 1
+    assert [tuple(value) for value in field_of(made, "joint axis")[1:]] == [
+        pytest.approx(joint.unit_axis if joint.is_movable else (0, 0, 0)) for joint in robot.joints
+    ]
+
+
+def test_the_robot_of_tokens_moves_in_scaled_positions():
+    back, shapes = robot_of_tokens(arm_tokens(), "back")
+    assert back.name == "back"
+    assert [link.name for link in back.links] == [f"link{i}" for i in range(6)]
+    assert [joint.name for joint in back.joints] == [f"joint{i}" for i in range(1, 6)]
+    assert {joint.limits for joint in back.joints} == {(-1.0, 1.0)}
+    assert back.home == pytest.approx((0.2, 0.25, -0.5, 0.0, 0.0))
+    np.testing.assert_allclose(scaled_positions(back, back.home), back.home)
+    assert back.frames == (Frame("tool", "link3"),)
+    assert shapes["link0"] == Shape(Box((0.1, 0.1, 0.04)))
+
+
+def test_tokens_in_single_precision_are_read():
+    made = arm_tokens()
+    back, shapes = robot_of_tokens(made.astype(np.float32), "back")
+    np.testing.assert_allclose(tokens(back, shapes), made, atol=2e-5)
+
+
+def spoilt(row, column, value):
+    made = arm_tokens()
+    made[row, column] = value
+    return made
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (spoilt(2, 20, math.nan), "link 2: joint axis: [1, nan, 0] is not finite"),
+        (spoilt(0, 0, math.inf), "link 0: link index: [inf] is not finite"),
+        (np.zeros((3, 47)), "shape (3, 47); expected (n_links, 48)"),
+        (np.zeros((2, 3, 48)), "shape (2, 3, 48); expected (n_links, 48)"),
+        (np.zeros((0, 48)), "shape (0, 48); expected (n_links, 48)"),
+        (np.zeros((24, 48)), "has 24 links, more than max_links 23"),
+        (spoilt(2, 0, 0.5), "link 2: link index: 0.5, not 2/22: made with another max_links"),
+        (arm_tokens()[[0, 2, 1, 3, 4, 5]], "link 1: link index: 0.0909091, not 1/22"),
+        (padded(arm_tokens(), 8)[0], "link 6: link index: 0, not 6/22: "),
+        (spoilt(0, 1, 0.0), "link 0: parent index: 0 makes no tree; expected -1/22"),
+        (spoilt(1, 1, -1 / 22), "link 1: parent index: -0.0454545 makes no tree; expected 0/22"),
+        (
+            spoilt(3, 1, 3 / 22),
+            "link 3: parent index: 0.136364 makes no tree; expected k/22, k = 0",
+        ),
+        (spoilt(3, 1, 1.5 / 22), "link 3: parent index: 0.0681818 makes no tree"),
+        (spoilt(3, 3, 0.0), "link 3: end-effector: [1, 0, 1, 1] is neither four times 0 nor"),
+        (spoilt(1, slice(2, 6), 2.0), "link 1: end-effector: [2, 2, 2, 2] is neither"),
+        (spoilt(5, slice(2, 6), 1.0), "link 5: end-effector: link 3 is flagged, too"),
+        (spoilt(0, 6, 1.0), "link 0: geometry: [1, 0, 1] is no one-hot of [sphere, cylinder, box]"),
+        (spoilt(0, 8, 0.0), "link 0: geometry: [0, 0, 0] is no one-hot"),
+        (spoilt(0, 9, -0.1), "link 0: geometry: sizes [-0.1, 0.1, 0.04] are not all positive"),
+        (
+            spoilt(1, 9, 0.03),
+            "link 1: geometry: a cylinder has 2 times its radius, not [0.03, 0.02]",
+        ),
+        (spoilt(0, slice(6, 9), (1, 0, 0)), "link 0: geometry: a sphere has 3 times its radius"),
+        (
+            spoilt(0, slice(6, 12), 0.0),
+            "link 0: geometry pose: it is not zero, but the link has no",
+        ),
+        (
+            spoilt(1, 15, 0.9),
+            "link 1: geometry pose: the quaternion [0.9, 0, 0, 0] is of length 0.9",
+        ),
+        (spoilt(2, 25, 0.0), "link 2: joint origin: the quaternion [0, 0, 0, 0] is of length 0"),
+        (spoilt(0, 22, 0.1), "link 0: joint origin: the base has no parent"),
+        (
+            spoilt(0, slice(29, 32), (0, 1, 0)),
+            "link 0: joint axis: the axis [0, 0, 0] is of length 0",
+        ),
+        (spoilt(1, 19, 1.0), "link 1: joint axis: the axis [1, 1, 0] is of length 1.41421, not 1"),
+        (
+            spoilt(1, slice(29, 32), 0.0),
+            "link 1: joint type: [0, 0, 0] is no one-hot of [prismatic,",
+        ),
+        (
+            spoilt(1, slice(29, 32), (0, 0.5, 0.5)),
+            "link 1: joint type: [0, 0.5, 0.5] is no one-hot",
+        ),
+        (
+            spoilt(1, slice(29, 32), (0, 0, 1)),
+            "link 1: joint axis: it is not zero, but the joint is fixed",
+        ),
+        (spoilt(0, 35, 1.0), "link 0: joint position: it is not zero, but the joint is fixed"),
+        (spoilt(1, slice(32, 48), 0.0), "link 1: joint position: number 8 is 0, but the first"),
+        (spoilt(1, 35, 0.0), "link 1: joint position: number 3 is 0, but the first frequency says"),
+        (spoilt(1, 32, 2.0), "link 1: joint position: number "),
+    ],
+)
+def test_what_is_no_token_is_refused_by_link_and_field(made, message):
+    with pytest.raises(BenchmarkError, match=re.escape(message)) as refusal:
+        robot_of_tokens(made, "x")
+    assert str(refusal.value).startswith("tokens of 'x'")
+
+
+def test_a_base_that_moves_is_refused():
+    made = arm_tokens()
+    made[0, 19:] = made[1, 19:]
+    with pytest.raises(BenchmarkError, match="link 0: joint type: revolute, but the base is fixed"):
+        robot_of_tokens(made, "x")
+
+
+def test_tokens_made_for_other_sizes_are_refused():
+    made = tokens(arm(), {}, max_links=30)
+    assert_read_back(made, max_links=30)
+    with pytest.raises(BenchmarkError, match="made with another max_links than 23"):
+        robot_of_tokens(made, "x")
+
+
+# ---- together
+
+
+def test_padding_adds_rows_of_zeros_and_a_mask():
+    made = np.stack([arm_tokens()] * 3)
+    all_, mask = padded(made, 9)
+    assert all_.shape == (3, 9, 48)
+    assert mask.tolist() == [True] * 6 + [False] * 3
+    np.testing.assert_array_equal(all_[:, mask], made)
+    assert not all_[:, ~mask].any()
+    with pytest.raises(BenchmarkError, match="has 6 links, more than max_links 5"):
+        padded(made, 5)
+
+
+def test_a_file_of_tokens_is_the_same_bytes_and_needs_no_pickle():
+    links = [link.name for link in arm().links]
+    content = npz(arm_tokens(), links, "arm", 23)
+    assert content == npz(arm_tokens(), links, "arm", 23)
+    with np.load(io.BytesIO(content), allow_pickle=False) as data:
+        np.testing.assert_array_equal(data["tokens"], arm_tokens())
+        assert data["links"].tolist() == links
+        assert data["layout"].tolist() == [field.name for field in LAYOUT]
+        assert data["columns"].tolist() == [[f.start, f.start + f.size] for f in LAYOUT]
+        assert (data["name"].item(), data["max_links"].item()) == ("arm", 23)
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "tokens.md").read_text(encoding="utf-8")
+
+
+def test_the_pages_example_runs_and_says_the_shapes():
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(code.splitlines()) < 10
+    names = {}
+    exec(code, names)
+    assert names["table"].shape == (100, 7, 48)
+    assert names["batch"].shape == (100, 23, 48)
+    assert names["mask"].shape == (23,)
+    np.testing.assert_allclose(tokens(names["again"], names["shapes"]), names["table"][0])
+
+
+def test_the_page_has_every_field():
+    for field in LAYOUT:
+        columns = f"{field.start}:{field.columns.stop}"
+        assert f"| {field.name} | {columns} | {field.content} |" in PAGE

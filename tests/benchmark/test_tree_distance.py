@@ -1,0 +1,293 @@
+"""The edit distance of kinematic trees: the least work, a metric, and blind to bookkeeping."""
+
+import itertools
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import arm
+
+import morphgen
+from morphgen.benchmark.tree_distance import (
+    FIXED,
+    change_costs,
+    edit_distance,
+    kinematic_tree,
+    normalised_distance,
+)
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.robot import Joint, Link, Robot
+from morphgen.model.scaling import scaled
+
+BLOCK = Shape(Box((0.1, 0.2, 0.3)))
+AXES = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, 0.6, 0.8))
+GEOMETRIES = (Box((0.1, 0.2, 0.3)), Sphere(0.05), Cylinder(0.02, 0.4), Capsule(0.02, 0.2))
+
+
+def body(*joints, shapes=(), home=None):
+    """A robot of joints given as (kind, parent, axis, offset), link0 its root."""
+    made = [
+        Joint(f"joint{k}", kind, f"link{parent}", f"link{k}", Pose((offset, 0.0, 0.0)), axis)
+        for k, (kind, parent, axis, offset) in enumerate(joints, 1)
+    ]
+    links = tuple(
+        Link(f"link{k}", collisions=(shape,) if shape else ())
+        for k, shape in itertools.zip_longest(range(len(made) + 1), shapes)
+    )
+    moving = sum(joint.is_movable for joint in made)
+    return Robot("body", links, tuple(made), home=home or (0.0,) * moving)
+
+
+def tree(robot, reach=1.0):
+    shapes = {link.name: link.collisions[0] for link in robot.links if link.collisions}
+    return kinematic_tree(robot, shapes, reach)
+
+
+def distance(a, b):
+    return normalised_distance(tree(a), tree(b))
+
+
+@st.composite
+def trees(draw, most=5):
+    n = draw(st.integers(0, most))
+    joints = [
+        (
+            draw(st.sampled_from(["fixed", "prismatic", "revolute", "continuous"])),
+            draw(st.integers(0, k)),
+            draw(st.sampled_from(AXES)),
+            draw(st.sampled_from([0.0, 0.1, 0.25, 1.0])),
+        )
+        for k in range(n)
+    ]
+    shape = st.none() | st.sampled_from(GEOMETRIES).map(Shape)
+    return tree(body(*joints, shapes=[draw(shape) for _ in range(n + 1)]))
+
+
+def brute_force(a, b):
+    """The cheapest of all mappings that keep order and descent."""
+    costs = change_costs(a, b)
+    everything = math.fsum(a.weights) + math.fsum(b.weights)
+    best = everything
+    for size in range(1, min(len(a.kinds), len(b.kinds)) + 1):
+        for mine in itertools.combinations(range(len(a.kinds)), size):
+            for yours in itertools.combinations(range(len(b.kinds)), size):
+                if all(
+                    is_below(a, mine[s], mine[t]) == is_below(b, yours[s], yours[t])
+                    for s, t in itertools.combinations(range(size), 2)
+                ):
+                    kept = a.weights[list(mine)].sum() + b.weights[list(yours)].sum()
+                    best = min(best, everything - kept + costs[mine, yours].sum())
+    return best
+
+
+def is_below(tree, lower, upper):
+    return tree.leftmost[upper] <= lower < upper
+
+
+@given(trees(4), trees(4))
+@settings(max_examples=150, deadline=None)
+def test_it_is_the_least_of_all_ways_to_change_one_into_the_other(a, b):
+    assert edit_distance(a, b) == pytest.approx(brute_force(a, b), abs=1e-12)
+
+
+@given(trees(), trees())
+@settings(deadline=None)
+def test_it_is_the_same_both_ways_and_zero_to_oneself(a, b):
+    assert normalised_distance(a, b) == normalised_distance(b, a)
+    assert normalised_distance(a, a) == 0.0
+    assert 0.0 <= normalised_distance(a, b) <= 1.0
+
+
+@given(trees(), trees(), trees())
+@settings(max_examples=300, deadline=None)
+def test_no_way_round_is_shorter(a, b, c):
+    for measured in (edit_distance, normalised_distance):
+        assert measured(a, c) <= measured(a, b) + measured(b, c) + 1e-12
+
+
+@given(trees(), trees(), trees())
+@settings(deadline=None)
+def test_the_costs_of_changes_insertions_and_deletions_are_a_metric(a, b, c):
+    costs, onwards, straight = change_costs(a, b), change_costs(b, c), change_costs(a, c)
+    np.testing.assert_allclose(change_costs(b, a), costs.T, atol=0)
+    assert (costs >= np.abs(a.weights[:, None] - b.weights) - 1e-12).all()
+    assert (costs <= np.minimum(a.weights[:, None] + b.weights, 1.0) + 1e-12).all()
+    assert (straight[:, None, :] <= costs[:, :, None] + onwards[None] + 1e-12).all()
+
+
+def test_nothing_in_common_is_one_and_nothing_at_all_is_the_same():
+    hinge = body(("revolute", 0, (0, 0, 1), 0.1))
+    assert distance(body(), hinge) == 1.0
+    assert distance(body(), body()) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "cost"),
+    [
+        (("prismatic", 0, (0, 0, 1), 0.2), 1 / 2),
+        (("revolute", 0, (0, 1, 0), 0.2), 1 / 4),
+        (("revolute", 0, (0, 1, 1), 0.2), 1 / 8),
+        (("revolute", 0, (0, 0, -2), 0.2), 0.0),
+        (("continuous", 0, (0, 0, 1), 0.2), 0.0),
+        (("prismatic", 0, (1, 0, 0), 0.2), 3 / 4),
+        (("fixed", 0, (0, 0, 1), 0.2), 3 / 4),
+        (("revolute", 0, (0, 0, 1), 0.45), 1 / 8 * 0.25 / 0.7),
+    ],
+)
+def test_a_changed_joint_costs_what_the_page_says(change, cost):
+    hinge = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, BLOCK])
+    other = body(change, shapes=[None, BLOCK])
+    assert edit_distance(tree(hinge), tree(other)) == pytest.approx(cost, abs=1e-12)
+
+
+def test_another_size_costs_its_mean_relative_difference():
+    hinge = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, BLOCK])
+    other = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, Shape(Box((0.3, 0.1, 0.6)))])
+    cost = 1 / 16 * (0 + 0.1 / 0.55 + 0.3 / 0.95) / 3
+    assert edit_distance(tree(hinge), tree(other)) == pytest.approx(cost)
+
+
+@pytest.mark.parametrize(
+    ("other", "cost"), [(Sphere(0.1), 1 / 16), (Cylinder(0.1, 0.2), 1 / 16), (Box((0.2,) * 3), 0.0)]
+)
+def test_another_shape_of_the_same_size_costs_a_sixteenth(other, cost):
+    cube, changed = (
+        body(("prismatic", 0, (0, 0, 1), 0.2), shapes=[None, Shape(geometry)])
+        for geometry in (Box((0.2, 0.2, 0.2)), other)
+    )
+    assert edit_distance(tree(cube), tree(changed)) == cost
+
+
+def test_a_capsule_counts_as_a_cylinder_and_a_shape_as_more_than_none():
+    joint = ("prismatic", 0, (0, 0, 1), 0.2)
+    capsule, cylinder = Shape(Capsule(0.1, 0.3)), Shape(Cylinder(0.1, 0.5))
+    a, b = (tree(body(joint, shapes=[None, shape])) for shape in (capsule, cylinder))
+    assert edit_distance(a, b) == pytest.approx(0, abs=1e-12)
+    assert edit_distance(a, tree(body(joint))) > 1 / 16
+
+
+def test_a_mesh_is_refused():
+    with pytest.raises(ValueError, match="a mesh is no primitive"):
+        kinematic_tree(body(), {"link0": Shape(Mesh(Path("a.stl")))}, 1.0)
+
+
+def test_a_joint_more_costs_one_and_a_body_on_a_fixed_joint_a_quarter():
+    hinge = ("revolute", 0, (0, 0, 1), 0.2)
+    one = tree(body(hinge))
+    two = tree(body(hinge, ("revolute", 1, (0, 1, 0), 0.3)))
+    rigid = tree(body(hinge, ("fixed", 1, (1, 0, 0), 0.3), shapes=[None, None, BLOCK]))
+    assert edit_distance(one, two) == 1.0
+    assert edit_distance(one, rigid) == FIXED
+    assert normalised_distance(one, two) == 2 / (1 + 2 + 1)
+
+
+def test_axes_are_compared_at_home():
+    bent = body(("revolute", 0, (0, 0, 1), 0.0), ("revolute", 1, (1, 0, 0), 0.1))
+    turned = replace(bent, home=(math.pi / 2, 0.0))
+    along_y = body(("revolute", 0, (0, 0, 1), 0.0), ("revolute", 1, (0, 1, 0), 0.1))
+    assert edit_distance(tree(bent), tree(turned)) == pytest.approx(1 / 4)
+    assert edit_distance(tree(turned), tree(along_y)) == pytest.approx(0, abs=1e-12)
+
+
+def test_frames_without_a_body_do_not_count():
+    plain = body(("revolute", 0, (0, 0, 1), 0.3), ("revolute", 1, (0, 1, 0), 0.2))
+    framed = body(
+        ("fixed", 0, (1, 0, 0), 0.1),
+        ("revolute", 1, (0, 0, 1), 0.2),
+        ("fixed", 2, (1, 0, 0), -0.1),
+        ("fixed", 3, (1, 0, 0), 0.3),
+        ("revolute", 4, (0, 1, 0), 0.0),
+        ("fixed", 5, (1, 0, 0), 0.7),
+    )
+    assert distance(plain, framed) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_body_between_does_count():
+    plain = body(("revolute", 0, (0, 0, 1), 0.3))
+    stood = body(
+        ("fixed", 0, (1, 0, 0), 0.1), ("revolute", 1, (0, 0, 1), 0.3), shapes=[None, BLOCK]
+    )
+    assert edit_distance(tree(plain), tree(stood)) == pytest.approx(FIXED)
+
+
+@given(st.randoms(use_true_random=False))
+@settings(max_examples=25, deadline=None)
+def test_the_order_of_links_in_the_file_does_not_matter(random):
+    hand = morphgen.compose("arm=lwr ee=claw")
+    left, shuffled = list(hand.joints), []
+    known = {hand.root.name}
+    while left:
+        joint = random.choice([joint for joint in left if joint.parent in known])
+        left.remove(joint)
+        shuffled.append(joint)
+        known.add(joint.child)
+    links = (hand.root, *(hand.link(joint.child) for joint in shuffled))
+    home = {hand.joints[k].name: q for k, q in zip(hand.independent, hand.home, strict=True)}
+    moved = tuple(home[joint.name] for joint in shuffled if joint.is_independent)
+    other = replace(hand, links=links, joints=tuple(shuffled), home=moved)
+    assert distance(hand, other) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(4))))
+def test_the_order_of_siblings_and_the_sign_of_axes_do_not_matter(order):
+    fingers = [
+        ("revolute", 0, (0, 0, 1), 0.1),
+        ("revolute", 0, (0, 0.6, 0.8), 0.1),
+        ("revolute", 0, (0, 0, 1), 0.3),
+        ("prismatic", 0, (1, 0, 0), 0.1),
+    ]
+    pads = [BLOCK, BLOCK, None, BLOCK]
+    hand = body(*fingers, shapes=[None, *pads])
+    other = [
+        (kind, parent, tuple(-x for x in axis) if k % 2 else axis, offset)
+        for k, (kind, parent, axis, offset) in enumerate(fingers)
+    ]
+    shuffled = body(*(other[k] for k in order), shapes=[None, *(pads[k] for k in order)])
+    assert distance(hand, shuffled) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("factor", [0.01, 3.0])
+def test_size_does_not_matter(factor):
+    robot = morphgen.compose("arm=lwr ee=claw")
+    large = scaled(robot, {link.name: factor for link in robot.links})
+    a, b = tree(robot, reach=1.2), tree(large, reach=1.2 * factor)
+    assert normalised_distance(a, b) == pytest.approx(0, abs=1e-9)
+    assert normalised_distance(a, tree(large, reach=1.2)) > 0.01
+
+
+def test_names_do_not_matter():
+    robot = arm()
+    links = {link.name: f"new_{link.name}" for link in robot.links}
+    other = replace(
+        robot,
+        links=tuple(replace(link, name=links[link.name]) for link in robot.links),
+        joints=tuple(
+            replace(joint, parent=links[joint.parent], child=links[joint.child])
+            for joint in robot.joints
+        ),
+        frames=(),
+    )
+    assert distance(robot, other) == 0.0
+
+
+def test_alike_bodies_are_nearer_than_others():
+    near = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm=lwr ee=plane"))
+    far = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm3"))
+    assert 0 < near < 0.1 < far
+
+
+def test_the_benchmarks_largest_robots_take_milliseconds():
+    pair = [kinematic_tree(robot, token_shapes(robot), 1.0) for robot in morphgen.sample("arm5", 2)]
+    assert [len(each.kinds) for each in pair] == [23, 23]
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        edit_distance(*pair)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.01
