@@ -1,14 +1,14 @@
 """How much faster simulators step a robot whose collision meshes became primitives.
 
-    python benchmarks/primitive_speed.py [--only panda,ur5] [--steps 4000] [--blocks 7] [--seed 0]
+    python benchmarks/primitive_speed.py [--only panda,ur5] [--single] [--steps 4000] [--blocks 7]
 
 Every real arm that collides with meshes, without a tool, its base fixed: with the meshes, which
 both simulators take for their convex hulls, and with the stored fits of up to four primitives a
-link (fitted now where none is stored). Pairs of links that either robot ignores are tested on
-neither. Position targets lead from home through random configurations without self-collision, one
-a second, the same for both robots; steps of 5 ms; no weight; no visuals. Two scenes: the arm alone,
-tested against itself, and above a table, a box right below all that the arm is at home, on which
-every second configuration presses.
+link, or with ``--single`` of one (fitted now where none is stored). Pairs of links that either
+robot ignores are tested on neither. Position targets lead from home through random configurations
+without self-collision, one a second, the same for both robots; steps of 5 ms; no weight; no
+visuals. Two scenes: the arm alone, tested against itself, and above a table, a box right below all
+that the arm is at home, on which every second configuration presses.
 
 A row an arm for every scene: links with collision shapes, vertices of their hulls, primitives; and
 for each simulator the share of steps with a contact (meshes, primitives), 1000 steps/s with meshes
@@ -24,36 +24,32 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from tabulate import tabulate
 from tqdm import tqdm
+from worlds import Make, MujocoWorld, PybulletWorld, World
 
 import morphgen
 from morphgen.checks.self_collision import SelfCollision
-from morphgen.fitting.dressed import are_primitives, as_primitives
-from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.formats.mjcf import TIMESTEP, to_spec
-from morphgen.formats.picture import quiet
+from morphgen.fitting.dressed import are_primitives, as_primitives, with_primitives
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.mjcf import to_spec
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import (
     forward_kinematics,
-    movable_positions,
     random_configurations,
 )
-from morphgen.model.robot import DEFAULT_EFFORT, Robot, sorted_pair
+from morphgen.model.robot import Robot, sorted_pair
 
 Array = NDArray[np.float64]
 
@@ -63,31 +59,10 @@ HOLD = 10
 """Steps that a target on the way is held."""
 TRIES = 32
 """Configurations that are drawn for each that is needed."""
-TABLE_SIZE = (3.0, 3.0, 0.5)
-"""Edges of the table, centred below the root, metres."""
 PRESS = 0.05
 """How far below the table the lowest joint is when it is to press on it, metres."""
 CLEARANCE = 0.005
 """Height of the arm at home above the table, metres."""
-
-
-class World(Protocol):
-    """A robot in a simulator."""
-
-    def reset(self) -> None:
-        """Put the robot home, at rest."""
-
-    def hold(self, target: Array, steps: int) -> None:
-        """Step with a target position of every independent joint, shape (dof,)."""
-
-    def touches(self) -> bool:
-        """Whether there is a contact."""
-
-    def is_stable(self) -> bool:
-        """Whether nothing has exploded since the reset."""
-
-    def close(self) -> None:
-        """Free the simulator."""
 
 
 @dataclass(frozen=True)
@@ -122,27 +97,26 @@ class Speeds:
 
 Table = dict[str, dict[str, Speeds]]
 """What a scene gave, by arm and simulator."""
-Make = Callable[..., World]
-"""Makes a world of a robot, with the height of the table's top; None for no table."""
 
 
 def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", help="names of arms, separated by commas")
+    parser.add_argument("--single", action="store_true", help="one primitive a link, not four")
     parser.add_argument("--steps", type=int, default=4000, help="steps of a block")
     parser.add_argument("--blocks", type=int, default=7)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     library = default_library()
-    makers: dict[str, Make] = {"MuJoCo": _Mujoco}
+    makers: dict[str, Make] = {"MuJoCo": MujocoWorld}
     if find_spec("pybullet") is not None:
-        makers["PyBullet"] = _Pybullet
+        makers["PyBullet"] = PybulletWorld
     sizes: dict[str, tuple[int, int, int]] = {}
     scenes: dict[str, Table] = {"alone": {}, "above a table": {}}
     left_out = []
     for name in tqdm(_names(library, args.only), unit="arm", file=sys.stderr):
-        arm = _arm(name, library)
+        arm = _arm(name, library, single=args.single)
         if arm is None:
             left_out.append(name)
             continue
@@ -163,119 +137,22 @@ def main() -> int:
     return 0
 
 
-class _Mujoco:
-    """A robot as its MJCF says, in MuJoCo."""
-
-    def __init__(self, robot: Robot, table_top: float | None) -> None:
-        spec = to_spec(robot)
-        if table_top is not None:
-            spec.worldbody.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=[edge / 2 for edge in TABLE_SIZE],
-                pos=[0, 0, table_top - TABLE_SIZE[2] / 2],
-            )
-        self._model = spec.compile()
-        self._data = mujoco.MjData(self._model)
-
-    def reset(self) -> None:
-        mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
-
-    def hold(self, target: Array, steps: int) -> None:
-        self._data.ctrl[:] = target
-        mujoco.mj_step(self._model, self._data, nstep=steps)
-
-    def touches(self) -> bool:
-        return bool(self._data.ncon > 0)
-
-    def is_stable(self) -> bool:
-        return not self._data.warning.number.any()
-
-    def close(self) -> None:
-        del self._data, self._model
-
-
-class _Pybullet:
-    """A robot as its URDF says, in PyBullet, less the pairs that it ignores."""
-
-    def __init__(self, robot: Robot, table_top: float | None) -> None:
-        with quiet(), tempfile.TemporaryDirectory() as scratch:
-            import pybullet
-
-            self._bullet, self._robot = pybullet, robot
-            self._client = {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
-            folder = write_bundle(robot, Path(scratch) / robot.name, picture=False)
-            self._body = pybullet.loadURDF(
-                str(folder / URDF),
-                useFixedBase=True,
-                flags=pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_IMPLICIT_CYLINDER,
-                **self._client,
-            )
-        pybullet.setTimeStep(TIMESTEP, **self._client)
-        count = pybullet.getNumJoints(self._body, **self._client)
-        infos = [pybullet.getJointInfo(self._body, i, **self._client) for i in range(count)]
-        joints = {info[1].decode(): info[0] for info in infos}
-        links = {robot.root.name: -1} | {info[12].decode(): info[0] for info in infos}
-        movable = [robot.joints[k] for k in robot.movable]
-        self._joints = [joints[joint.name] for joint in movable]
-        self._efforts = [joint.effort or DEFAULT_EFFORT for joint in movable]
-        for a, b in robot.ignore_pairs:
-            self._ignore(links[a], self._body, links[b])
-        if table_top is not None:
-            half = [edge / 2 for edge in TABLE_SIZE]
-            box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
-            centre = [0, 0, table_top - half[2]]
-            # MuJoCo does not test what stands still against it either.
-            self._ignore(
-                -1, pybullet.createMultiBody(0, box, basePosition=centre, **self._client), -1
-            )
-
-    def reset(self) -> None:
-        home = movable_positions(self._robot, self._robot.home).tolist()
-        for joint, position in zip(self._joints, home, strict=True):
-            self._bullet.resetJointState(self._body, joint, position, **self._client)
-
-    def hold(self, target: Array, steps: int) -> None:
-        self._bullet.setJointMotorControlArray(
-            self._body,
-            self._joints,
-            self._bullet.POSITION_CONTROL,
-            targetPositions=movable_positions(self._robot, target).tolist(),
-            forces=self._efforts,
-            **self._client,
-        )
-        for _ in range(steps):
-            self._bullet.stepSimulation(**self._client)
-
-    def touches(self) -> bool:
-        normal_force = 9
-        points = self._bullet.getContactPoints(**self._client)
-        return any(point[normal_force] > 0 for point in points)
-
-    def is_stable(self) -> bool:
-        states = self._bullet.getJointStates(self._body, self._joints, **self._client)
-        return bool(np.isfinite([state[:2] for state in states]).all())
-
-    def close(self) -> None:
-        self._bullet.disconnect(**self._client)
-
-    def _ignore(self, link: int, other_body: int, other_link: int) -> None:
-        self._bullet.setCollisionFilterPair(
-            self._body, other_body, link, other_link, 0, **self._client
-        )
-
-
 def _names(library: Library, only: str | None) -> list[str]:
     if only:
         return [library.manifest(name, "arm").name for name in only.split(",")]
     return [m.name for m in library.manifests("arm") if not m.is_template and not m.scaling]
 
 
-def _arm(name: str, library: Library) -> Arm | None:
+def _arm(name: str, library: Library, *, single: bool) -> Arm | None:
     """The two forms of an arm; None if it has no collision meshes."""
     robot = morphgen.compose(f"arm={name}")
     if all(are_primitives(link.collisions) for link in robot.links):
         return None
-    fitted = as_primitives(robot, library.folders)
+    if single:
+        shapes = token_shapes(robot, library.folders)
+        fitted = with_primitives(robot, {link: (shape,) for link, shape in shapes.items()})
+    else:
+        fitted = as_primitives(robot, library.folders)
     ignored = tuple(sorted({sorted_pair(*p) for p in (*robot.ignore_pairs, *fitted.ignore_pairs)}))
     return Arm(name, _bare(robot, ignored), _bare(fitted, ignored))
 

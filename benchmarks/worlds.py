@@ -1,0 +1,157 @@
+"""A robot with a fixed base in MuJoCo and in PyBullet, alone or above a table; for benchmarks."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.formats.bundle import URDF, write_bundle
+from morphgen.formats.mjcf import TIMESTEP, to_spec
+from morphgen.formats.picture import quiet
+from morphgen.model.kinematics import movable_positions
+from morphgen.model.robot import DEFAULT_EFFORT, Robot
+
+Array = NDArray[np.float64]
+
+TABLE_SIZE = (3.0, 3.0, 0.5)
+"""Edges of the table, centred below the root, metres."""
+
+
+class World(Protocol):
+    """A robot in a simulator."""
+
+    def reset(self) -> None:
+        """Put the robot home, at rest."""
+
+    def hold(self, target: Array, steps: int) -> None:
+        """Step with a target position of every independent joint, shape (dof,)."""
+
+    def touches(self) -> bool:
+        """Whether there is a contact."""
+
+    def is_stable(self) -> bool:
+        """Whether nothing has exploded since the reset."""
+
+    def close(self) -> None:
+        """Free the simulator."""
+
+
+Make = Callable[..., World]
+"""Makes a world of a robot, with the height of the table's top; None for no table."""
+
+
+class MujocoWorld:
+    """A robot as its MJCF says, in MuJoCo."""
+
+    def __init__(self, robot: Robot, table_top: float | None) -> None:
+        spec = to_spec(robot)
+        if table_top is not None:
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=[edge / 2 for edge in TABLE_SIZE],
+                pos=[0, 0, table_top - TABLE_SIZE[2] / 2],
+            )
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+
+    def reset(self) -> None:
+        """Put the robot home, at rest."""
+        mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
+
+    def hold(self, target: Array, steps: int) -> None:
+        """Step with a target position of every independent joint, shape (dof,)."""
+        self._data.ctrl[:] = target
+        mujoco.mj_step(self._model, self._data, nstep=steps)
+
+    def touches(self) -> bool:
+        """Whether there is a contact."""
+        return bool(self._data.ncon > 0)
+
+    def is_stable(self) -> bool:
+        """Whether nothing has exploded since the reset."""
+        return not self._data.warning.number.any()
+
+    def close(self) -> None:
+        """Free the simulator."""
+        del self._data, self._model
+
+
+class PybulletWorld:
+    """A robot as its URDF says, in PyBullet, less the pairs that it ignores."""
+
+    def __init__(self, robot: Robot, table_top: float | None) -> None:
+        with quiet(), tempfile.TemporaryDirectory() as scratch:
+            import pybullet
+
+            self._bullet, self._robot = pybullet, robot
+            self._client = {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
+            folder = write_bundle(robot, Path(scratch) / robot.name, picture=False)
+            self._body = pybullet.loadURDF(
+                str(folder / URDF),
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_IMPLICIT_CYLINDER,
+                **self._client,
+            )
+        pybullet.setTimeStep(TIMESTEP, **self._client)
+        count = pybullet.getNumJoints(self._body, **self._client)
+        infos = [pybullet.getJointInfo(self._body, i, **self._client) for i in range(count)]
+        joints = {info[1].decode(): info[0] for info in infos}
+        links = {robot.root.name: -1} | {info[12].decode(): info[0] for info in infos}
+        movable = [robot.joints[k] for k in robot.movable]
+        self._joints = [joints[joint.name] for joint in movable]
+        self._efforts = [joint.effort or DEFAULT_EFFORT for joint in movable]
+        for a, b in robot.ignore_pairs:
+            self._ignore(links[a], self._body, links[b])
+        if table_top is not None:
+            half = [edge / 2 for edge in TABLE_SIZE]
+            box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
+            centre = [0, 0, table_top - half[2]]
+            # MuJoCo does not test what stands still against it either.
+            self._ignore(
+                -1, pybullet.createMultiBody(0, box, basePosition=centre, **self._client), -1
+            )
+
+    def reset(self) -> None:
+        """Put the robot home, at rest."""
+        home = movable_positions(self._robot, self._robot.home).tolist()
+        for joint, position in zip(self._joints, home, strict=True):
+            self._bullet.resetJointState(self._body, joint, position, **self._client)
+
+    def hold(self, target: Array, steps: int) -> None:
+        """Step with a target position of every independent joint, shape (dof,)."""
+        self._bullet.setJointMotorControlArray(
+            self._body,
+            self._joints,
+            self._bullet.POSITION_CONTROL,
+            targetPositions=movable_positions(self._robot, target).tolist(),
+            forces=self._efforts,
+            **self._client,
+        )
+        for _ in range(steps):
+            self._bullet.stepSimulation(**self._client)
+
+    def touches(self) -> bool:
+        """Whether there is a contact."""
+        normal_force = 9
+        points = self._bullet.getContactPoints(**self._client)
+        return any(point[normal_force] > 0 for point in points)
+
+    def is_stable(self) -> bool:
+        """Whether nothing has exploded since the reset."""
+        states = self._bullet.getJointStates(self._body, self._joints, **self._client)
+        return bool(np.isfinite([state[:2] for state in states]).all())
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._bullet.disconnect(**self._client)
+
+    def _ignore(self, link: int, other_body: int, other_link: int) -> None:
+        self._bullet.setCollisionFilterPair(
+            self._body, other_body, link, other_link, 0, **self._client
+        )
