@@ -16,7 +16,7 @@ from morphgen.formats.mjcf_elements import (
     pose_attributes,
 )
 from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
-from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, Actuation, actuation
+from morphgen.model.dynamics import Actuation, actuation
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Joint, Link, Robot
 
@@ -41,9 +41,9 @@ def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
     moves a tool by micrometres and inertias by parts per million; so nothing goes through it.
 
     A massless link on a moving joint is refused by MuJoCo; the ``<compiler>`` bounds it at
-    1e-12 kg and 1e-14 kg m^2, far below any real part. A joint that moves less inertia than
-    ``MIN_INERTIA`` gets that much armature, the inertia that its gains assume. An effort of zero
-    means, as in most URDFs that have it, that nobody filled it in: the actuator has no limit.
+    1e-12 kg and 1e-14 kg m^2, far below any real part. What a motor adds to the inertia of a light
+    joint is armature. An effort of zero means, as in most URDFs that have it, that nobody filled it
+    in: the actuator has no limit.
 
     Args:
         robot: The body.
@@ -111,7 +111,7 @@ def _write_bodies(
     for frame in robot.frames:
         attributes = {"name": frame.name, "group": str(_SITE_GROUP)}
         sites.setdefault(frame.link, []).append(attributes | pose_attributes(frame.T_link_frame))
-    light = {gain.joint for gain in gains if gain.stiffness <= BANDWIDTH**2 * MIN_INERTIA}
+    armature = {gain.joint: gain.armature for gain in gains}
     bodies: list[etree._Element] = []
     for i, link in enumerate(robot.links):
         if link.name == "world":
@@ -131,7 +131,7 @@ def _write_bodies(
             )
             _write_inertial(body, link)
             if joint is not None and joint.is_movable:
-                _write_joint(body, joint, armature=MIN_INERTIA if joint.name in light else 0.0)
+                _write_joint(body, joint, armature.get(joint.name, 0.0))
         for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for shape in shapes:
                 attributes = geom_attributes(shape, meshes, collision=kind == "collision")

@@ -14,8 +14,14 @@ Array = NDArray[np.float64]
 
 BANDWIDTH = 30.0
 """Natural frequency of the position control that the gains give, rad/s."""
+REFLECTED = 0.05
+"""Least inertia of a joint, relative to the robot's largest of its kind, turning or sliding.
+
+Geared motors add their rotor's inertia, times the square of the gear ratio, to the joint; a wrist
+with the gains of its own few grams would give way to a touch. Descriptions hardly ever name it.
+"""
 MIN_INERTIA = 1e-5
-"""Joint-space inertia below which a joint is controlled as if it had this much."""
+"""Least inertia of any joint, kg m^2 or kg."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,8 @@ class Actuation:
     """N m/rad or N/m."""
     damping: float
     """N m s/rad or N s/m."""
+    armature: float
+    """Inertia that the motor adds to the joint, kg m^2 or kg."""
     effort: float | None
     """Largest torque or force, N m or N; None where the source names none."""
     velocity: float | None
@@ -74,19 +82,25 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
     """Gains of every independent joint from the body's inertia at home.
 
     Stiffness is omega^2 I and damping 2 omega I (critical), with omega = ``BANDWIDTH`` and I
-    the joint's diagonal entry of the joint-space inertia at home.
+    the joint's diagonal entry of the joint-space inertia at home, with the motor's: see
+    ``REFLECTED``.
     """
-    inertia = np.maximum(np.diag(mass_matrix(robot, robot.home)), MIN_INERTIA)
-    gains = []
-    for k, value in zip(robot.independent, inertia.tolist(), strict=True):
-        joint = robot.joints[k]
-        gains.append(
-            Actuation(
-                joint.name,
-                stiffness=BANDWIDTH**2 * value,
-                damping=2 * BANDWIDTH * value,
-                effort=joint.effort,
-                velocity=joint.velocity,
-            )
+    inertia = np.diag(mass_matrix(robot, robot.home))
+    slides = np.array([robot.joints[k].kind == "prismatic" for k in robot.independent], dtype=bool)
+    least = np.full(robot.dof, MIN_INERTIA)
+    for kind in (slides, ~slides):
+        least[kind] = max(REFLECTED * inertia[kind].max(initial=0.0), MIN_INERTIA)
+    total = np.maximum(inertia, least)
+    return tuple(
+        Actuation(
+            robot.joints[k].name,
+            stiffness=BANDWIDTH**2 * value,
+            damping=2 * BANDWIDTH * value,
+            armature=added,
+            effort=robot.joints[k].effort,
+            velocity=robot.joints[k].velocity,
         )
-    return tuple(gains)
+        for k, value, added in zip(
+            robot.independent, total.tolist(), (total - inertia).tolist(), strict=True
+        )
+    )

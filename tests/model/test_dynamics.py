@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 from robots import arm
 
+from morphgen.api import compose
 from morphgen.formats.mjcf import to_spec
-from morphgen.model.dynamics import BANDWIDTH, MIN_INERTIA, actuation, mass_matrix
+from morphgen.model.dynamics import (
+    BANDWIDTH,
+    MIN_INERTIA,
+    REFLECTED,
+    actuation,
+    mass_matrix,
+)
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
@@ -73,9 +80,25 @@ def test_gains_are_critically_damped():
     gains = actuation(robot)
     assert [gain.joint for gain in gains] == ["shoulder", "elbow", "extend", "left"]
     for gain, value in zip(gains, inertia, strict=True):
-        assert gain.stiffness == pytest.approx(BANDWIDTH**2 * value)
-        ratio = gain.damping / (2 * np.sqrt(gain.stiffness * value))
+        total = value + gain.armature
+        assert gain.stiffness == pytest.approx(BANDWIDTH**2 * total)
+        ratio = gain.damping / (2 * np.sqrt(gain.stiffness * total))
         assert ratio == pytest.approx(1.0)
+
+
+def test_motors_lift_light_joints_to_a_share_of_the_heaviest_of_their_kind():
+    robot = arm()
+    turning, sliding = [], []
+    for k, gain in zip(robot.independent, actuation(robot), strict=True):
+        kind = sliding if robot.joints[k].kind == "prismatic" else turning
+        kind.append(gain.stiffness / BANDWIDTH**2)
+    for totals in (turning, sliding):
+        assert min(totals) >= REFLECTED * max(totals) * (1 - 1e-9)
+    robot = compose("arm=ur5 ee=plane")
+    gains = actuation(robot)
+    inertia = np.diag(mass_matrix(robot, robot.home))
+    assert gains[0].armature == 0
+    assert gains[-1].armature == pytest.approx(REFLECTED * inertia.max() - inertia[-1])
 
 
 def test_gains_take_a_smallest_inertia():
