@@ -36,6 +36,10 @@ class BenchmarkError(MorphgenError):
     """Tokens, a similarity or a split that cannot be made as asked."""
 
 
+class SimulationError(MorphgenError):
+    """A simulator that cannot hold a scene, became unstable or died."""
+
+
 class GrammarError(MorphgenError):
     """A grammar, a condition or a derivation is malformed or means nothing."""
 

@@ -1,0 +1,1 @@
+"""Reach and push over a batch of bodies, on interchangeable simulators."""

@@ -1,0 +1,105 @@
+"""All that a task knows of physics: scenes, and a batch of them that steps together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.robot import Robot
+from morphgen.model.rotation import Vec3
+
+TIMESTEP = 0.005
+"""Physics step, seconds: 200 Hz, as the benchmark has it."""
+SUBSTEPS = 4
+"""Physics steps of a control step: 50 Hz."""
+GRAVITY = 9.81
+"""m/s^2, along -z. Robots carry their own weight, as the controllers of real arms see to it."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A box in a scene, in the world frame."""
+
+    size: Vec3
+    """Edges, metres."""
+    pose: Pose = IDENTITY
+    mass: float = 0.0
+    """Kilograms; a block without mass does not move."""
+    friction: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What one environment holds: a robot whose root is held, what it may move, what it may not."""
+
+    robot: Robot
+    T_world_root: Pose = IDENTITY
+    block: Block | None = None
+    """The one thing that can be moved."""
+    obstacles: tuple[Block, ...] = ()
+    ground: bool = True
+    """A plane at z = 0; the root link does not touch it."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What may touch what."""
+
+    scene: bool = True
+    """The robot touches the ground, the block and obstacles."""
+    self_collision: bool = True
+    """Links touch each other, but for ``Robot.ignore_pairs``."""
+
+
+class Simulation(Protocol):
+    """Environments, each with its scene, stepped together.
+
+    Tensors live on ``device``, float32, and are padded to the largest number of independent joints,
+    J; padding is zero. They are views that the next call may overwrite. Environments do not
+    influence each other: one gives the same numbers whatever else is in the batch.
+    """
+
+    scenes: Sequence[Scene]
+    device: torch.device
+
+    @property
+    def q(self) -> torch.Tensor:
+        """Positions of the independent joints, shape (n, J), rad or m."""
+
+    @property
+    def qd(self) -> torch.Tensor:
+        """Their velocities, shape (n, J)."""
+
+    @property
+    def block_pose(self) -> torch.Tensor:
+        """Pose of the block in the world, (x, y, z, qw, qx, qy, qz), (n, 7); zeros if none."""
+
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Linear and angular velocity of the block in the world, shape (n, 6); zeros if none."""
+
+    def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
+        """Put some environments at rest; nothing of their past has an influence any more.
+
+        Args:
+            envs: Indices, shape (k,), int64.
+            q: Positions of their independent joints, which become the targets, shape (k, J).
+            block_pose: Poses of their blocks, shape (k, 7); ignored where there is none.
+        """
+
+    def step(self, targets: torch.Tensor) -> None:
+        """Move all by one control step.
+
+        Args:
+            targets: Target positions of the independent joints, shape (n, J).
+
+        Raises:
+            SimulationError: If a simulation became unstable, or a worker died; it names which.
+        """
+
+    def close(self) -> None:
+        """Free everything; a second time does nothing."""

@@ -1,0 +1,158 @@
+"""The robots of a batch as padded tensors."""
+
+import numpy as np
+import pytest
+import torch
+
+import morphgen
+from morphgen.benchmark.tokens import tokens
+from morphgen.errors import BenchmarkError, RobotError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.library import default_library
+from morphgen.model.geometry import Box, Shape
+from morphgen.model.kinematics import forward_kinematics, frame_pose, random_configurations
+from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.tasks.bodies import bodies_of
+from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
+from morphgen.tasks.kinematics import quaternions, tool_jacobians, tool_poses
+from morphgen.tasks.observation import joint_positions
+
+FOLDERS = default_library(()).folders
+WORDS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain beads=2", "prims", "arm3")
+
+
+@pytest.fixture(scope="module")
+def robots():
+    return [morphgen.compose(words) for words in WORDS]
+
+
+@pytest.fixture(scope="module")
+def bodies(robots):
+    return bodies_of(robots, FOLDERS)
+
+
+def configurations(robots, bodies, n=20):
+    """Which body and q of n configurations each, (n R,) and (n R, J)."""
+    rng = np.random.default_rng(0)
+    body = torch.arange(len(robots)).repeat_interleave(n)
+    q = torch.zeros(len(body), bodies.max_joints, dtype=torch.float64)
+    for i, robot in enumerate(robots):
+        q[body == i, : robot.dof] = torch.from_numpy(random_configurations(robot, n, rng))
+    return body, q
+
+
+def test_tools_are_where_the_model_has_them(robots, bodies):
+    body, q = configurations(robots, bodies)
+    found = tool_poses(bodies.chain, body, q.float()).double().numpy()
+    for i, robot in enumerate(robots):
+        T = frame_pose(robot, q[body == i, : robot.dof].numpy())
+        mine = found[body == i]
+        assert mine[:, :3] == pytest.approx(T[:, :3, 3], abs=1e-5)
+        assert (mine[:, 3] >= 0).all()
+        expected = quaternions(torch.from_numpy(T[:, :3, :3])).numpy()
+        assert np.abs((mine[:, 3:] * expected).sum(axis=1)) == pytest.approx(1, abs=1e-5)
+
+
+def test_jacobians_are_the_derivatives(robots, bodies):
+    body, q = configurations(robots, bodies, n=5)
+    jacobian = tool_jacobians(bodies.chain, body, q.float())
+    step = 1e-3
+    for j in range(bodies.max_joints):
+        ahead, behind = q.clone(), q.clone()
+        ahead[:, j] += step
+        behind[:, j] -= step
+        for i, robot in enumerate(robots):
+            rows = body == i
+            if j >= robot.dof:
+                assert (jacobian[rows, :, j] == 0).all()
+                continue
+            a, b = (
+                frame_pose(robot, x[rows, : robot.dof].numpy())[:, :3, 3] for x in (ahead, behind)
+            )
+            assert jacobian[rows, :3, j].numpy() == pytest.approx((a - b) / (2 * step), abs=2e-4)
+
+
+def test_quaternions_of_half_turns_too():
+    turns = np.array([np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1])])
+    found = quaternions(torch.from_numpy(turns.astype(float))).numpy()
+    assert np.abs(found) == pytest.approx(np.eye(4), abs=1e-9)
+
+
+def test_the_position_codes_are_those_of_the_tokens(robots, bodies):
+    body, q = configurations(robots, bodies, n=4)
+    found = joint_positions(bodies, body, q.float())
+    for i, robot in enumerate(robots):
+        shapes = token_shapes(robot, FOLDERS)
+        expected = tokens(robot, shapes, q[body == i, : robot.dof].numpy())
+        together = bodies.tokens[i][None].repeat(4, 1, 1)
+        together[:, :, 32:] = found[body == i]
+        n = len(robot.links)
+        # The fastest sine turns 64 pi a unit, so float32 costs it five digits.
+        assert together[:, :n].numpy() == pytest.approx(expected, abs=2e-4)
+        assert (together[:, n:] == 0).all()
+
+
+def test_masks_and_steps_follow_the_joints(robots, bodies):
+    for i, robot in enumerate(robots):
+        n = len(robot.links)
+        assert bodies.links[i].tolist() == [True] * n + [False] * (bodies.max_links - n)
+        moved = [k + 1 for k in robot.independent]
+        assert torch.nonzero(bodies.joint_of_link[i] >= 0)[:, 0].tolist() == moved
+        for j, k in enumerate(robot.independent):
+            joint = robot.joints[k]
+            most = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
+            expected = min(most, (joint.velocity or np.inf) * CONTROL_PERIOD)
+            assert bodies.step[i, j] == pytest.approx(expected)
+            assert bodies.lower[i, j] == pytest.approx(joint.bounds[0])
+            assert bodies.upper[i, j] == pytest.approx(joint.bounds[1])
+        assert (bodies.step[i, robot.dof :] == 0).all()
+
+
+def test_fingers_act_in_push_and_not_in_reach(robots, bodies):
+    panda = 1
+    reach, push = (bodies.action_mask(fingers=fingers)[panda] for fingers in (False, True))
+    names = [link.name for link in robots[panda].links]
+    fingers = [names[i] for i in torch.nonzero(push & ~reach)[:, 0].tolist()]
+    assert reach.sum() == 7
+    assert fingers
+    assert all("finger" in name for name in fingers)
+
+
+def test_a_mimic_joint_follows_its_leader():
+    links = tuple(Link(n, collisions=(Shape(Box((0.1, 0.1, 0.1))),)) for n in ("a", "b", "c"))
+    joints = (
+        Joint("lead", "revolute", "a", "b", axis=(0, 0, 1), limits=(-1.0, 1.0)),
+        Joint(
+            "follow",
+            "prismatic",
+            "b",
+            "c",
+            axis=(1, 0, 0),
+            limits=(0.0, 1.0),
+            mimic=morphgen.model.robot.Mimic("lead", 0.3, 0.1),
+        ),
+    )
+    robot = Robot("r", links, joints, (Frame("tool", "c"),), (0.2,))
+    bodies = bodies_of([robot])
+    q = torch.tensor([[0.5]])
+    pose = tool_poses(bodies.chain, torch.tensor([0]), q)
+    T = forward_kinematics(robot, [[0.5]])[0, 2]
+    assert pose[0, :3].numpy() == pytest.approx(T[:3, 3], abs=1e-6)
+    assert bodies.action_mask(fingers=True)[0].sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("robot", "error", "words"),
+    [
+        (Robot("r", (Link("a"),)), RobotError, "tool"),
+        (Robot("r", (Link("a"),), frames=(Frame("tool", "a"),)), RobotError, "no joint moves"),
+    ],
+)
+def test_what_cannot_act_is_refused(robot, error, words):
+    with pytest.raises(error, match=words):
+        bodies_of([robot])
+
+
+def test_an_empty_batch_is_refused():
+    with pytest.raises(BenchmarkError, match="no robots"):
+        bodies_of([])
