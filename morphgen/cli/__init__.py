@@ -20,6 +20,7 @@ from morphgen.cli import (
     list_parts,
     sample,
     similarity,
+    split,
     tokens,
     view,
 )
@@ -38,6 +39,7 @@ COMMANDS = (
     grammar,
     derive,
     similarity,
+    split,
     view,
 )
 

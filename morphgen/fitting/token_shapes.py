@@ -24,16 +24,20 @@ from morphgen.fitting.stored import (
 )
 from morphgen.formats.bundle import write_atomic
 from morphgen.model.geometry import Shape
+from morphgen.model.inertia import union_moments
 from morphgen.model.robot import Robot
 from morphgen.model.scaling import scaled_shape
+
+NEARLY = 0.95
+"""Share of a link's volume from which its largest primitive stands for it; this is the IoU, too."""
 
 
 def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]:
     """The box, cylinder or sphere that overlaps each link most.
 
-    A link that is a primitive keeps it, in its canonical pose; for meshes of the library's parts
-    the stored fit is taken; others are fitted, which takes about a second a link, and kept in the
-    user's cache.
+    A link that is a primitive, or nearly is (``NEARLY``), keeps it in its canonical pose; for
+    meshes of the library's parts the stored fit is taken; others are fitted, about a second a
+    link, and kept in the user's cache.
 
     Args:
         robot: The body.
@@ -52,13 +56,22 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
         shapes = link_shapes(link)
         if not shapes:
             continue
-        if len(shapes) == 1 and are_primitives(shapes):
-            found[link.name] = canonical(replace(shapes[0], rgba=None))
+        if main := _main_primitive(shapes):
+            found[link.name] = canonical(replace(main, rgba=None))
         elif fit := stored_fit(shapes, stored):
             found[link.name] = fit.token
         elif shape := _cached_fit(shapes):
             found[link.name] = shape
     return found
+
+
+def _main_primitive(shapes: Sequence[Shape]) -> Shape | None:
+    """The shape that the others hardly add to, if it is a primitive."""
+    if not are_primitives(shapes):
+        return None
+    largest = max(shapes, key=lambda shape: union_moments([shape]).volume)
+    share = union_moments([largest]).volume / union_moments(shapes).volume
+    return largest if share >= NEARLY else None
 
 
 def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:

@@ -41,6 +41,13 @@ def test_a_link_that_is_one_primitive_keeps_it(no_search):
     assert token_shapes(robot_of(can)) == {"body": Shape(can.geometry, can.T_link_shape)}
 
 
+def test_a_primitive_that_others_hardly_add_to_stands_for_the_link(no_search):
+    disc, lug = Shape(Cylinder(0.07, 0.05)), Shape(Box((0.02, 0.005, 0.03)), Pose((0.0, 0.0, 0.02)))
+    assert token_shapes(robot_of(lug, disc)) == {"body": disc}
+    with pytest.raises(AssertionError, match="searched for"):
+        token_shapes(robot_of(disc, Shape(Sphere(0.08), Pose((0.05, 0.0, 0.0)))))
+
+
 def test_meshes_of_the_library_cost_no_search_also_scaled_ones(no_search):
     arm = morphgen.compose("arm=panda")
     larger = morphgen.compose("arm=panda_scaled arm.scale3=1.4")

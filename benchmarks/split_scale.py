@@ -1,0 +1,106 @@
+"""Splits of many bodies: what making, auditing, building and verifying them takes, and their size.
+
+    python benchmarks/split_scale.py [--train 10,100,1000] [--jobs 1] [--light]
+
+Extrapolation from stick, nlink and prims to chain, the train robots of a smaller split being the
+first of a larger one. The splits are made once, for the largest size. Every step is the function
+behind its command, in temporary folders; loading morphgen is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.benchmark.audit import audit
+from morphgen.benchmark.contents import Settings
+from morphgen.benchmark.export import build
+from morphgen.benchmark.extrapolation import extrapolation
+from morphgen.benchmark.generate import Order
+from morphgen.benchmark.split import Split
+from morphgen.benchmark.split_file import split_text, write_split
+from morphgen.benchmark.verify import verify
+from morphgen.grammar.library import default_library
+from morphgen.grammar.model import find_grammar, load_grammar
+
+T = TypeVar("T")
+
+TRAIN, TEST = ("stick", "nlink", "prims"), ("chain",)
+MIB = 2**20
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--train", default="10,100,1000", help="robots to train on, ascending")
+    parser.add_argument("--test", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--light", action="store_true", help="build URDF and derivation only")
+    args = parser.parse_args()
+    sizes = tuple(int(text) for text in args.train.split(","))
+    order = Order("scaled", sizes, args.test, seed=args.seed)
+    library = default_library()
+    train, test = ([load_grammar(find_grammar(name)) for name in names] for names in (TRAIN, TEST))
+    seconds, splits = _timed(lambda: extrapolation(order, train, test, library, jobs=args.jobs))
+    rows, sound = [], True
+    for split in tqdm(splits, unit="split", file=sys.stderr, disable=None):
+        row, passed = _row(split, args)
+        rows.append(row)
+        sound &= passed
+    print(f"{', '.join(TRAIN)} to {', '.join(TEST)}, {args.test} test robots, jobs: {args.jobs}")
+    print(f"splits of {args.train} train robots made in {seconds:.1f} s")
+    print(tabulate(rows, headers="keys"))
+    return int(not sound)
+
+
+def _row(split: Split, args: argparse.Namespace) -> tuple[dict[str, object], bool]:
+    library, jobs = default_library(), args.jobs
+    settings = Settings(light=args.light)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        path = folder / "split.yaml"
+        write_split(split, path)
+        auditing, done = _timed(lambda: audit(split, library, jobs=jobs))
+        building, report = _timed(
+            lambda: build(split, folder, library, jobs=jobs, settings=settings)
+        )
+        again, _ = _timed(lambda: build(split, folder, library, jobs=jobs, settings=settings))
+        by_file, of_file = _timed(lambda: verify(path, library, jobs=jobs))
+        by_folder, of_folder = _timed(lambda: verify(report.folder, library, jobs=jobs))
+        files = [each for each in report.folder.rglob("*") if each.is_file()]
+        size = sum(each.stat().st_size for each in files)
+    whole = not (of_file.differences or of_folder.differences)
+    row = {
+        "train": len(split.train),
+        "file (KiB)": f"{len(split_text(split).encode()) / 1024:.0f}",
+        "audit (s)": f"{auditing:.1f}",
+        "passed": "yes" if done.passed() else "NO",
+        "build (s)": f"{building:.1f}",
+        "again (s)": f"{again:.1f}",
+        "files": len(files),
+        "MiB": f"{size / MIB:.1f}",
+        "verify file (s)": f"{by_file:.1f}",
+        "folder (s)": f"{by_folder:.1f}",
+        "whole": "yes" if whole else "NO",
+    }
+    return row, whole and done.passed()
+
+
+def _timed(work: Callable[[], T]) -> tuple[float, T]:
+    """Seconds that a piece of work takes, and its result."""
+    start = time.perf_counter()
+    result = work()
+    return time.perf_counter() - start, result
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""Robots of a split, each made after a recipe that any process can follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from morphgen.benchmark.processes import mapped
+from morphgen.benchmark.similarity import Features, features
+from morphgen.benchmark.split import COMPOSED, Member, Task, robot_hash
+from morphgen.checks import check
+from morphgen.errors import BenchmarkError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.library import Library
+from morphgen.grammar.model import Grammar, grammar_names
+from morphgen.grammar.request import parse_words
+from morphgen.grammar.sampling import draw
+from morphgen.model.robot import Robot
+
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A robot drawn from a grammar: what ``morphgen sample`` draws as that number of that seed."""
+
+    grammar: Grammar
+    number: int
+    seed: int
+    name: str
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A robot given by words of ``morphgen compose``."""
+
+    words: tuple[str, ...]
+    name: str = ""
+    """By default from its parts."""
+
+
+Recipe = Drawn | Composed
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A robot that was made."""
+
+    name: str
+    category: str
+    derivation: Derivation
+    hash: str
+    """See ``robot_hash``."""
+    features: Features | None = None
+    """For comparing, if asked for."""
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Makes robots."""
+
+    folders: tuple[Path, ...]
+    """Of the library."""
+    comparable: bool = False
+    """Whether their features are wanted."""
+
+    @cached_property
+    def library(self) -> Library:
+        """Where parts are."""
+        return Library(self.folders)
+
+    def __call__(self, recipe: Recipe) -> Body:
+        """Make a robot.
+
+        Raises:
+            BenchmarkError: If a composed one has an error of ``morphgen check``.
+            SamplingError: If none can be drawn.
+            MorphgenError: If the recipe names what does not exist or does not fit.
+        """
+        if isinstance(recipe, Drawn):
+            sample = draw(
+                recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
+            )
+            return self._body(sample.robot, sample.derivation, recipe.grammar.name)
+        derivation, name = parse_words(recipe.words, self.library)
+        robot = compose(derivation, self.library, recipe.name or name)
+        for finding in check(robot):
+            if finding.severity == "error":
+                raise BenchmarkError(
+                    f"{' '.join(recipe.words)}: {finding.code} at {finding.where}: {finding.why}"
+                )
+        return self._body(robot, derivation, category_of(recipe.words, self.library))
+
+    def _body(self, robot: Robot, derivation: Derivation, category: str) -> Body:
+        # The text keeps 12 digits of a number; what it says is what counts.
+        written = parse_derivation(str(derivation))
+        if written != derivation:
+            robot = compose(written, self.library, robot.name)
+        found = None
+        if self.comparable:
+            found = features(robot, token_shapes(robot, self.folders))
+        return Body(robot.name, category, written, robot_hash(robot), found)
+
+
+def make_all(
+    recipes: Sequence[Recipe],
+    maker: Maker,
+    *,
+    jobs: int = 1,
+    progress: Progress = lambda done: None,
+) -> list[Body]:
+    """Make robots, in order.
+
+    Args:
+        recipes: What to make.
+        maker: Makes them.
+        jobs: Processes.
+        progress: Told how many are done, again and again.
+    """
+    bodies = []
+    for body in mapped(maker, recipes, jobs):
+        bodies.append(body)
+        progress(len(bodies))
+    return bodies
+
+
+def category_of(words: Sequence[str], library: Library) -> str:
+    """The grammar that words name first, else ``composed``."""
+    is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
+    return COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
+
+
+def numbered(prefix: str, number: int) -> str:
+    """The name of a drawn robot, such as ``arm3-000004``."""
+    return f"{prefix}-{number:06d}"
+
+
+def stream_seed(seed: int, prefix: str) -> int:
+    """The seed of all robots of one prefix: by name, so that no robot hangs on what else is drawn.
+
+    Args:
+        seed: Of the split.
+        prefix: Of the robots' names.
+    """
+    return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
+
+
+def members(bodies: Iterable[Body], tasks: Sequence[Task], obstacles: bool) -> tuple[Member, ...]:
+    """Every robot at every task; with several tasks the name tells which."""
+    return tuple(
+        Member(
+            body.name if len(tasks) == 1 else f"{body.name}-{task}",
+            body.category,
+            str(body.derivation),
+            task,
+            obstacles,
+            body.hash,
+        )
+        for body in bodies
+        for task in tasks
+    )

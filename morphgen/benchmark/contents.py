@@ -1,0 +1,219 @@
+"""What the files of a built split hold that are there once; made to be written or compared."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.benchmark.built import BUNDLES, FORMAT, ROBOTS, SETTINGS, SPLIT, SUMS, TOKENS, Record
+from morphgen.benchmark.split import Member, Side, Split, split_id
+from morphgen.benchmark.survey import facts_of
+from morphgen.benchmark.token_layout import INDEX, LAYOUT, MAX_LINKS, PARENT, padded
+from morphgen.benchmark.tokens import tokens
+from morphgen.errors import BenchmarkError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.model.robot import Robot
+
+Array = NDArray[np.float64]
+
+_README = """\
+# {name}
+
+{summary}
+
+A split of robots for cross-embodiment learning ({regime}): {train} robots to train on, {test} to
+test on. `{split}` says how they were chosen; its id is `{id}`.
+
+- `{robots}`: a line of JSON a robot: name, side (train or test), task, obstacles, category,
+  derivation (parts and parameters), hash of the body, links, movable joints, those between root and
+  tool, degrees of freedom, reach (m), mass (kg), and path of its folder
+- `{tokens}`: tokens (n, max_links, 48) at home, mask (n, max_links), names (n,), in the order of
+  `{robots}`; layout and columns say what the 48 numbers are
+- `{bundles}/`: {bundle}
+- `{settings}`: how this folder was built
+- `{sums}`: of every file, for `sha256sum -c {sums}`; `morphgen split verify .` also tests that the
+  robots are those of `{split}`
+
+```python
+from morphgen.benchmark.built import load_built
+
+built = load_built(".")
+for robot in built.train:
+    print(robot["name"], robot["tokens"].shape, built.folder / robot["path"] / "robot.urdf")
+```
+
+Without morphgen: `datasets.load_dataset("json", data_files="{robots}")` and
+`numpy.load("{tokens}")`.
+"""
+_BUNDLE = (
+    "a folder a body: `robot.urdf`, `robot.xml` (MJCF), `meshes/`, and `card.json` with the\n"
+    "  sources and licences of its parts"
+)
+_LIGHT = (
+    "a folder a body: `robot.urdf`, whose meshes are named where their data packages have\n"
+    "  them, and `derivation.txt`"
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How robots are written."""
+
+    light: bool = False
+    """URDF and derivation only; meshes are named where their data packages have them."""
+    picture: bool = False
+    """Bundles with ``preview.png``."""
+
+
+BUNDLED = Settings()
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What is known of a body besides its folder."""
+
+    facts: Mapping[str, object]
+    tokens: Array
+    """Indices are divided by the number of its links, shape (n_links, 48)."""
+
+
+def body_of(robot: Robot, folders: Sequence[Path]) -> Body:
+    """Measure a robot.
+
+    Args:
+        robot: The body.
+        folders: Folders of parts, for their stored fits.
+    """
+    table = tokens(robot, token_shapes(robot, folders), max_links=len(robot.links) + 1)
+    return Body(facts_of(robot).as_dict(), table)
+
+
+def bodies(split: Split) -> list[Member]:
+    """The first member of every body, train first; the body's folder has its name.
+
+    Raises:
+        BenchmarkError: If two bodies have the same name.
+    """
+    firsts: dict[str, Member] = {}
+    named: dict[str, str] = {}
+    for _, member in sided(split):
+        firsts.setdefault(member.body, member)
+        if named.setdefault(member.name, member.body) != member.body:
+            raise BenchmarkError(
+                f"split {split.name!r}: a train and a test robot of different bodies are both "
+                f"named {member.name!r}; rename one"
+            )
+    return list(firsts.values())
+
+
+def body_paths(split: Split) -> dict[str, str]:
+    """The folder of every body below the split's, by the body's hash."""
+    return {member.body: f"{BUNDLES}/{member.name}" for member in bodies(split)}
+
+
+def records(split: Split, known: Mapping[str, Body]) -> list[Record]:
+    """The lines of ``robots.jsonl``.
+
+    Args:
+        split: The split.
+        known: Every body by its hash.
+    """
+    paths = body_paths(split)
+    return [
+        {
+            "name": member.name,
+            "side": side,
+            "task": member.task,
+            "obstacles": member.obstacles,
+            "category": member.category,
+            "derivation": member.derivation,
+            "hash": member.body,
+            **known[member.body].facts,
+            "path": paths[member.body],
+        }
+        for side, member in sided(split)
+    ]
+
+
+def records_text(split: Split, known: Mapping[str, Body]) -> str:
+    """``robots.jsonl``."""
+    lines = (json.dumps(record, ensure_ascii=False) for record in records(split, known))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def token_tables(split: Split, known: Mapping[str, Body]) -> tuple[Array, NDArray[np.bool_]]:
+    """Tokens (n, max_links, 48) and mask (n, max_links) of all members."""
+    tables = [known[member.body].tokens for _, member in sided(split)]
+    max_links = max(MAX_LINKS, *map(len, tables))
+    both = [padded(_reindexed(table, max_links), max_links) for table in tables]
+    return np.array([table for table, _ in both]), np.array([mask for _, mask in both])
+
+
+def tokens_npz(split: Split, known: Mapping[str, Body]) -> bytes:
+    """``tokens.npz``."""
+    tables, mask = token_tables(split, known)
+    content = io.BytesIO()
+    np.savez(
+        content,
+        tokens=tables,
+        mask=mask,
+        names=np.array([member.name for _, member in sided(split)]),
+        layout=np.array([field.name for field in LAYOUT]),
+        columns=np.array([(field.start, field.columns.stop) for field in LAYOUT]),
+    )
+    return content.getvalue()
+
+
+def settings_text(split: Split, settings: Settings) -> str:
+    """``build.json``: a build is only continued with the same."""
+    data = {
+        "format": FORMAT,
+        "split": split_id(split),
+        "light": settings.light,
+        "picture": settings.picture,
+    }
+    return json.dumps(data, indent=2) + "\n"
+
+
+def readme_text(split: Split, settings: Settings) -> str:
+    """``README.md``."""
+    return _README.format(
+        name=split.name,
+        summary=split.summary or "(no summary)",
+        regime=split.regime,
+        train=len(split.train),
+        test=len(split.test),
+        id=split_id(split),
+        bundle=_LIGHT if settings.light else _BUNDLE,
+        split=SPLIT,
+        robots=ROBOTS,
+        tokens=TOKENS,
+        bundles=BUNDLES,
+        settings=SETTINGS,
+        sums=SUMS,
+    )
+
+
+def sums_text(sums: Mapping[str, str]) -> str:
+    """``SHA256SUMS``: hexadecimal hashes by path."""
+    return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
+
+
+def sided(split: Split) -> list[tuple[Side, Member]]:
+    """Every member with its side, in the order of all files."""
+    train: list[tuple[Side, Member]] = [("train", member) for member in split.train]
+    return [*train, *(("test", member) for member in split.test)]
+
+
+def _reindexed(table: Array, max_links: int) -> Array:
+    """Tokens of ``Body`` with indices divided by one less than ``max_links``."""
+    made = table.copy()
+    for field in (INDEX, PARENT):
+        made[:, field.columns] = np.round(made[:, field.columns] * len(table)) / (max_links - 1)
+    return made

@@ -1,0 +1,100 @@
+"""Do the same to many things, in one process or in several."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context, parent_process
+from threading import Thread
+from typing import Any, TypeVar
+
+from morphgen.errors import BenchmarkError, MorphgenError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+Progress = Callable[[int, int], None]
+"""Told how much is done, and of how much."""
+
+CHUNK = 8
+"""Things that a worker does before it reports."""
+
+_work: Callable[[Any], object] | None = None
+
+
+def unseen(done: int, total: int) -> None:
+    """A progress that is shown to nobody."""
+
+
+def mapped(
+    work: Callable[[T], R], things: Sequence[T], jobs: int, progress: Progress = unseen
+) -> Iterator[R]:
+    """Do work on every thing; results in the order of the things.
+
+    Args:
+        work: A function that can be pickled, with all that it needs; each process gets it once.
+        things: What it is done to.
+        jobs: Processes. No more are started than there is work for.
+        progress: Told how many results there are, and how many there will be.
+
+    Raises:
+        BenchmarkError: If ``jobs`` is below 1.
+        MorphgenError: What the work raises, or that a process died.
+    """
+    if jobs < 1:
+        raise BenchmarkError(f"{jobs} jobs: expected 1 or more")
+    chunks = [things[i : i + CHUNK] for i in range(0, len(things), CHUNK)]
+    jobs = min(jobs, len(chunks))
+    results = map(work, things) if jobs <= 1 else _in_processes(work, chunks, jobs)
+    for done, result in enumerate(results, 1):
+        progress(done, len(things))
+        yield result
+
+
+def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,))
+    waiting = iter(chunks)
+    try:
+        running: deque[Future[list[R]]] = deque(
+            pool.submit(_do, chunk) for chunk in itertools.islice(waiting, 2 * jobs)
+        )
+        while running:
+            done = _result(running.popleft())
+            running.extend(pool.submit(_do, chunk) for chunk in itertools.islice(waiting, 1))
+            yield from done
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[list[R]]) -> list[R]:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise MorphgenError("a worker died, perhaps for want of memory; try fewer jobs") from error
+
+
+def _start(work: Callable[[Any], object]) -> None:
+    """Prepare a worker; Ctrl-C is for the parent, which lets it finish its chunk."""
+    global _work
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+    _work = work
+
+
+def _end_with_parent() -> None:
+    """A killed parent tells its workers nothing, and they would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _do(things: Sequence[Any]) -> list[Any]:
+    if _work is None:
+        raise RuntimeError("the worker was not prepared")
+    return [_work(thing) for thing in things]

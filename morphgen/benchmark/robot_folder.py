@@ -1,0 +1,133 @@
+"""The folder of one robot in a built split: written, and compared with the robot."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+from morphgen.checks import check
+from morphgen.errors import FormatError
+from morphgen.formats.bundle import (
+    CARD,
+    PICTURE,
+    URDF,
+    file_findings,
+    replacing_folder,
+    split_colours,
+    write_bundle,
+)
+from morphgen.formats.card import card_of, card_text
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.robot_set import DERIVATION, light_urdf
+from morphgen.model.robot import Robot
+
+_MESH = re.compile(r'(<mesh filename=")[^"]*"')
+_FREE = {"findings", "versions"}
+"""What of a card is not compared."""
+_RELATIVE, _ABSOLUTE = 1e-6, 1e-9
+"""How far numbers of two cards may differ: another machine may round otherwise."""
+
+
+def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> None:
+    """Write a robot's bundle in place of what is there; ``light``: only its URDF and derivation.
+
+    Raises:
+        FormatError: If the folder cannot be written.
+    """
+    if light:
+        with replacing_folder(folder) as partial:
+            for name, text in _light_files(robot).items():
+                (partial / name).write_text(text, encoding="utf-8")
+        return
+    if not (folder / CARD).is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+    write_bundle(robot, folder, check(robot), picture=picture)
+
+
+def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
+    """What of a robot's folder is not as the robot says, a line each; none if all is.
+
+    The URDF, but for the names of meshes, and the card, but for its findings and versions, are
+    compared with the robot; all other files with the hashes on the card.
+    """
+    if not folder.is_dir():
+        return ["its folder is missing"]
+    return list(_light_differences(folder, robot) if light else _differences(folder, robot))
+
+
+def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
+    """Whether this version of morphgen would write a folder without differences again."""
+    if light:
+        return True
+    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    has_picture = (folder / PICTURE).is_file()
+    return card["versions"] == {"morphgen": version("morphgen")} and has_picture == picture
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, hexadecimal, by its path, sorted."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def _light_files(robot: Robot) -> dict[str, str]:
+    return {URDF: light_urdf(robot), DERIVATION: f"{robot.provenance['derivation']}\n"}
+
+
+def _light_differences(folder: Path, robot: Robot) -> Iterator[str]:
+    files = _light_files(robot)
+    for name, text in files.items():
+        path = folder / name
+        if not path.is_file():
+            yield f"file {name} is missing"
+        elif path.read_bytes() != text.encode():
+            yield f"file {name} is not the robot's"
+    yield from _extra(folder, files)
+
+
+def _differences(folder: Path, robot: Robot) -> Iterator[str]:
+    try:
+        findings = file_findings(folder)
+    except FormatError as error:
+        yield str(error)
+        return
+    yield from (f"{finding.where}: {finding.why}" for finding in findings)
+    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    urdf = folder / URDF
+    if urdf.is_file() and _MESH.sub(r'\1"', urdf.read_text("utf-8", "replace")) != _nameless(robot):
+        yield f"file {URDF} is not the robot's"
+    expected = json.loads(card_text(card_of(robot, (), card["hashes"], {})))
+    for key in sorted(expected.keys() - _FREE):
+        if not same(card.get(key), expected[key]):
+            yield f"file {CARD}: its {key!r} is not the robot's"
+    yield from _extra(folder, (*card["hashes"], CARD, PICTURE))
+
+
+def _nameless(robot: Robot) -> str:
+    """A bundle's URDF, meshes without names."""
+    return urdf_text(split_colours(robot), lambda mesh: "")
+
+
+def _extra(folder: Path, known: Iterable[str]) -> Iterator[str]:
+    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    yield from (f"file {name} does not belong to it" for name in sorted(found - set(known)))
+
+
+def same(a: object, b: object) -> bool:
+    """Whether two values read from JSON are the same, but for rounding."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=_RELATIVE, abs_tol=_ABSOLUTE)
+    return a == b

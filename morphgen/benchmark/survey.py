@@ -1,0 +1,197 @@
+"""Every robot of a split composed and measured, and each test robot compared with each train robot.
+
+What the audit and the statistics are made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.benchmark.processes import Progress, mapped, unseen
+from morphgen.benchmark.similarity import MEASURES, Features, features
+from morphgen.benchmark.split import Member, Split, robot_hash
+from morphgen.errors import MorphgenError, nearest
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.card import rounded
+from morphgen.grammar.compose import compose
+from morphgen.grammar.conditions import Properties
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import Library
+from morphgen.model.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What tables say of a robot."""
+
+    links: int
+    movable: int
+    """Joints that move, mimic joints among them."""
+    movable_to_tool: int
+    """Those between the root and the tool's link."""
+    dof: int
+    reach: float
+    """Largest distance of the tool from the root's origin, metres."""
+    mass: float
+    """Kilograms."""
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why a robot of a split cannot be had."""
+
+    code: str
+    """``part-missing`` if the library lacks a part, else ``body-broken``."""
+    why: str
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """A robot of a split as it is composed today."""
+
+    body: str
+    """Its hash."""
+    facts: Facts
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What was found of a split's robots, in the order of the split."""
+
+    split: Split
+    train: tuple[Surveyed | Fault, ...]
+    test: tuple[Surveyed | Fault, ...]
+    likeness: Array
+    """Of every train robot to every test robot by every measure, in the order of ``MEASURES``,
+    shape (n_train, n_test, n_measures); NaN where one of the two has a fault."""
+
+    def of(self, measure: str) -> Array:
+        """Likeness by one measure, shape (n_train, n_test)."""
+        return self.likeness[:, :, tuple(MEASURES).index(measure)]
+
+
+def facts_of(robot: Robot) -> Facts:
+    """Count and measure a robot."""
+    known = Properties(robot)
+    return Facts(
+        len(robot.links),
+        len(robot.movable),
+        int(known.movable_to_tool),
+        robot.dof,
+        float(rounded(known.reach) or 0.0),
+        float(rounded(known.mass) or 0.0),
+    )
+
+
+def survey(split: Split, library: Library, *, jobs: int = 1, progress: Progress = unseen) -> Survey:
+    """Compose, measure and compare a split's robots; what is named twice is composed once a side.
+
+    Args:
+        split: The split.
+        library: Where its parts are.
+        jobs: Processes.
+        progress: Told how many robots are done, again and again.
+
+    Raises:
+        BenchmarkError: If ``jobs`` is below 1.
+    """
+    trains, tests = _firsts(split.train), _firsts(split.test)
+    total = len(trains) + len(tests)
+    tested = list(
+        mapped(_Examination(library.folders), tests, jobs, lambda done, _: progress(done, total))
+    )
+    look = _Comparison(library.folders, tuple(map(_features_of, tested)))
+    trained = list(mapped(look, trains, jobs, lambda done, _: progress(len(tests) + done, total)))
+    rows, columns = _places(split.train, trains), _places(split.test, tests)
+    shape = (len(trains), len(tests), len(MEASURES))
+    likeness = np.array([values for _, values in trained]).reshape(shape)
+    return Survey(
+        split,
+        tuple(trained[row][0] for row in rows),
+        tuple(_surveyed(tested[column]) for column in columns),
+        likeness[rows][:, columns],
+    )
+
+
+def _firsts(members: Sequence[Member]) -> list[Member]:
+    """The first member of every derivation."""
+    return list({member.derivation: member for member in reversed(members)}.values())[::-1]
+
+
+def _places(members: Sequence[Member], firsts: Sequence[Member]) -> list[int]:
+    """For every member the index of the first one of its derivation."""
+    place = {member.derivation: i for i, member in enumerate(firsts)}
+    return [place[member.derivation] for member in members]
+
+
+@dataclass(frozen=True, eq=False)
+class _Examined:
+    surveyed: Surveyed
+    features: Features
+
+
+@dataclass(frozen=True, eq=False)
+class _Examination:
+    """How a worker sees to a robot."""
+
+    folders: tuple[Path, ...]
+
+    @cached_property
+    def library(self) -> Library:
+        return Library(self.folders)
+
+    def __call__(self, member: Member) -> _Examined | Fault:
+        try:
+            parsed = parse_derivation(member.derivation)
+            missing = {node.part for node in parsed.walk()} - self.library.paths.keys()
+            if missing:
+                hints = (f"{part!r}{nearest(part, self.library.paths)}" for part in sorted(missing))
+                return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
+            robot = compose(parsed, self.library, member.name)
+            shapes = token_shapes(robot, self.folders)
+            surveyed = Surveyed(robot_hash(robot), facts_of(robot))
+            return _Examined(surveyed, features(robot, shapes))
+        except MorphgenError as error:
+            return Fault("body-broken", str(error))
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """How a worker compares a robot with the test robots."""
+
+    folders: tuple[Path, ...]
+    tests: tuple[Features | None, ...]
+
+    @cached_property
+    def examination(self) -> _Examination:
+        return _Examination(self.folders)
+
+    def __call__(self, member: Member) -> tuple[Surveyed | Fault, Array]:
+        found = self.examination(member)
+        values = np.full((len(self.tests), len(MEASURES)), np.nan)
+        if isinstance(found, Fault):
+            return found, values
+        for row, test in zip(values, self.tests, strict=True):
+            if test is not None:
+                row[:] = [each.function(test, found.features) for each in MEASURES.values()]
+        return found.surveyed, values
+
+
+def _surveyed(found: _Examined | Fault) -> Surveyed | Fault:
+    return found.surveyed if isinstance(found, _Examined) else found
+
+
+def _features_of(found: _Examined | Fault) -> Features | None:
+    return found.features if isinstance(found, _Examined) else None

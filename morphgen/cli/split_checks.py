@@ -1,0 +1,328 @@
+"""``morphgen split audit``, ``build``, ``verify`` and ``stats``."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+
+if TYPE_CHECKING:
+    from morphgen.benchmark.audit import Audit, Near
+    from morphgen.benchmark.paper import Figures
+    from morphgen.benchmark.processes import Progress
+    from morphgen.benchmark.split import Split
+    from morphgen.model.findings import Finding
+
+LISTED = 10
+"""Findings of one code, or differences, that are printed."""
+
+
+def add(verbs: Subparsers) -> None:
+    """Declare the verbs."""
+    _add_audit(verbs)
+    _add_build(verbs)
+    _add_verify(verbs)
+    _add_stats(verbs)
+
+
+def _add_audit(verbs: Subparsers) -> None:
+    parser = verbs.add_parser(
+        "audit",
+        help="look for leaks between train and test",
+        description="Look for leaks between train and test and for broken rules of the regime, "
+        "and name the train robot nearest to every test robot. Exit code 1 if there is an error "
+        "that the split does not accept (with --strict: or a warning).",
+    )
+    parser.add_argument("split", metavar="SPLIT", help="a split's file or name")
+    parser.add_argument(
+        "--near",
+        metavar="TREE,COSINE",
+        help="bodies whose tree distance is below and whose cosine is above are nearly the same "
+        "(default: 0.001,0.99999)",
+    )
+    parser.add_argument("--strict", action="store_true", help="warnings fail, too")
+    _add_jobs(parser)
+    add_library(parser)
+    add_json(parser)
+    parser.set_defaults(run=run_audit)
+
+
+def _add_build(verbs: Subparsers) -> None:
+    parser = verbs.add_parser(
+        "build",
+        help="write every robot of a split",
+        description="Write every robot of a split, with its tokens, into a folder of the split's "
+        "name. Interrupted, it goes on where it was when run again; the same split gives the same "
+        "bytes, with any --jobs.",
+    )
+    parser.add_argument("split", metavar="SPLIT", help="a split's file or name")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("data"), help="default: data/"
+    )
+    parser.add_argument("--light", action="store_true", help="URDF and derivation only")
+    parser.add_argument("--picture", action="store_true", help="draw preview.png of every robot")
+    _add_jobs(parser)
+    add_library(parser)
+    add_json(parser)
+    parser.set_defaults(run=run_build)
+
+
+def _add_verify(verbs: Subparsers) -> None:
+    parser = verbs.add_parser(
+        "verify",
+        help="prove that a split, or a built one, is what it claims to be",
+        description="Compose every robot again and compare: with the hashes in a split's file, or "
+        "with all files of a split that was built. Exit code 1 if something differs.",
+    )
+    parser.add_argument("path", metavar="PATH", help="a split's file or name, or a built folder")
+    _add_jobs(parser)
+    add_library(parser)
+    add_json(parser)
+    parser.set_defaults(run=run_verify)
+
+
+def _add_stats(verbs: Subparsers) -> None:
+    parser = verbs.add_parser(
+        "stats",
+        help="figures of splits, beside those of the paper",
+        description="Print figures of splits: the mean number of links, movable joints and those "
+        "on the way to the tool of the train robots, and the cosine similarity of test and train "
+        "robots; the paper's in parentheses. Splits with the same robots share a row.",
+    )
+    parser.add_argument(
+        "splits", nargs="*", metavar="SPLIT", help="files or names (default: all that are shipped)"
+    )
+    parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
+    _add_jobs(parser)
+    add_library(parser)
+    add_json(parser)
+    parser.set_defaults(run=run_stats)
+
+
+def _add_jobs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
+def run_audit(args: argparse.Namespace) -> int:
+    """Audit and print."""
+    from morphgen.benchmark.audit import audit
+    from morphgen.benchmark.split_file import read_split
+
+    near = _near(args.near)
+    split = read_split(args.split)
+    with _bar(args) as progress:
+        done = audit(split, library_of(args), near=near, jobs=args.jobs, progress=progress)
+    passed = done.passed(strict=args.strict)
+    if args.json:
+        print(json.dumps({**done.as_dict(), "passed": passed}))
+    else:
+        print(_audit_text(done, passed))
+    return int(not passed)
+
+
+def _near(text: str | None) -> Near:
+    from morphgen.benchmark.audit import NEAR, Near
+    from morphgen.errors import BenchmarkError
+
+    if text is None:
+        return NEAR
+    try:
+        tree, cosine = map(float, text.split(","))
+    except ValueError as error:
+        raise BenchmarkError(
+            f"--near {text}: expected a tree distance and a cosine, such as 0.001,0.99999"
+        ) from error
+    if not (0 <= tree <= 1 and -1 <= cosine <= 1):
+        raise BenchmarkError(
+            f"--near {text}: a tree distance is from 0 to 1, and a cosine from -1 to 1"
+        )
+    return Near(tree, cosine)
+
+
+def _audit_text(done: Audit, passed: bool) -> str:
+    from tabulate import tabulate
+
+    from morphgen.benchmark.similarity import MEASURES
+
+    nearest: dict[str, list[str]] = {}
+    for one in done.neighbours:
+        nearest.setdefault(one.test, []).append(f"{one.train} {one.value:.3f}")
+    rows = [(test, *cells) for test, cells in nearest.items()]
+    headers = ("test robot", *(f"nearest by {name}" for name in MEASURES))
+    lines = [tabulate(rows, headers, disable_numparse=True)] if rows else []
+    for code, findings in _by_code(done.findings).items():
+        lines.append(f"{findings[0].severity} {code} ({len(findings)})")
+        lines += _shortened([f"  {each.where}: {each.why}" for each in findings])
+        lines.append(f"    fix: {findings[0].fix}")
+    reasons = {each.code: reason for each, reason in done.accepted}
+    for code, findings in _by_code([each for each, _ in done.accepted]).items():
+        lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
+        lines += _shortened([f"  {each.where}: {each.why}" for each in findings])
+    counts = {
+        severity: sum(each.severity == severity for each in done.findings)
+        for severity in ("error", "warning")
+    }
+    text = ", ".join(f"{n} {severity}" for severity, n in counts.items())
+    lines.append(
+        f"{done.split}: {'passed' if passed else 'FAILED'}: {text}, {len(done.accepted)} accepted"
+    )
+    return "\n".join(lines)
+
+
+def _by_code(findings: Sequence[Finding]) -> dict[str, list[Finding]]:
+    found: dict[str, list[Finding]] = {}
+    for finding in findings:
+        found.setdefault(finding.code, []).append(finding)
+    return found
+
+
+def _shortened(lines: Sequence[str]) -> list[str]:
+    more = len(lines) - LISTED
+    return [*lines[:LISTED], *([f"  and {more} more (--json lists all)"] if more > 0 else [])]
+
+
+def run_build(args: argparse.Namespace) -> int:
+    """Build and say where."""
+    from morphgen.benchmark.contents import Settings
+    from morphgen.benchmark.export import build
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.errors import BenchmarkError
+
+    if args.light and args.picture:
+        raise BenchmarkError("--light writes no pictures; say --light or --picture")
+    settings = Settings(light=args.light, picture=args.picture)
+    split = read_split(args.split)
+    with _bar(args) as progress:
+        report = build(
+            split,
+            args.out,
+            library_of(args),
+            jobs=args.jobs,
+            settings=settings,
+            progress=progress,
+        )
+    if args.json:
+        found = {"folder": str(report.folder), "made": report.made, "kept": report.kept}
+        print(json.dumps(found))
+        return 0
+    print(f"{report.folder}: {report.made} robots made, {report.kept} were there")
+    print(f"test it anywhere: morphgen split verify {report.folder}")
+    return 0
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """Verify and print what differs."""
+    from morphgen.benchmark.verify import verify
+
+    with _bar(args) as progress:
+        found = verify(args.path, library_of(args), jobs=args.jobs, progress=progress)
+    whole = not found.differences
+    if args.json:
+        differences = [{"where": each.where, "why": each.why} for each in found.differences]
+        data = {"split": found.split.name, "id": found.id, "differences": differences}
+        print(json.dumps({**data, "passed": whole}))
+        return int(not whole)
+    lines = _shortened([f"  {each.where}: {each.why}" for each in found.differences])
+    n = len(found.split.train) + len(found.split.test)
+    count = len(found.differences)
+    differing = f"{count} difference{'' if count == 1 else 's'}"
+    verdict = f"all {n} robots are the same" if whole else differing
+    print("\n".join([f"{found.split.name}, id {found.id}: {verdict}", *lines]))
+    return int(not whole)
+
+
+def run_stats(args: argparse.Namespace) -> int:
+    """Print the table."""
+    from tabulate import tabulate
+
+    from morphgen.benchmark.paper import SOURCE, figures_of
+    from morphgen.benchmark.split_file import read_split, split_names
+    from morphgen.benchmark.statistics import statistics
+
+    library = library_of(args)
+    rows = _same_robots([read_split(name) for name in args.splits or split_names()])
+    found: list[tuple[str, list[Split], dict[str, object]]] = []
+    for title, splits in rows.items():
+        with _bar(args, title) as progress:
+            figures = statistics(splits[0], library, jobs=args.jobs, progress=progress)
+        found.append((title, splits, figures))
+    if args.json:
+        data = [
+            {
+                "robots": title,
+                "splits": [split.name for split in splits],
+                "ours": figures,
+                "paper": asdict(theirs) if (theirs := figures_of(title)) else None,
+            }
+            for title, splits, figures in found
+        ]
+        print(json.dumps({"rows": data, "paper": SOURCE}))
+        return 0
+    lines = [_stats_row(title, figures) for title, _, figures in found]
+    style = "github" if args.markdown else "simple"
+    print(tabulate(lines, "keys", tablefmt=style, disable_numparse=True))
+    print("\nlinks, joints, mass: mean over the train robots; cosine: of test and train robots")
+    print(f"in parentheses: {SOURCE}")
+    return 0
+
+
+def _same_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
+    """Splits that have the same bodies in the same order, by what their names have in common."""
+    groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
+    for split in splits:
+        bodies = tuple(tuple(each.body for each in side) for side in (split.train, split.test))
+        groups.setdefault(bodies, []).append(split)
+    return {_common([split.name for split in group]): group for group in groups.values()}
+
+
+def _common(names: Sequence[str]) -> str:
+    """The words that names begin with; the first name where there are none."""
+    words = list(zip(*(name.split("/") for name in names), strict=False))
+    same = list(itertools.takewhile(lambda column: len(set(column)) == 1, words))
+    return "/".join(column[0] for column in same) or names[0]
+
+
+def _stats_row(title: str, figures: Mapping[str, Any]) -> dict[str, str]:
+    from morphgen.benchmark.paper import figures_of
+
+    train, cosine = figures["train"], figures["cosine"]
+    theirs = figures_of(title)
+    row = {"robots": title, "train": train["robots"], "test": figures["test"]["robots"]}
+    for key in ("links", "movable", "movable_to_tool"):
+        row[key.replace("_", " ")] = _beside(f"{train[key]:.4g}", theirs, key)
+    row["cosine"] = _beside(f"{cosine['mean']:.2f}", theirs, "cosine")
+    row["least to largest"] = f"{cosine['min']:.2f} to {cosine['max']:.2f}"
+    row["mass (kg)"] = f"{train['mass']['mean']:.3g}"
+    row["reach (m)"] = f"{train['reach']['min']:.2f} to {train['reach']['max']:.2f}"
+    return row
+
+
+def _beside(ours: str, theirs: Figures | None, key: str) -> str:
+    """Our figure, the paper's in parentheses if there is one."""
+    if theirs is None:
+        return ours
+    value = getattr(theirs, key)
+    return f"{ours} ({'-' if value is None else f'{value:g}'})"
+
+
+@contextmanager
+def _bar(args: argparse.Namespace, title: str | None = None) -> Iterator[Progress]:
+    """A bar on stderr, gone when done."""
+    from tqdm import tqdm
+
+    hidden = args.json or None
+    with tqdm(desc=title, unit="robot", file=sys.stderr, disable=hidden, leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show

@@ -1,0 +1,274 @@
+"""An audit finds what a split gives away, and what it promises and does not keep."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splits import LIBRARY, TEST, TRAIN, combined, member, split
+
+from morphgen.benchmark.audit import NEAR, Near, audit
+from morphgen.benchmark.similarity import MEASURES, cosine, features, tree_distance
+from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.survey import survey
+from morphgen.errors import BenchmarkError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.model import find_grammar, load_grammar
+from morphgen.grammar.sampling import draw
+
+
+def found(made, **options):
+    """Code and place of every finding."""
+    return [(each.code, each.where) for each in audit(made, LIBRARY, **options).findings]
+
+
+def test_a_sound_split_passes():
+    done = audit(combined(), LIBRARY)
+    assert (done.findings, done.accepted, done.passed(strict=True)) == ((), (), True)
+
+
+def test_the_nearest_train_robot_is_told_by_every_measure():
+    made = split([*TRAIN, "base=planar ee=cube ee.size=0.3"], [*TEST, "base=gantry ee=cube"])
+    expected = {}
+    robots = {m.name: member_robot(m, LIBRARY) for m in (*made.train, *made.test)}
+    known = {name: features(robot, token_shapes(robot)) for name, robot in robots.items()}
+    for test in made.test:
+        for name, measure in MEASURES.items():
+            best = max if measure.larger_is_more_alike else min
+            values = {m.name: measure.function(known[test.name], known[m.name]) for m in made.train}
+            nearest = best(values, key=values.get)
+            expected[test.name, name] = (nearest, values[nearest])
+    neighbours = audit(made, LIBRARY).neighbours
+    assert {(n.test, n.measure): (n.train, n.value) for n in neighbours} == expected
+
+
+def test_the_same_body_on_both_sides_is_a_leak_by_whatever_name():
+    twin = member(TRAIN[0], "somebody_else")
+    done = audit(combined(test=[*TEST, twin]), LIBRARY)
+    (leak,) = [each for each in done.findings if each.code == "body-shared"]
+    assert leak.where == "test robot somebody_else"
+    assert leak.why == "train robot gantry-plane has the same body, and learns the same task"
+    assert not done.passed()
+
+
+def test_the_same_body_at_another_task_is_none():
+    made = combined(train=[*TRAIN, member(TEST[0], task="reach", name="planar-reach")])
+    codes = {code for code, _ in found(made)}
+    assert "combination-seen" in codes
+    assert not codes & {"body-shared", "body-near"}
+
+
+def test_a_body_that_is_nearly_in_train_is_a_leak():
+    near = split([member(f"{TEST[0]} ee.size=100.1mm", "near"), *TRAIN], TEST)
+    done = audit(near, LIBRARY)
+    (leak,) = [each for each in done.findings if each.code == "body-near"]
+    assert leak.where == "test robot planar-plane"
+    assert "train robot near is nearly the same: tree distance" in leak.why
+    assert "body-near" not in {code for code, _ in found(near, near=Near(0.0, 1.0))}
+
+
+def test_nearness_needs_both_measures():
+    made = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
+    likeness = survey(made, LIBRARY)
+    tree, alike = likeness.of("tree")[0, 0], likeness.of("cosine")[0, 0]
+    for near, expected in (
+        (Near(tree * 1.01, alike - 1e-12), True),
+        (Near(tree, alike - 1e-12), False),
+        (Near(tree * 1.01, alike), False),
+    ):
+        codes = {code for code, _ in found(made, near=near)}
+        assert ("body-near" in codes) == expected
+
+
+def jittered(node, amount, rng):
+    """A derivation, every parameter but whole numbers and angles made larger or smaller."""
+    known = LIBRARY.manifest(node.part).parameters
+    values = tuple(
+        (name, value * (1 + amount * rng.choice([-1, 1])))
+        if name in known and known[name].unit == "m" and value
+        else (name, value)
+        for name, value in node.parameters
+    )
+    children = tuple((port, jittered(child, amount, rng)) for port, child in node.children)
+    return Derivation(node.label, node.part, values, children)
+
+
+@pytest.mark.parametrize("category", ["arm5", "chain", "planar_arm", "cubes", "stick"])
+def test_nearness_is_about_one_per_cent_of_size(category):
+    sample = draw(load_grammar(find_grammar(category)), LIBRARY, 0, seed=1)
+    rng = np.random.default_rng(0)
+    one = features(sample.robot, token_shapes(sample.robot))
+
+    def is_near(amount):
+        robot = compose(jittered(sample.derivation, amount, rng), LIBRARY, "other")
+        other = features(robot, token_shapes(robot))
+        return tree_distance(one, other) < NEAR.tree and cosine(one, other) > NEAR.cosine
+
+    assert is_near(0.005)
+    assert not is_near(0.06)
+
+
+def test_a_name_may_not_stand_for_two_bodies():
+    made = combined(test=[*TEST, member("base=planar ee=cylinder", "gantry-plane")])
+    assert found(made) == [("name-shared", "test robot gantry-plane")]
+
+
+def test_a_part_that_is_not_there_is_told_with_the_nearest():
+    wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
+    done = audit(combined(train=[TRAIN[0], wrong, TRAIN[2], "base=planar ee=stick"]), LIBRARY)
+    (missing,) = done.findings
+    assert (missing.code, missing.where) == ("part-missing", "train robot planar-cube")
+    assert "no part 'cubw'; did you mean 'cube" in missing.why
+    assert {n.train for n in done.neighbours} <= {"gantry-plane", "gantry-cylinder", "planar-stick"}
+
+
+@pytest.mark.parametrize(
+    ("derivation", "why"),
+    [
+        ("base=planar[up: ee=cube]", "no port 'up'"),
+        ("base=planar[top: ee=cube(size=9)]", "out of range"),
+        ("base=planar[", "no derivation"),
+        ("base=fixed[top: ee=cube]", "no joint moves its tool"),
+    ],
+)
+def test_a_robot_that_cannot_be_composed_or_compared_is_told(derivation, why):
+    wrong = replace(member(TRAIN[1]), name="wrong", body="0" * 32, derivation=derivation)
+    (broken,) = audit(combined(train=[*TRAIN, wrong]), LIBRARY).findings
+    assert (broken.code, broken.where) == ("body-broken", "train robot wrong")
+    assert why in broken.why
+
+
+def test_a_test_robot_that_cannot_be_composed_has_no_neighbours():
+    wrong = replace(member(TEST[0]), derivation="base=planar[top: ee=cubw]")
+    done = audit(combined(test=[wrong]), LIBRARY)
+    assert [each.code for each in done.findings] == ["part-missing"]
+    assert done.neighbours == ()
+
+
+def test_a_split_without_a_sound_train_robot_can_be_audited():
+    wrong = [replace(member(words), derivation="base=nothing") for words in TRAIN]
+    assert {code for code, _ in found(combined(train=wrong))} == {"part-missing"}
+
+
+def test_a_body_that_is_another_today_is_told():
+    changed = replace(member(TRAIN[0]), body="0" * 32)
+    done = audit(combined(train=[changed, *TRAIN[1:]]), LIBRARY)
+    (finding,) = done.findings
+    assert finding.code == "body-changed"
+    assert f"names body {'0' * 32}, its derivation gives {member(TRAIN[0]).body}" in finding.why
+
+
+def test_a_robot_that_is_there_twice_is_a_warning():
+    done = audit(combined(train=[*TRAIN, member(TRAIN[0], "again")]), LIBRARY)
+    (finding,) = done.findings
+    assert (finding.code, finding.severity) == ("body-repeated", "warning")
+    assert finding.where == "train robot again"
+    assert done.passed()
+    assert not done.passed(strict=True)
+
+
+def test_the_rules_of_the_regimes_are_kept():
+    unseen = combined(test=["base=planar ee=sphere"])
+    assert found(unseen) == [("part-unseen", "test robot planar-sphere")]
+    large = member("base=planar ee=cube ee.size=0.3", "large-cube")
+    seen = combined(regime="extrapolation", test=[large])
+    assert found(seen) == [("structure-seen", "test robot large-cube")]
+    other = combined(regime="interpolation")
+    assert found(other) == [("structure-unseen", "test robot planar-plane")]
+
+
+def drawn(category, n, seed, **changes):
+    grammar = load_grammar(find_grammar(category))
+    for i in range(n):
+        robot = draw(grammar, LIBRARY, i, seed=seed)
+        made = member("cubes", f"{category}-{seed}-{i}", category=category)
+        body = str(parse_derivation(str(robot.derivation)))
+        yield replace(made, derivation=body, body=_hash(body), **changes)
+
+
+def _hash(derivation):
+    from morphgen.benchmark.split import robot_hash
+
+    return robot_hash(compose(parse_derivation(derivation), LIBRARY, "x"))
+
+
+def test_a_hull_that_was_promised_is_tested():
+    train, tests = list(drawn("cubes", 4, 0)), list(drawn("cubes", 8, 1))
+    sizes = [dict(parse_derivation(m.derivation).parameters)["size"] for m in (*train, *tests)]
+    low, high = min(sizes[:4]), max(sizes[:4])
+    inside = [m for m, size in zip(tests, sizes[4:], strict=True) if low <= size <= high]
+    outside = [m for m in tests if m not in inside]
+    assert inside
+    assert outside
+    for hull, wrong in (("inside", outside), ("outside", inside), ("any", [])):
+        made = split(train, tests, regime="interpolation", made={"hull": hull})
+        told = {where for code, where in found(made) if code == "hull"}
+        assert told == {f"test robot {m.name}" for m in wrong}
+
+
+def test_a_category_that_is_trained_is_no_extrapolation():
+    made = split([*drawn("cubes", 2, 0)], [*drawn("cubes", 1, 1)], regime="extrapolation")
+    assert {code for code, _ in found(made)} >= {"category-seen", "structure-seen"}
+
+
+def test_a_bound_on_likeness_that_was_promised_is_tested():
+    likeness = survey(combined(), LIBRARY).of("cosine").max()
+    for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
+        made = combined(made={"similarity": bound})
+        codes = {code for code, _ in found(made)}
+        assert codes == (set() if holds else {"similarity-bound"})
+    assert 0.99 < likeness < 1
+    with pytest.raises(BenchmarkError, match=r"split 'mine/some': made: .*'<'"):
+        audit(combined(made={"similarity": "small"}), LIBRARY)
+
+
+def test_what_the_author_accepts_is_listed_with_the_reason_and_fails_nothing():
+    accepted = {"part-unseen": "the sphere is new on purpose"}
+    done = audit(combined(test=["base=planar ee=sphere"], accepted=accepted), LIBRARY)
+    assert done.findings == ()
+    ((finding, reason),) = done.accepted
+    assert (finding.code, reason) == ("part-unseen", accepted["part-unseen"])
+    assert done.passed(strict=True)
+
+
+def test_accepting_one_thing_accepts_no_other():
+    accepted = {"part-unseen": "on purpose"}
+    tests = ["base=planar ee=sphere", member(TRAIN[0], "twin")]
+    done = audit(combined(test=tests, accepted=accepted), LIBRARY)
+    assert {each.code for each in done.findings} == {"body-shared", "combination-seen"}
+    assert not done.passed()
+
+
+def test_accepting_what_is_not_found_is_told():
+    done = audit(combined(accepted={"body-naer": "a typo"}), LIBRARY)
+    (finding,) = done.findings
+    assert (finding.code, finding.severity) == ("accepted-unused", "warning")
+    assert finding.where == "accepted body-naer"
+    assert done.passed()
+
+
+def test_progress_is_told_and_processes_change_nothing():
+    words = [f"base=planar ee=cube ee.size={50 + i}mm" for i in range(9)]
+    made = combined(train=[*TRAIN, *(member(each, f"cube-{i}") for i, each in enumerate(words))])
+    seen = []
+    one = audit(made, LIBRARY, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(i, 13) for i in range(1, 14)]
+    assert audit(made, LIBRARY, jobs=2) == one
+
+
+def test_a_derivation_that_two_members_share_is_composed_once():
+    made = combined(train=[*TRAIN, member(TRAIN[0], "reaching", task="reach")])
+    seen = []
+    survey(made, LIBRARY, progress=lambda done, total: seen.append(total))
+    assert seen == [4] * 4
+    both = survey(made, LIBRARY)
+    assert both.train[0] == both.train[3]
+    np.testing.assert_array_equal(both.likeness[0], both.likeness[3])
+
+
+def test_an_audit_is_plain_data():
+    data = audit(combined(accepted={"x": "y"}), LIBRARY).as_dict()
+    assert data["split"] == "mine/some"
+    assert [each["code"] for each in data["findings"]] == ["accepted-unused"]
+    assert set(data["nearest"]["planar-plane"]) == set(MEASURES)

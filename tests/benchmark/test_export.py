@@ -1,0 +1,403 @@
+"""A split that was built is whole, reads back, and is the same however it was made."""
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+from commands import start, tree
+from splits import LIBRARY, combined, member, split
+
+from morphgen.benchmark.built import Robots
+from morphgen.benchmark.contents import BUNDLED, Settings
+from morphgen.benchmark.export import build, load_built
+from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split_file import read_split, write_split
+from morphgen.benchmark.token_layout import padded
+from morphgen.benchmark.tokens import tokens
+from morphgen.errors import BenchmarkError, FormatError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.bundle import read_robot
+from morphgen.grammar.robot_set import light_urdf
+
+LIGHT = Settings(light=True)
+
+
+@pytest.fixture
+def made():
+    return combined()
+
+
+@pytest.fixture
+def whole(tmp_path, made):
+    """A built split."""
+    return build(made, tmp_path / "whole", LIBRARY).folder
+
+
+def test_its_folder_has_the_splits_name(tmp_path, made):
+    report = build(made, tmp_path / "data", LIBRARY)
+    assert report.folder == tmp_path / "data" / "mine" / "some"
+    assert (report.made, report.kept) == (4, 0)
+    names = ["README.md", "SHA256SUMS", "build.json", "robots", "robots.jsonl", "split.yaml"]
+    assert sorted(path.name for path in report.folder.iterdir()) == [*names, "tokens.npz"]
+    assert read_split(report.folder / "split.yaml") == made
+
+
+def test_every_robot_is_a_bundle(whole, made):
+    for one in (*made.train, *made.test):
+        folder = whole / "robots" / one.name
+        files = {path.name for path in folder.iterdir()}
+        assert files == {"robot.urdf", "robot.xml", "card.json"}
+        read, robot = read_robot(folder), member_robot(one, LIBRARY)
+        assert (read.name, read.home, len(read.links)) == (one.name, robot.home, len(robot.links))
+
+
+def test_a_line_of_json_tells_a_robot(whole, made):
+    records = [json.loads(line) for line in (whole / "robots.jsonl").read_text().splitlines()]
+    assert [record["name"] for record in records] == [m.name for m in (*made.train, *made.test)]
+    assert [record["side"] for record in records] == ["train"] * 3 + ["test"]
+    assert records[0] == {
+        "name": "gantry-plane",
+        "side": "train",
+        "task": "push",
+        "obstacles": False,
+        "category": "composed",
+        "derivation": made.train[0].derivation,
+        "hash": made.train[0].body,
+        "links": 7,
+        "movable": 5,
+        "movable_to_tool": 5,
+        "dof": 5,
+        "reach": pytest.approx(1.167, abs=1e-3),
+        "mass": pytest.approx(member_robot(made.train[0], LIBRARY).mass),
+        "path": "robots/gantry-plane",
+    }
+    table = pandas.read_json(whole / "robots.jsonl", lines=True)
+    assert table.groupby("side").size().to_dict() == {"test": 1, "train": 3}
+
+
+def test_tokens_are_those_of_the_robots(whole, made):
+    with np.load(whole / "tokens.npz", allow_pickle=False) as data:
+        assert data["tokens"].shape == (4, 23, 48)
+        assert data["columns"].tolist()[0] == [0, 1]
+        for i, one in enumerate((*made.train, *made.test)):
+            robot = member_robot(one, LIBRARY)
+            table, mask = padded(tokens(robot, token_shapes(robot)), 23)
+            assert data["names"][i] == one.name
+            np.testing.assert_array_equal(data["tokens"][i], table)
+            np.testing.assert_array_equal(data["mask"][i], mask)
+
+
+def test_a_larger_robot_widens_all_tokens(tmp_path):
+    made = split(["chain beads=7"], ["base=gantry ee=cube"])
+    built = load_built(build(made, tmp_path, LIBRARY, settings=LIGHT).folder)
+    assert built.tokens.shape == (2, 25, 48)
+    for one, table in zip((*made.train, *made.test), built.tokens, strict=True):
+        robot = member_robot(one, LIBRARY)
+        expected = tokens(robot, token_shapes(robot), max_links=25)
+        np.testing.assert_array_equal(table[: len(expected)], expected)
+
+
+def test_sums_are_of_every_other_file(whole):
+    lines = (whole / "SHA256SUMS").read_text().splitlines()
+    told = {line[66:]: line[:64] for line in lines}
+    files = {name: data for name, data in tree(whole).items() if data is not None}
+    assert told.keys() == files.keys() - {"SHA256SUMS"}
+    for name, value in told.items():
+        assert hashlib.sha256(files[name]).hexdigest() == value
+    assert [line[64:66] for line in lines] == ["  "] * len(lines)
+
+
+def test_the_readme_tells_how_to_load_it_and_that_runs(whole, monkeypatch, capsys):
+    monkeypatch.chdir(whole)
+    text = Path("README.md").read_text()
+    (code,) = [part.split("```")[0] for part in text.split("```python\n")[1:]]
+    exec(code, {})
+    assert capsys.readouterr().out.splitlines()[0] == (
+        "gantry-plane (23, 48) robots/gantry-plane/robot.urdf"
+    )
+
+
+def test_a_light_build_names_meshes_where_their_packages_have_them(tmp_path):
+    made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
+    folder = build(made, tmp_path, LIBRARY, settings=LIGHT).folder
+    own = folder / "robots" / "ur5-plane"
+    assert sorted(path.name for path in own.iterdir()) == ["derivation.txt", "robot.urdf"]
+    assert (own / "derivation.txt").read_text() == f"{made.train[0].derivation}\n"
+    assert (own / "robot.urdf").read_text() == light_urdf(member_robot(made.train[0], LIBRARY))
+    assert 'filename="package://' in (own / "robot.urdf").read_text()
+    assert "derivation.txt" in (folder / "README.md").read_text()
+
+
+def test_a_body_that_is_named_twice_is_written_once(tmp_path):
+    twin = member("base=gantry ee=plane", "twin", task="reach")
+    made = combined(test=[twin, *combined().test])
+    report = build(made, tmp_path, LIBRARY, settings=LIGHT)
+    assert report.made == 4
+    assert {path.name for path in (report.folder / "robots").iterdir()} == {
+        "gantry-plane",
+        "planar-cube",
+        "gantry-cylinder",
+        "planar-plane",
+    }
+    (record,) = [robot for robot in load_built(report.folder).test if robot["name"] == "twin"]
+    assert (record["path"], record["task"]) == ("robots/gantry-plane", "reach")
+
+
+def test_pictures_are_drawn_if_asked_for(tmp_path):
+    made = split(["cubes"], ["base=planar ee=plane"])
+    folder = build(made, tmp_path, LIBRARY, settings=Settings(picture=True)).folder
+    assert (folder / "robots" / "cubes" / "preview.png").is_file()
+    assert build(made, tmp_path, LIBRARY, settings=Settings(picture=True)).kept == 2
+
+
+@pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
+def test_twice_and_in_two_processes_it_is_the_same_bytes(tmp_path, settings):
+    cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
+    made = split(cubes, ["arm=ur5 ee=plane"])
+    one = build(made, tmp_path / "one", LIBRARY, settings=settings)
+    two = build(made, tmp_path / "two", LIBRARY, settings=settings, jobs=2)
+    assert tree(one.folder) == tree(two.folder)
+    again = build(made, tmp_path / "one", LIBRARY, settings=settings)
+    assert (again.made, again.kept) == (0, 10)
+    assert tree(one.folder) == tree(two.folder)
+
+
+def test_progress_counts_bodies(tmp_path, made):
+    seen = []
+    build(made, tmp_path, LIBRARY, settings=LIGHT, progress=lambda *counts: seen.append(counts))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
+@pytest.mark.parametrize("done", [1, 3, 4])
+def test_what_was_done_before_an_interruption_is_kept(tmp_path, made, settings, done):
+    whole = build(made, tmp_path / "whole", LIBRARY, settings=settings).folder
+
+    def stop(number, total):
+        if number == done:
+            raise Killed
+
+    with pytest.raises(Killed):
+        build(made, tmp_path / "own", LIBRARY, settings=settings, progress=stop)
+    own = tmp_path / "own" / "mine" / "some"
+    with pytest.raises(BenchmarkError, match="is not finished: it has no SHA256SUMS; build it"):
+        load_built(own)
+    report = build(made, tmp_path / "own", LIBRARY, settings=settings)
+    assert (report.made, report.kept) == (4 - done, done)
+    assert tree(own) == tree(whole)
+
+
+@pytest.mark.parametrize(
+    ("path", "content"),
+    [
+        ("robots/planar-cube/robot.urdf", b"<robot/>"),
+        ("robots/planar-cube/robot.xml", None),
+        ("robots/planar-cube/card.json", b"{"),
+        ("robots/planar-cube/card.json", None),
+        ("robots/planar-cube/notes.txt", b"mine"),
+        ("robots.jsonl", b""),
+        ("tokens.npz", None),
+        ("README.md", b"?"),
+        ("SHA256SUMS", None),
+        ("split.yaml", b""),
+        ("robots/.planar-cube.x1y2/robot.urdf", b"<rob"),
+    ],
+)
+def test_what_is_not_as_it_should_be_is_made_again(tmp_path, whole, made, path, content):
+    before = tree(whole)
+    if content is None:
+        (whole / path).unlink()
+    else:
+        (whole / path).parent.mkdir(exist_ok=True)
+        (whole / path).write_bytes(content)
+    build(made, tmp_path / "whole", LIBRARY)
+    assert tree(whole) == before
+
+
+def test_a_robot_whose_card_was_changed_with_its_file_is_made_again(tmp_path, whole, made):
+    before = tree(whole)
+    folder = whole / "robots" / "planar-cube"
+    text = (folder / "robot.urdf").read_text().replace('effort="', 'effort="1')
+    (folder / "robot.urdf").write_text(text)
+    card = json.loads((folder / "card.json").read_text())
+    card["hashes"]["robot.urdf"] = hashlib.sha256(text.encode()).hexdigest()
+    (folder / "card.json").write_text(json.dumps(card))
+    assert build(made, tmp_path / "whole", LIBRARY).made == 1
+    assert tree(whole) == before
+
+
+def test_a_robot_of_another_version_is_made_again(tmp_path, whole, made):
+    before = tree(whole)
+    path = whole / "robots" / "planar-cube" / "card.json"
+    path.write_text(path.read_text().replace('"morphgen": "', '"morphgen": "0.0.'))
+    assert build(made, tmp_path / "whole", LIBRARY).made == 1
+    assert tree(whole) == before
+
+
+def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path):
+    cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(60)]
+    made = split(cubes, ["base=planar ee=plane"])
+    write_split(made, tmp_path / "some.yaml")
+    words = ("split", "build", tmp_path / "some.yaml", "--out", tmp_path / "killed", "--jobs", 2)
+    process = start(*words)
+    robots = tmp_path / "killed" / "mine" / "some" / "robots"
+    for _ in range(1200):
+        if robots.is_dir() and len(list(robots.iterdir())) > 5:
+            break
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=30)
+    assert not (robots.parent / "SHA256SUMS").exists()
+    whole = build(made, tmp_path / "whole", LIBRARY).folder
+    assert build(made, tmp_path / "killed", LIBRARY).kept > 0
+    assert tree(robots.parent) == tree(whole)
+
+
+def test_a_folder_of_another_build_is_refused(tmp_path, whole, made):
+    before = tree(whole)
+    for other, settings, message in (
+        (combined(test=["base=planar ee=cylinder"]), BUNDLED, "its split is '[0-9a-f]{32}', not"),
+        (made, LIGHT, "its light is False, not True; name another folder"),
+        (made, Settings(picture=True), "its picture is False, not True"),
+    ):
+        with pytest.raises(BenchmarkError, match=message):
+            build(other, tmp_path / "whole", LIBRARY, settings=settings)
+    assert tree(whole) == before
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path, made):
+    (tmp_path / "mine" / "some").mkdir(parents=True)
+    (tmp_path / "mine" / "some" / "notes.txt").write_text("mine")
+    before = tree(tmp_path)
+    with pytest.raises(BenchmarkError, match=r"is no built split \(no build.json\); name another"):
+        build(made, tmp_path, LIBRARY)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("place", ["mine", "mine/some"])
+def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path, made, place):
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).write_text("mine")
+    with pytest.raises(BenchmarkError, match=r"exists and is no built split|cannot write"):
+        build(made, tmp_path, LIBRARY)
+    assert (tmp_path / place).read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["../up", "a//b", "/tmp/x", "", ".hidden"])
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+    with pytest.raises(FormatError, match="use letters, digits"):
+        build(combined(name=name), tmp_path / "data", LIBRARY)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_name_of_two_bodies_is_refused(tmp_path):
+    made = combined(test=[member("base=planar ee=cylinder", "gantry-plane")])
+    with pytest.raises(BenchmarkError, match="both named 'gantry-plane'; rename one"):
+        build(made, tmp_path / "data", LIBRARY)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_second_run_into_the_same_folder_is_refused(tmp_path, made):
+    def again(done, total):
+        with pytest.raises(BenchmarkError, match="is being written by another run"):
+            build(made, tmp_path, LIBRARY, settings=LIGHT)
+
+    report = build(made, tmp_path, LIBRARY, settings=LIGHT, progress=again)
+    assert len(load_built(report.folder)) == 4
+
+
+def test_a_disk_that_is_full_is_told_and_nothing_half_written_is_left(tmp_path, made, monkeypatch):
+    written = Path.write_text
+
+    def full(path, *args, **options):
+        if path.name == "card.json":
+            raise OSError(28, "No space left on device", str(path))
+        return written(path, *args, **options)
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(FormatError, match=r"cannot write .*No space left on device"):
+        build(made, tmp_path, LIBRARY)
+    assert list((tmp_path / "mine" / "some" / "robots").iterdir()) == []
+    monkeypatch.undo()
+    assert build(made, tmp_path, LIBRARY).made == 4
+
+
+def test_loading_gives_plain_records_with_tokens(whole, made):
+    built = load_built(whole)
+    assert [robot["name"] for robot in built] == [m.name for m in (*made.train, *made.test)]
+    assert [len(each) for each in (built, built.train, built.test)] == [4, 3, 1]
+    for i, robot in enumerate(built):
+        assert type(robot) is dict
+        assert robot["side"] == ("test" if i == 3 else "train")
+        np.testing.assert_array_equal(robot["tokens"], built.tokens[i])
+        assert robot["mask"].sum() == robot["links"]
+        assert (built.folder / robot["path"] / "robot.urdf").is_file()
+    assert built.test[0]["name"] == built.train[:2][1]["name"].replace("cube", "plane")
+    assert isinstance(built.train[:2], Robots)
+    assert load_built(str(whole)).folder == whole
+
+
+def test_loading_needs_no_torch(whole):
+    code = (
+        "import sys; from morphgen.benchmark.built import load_built; "
+        f"print(len(load_built({str(whole)!r}).train), 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["3", "False"]
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "message"),
+    [
+        ("build.json", None, r"is no built split: it has no build.json; morphgen split build"),
+        ("SHA256SUMS", None, "is not finished: it has no SHA256SUMS; build it again"),
+        ("robots.jsonl", None, "robots.jsonl: no such file"),
+        ("robots.jsonl", b"{\n", "robots.jsonl:1: no valid JSON"),
+        ("robots.jsonl", b"[]\n", "robots.jsonl:1: expected an object with a name and a side"),
+        ("robots.jsonl", b"\xff\n", "robots.jsonl: cannot be read"),
+        ("robots.jsonl", b"", "tokens.npz is not of the robots in robots.jsonl"),
+        ("tokens.npz", None, "tokens.npz: no such file"),
+        ("tokens.npz", b"", "tokens.npz: cannot be read"),
+        ("tokens.npz", b"PK\x03\x04 and so on", "tokens.npz: cannot be read"),
+    ],
+)
+def test_what_cannot_be_loaded_is_refused_by_name(whole, path, content, message):
+    if content is None:
+        (whole / path).unlink()
+    else:
+        (whole / path).write_bytes(content)
+    with pytest.raises(BenchmarkError, match=message):
+        load_built(whole)
+
+
+@pytest.mark.parametrize("change", ["tokens", "mask", "names"])
+def test_tokens_that_do_not_go_together_are_refused(whole, change):
+    with np.load(whole / "tokens.npz") as data:
+        arrays = dict(data)
+    arrays[change] = arrays[change][:2]
+    np.savez(whole / "tokens.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=r"names, tokens and mask are of shapes \("):
+        load_built(whole)
+    del arrays[change]
+    np.savez(whole / "tokens.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=f"cannot be read: .*{change}"):
+        load_built(whole)
+
+
+def test_the_folder_above_hints_at_the_one_that_is_meant(tmp_path, whole):
+    with pytest.raises(BenchmarkError, match=r"did you mean .*whole/mine/some\?"):
+        load_built(tmp_path / "whole")
+    with pytest.raises(BenchmarkError, match="nowhere: no such folder"):
+        load_built(tmp_path / "nowhere")

@@ -1,0 +1,402 @@
+"""New splits: the rules of each regime hold, seeds decide, and what cannot be is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from grammars import grammar, shipped
+from scipy.spatial import Delaunay
+
+import morphgen
+from morphgen.benchmark import bodies, generate
+from morphgen.benchmark.bodies import Composed, Drawn, Maker, make_all
+from morphgen.benchmark.composition import composition, expand
+from morphgen.benchmark.extrapolation import Bound, extrapolation, parse_bound
+from morphgen.benchmark.generate import Order
+from morphgen.benchmark.interpolation import interpolation
+from morphgen.benchmark.regimes import parameters, parts, regime_findings, structure
+from morphgen.benchmark.similarity import cosine, features
+from morphgen.benchmark.split import member_robot, robot_hash
+from morphgen.errors import BenchmarkError, CompositionError, PartError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import default_library
+from morphgen.model.findings import Finding
+
+LIBRARY = default_library()
+
+
+def order(*train, test=1, **changes):
+    return Order("mine", train, test, **changes)
+
+
+def derivations(members):
+    return [parse_derivation(member.derivation) for member in members]
+
+
+def points(members):
+    return np.array([list(parameters(d, LIBRARY).values()) for d in derivations(members)])
+
+
+def names(members):
+    return [member.name for member in members]
+
+
+def require_sound(split):
+    """Require that its robots can be made, and that the regime holds."""
+    for member in (*split.train, *split.test):
+        assert member_robot(member, LIBRARY).name == member.name
+    assert regime_findings(split, LIBRARY) == ()
+
+
+def test_robots_are_those_that_sample_draws():
+    (split,) = interpolation(order(3), shipped("cubes"), LIBRARY)
+    seeds = split.made["seeds"]
+    drawn = morphgen.sample("cubes", 3, seed=seeds["cubes"])
+    assert [m.body for m in split.train] == [robot_hash(robot) for robot in drawn]
+    first = next(morphgen.sample("cubes", 1, seed=seeds["cubes-test"]))
+    assert split.test[0].body == robot_hash(first)
+    assert names(split.train) == ["cubes-000000", "cubes-000001", "cubes-000002"]
+    assert names(split.test) == ["cubes-test-000000"]
+    assert {m.category for m in (*split.train, *split.test)} == {"cubes"}
+    require_sound(split)
+
+
+def test_the_seed_decides_and_the_number_of_robots_does_not():
+    few, again, other = (
+        interpolation(order(n, seed=seed), shipped("cubes"), LIBRARY)[0]
+        for n, seed in ((2, 5), (6, 5), (2, 6))
+    )
+    assert few.train == again.train[:2]
+    assert few.test == again.test
+    bodies = {m.body for m in (*few.train, *few.test)}
+    assert bodies.isdisjoint(m.body for m in (*other.train, *other.test))
+
+
+@pytest.mark.parametrize("hull", ["inside", "outside"])
+def test_test_robots_of_every_size_keep_to_the_hull(hull):
+    splits = interpolation(order(6, 12, 24, test=3), shipped("arm3"), LIBRARY, hull=hull)
+    assert [split.name for split in splits] == ["mine-train6", "mine-train12", "mine-train24"]
+    for split in splits:
+        train, test = points(split.train), points(split.test)
+        varied = np.ptp(train, axis=0) > 0
+        assert varied.sum() == 3
+        inside = Delaunay(train[:, varied]).find_simplex(test[:, varied]) >= 0
+        assert list(inside) == [hull == "inside"] * 3
+        assert regime_findings(split, LIBRARY) == ()
+        assert split.made["hull"] == hull
+        assert split.made["nested"] == [6, 12, 24]
+
+
+def test_sizes_are_nested_around_the_same_test():
+    small, middle, large = interpolation(order(2, 3, 5, test=2), shipped("cubes"), LIBRARY)
+    assert [len(split.train) for split in (small, middle, large)] == [2, 3, 5]
+    assert small.train == middle.train[:2] == large.train[:2]
+    assert middle.train == large.train[:3]
+    assert small.test == middle.test == large.test
+    assert [split.made["train"] for split in (small, middle, large)] == [2, 3, 5]
+
+
+def test_a_grammar_of_several_structures_is_tested_by_those_that_are_trained():
+    (split,) = interpolation(order(2, test=6), shipped("prims"), LIBRARY)
+    trained = {structure(d, LIBRARY) for d in derivations(split.train)}
+    assert len(trained) <= 2
+    assert {structure(d, LIBRARY) for d in derivations(split.test)} <= trained
+    require_sound(split)
+
+
+def test_every_robot_does_every_task():
+    splits = interpolation(
+        order(1, 2, tasks=("reach", "push"), obstacles=True), shipped("cubes"), LIBRARY
+    )
+    assert names(splits[1].train) == [
+        "cubes-000000-reach",
+        "cubes-000000-push",
+        "cubes-000001-reach",
+        "cubes-000001-push",
+    ]
+    assert names(splits[0].train) == names(splits[1].train)[:2]
+    assert [m.task for m in splits[0].test] == ["reach", "push"]
+    assert len({m.body for m in splits[0].test}) == 1
+    assert all(m.obstacles for m in splits[0].train)
+
+
+def test_several_processes_make_the_same():
+    one, two = (interpolation(order(10), shipped("cubes"), LIBRARY, jobs=n) for n in (1, 2))
+    assert one == two
+
+
+def test_progress_is_told_up_to_the_end():
+    told = []
+    interpolation(order(3, test=2), shipped("cubes"), LIBRARY, progress=told.append)
+    assert told == [1, 2, 3, 4, 5]
+    told.clear()
+    patterns = ["base=gantry ee={plane,cube}", "base=fixed arm=lwr ee={plane,cube}"]
+    composition(order(2), patterns, LIBRARY, progress=told.append)
+    assert told == [1, 2, 3]
+
+
+def test_a_body_of_train_is_never_tested():
+    few = grammar("robot -> gantry plane(size=choice(0.1, 0.2, 0.3))")
+    (split,) = interpolation(order(2), few, LIBRARY)
+    bodies = {m.body for m in split.train}
+    assert bodies.isdisjoint(m.body for m in split.test)
+    with pytest.raises(BenchmarkError, match=r"0 of 1 .* in 200 draws; \d+ had the body of g-"):
+        interpolation(order(30), few, LIBRARY)
+
+
+def test_a_hull_that_nothing_is_in_is_told(monkeypatch):
+    monkeypatch.setattr(generate, "MAX_DRAWS", 100)
+    with pytest.raises(BenchmarkError) as caught:
+        interpolation(order(3), shipped("arm3"), LIBRARY, hull="inside")
+    assert str(caught.value) == (
+        "arm3: 0 of 1 test robots found in 100 draws; 100 had parameters outside the hull of "
+        "the train robots; 3 parameters vary, and the smallest hull is that of 3 robots: ask for "
+        "more train robots, or for --hull any"
+    )
+
+
+def test_unknown_hulls_name_the_valid_ones():
+    with pytest.raises(BenchmarkError, match="--hull insid: unknown; did you mean 'inside'"):
+        interpolation(order(3), shipped("arm3"), LIBRARY, hull="insid")
+
+
+CATEGORIES = ("stick", "nlink", "prims")
+
+
+def grammars(*wanted):
+    return [shipped(name) for name in wanted]
+
+
+def test_extrapolation_takes_categories_in_turn():
+    few, many = extrapolation(
+        order(4, 7, test=2), grammars(*CATEGORIES), grammars("chain", "cubes"), LIBRARY
+    )
+    assert [m.category for m in many.train] == [*CATEGORIES, *CATEGORIES, "stick"]
+    assert names(many.train)[3:] == ["stick-000001", "nlink-000001", "prims-000001", "stick-000002"]
+    assert few.train == many.train[:4]
+    assert names(many.test) == ["chain-000000", "cubes-000000"]
+    require_sound(many)
+
+
+def test_a_category_has_the_same_robots_whatever_stands_beside_it():
+    (one,) = extrapolation(order(2), grammars("stick", "nlink"), grammars("cubes"), LIBRARY)
+    (other,) = extrapolation(order(2), grammars("cubes", "stick"), grammars("chain"), LIBRARY)
+    assert one.train[0] == other.train[1]
+    assert one.test[0] == other.train[0]
+
+
+def test_a_structure_that_is_trained_is_not_tested():
+    mine = grammar(
+        "robot -> post links sphere(radius=0.02)",
+        "links -> beam(length=uniform(0.1, 0.5)){2,7}",
+        name="mine",
+    )
+    (split,) = extrapolation(order(8, test=3), grammars("nlink"), [mine], LIBRARY)
+    trained = {structure(d, LIBRARY) for d in derivations(split.train)}
+    assert trained.isdisjoint(structure(d, LIBRARY) for d in derivations(split.test))
+    assert names(split.test) != ["mine-000000", "mine-000001", "mine-000002"]
+    same = replace(shipped("nlink"), name="mine")
+    with pytest.raises(BenchmarkError, match=r"2000 draws; .* had the structure of train robot"):
+        extrapolation(order(40), grammars("nlink"), [same], LIBRARY)
+
+
+def cosines(split):
+    """Of every test robot to every train robot."""
+    rows = []
+    for side in (split.test, split.train):
+        made = [member_robot(member, LIBRARY) for member in side]
+        rows.append([features(robot, token_shapes(robot, LIBRARY.folders)) for robot in made])
+    return np.array([[cosine(test, train) for train in rows[1]] for test in rows[0]])
+
+
+@pytest.mark.parametrize(("bound", "holds"), [("<0.55", np.less), (" > .55 ", np.greater)])
+def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
+    splits = extrapolation(
+        order(3, 9, test=2),
+        grammars(*CATEGORIES),
+        grammars("chain"),
+        LIBRARY,
+        similarity=parse_bound(bound),
+    )
+    for split in splits:
+        nearest = cosines(split).max(axis=1)
+        assert holds(nearest, 0.55).all()
+        assert split.made["similarity"] == f"{bound.strip()[0]}0.55"
+
+
+def test_a_bound_that_nothing_meets_is_told_with_the_nearest(monkeypatch):
+    monkeypatch.setattr(generate, "MAX_COMPOSED", 9)
+    with pytest.raises(BenchmarkError) as caught:
+        extrapolation(
+            order(2), grammars("prims"), grammars("cubes"), LIBRARY, similarity=Bound(True, 0.01)
+        )
+    text = str(caught.value)
+    assert text.startswith("cubes: 0 of 1 test robots found in 9 draws; 9 had a cosine to the ")
+    assert "not <0.01; the nearest to the bound was cubes-" in text
+    assert text.endswith(": choose another bound, or other categories")
+
+
+def test_bounds_are_read():
+    assert [parse_bound(text) for text in ("<0.6", " > .25 ")] == [
+        Bound(True, 0.6),
+        Bound(False, 0.25),
+    ]
+
+
+@pytest.mark.parametrize("text", ["0.6", "<", "<=0.6", "<6", "< nan", "", "<-1", "<0.6 0.7"])
+def test_what_is_no_bound_is_refused(text):
+    with pytest.raises(BenchmarkError, match="expected '<' or '>' and a number from 0 to 1"):
+        parse_bound(text)
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        (("stick", "chain"), ("chain",), "--test-category chain: the category is on both sides"),
+        (("stick", "stick"), ("chain",), "--train-category stick: the category is there twice"),
+        (("stick",), ("chain", "chain"), "--test-category chain: the category is"),
+    ],
+)
+def test_a_category_is_named_once(train, test, message):
+    with pytest.raises(BenchmarkError, match=message):
+        extrapolation(order(4), grammars(*train), grammars(*test), LIBRARY)
+
+
+FROM = ["arm={ur5,lwr,xarm7} ee={plane,stick,cylinder}"]
+
+
+def test_composition_holds_out_combinations_whose_parts_are_trained():
+    for seed in range(3):
+        (split,) = composition(order(6, test=2, seed=seed, tasks=("push",)), FROM, LIBRARY)
+        trained = [parts(d) for d in derivations(split.train)]
+        for own in map(parts, derivations(split.test)):
+            assert own not in trained
+            assert own <= frozenset().union(*trained)
+        assert (len(split.train), len(split.test)) == (6, 2)
+        assert {m.task for m in split.train} == {"push"}
+        assert {m.category for m in split.train} == {"composed"}
+        assert regime_findings(split, LIBRARY) == ()
+    require_sound(split)
+
+
+def test_without_a_size_all_is_trained_that_may_be():
+    (split,) = composition(order(test=2), FROM, LIBRARY)
+    assert len(split.train) == 7
+    assert split.made["from"] == FROM
+
+
+def test_nested_sizes_each_train_every_part_of_the_test_robots():
+    splits = composition(order(3, 5, 7), FROM, LIBRARY)
+    assert splits[0].train == splits[2].train[:3]
+    assert splits[1].train == splits[2].train[:5]
+    assert [regime_findings(split, LIBRARY) for split in splits] == [()] * 3
+
+
+def test_sizes_of_parts_are_choices_too_but_no_combinations():
+    sized = ["base=gantry ee={plane,cube} ee.size={5cm,10cm}", "arm=lwr ee={plane,cube}"]
+    (split,) = composition(order(test=2), sized, LIBRARY)
+    tested = {structure(d, LIBRARY) for d in derivations(split.test)}
+    assert len(tested) == 2
+    assert tested.isdisjoint(structure(d, LIBRARY) for d in derivations(split.train))
+    assert len(set(names((*split.train, *split.test)))) == len(split.train) + 2
+    require_sound(split)
+
+
+def test_body_and_task_are_composed():
+    (split,) = composition(order(test=2, tasks=("reach", "push")), FROM, LIBRARY)
+    for member in split.test:
+        ee = parse_derivation(member.derivation).children[0][1].children[0][1].part
+        at = {m.task for m in split.train if ee in m.derivation}
+        assert at == {"reach", "push"} - {member.task}
+        assert member.name.endswith(f"{ee}-{member.task}")
+    assert {m.task for m in split.train} == {"reach", "push"}
+    require_sound(split)
+
+
+def test_grammars_and_limbs_can_be_combined():
+    patterns = ["nlink links={2,3}", "base={fixed,pedestal} left.arm=lwr left.ee={plane,cube}"]
+    (split,) = composition(order(test=2), patterns, LIBRARY)
+    members = (*split.train, *split.test)
+    assert sorted(m.category for m in members) == ["composed"] * 4 + ["nlink"] * 2
+    require_sound(split)
+
+
+def test_braces_are_written_out():
+    assert expand("arm={ur5,lwr} ee=plane") == [("arm=ur5", "ee=plane"), ("arm=lwr", "ee=plane")]
+    assert expand(" arm={ ur5 , lwr }  ") == [("arm=ur5",), ("arm=lwr",)]
+    assert expand("ee.size={5,10}{cm,mm}") == [
+        ("ee.size=5cm",),
+        ("ee.size=5mm",),
+        ("ee.size=10cm",),
+        ("ee.size=10mm",),
+    ]
+    assert expand("arm=ur5") == [("arm=ur5",)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("arm={ur5,lwr ee=plane", "a brace is not closed, or opened twice"),
+        ("arm=ur5,lwr} ee=plane", "a brace is not closed, or opened twice"),
+        ("arm={ur5,{lwr}}", "a brace is not closed, or opened twice"),
+        ("arm={ur5,,lwr}", r"{ur5,,lwr} has an empty choice"),
+        ("arm={}", r"{} has an empty choice"),
+        ("arm={ur5,lwr,ur5}", "{ur5,lwr,ur5} has 'ur5' twice"),
+        (" ", "--from is empty"),
+    ],
+)
+def test_braces_that_are_wrong_are_told(pattern, message):
+    with pytest.raises(BenchmarkError) as caught:
+        expand(pattern)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("asked", "patterns", "error", "message"),
+    [
+        (order(), ["arm=ur5 ee={plane,stick}"], BenchmarkError, "in one combination only: plane, "),
+        (order(test=7), FROM, BenchmarkError, "of 7 test robots can be held out of 9 combinations"),
+        (order(9), FROM, BenchmarkError, "0 of 1 test robots can be held out of 9 combinations"),
+        (order(1), FROM, BenchmarkError, "--train 1: 2 robots at least are needed so that every"),
+        (order(), ["arm={ur5,lwr} ee={plnae,stick}"], PartError, "unknown ee 'plnae'; did you"),
+        (order(), ["base={fixed,gantry}"], CompositionError, "nothing to compose"),
+    ],
+)
+def test_what_cannot_be_composed_says_why(asked, patterns, error, message):
+    with pytest.raises(error) as caught:
+        composition(asked, patterns, LIBRARY)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "changes", "message"),
+    [
+        ((0,), {}, "--train 0 --test 1 --seed 0: --train and --test start at 1"),
+        ((1,), {"test": 0}, "--train 1 --test 0 --seed 0: --train and --test start at 1"),
+        ((1,), {"seed": -1}, "--seed at 0"),
+        ((3, 2), {}, "--train 3,2: expected sizes that grow, such as 10,30,100"),
+        ((3, 3), {}, "--train 3,3: expected sizes that grow, such as 10,30,100"),
+    ],
+)
+def test_an_order_that_makes_no_sense_is_refused(sizes, changes, message):
+    with pytest.raises(BenchmarkError, match=message):
+        order(*sizes, **changes)
+
+
+def test_numbers_that_a_derivation_cannot_write_do_not_matter():
+    """The base's default has 16 digits; the hash is that of the robot that the text gives."""
+    body = Maker(LIBRARY.folders)(Composed(("base=planar", "ee=cube")))
+    assert "travel_yaw=3.14159265359" in str(body.derivation)
+    assert dict(body.derivation.parameters)["travel_yaw"] == 3.14159265359
+    own = grammar("robot -> planar ee", "ee -> cube(size=uniform(0.05, 0.1))")
+    drawn = Maker(LIBRARY.folders)(Drawn(own, 0, 1, "x"))
+    again = parse_derivation(str(drawn.derivation))
+    assert again == drawn.derivation
+
+
+def test_a_robot_that_fails_its_checks_is_refused(monkeypatch):
+    found = [Finding("overlap", "error", "link a", "too deep", "move it")]
+    monkeypatch.setattr(bodies, "check", lambda robot: found)
+    with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
+        make_all([Composed(("base=gantry", "ee=cube"))], Maker(LIBRARY.folders))

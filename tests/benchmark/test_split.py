@@ -1,0 +1,306 @@
+"""The hash of a body, the id of a split, and robots composed from members."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from robots import arm
+
+from morphgen.benchmark.split import (
+    COMPOSED,
+    Member,
+    Split,
+    member_robot,
+    robot_hash,
+    robots,
+    split_id,
+)
+from morphgen.errors import BenchmarkError, GrammarError, PartError
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_words
+from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape
+from morphgen.model.robot import Frame, Link, Mimic
+
+LIBRARY = default_library()
+
+
+def member(words, name="", **changes):
+    """A member of some words of compose."""
+    derivation, own = parse_words(words.split(), LIBRARY)
+    body = robot_hash(compose(derivation, LIBRARY, "any"))
+    return replace(Member(name or own, COMPOSED, str(derivation), "reach", False, body), **changes)
+
+
+def with_link(robot, name, **changes):
+    return robot.with_links([replace(robot.link(name), **changes)])
+
+
+def with_joint(robot, name, **changes):
+    joints = [replace(j, **changes) if j.name == name else j for j in robot.joints]
+    return replace(robot, joints=tuple(joints))
+
+
+def with_mesh(path, **mesh):
+    return Link("hull", collisions=(Shape(Mesh(path, **mesh)),))
+
+
+def jittered(robot, size, rng):
+    """The robot with noise on every pose, mass, inertia and limit; frames turned by nothing."""
+
+    def noisy(values):
+        return tuple(float(v + size * rng.standard_normal() * max(1, abs(v))) for v in values)
+
+    def pose(T):
+        w, x, y, z = noisy(T.quaternion)
+        return Pose(noisy(T.position), (w, x, y, z))
+
+    def shapes(given):
+        return tuple(replace(shape, T_link_shape=pose(shape.T_link_shape)) for shape in given)
+
+    def body(inertial):
+        if inertial is None:
+            return None
+        (mass,) = noisy([inertial.mass])
+        # Noise of an inertia is that of the mass times a squared length.
+        moments = [v + size * inertial.mass * rng.standard_normal() for v in inertial.inertia]
+        return replace(inertial, mass=mass, com=noisy(inertial.com), inertia=tuple(moments))
+
+    links = [
+        replace(
+            link,
+            inertial=body(link.inertial),
+            visuals=shapes(link.visuals),
+            collisions=shapes(link.collisions),
+        )
+        for link in robot.links
+    ]
+    joints = [
+        replace(
+            joint,
+            T_parent_joint=pose(joint.T_parent_joint),
+            limits=joint.limits and noisy(joint.limits),
+        )
+        for joint in robot.joints
+    ]
+    frames = [replace(frame, T_link_frame=pose(frame.T_link_frame)) for frame in robot.frames]
+    return replace(
+        robot,
+        links=tuple(links),
+        joints=tuple(joints),
+        frames=tuple(frames),
+        home=noisy(robot.home),
+    )
+
+
+def test_published_hashes_stay_what_they_are():
+    assert robot_hash(arm()) == "dd06919e2aa2efc559d9b0355cf237a3"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda r: replace(r, name="other"),
+        lambda r: replace(r, ignore_pairs=(("base", "lower"),)),
+        lambda r: replace(r, provenance={"derivation": "x"}),
+        lambda r: replace(r, frames=(*r.frames, Frame("camera", "upper"))),
+        lambda r: with_link(
+            r, "upper", visuals=(replace(r.link("upper").visuals[0], rgba=(0, 0, 1, 1)),)
+        ),
+        lambda r: with_joint(r, "shoulder", axis=(0, 5, 0)),
+    ],
+    ids=["name", "pairs", "provenance", "frame", "colour", "length of an axis"],
+)
+def test_what_does_not_make_the_body_does_not_count(changed):
+    assert robot_hash(changed(arm())) == robot_hash(arm())
+
+
+def test_labels_do_not_count():
+    """The same parts under other symbols are the same body, so nobody trains on it unseen."""
+    links = [replace(link, name=f"x_{link.name}") for link in arm().links]
+    joints = [
+        replace(
+            j,
+            name=f"x_{j.name}",
+            parent=f"x_{j.parent}",
+            child=f"x_{j.child}",
+            mimic=j.mimic and replace(j.mimic, joint=f"x_{j.mimic.joint}"),
+        )
+        for j in arm().joints
+    ]
+    frames = [replace(frame, link=f"x_{frame.link}") for frame in arm().frames]
+    renamed = replace(arm(), links=tuple(links), joints=tuple(joints), frames=tuple(frames))
+    assert robot_hash(renamed) == robot_hash(arm())
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda r: with_link(r, "upper", collisions=()),
+        lambda r: with_link(r, "upper", visuals=()),
+        lambda r: with_link(r, "upper", collisions=(Shape(Cylinder(0.02, 0.2401)),)),
+        lambda r: with_link(r, "base", collisions=(Shape(Box((0.1, 0.1001, 0.04))),)),
+        lambda r: with_link(r, "upper", inertial=replace(r.link("upper").inertial, mass=0.30001)),
+        lambda r: with_link(
+            r, "upper", inertial=replace(r.link("upper").inertial, com=(1e-6, 0, 0.15))
+        ),
+        lambda r: with_link(
+            r, "upper", inertial=replace(r.link("upper").inertial, inertia=(1, 0, 0, 1, 0, 1))
+        ),
+        lambda r: with_joint(r, "elbow", T_parent_joint=Pose((0, 0, 0.300001))),
+        lambda r: with_joint(
+            r, "elbow", T_parent_joint=Pose.from_xyz_rpy((0, 0, 0.3), (0, 1e-6, 0))
+        ),
+        lambda r: with_joint(r, "elbow", axis=(1, 1e-6, 0)),
+        lambda r: with_joint(r, "elbow", limits=(-2.0, 2.000001)),
+        lambda r: with_joint(r, "elbow", limits=None),
+        lambda r: with_joint(r, "elbow", kind="prismatic"),
+        lambda r: with_joint(r, "elbow", effort=51.0),
+        lambda r: with_joint(r, "elbow", velocity=None),
+        lambda r: with_joint(r, "elbow", damping=0.1),
+        lambda r: with_joint(r, "elbow", friction=0.1),
+        lambda r: with_joint(r, "right", mimic=Mimic("left", -1.0, 0.001)),
+        lambda r: with_joint(r, "right", mimic=Mimic("extend", -1.0, 0.0)),
+        lambda r: replace(r, home=(0.4, 0.5, 0.01, 0.020001)),
+        lambda r: replace(r, frames=()),
+        lambda r: replace(r, frames=(replace(r.frames[0], link="lower"),)),
+        lambda r: replace(r, frames=(replace(r.frames[0], T_link_frame=Pose((0, 0, 0.28))),)),
+    ],
+)
+def test_what_makes_the_body_counts(changed):
+    assert robot_hash(changed(arm())) != robot_hash(arm())
+
+
+def test_a_hinge_without_limits_is_continuous():
+    free = with_joint(arm(), "elbow", limits=None)
+    assert robot_hash(free) == robot_hash(with_joint(free, "elbow", kind="continuous"))
+    assert robot_hash(free) == robot_hash(
+        with_joint(arm(), "elbow", kind="continuous", limits=(-1.0, 1.0))
+    )
+
+
+def test_a_mesh_counts_by_its_content(tmp_path):
+    path, copy, other = tmp_path / "a.stl", tmp_path / "b" / "c.stl", tmp_path / "d.stl"
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
+    copy.parent.mkdir()
+    shutil.copy(path, copy)
+    trimesh.creation.box((0.1, 0.2, 0.31)).export(other)
+
+    def hashed(mesh_path, **mesh):
+        return robot_hash(
+            replace(
+                arm(),
+                links=(with_mesh(mesh_path, **mesh), *arm().links[1:]),
+                joints=tuple(
+                    replace(j, parent="hull") if j.parent == "base" else j for j in arm().joints
+                ),
+            )
+        )
+
+    same = hashed(path)
+    assert hashed(copy) == same
+    different = [hashed(other), hashed(path, scale=(1, 1, 1.01)), hashed(path, part=0)]
+    assert len({same, *different}) == 4
+    shutil.copy(other, copy)
+    assert hashed(copy) == hashed(other), "a file that has changed is read again"
+    with pytest.raises(Exception, match=r"no\.stl: cannot be read"):
+        hashed(tmp_path / "no.stl")
+
+
+@pytest.mark.parametrize(
+    "words", ["arm=ur5 ee=stick", "arm=lwr ee=panda_hand", "chain beads=4", "arm=widowx"]
+)
+def test_the_last_bits_do_not_count(words):
+    derivation, _ = parse_words(words.split(), LIBRARY)
+    robot = compose(derivation, LIBRARY, "r")
+    rng = np.random.default_rng(0)
+    hashes = {robot_hash(jittered(robot, 1e-13, rng)) for _ in range(20)}
+    assert hashes == {robot_hash(robot)}
+    assert robot_hash(jittered(robot, 1e-5, rng)) not in hashes
+
+
+@pytest.mark.parametrize("part", [1, 2, 3, 4, 5, 6, 8, 10])
+def test_sizes_that_people_write_are_far_from_where_rounding_changes(part):
+    """Also at the half, third and so on of the smallest step that counts."""
+
+    def hashed(z):
+        return robot_hash(with_joint(arm(), "elbow", T_parent_joint=Pose((0.0, 0.0, z))))
+
+    for steps in range(1, 60):
+        z = steps * 1e-7 / part
+        assert hashed(z - 5e-10) == hashed(z) == hashed(z + 5e-10)
+
+
+def test_a_member_is_composed_under_its_name():
+    robot = member_robot(member("arm=ur5 ee=plane", "mine"), LIBRARY)
+    assert (robot.name, len(robot.links)) == ("mine", 10)
+    assert robot.ignore_pairs
+
+
+def test_a_robot_of_another_body_is_refused():
+    changed = member("base=gantry ee=plane", body="0" * 32)
+    own = member("base=gantry ee=plane").body
+    with pytest.raises(BenchmarkError, match=f"'gantry-plane'.*{'0' * 32}.*{own}"):
+        member_robot(changed, LIBRARY)
+
+
+def test_a_member_that_cannot_be_composed_says_why():
+    with pytest.raises(PartError, match="unknown part 'plnae'"):
+        member_robot(member("base=gantry ee=plane", derivation="base=plnae"), LIBRARY)
+    with pytest.raises(GrammarError, match=r"derivation of 'mine'.*no derivation"):
+        member_robot(member("base=gantry ee=plane", "mine", derivation="base"), LIBRARY)
+
+
+def test_robots_are_composed_when_asked_for():
+    good, broken = member("base=gantry ee=plane"), member("base=gantry ee=cube", body="0" * 32)
+    split = Split("s", "composition", "", (good, broken), (good,))
+    train = robots(split, "train", LIBRARY)
+    assert next(train).name == "gantry-plane"
+    with pytest.raises(BenchmarkError):
+        next(train)
+    assert [robot.name for robot in robots(split, "test", LIBRARY)] == ["gantry-plane"]
+
+
+def split_of_two():
+    a, b = (
+        Member(f"r{i}", "arm3", f"arm3=arm3(length=0.{i})", "reach", False, str(i) * 32)
+        for i in (1, 2)
+    )
+    return Split("s", "interpolation", "one", (a, b), (replace(b, name="r3"),), {"seed": 1})
+
+
+def test_the_id_is_of_regime_and_robots_alone():
+    split = split_of_two()
+    same = replace(
+        split,
+        name="t",
+        summary="two",
+        made={},
+        accepted={"hull": "why"},
+        reference="a paper",
+        statistics={"n": 1},
+    )
+    assert split_id(same) == split_id(split)
+    assert len(split_id(split)) == 32
+    first, second = split.train
+    others = [
+        replace(split, regime="extrapolation"),
+        replace(split, train=(second, first)),
+        replace(split, train=(first,)),
+        replace(split, train=split.test, test=split.train),
+        replace(split, train=(first,), test=(second, *split.test)),
+        *(
+            replace(split, train=(replace(first, **change), second))
+            for change in (
+                {"name": "x"},
+                {"category": "x"},
+                {"derivation": "x"},
+                {"task": "push"},
+                {"obstacles": True},
+                {"body": "x"},
+            )
+        ),
+    ]
+    assert len({split_id(split), *map(split_id, others)}) == 1 + len(others)

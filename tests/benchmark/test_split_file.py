@@ -1,0 +1,253 @@
+"""The file of a split: found, written, read back, and told apart line by line."""
+
+import string
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from commands import tree
+from hypothesis import given
+from hypothesis import strategies as st
+
+from morphgen.benchmark.split import Member, Split, split_id
+from morphgen.benchmark.split_file import (
+    find_split,
+    read_split,
+    read_split_file,
+    split_names,
+    split_text,
+    write_split,
+)
+from morphgen.benchmark.split_reader import parse_split
+from morphgen.errors import BenchmarkError
+
+DERIVATION = "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size=0.1, thickness=0.01)]]"
+
+
+def robot(name="ur5-plane", **changes):
+    return replace(Member(name, "composed", DERIVATION, "reach", False, "0a" * 16), **changes)
+
+
+SPLIT = Split(
+    "mine/first",
+    "composition",
+    "A UR5: with a plane, or not",
+    (robot(), robot("arm3-000001", category="arm3", body="1e5" + "0" * 29)),
+    (robot("ur5-stick", task="push", obstacles=True),),
+    {"seed": 3, "train": 2, "from": ["arm={ur5}"], "seeds": {"arm3": 17}},
+    {"part-unseen": "the paper's own: so it is"},
+    "a paper, table 1",
+    {"train": {"links": 10.5}},
+)
+
+
+def lines_of(split):
+    return split_text(split).splitlines(keepends=True)
+
+
+@pytest.fixture
+def written(tmp_path):
+    path = tmp_path / "mine.yaml"
+    write_split(SPLIT, path)
+    return path
+
+
+def test_what_is_written_is_read(written):
+    assert read_split(written) == SPLIT
+    assert read_split(str(written)) == SPLIT
+    read = read_split_file(written)
+    assert (read.id, read.is_whole, read.path) == (split_id(SPLIT), True, written)
+    assert read.version == "0.1.0"
+
+
+def test_the_same_split_gives_the_same_bytes(written):
+    assert written.read_bytes() == split_text(SPLIT).encode()
+    assert split_text(read_split(written)) == split_text(SPLIT)
+
+
+def test_a_robot_has_a_line_of_its_own():
+    text = split_text(SPLIT)
+    for member in (*SPLIT.train, *SPLIT.test):
+        (line,) = [line for line in text.splitlines() if member.name in line]
+        assert member.derivation in line
+        assert member.body in line
+    fewer = replace(SPLIT, train=SPLIT.train[:1])
+    gone = set(text.splitlines()) - set(split_text(fewer).splitlines())
+    assert len(gone) == 2, "the robot's line and the id"
+
+
+def test_other_readers_of_yaml_see_the_same():
+    data = yaml.safe_load(split_text(SPLIT))
+    assert data["id"] == split_id(SPLIT)
+    assert data["train"][1]["body"] == SPLIT.train[1].body
+    assert data["test"][0]["obstacles"] is True
+    assert data["made"] == SPLIT.made
+
+
+def test_what_is_empty_is_left_out():
+    bare = Split("s", "interpolation", "x", SPLIT.train, SPLIT.test)
+    text = split_text(bare)
+    assert not any(f"{key}:" in text for key in ("made", "accepted", "statistics", "reference"))
+    assert parse_split(text, Path("s.yaml")).split == bare
+
+
+NAMES = st.text(string.ascii_letters + string.digits, min_size=1, max_size=6)
+TEXTS = st.text(string.printable[:95] + "äß漢😀", min_size=1)
+
+
+@given(NAMES, NAMES | st.sampled_from(["no", "null", "y", "1e5", "0x1F", "12:30", "~"]), TEXTS)
+def test_any_text_comes_back_as_it_was(name, category, text):
+    odd = replace(
+        SPLIT,
+        name=name,
+        summary=text,
+        train=(robot(name, category=category, derivation=text),),
+        made={"from": [text], category: text},
+        accepted={"hull": text},
+    )
+    assert parse_split(split_text(odd), Path("s.yaml")).split == odd
+
+
+def test_two_thousand_robots_are_read_and_written_at_once():
+    many = tuple(robot(f"arm3-{i:06d}") for i in range(2000))
+    started = time.process_time()
+    text = split_text(replace(SPLIT, train=many))
+    assert parse_split(text, Path("s.yaml")).split.train == many
+    assert time.process_time() - started < 3
+    assert len(text.splitlines()) < 2030
+
+
+def test_a_file_that_was_changed_is_refused_unless_asked_for(written):
+    text = written.read_text()
+    written.write_text(text.replace("size=0.1,", "size=0.2,", 1))
+    with pytest.raises(BenchmarkError) as caught:
+        read_split(written)
+    found = read_split_file(written)
+    assert not found.is_whole
+    place = f"{written}:{found.id_line}: id: {split_id(SPLIT)} is not that of its robots, which is "
+    assert str(caught.value).startswith(place + split_id(found.split))
+    assert text.splitlines()[found.id_line - 1].startswith("id: ")
+    written.write_text(text.replace("A UR5", "My UR5"))
+    assert read_split(written).summary.startswith("My UR5")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "further", "message"),
+    [
+        ("regime: composition", "regime: compostion", 0, "regime: unknown 'compostion'; did you"),
+        ("format: 1", "format: 2", 0, "format: '2' is not known to this morphgen; valid: 1"),
+        ("format: 1", "fromat: 1", 0, "unknown key 'fromat'; did you mean 'format'?"),
+        ("summary: ", "name: x\nsummary: ", 0, "key 'name' is there twice"),
+        ("summary: ", "summary: # ", 0, "summary: expected text, not None"),
+        ("name: mine/first", "name: [a, b]", 0, "name: expected text, not ['a', 'b']"),
+        ("name: mine/first", "name: 12", 0, "name: expected text, not 12"),
+        ("made:\n", "made: 5 #\n", 1, "no valid YAML: "),
+        ("regime: ", "regime: [", 1, "no valid YAML: "),
+        ("made:\n", "\tmade:\n", 0, "no valid YAML: "),
+        ("test:\n- ", "test: []\n# ", 0, "test: expected a list of robots, one at least"),
+        ("test:\n- ", "test: x\n# ", 0, "test: expected a list of robots, one at least"),
+        ("test:\n- ", "tset:\n- ", 0, "unknown key 'tset'; did you mean 'test'?"),
+        ("task: push", "task: pull", 0, "task: unknown 'pull'; did you mean 'push'?"),
+        ("obstacles: true", "obstacles: maybe", 0, "obstacles: 'maybe'; valid: false, true"),
+        ("name: ur5-stick", "nmae: ur5-stick", 0, "unknown key 'nmae'; did you mean 'name'?"),
+        ("name: ur5-stick, ", "", 0, "a robot of test lacks 'name'"),
+        ("name: ur5-stick", "name: ../x", 0, "name: '../x': use letters, digits"),
+        ("name: arm3-000001", "name: ur5-plane", 0, "train: two robots are named 'ur5-plane'"),
+        ('body: "1e5', 'body: "1g5', 0, "body: '1g500"),
+        ("seed: 3", "seed: &a [*a]", 0, "no valid YAML: found unconstructable recursive node"),
+        (
+            "accepted:\n  part",
+            "accepted: x\n# part",
+            0,
+            "accepted: expected a reason for every code",
+        ),
+        ("statistics:\n", "statistics: x\n#", 0, "statistics: expected keys and values"),
+        ("part-unseen: ", "part-unseen: 5 #", 0, "accepted part-unseen: expected text, not 5"),
+    ],
+)
+def test_what_is_wrong_is_told_by_its_line(written, old, new, further, message):
+    before, found, after = written.read_text().partition(old)
+    assert found
+    written.write_text(before + new + after)
+    with pytest.raises(BenchmarkError) as caught:
+        read_split(written)
+    line = before.count("\n") + 1 + further
+    assert str(caught.value).startswith(f"{written}:{line}: {message}")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", ": is empty; expected a split"),
+        (b"# nothing\n", ": is empty; expected a split"),
+        (b"- a\n", ":1: no split: expected 'format: 1'"),
+        (b"just words", ":1: no split: expected 'format: 1'"),
+        (b"a: \xff\xfe", ": cannot be read: no UTF-8 text"),
+        (b"a: \x00", ": no valid YAML: "),
+        (b"a: 1\n---\nb: 2\n", ":2: no valid YAML: "),
+        (b"format: 1\n? [a]\n: b\n", ":2: unknown key"),
+    ],
+)
+def test_what_is_no_split_is_refused(tmp_path, content, message):
+    path = tmp_path / "x.yaml"
+    path.write_bytes(content)
+    with pytest.raises(BenchmarkError) as caught:
+        read_split(path)
+    assert str(caught.value).startswith(f"{path}{message}")
+
+
+def test_splits_are_found_by_name_or_path(written, tmp_path, monkeypatch):
+    assert find_split("interpolation/arm3/reach").name == "reach.yaml"
+    assert find_split("mine", [tmp_path]) == written
+    monkeypatch.chdir(tmp_path)
+    assert find_split("mine.yaml") == Path("mine.yaml")
+    (tmp_path / "plain").write_text(split_text(SPLIT))
+    assert find_split("plain") == Path("plain")
+    assert read_split("plain") == SPLIT
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("interpolation/arm3/reech", "did you mean 'interpolation/arm3/reach'?"),
+        ("nowhere.yaml", "nowhere.yaml: no such file"),
+        ("../../split", "unknown split '../../split'"),
+        ("", "unknown split ''"),
+    ],
+)
+def test_a_split_that_is_not_there_names_the_nearest(name, message):
+    with pytest.raises(BenchmarkError, match=message.replace("?", r"\?")):
+        find_split(name)
+
+
+def test_every_name_is_a_split_of_that_name():
+    assert [read_split(name).name for name in split_names()] == split_names()
+
+
+@pytest.mark.parametrize("name", ["", "/x", "x/", "../x", "a b", ".x", "x//y", "x/../y"])
+def test_a_name_that_is_no_file_is_refused(name):
+    with pytest.raises(BenchmarkError, match="use letters, digits"):
+        split_text(replace(SPLIT, name=name))
+
+
+@pytest.mark.parametrize("name", ["", "../x", "a b", ".x", "n" * 201])
+def test_a_robots_name_that_is_no_folder_is_refused(name):
+    with pytest.raises(BenchmarkError, match="robot name"):
+        split_text(replace(SPLIT, test=(robot(name),)))
+
+
+def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    before = tree(tmp_path)
+    with pytest.raises(BenchmarkError, match=r"cannot write .*file/x\.yaml: "):
+        write_split(SPLIT, tmp_path / "file" / "x.yaml")
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_split(SPLIT, tmp_path / "x.yaml")
+    assert tree(tmp_path) == before

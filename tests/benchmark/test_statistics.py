@@ -1,0 +1,88 @@
+"""A split in numbers, ours and the paper's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splits import LIBRARY, combined, member, split
+
+from morphgen.benchmark.paper import PAPER, figures_of, robot_set
+from morphgen.benchmark.similarity import cosine, features
+from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.benchmark.statistics import statistics
+from morphgen.errors import BenchmarkError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.model.kinematics import reach
+
+
+def test_counts_are_means_over_the_robots_of_a_side():
+    found = statistics(split(["base=gantry ee=plane", "cubes"], ["chain beads=2"]), LIBRARY)
+    assert (found["train"]["robots"], found["test"]["robots"]) == (2, 1)
+    for key, gantry, cubes, chain in (
+        ("links", 7, 3, 10),
+        ("movable", 5, 2, 7),
+        ("movable_to_tool", 5, 2, 7),
+    ):
+        assert found["train"][key] == (gantry + cubes) / 2
+        assert found["test"][key] == chain
+
+
+def test_joints_beyond_the_tool_and_mimic_joints_count_as_movable_only():
+    found = statistics(split(["arm=lwr ee=claw"], ["arm=lwr ee=plane"]), LIBRARY)
+    assert (found["train"]["movable"], found["train"]["movable_to_tool"]) == (11, 7)
+    assert (found["test"]["movable"], found["test"]["movable_to_tool"]) == (7, 7)
+
+
+def test_masses_reaches_and_cosines_have_mean_and_range():
+    made = combined()
+    found = statistics(made, LIBRARY)
+    robots = [member_robot(m, LIBRARY) for m in made.train]
+    (test,) = (member_robot(m, LIBRARY) for m in made.test)
+    alike = [
+        cosine(features(test, token_shapes(test)), features(robot, token_shapes(robot)))
+        for robot in robots
+    ]
+    for got, values in (
+        (found["train"]["mass"], [robot.mass for robot in robots]),
+        (found["train"]["reach"], [reach(robot) for robot in robots]),
+        (found["cosine"], alike),
+    ):
+        expected = {"mean": np.mean(values), "min": min(values), "max": max(values)}
+        assert got == pytest.approx(expected, abs=5e-5)
+
+
+def test_a_body_at_two_tasks_is_two_robots_and_one_body():
+    reaching = replace(member("cubes"), name="reaching", task="reach")
+    found = statistics(split(["cubes", reaching], ["base=gantry ee=cube"]), LIBRARY)
+    assert (found["train"]["robots"], found["train"]["bodies"]) == (2, 1)
+
+
+def test_processes_change_nothing():
+    cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
+    made = split(cubes, ["base=gantry ee=cube"])
+    assert statistics(made, LIBRARY, jobs=2) == statistics(made, LIBRARY)
+
+
+def test_a_robot_that_cannot_be_composed_has_no_figures():
+    wrong = replace(member("cubes"), derivation="cubes=cubez")
+    with pytest.raises(
+        BenchmarkError, match=r"'mine/some': robot 'cubes': .*'cubez'; did you mean"
+    ):
+        statistics(split([wrong], ["chain"]), LIBRARY)
+    with pytest.raises(BenchmarkError, match="a side without robots"):
+        statistics(split(["cubes"], []), LIBRARY)
+
+
+def test_every_row_of_the_paper_has_scenarios_and_few_scenarios_no_row():
+    sets = {robot_set(name) for name in split_names()}
+    assert set(PAPER) <= sets
+    assert sets - set(PAPER) == {"extrapolation/arms-small"}
+    assert figures_of("extrapolation/arms/push") is PAPER["extrapolation/arms"]
+    assert figures_of("mine/arms/push") is None
+
+
+@pytest.mark.parametrize("name", ["extrapolation/primitives/reach", "composition/ee-task"])
+def test_scenarios_of_templates_and_few_meshes_have_the_papers_counts(name):
+    ours, theirs = statistics(read_split(name), LIBRARY)["train"], figures_of(name)
+    assert (ours["links"], ours["movable"]) == (theirs.links, theirs.movable)

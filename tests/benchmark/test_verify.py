@@ -1,0 +1,306 @@
+"""A split that is not what it claims to be is told, robot by robot."""
+
+import hashlib
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splits import LIBRARY, TRAIN, combined, member, split
+
+from morphgen.benchmark.contents import Settings
+from morphgen.benchmark.export import build
+from morphgen.benchmark.split import split_id
+from morphgen.benchmark.split_file import split_names, split_text
+from morphgen.benchmark.token_layout import GEOMETRY, ORIGIN, PARENT
+from morphgen.benchmark.verify import verify
+from morphgen.errors import BenchmarkError
+
+LIGHT = Settings(light=True)
+
+
+def found(path, **options):
+    """Where and why of every difference."""
+    return [(each.where, each.why) for each in verify(path, LIBRARY, **options).differences]
+
+
+def written(folder, made):
+    path = folder / "some.yaml"
+    path.write_text(split_text(made))
+    return path
+
+
+@pytest.fixture(params=[Settings(), LIGHT], ids=["bundles", "light"])
+def whole(tmp_path, request):
+    return build(combined(), tmp_path / "whole", LIBRARY, settings=request.param).folder
+
+
+@pytest.fixture
+def bundles(tmp_path):
+    return build(combined(), tmp_path / "whole", LIBRARY).folder
+
+
+def summed(folder):
+    """Write the sums anew, so that they hide what was changed."""
+    lines = (folder / "SHA256SUMS").read_text().splitlines()
+    names = [line[66:] for line in lines]
+    sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    text = "".join(f"{value}  {name}\n" for name, value in sums.items())
+    (folder / "SHA256SUMS").write_text(text)
+
+
+def test_a_file_that_was_not_touched_is_verified(tmp_path):
+    made = combined()
+    seen = verify(written(tmp_path, made), LIBRARY)
+    assert (seen.split, seen.id, seen.differences) == (made, split_id(made), ())
+
+
+def test_a_shipped_split_is_verified_by_its_name():
+    assert "composition/ee-task" in split_names()
+    assert found("composition/ee-task") == []
+
+
+def test_a_line_that_was_changed_is_told_by_the_robots_name_and_by_the_id(tmp_path):
+    path = written(tmp_path, combined())
+    path.write_text(path.read_text().replace("cube(size=0.1)", "cube(size=0.11)"))
+    (file, id_), (robot, why) = found(path)
+    assert (file, id_.startswith(f"its id is {split_id(combined())}, but that of")) == (
+        str(path),
+        True,
+    )
+    assert robot == "planar-cube"
+    assert "was made with body" in why
+
+
+def test_a_robot_that_was_left_out_is_told_by_the_id(tmp_path):
+    path = written(tmp_path, combined())
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if "gantry-plane" not in line))
+    ((where, why),) = found(path)
+    assert (where, "its id is" in why) == (str(path), True)
+
+
+def test_words_about_a_split_may_be_changed(tmp_path):
+    path = written(tmp_path, combined())
+    path.write_text(path.read_text().replace("a split of a test", "another summary"))
+    assert found(path) == []
+
+
+@pytest.mark.parametrize(
+    ("derivation", "why"),
+    [
+        ("base=planar[top: ee=cubw]", "unknown part 'cubw'; did you mean 'cube'?"),
+        ("base=planar[top: ee=cube(size=9)]", "out of range"),
+        ("base=planar[", "no derivation"),
+    ],
+)
+def test_a_robot_that_cannot_be_composed_is_told(tmp_path, derivation, why):
+    wrong = replace(member(TRAIN[1]), derivation=derivation)
+    path = written(tmp_path, combined(train=[TRAIN[0], wrong]))
+    ((where, told),) = found(path)
+    assert (where, why in told) == ("planar-cube", True)
+
+
+def test_every_member_of_a_wrong_derivation_is_told(tmp_path):
+    wrong = replace(member(TRAIN[0]), body="0" * 32)
+    path = written(tmp_path, combined(train=[wrong, replace(wrong, name="again", task="reach")]))
+    assert [where for where, _ in found(path)] == ["gantry-plane", "again"]
+
+
+def test_a_built_split_is_verified_wherever_it_was_moved_to(whole, tmp_path):
+    whole.rename(tmp_path / "elsewhere")
+    seen = []
+    assert found(tmp_path / "elsewhere", progress=lambda *counts: seen.append(counts)) == []
+    assert seen == [(i, 4) for i in (1, 2, 3, 4)]
+
+
+def test_processes_change_nothing(tmp_path):
+    cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
+    made = split(cubes, ["base=planar ee=plane"])
+    folder = build(made, tmp_path / "data", LIBRARY, settings=LIGHT).folder
+    (folder / "robots" / "cube-3" / "robot.urdf").unlink()
+    assert [where for where, _ in found(folder)] == ["cube-3"]
+    assert found(folder, jobs=2) == found(folder)
+
+
+@pytest.mark.parametrize(
+    ("path", "where"),
+    [
+        ("robots/planar-cube/robot.urdf", "planar-cube"),
+        ("robots.jsonl", "robots.jsonl"),
+        ("tokens.npz", "tokens.npz"),
+        ("README.md", "README.md"),
+    ],
+)
+@pytest.mark.parametrize("change", ["cut", "longer", "gone"])
+def test_a_file_that_was_damaged_is_told(whole, path, where, change):
+    data = (whole / path).read_bytes()
+    match change:
+        case "cut":
+            (whole / path).write_bytes(data[: len(data) // 2])
+        case "longer":
+            (whole / path).write_bytes(data + b"\n")
+        case "gone":
+            (whole / path).unlink()
+    told = found(whole)
+    why = "is missing, but SHA256SUMS names it" if change == "gone" else "is not what SHA256SUMS"
+    file = path.rpartition("/")[2]
+    assert (where, True) in [(place, f"file {file} {why}" in text) for place, text in told]
+    assert {place for place, _ in told} <= {where, "gantry-plane"}
+
+
+def test_a_file_too_many_is_told(whole):
+    (whole / "robots" / "planar-cube" / "notes.txt").write_text("mine")
+    (whole / "robots" / "stranger").mkdir()
+    (whole / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
+    assert found(whole) == [
+        ("planar-cube", "file notes.txt is not named by SHA256SUMS"),
+        ("stranger", "file robot.urdf is not named by SHA256SUMS"),
+    ]
+
+
+def test_a_urdf_that_was_changed_with_its_sums_is_not_the_robots(whole):
+    path = whole / "robots" / "planar-cube" / "robot.urdf"
+    path.write_text(path.read_text().replace('effort="', 'effort="1', 1))
+    card = path.with_name("card.json")
+    if card.is_file():
+        data = json.loads(card.read_text())
+        data["hashes"]["robot.urdf"] = hashlib.sha256(path.read_bytes()).hexdigest()
+        card.write_text(json.dumps(data))
+    summed(whole)
+    assert found(whole) == [("planar-cube", "file robot.urdf is not the robot's")]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("mass", 3.0), ("home", {}), ("ignore_pairs", [["a", "b"]]), ("dof", 4)]
+)
+def test_a_card_that_was_changed_with_its_sums_is_not_the_robots(bundles, key, value):
+    path = bundles / "robots" / "planar-cube" / "card.json"
+    card = json.loads(path.read_text())
+    path.write_text(json.dumps(card | {key: value}))
+    summed(bundles)
+    assert found(bundles) == [("planar-cube", f"file card.json: its {key!r} is not the robot's")]
+
+
+def test_a_card_of_another_machine_may_differ_in_the_last_digits(bundles):
+    path = bundles / "robots" / "planar-cube" / "card.json"
+    card = json.loads(path.read_text())
+    path.write_text(json.dumps(card | {"reach": card["reach"] * (1 + 1e-9)}))
+    summed(bundles)
+    assert found(bundles) == []
+
+
+def test_meshes_of_a_real_arm_are_verified(tmp_path):
+    made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
+    folder = build(made, tmp_path / "data", LIBRARY).folder
+    assert found(folder) == []
+    mesh = next((folder / "robots" / "ur5-plane" / "meshes").iterdir())
+    mesh.write_bytes(mesh.read_bytes()[:-1] + b"\x01")
+    ((where, why),) = found(folder)
+    assert (where, why) == (
+        "ur5-plane",
+        f"file meshes/{mesh.name} is not what SHA256SUMS was written for",
+    )
+    summed(folder)
+    ((where, why),) = found(folder)
+    assert (where, f"file meshes/{mesh.name}: its content is not" in why) == ("ur5-plane", True)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (
+            lambda records: records[1].update(mass=1.5),
+            ("planar-cube", "robots.jsonl:2: mass is 1.5, not"),
+        ),
+        (
+            lambda records: records[3].update(side="train"),
+            ("planar-plane", "robots.jsonl:4: side is 'train', not 'test'"),
+        ),
+        (
+            lambda records: records[0].pop("task"),
+            ("gantry-plane", "robots.jsonl:1: task is None, not 'push'"),
+        ),
+        (lambda records: records.pop(), ("robots.jsonl", "it has 3 robots, not 4")),
+    ],
+)
+def test_a_record_that_was_changed_with_its_sums_is_told(whole, change, expected):
+    path = whole / "robots.jsonl"
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    change(records)
+    path.write_text("".join(json.dumps(record) + "\n" for record in records))
+    summed(whole)
+    ((where, why),) = found(whole)
+    assert (where, why.startswith(expected[1])) == (expected[0], True)
+
+
+def changed_tokens(folder, change):
+    with np.load(folder / "tokens.npz") as data:
+        arrays = dict(data)
+    change(arrays)
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    (folder / "tokens.npz").write_bytes(content.getvalue())
+    summed(folder)
+
+
+@pytest.mark.parametrize("field", [PARENT, ORIGIN, GEOMETRY])
+def test_tokens_that_were_changed_with_their_sums_are_told(whole, field):
+    def change(arrays):
+        arrays["tokens"][1, 2, field.start] += 0.01
+
+    changed_tokens(whole, change)
+    why = f"tokens.npz: {field.name} of link 2 is not the robot's"
+    assert found(whole) == [("planar-cube", why)]
+
+
+def test_tokens_that_are_not_numbers_are_told(whole):
+    changed_tokens(whole, lambda arrays: arrays["tokens"].__setitem__((0, 0, 5), np.nan))
+    assert [where for where, _ in found(whole)] == ["gantry-plane"]
+
+
+def test_a_mask_and_names_are_compared_too(whole):
+    changed_tokens(whole, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
+    assert found(whole) == [
+        ("gantry-cylinder", "tokens.npz: its mask is not that of its links"),
+    ]
+    changed_tokens(whole, lambda arrays: arrays["names"].__setitem__(0, "other"))
+    assert found(whole) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
+
+
+def test_a_split_that_was_exchanged_is_told(whole):
+    other = combined(test=["base=planar ee=cylinder"])
+    (whole / "split.yaml").write_text(split_text(other))
+    summed(whole)
+    told = found(whole)
+    assert ("build.json", f"it is of split {split_id(combined())}, not of split.yaml") in told
+    assert ("planar-cylinder", "its folder is missing") in told
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "message"),
+    [
+        ("build.json", None, "is no built split: it has no build.json"),
+        ("build.json", b"[]", "build.json: does not say how the split was built"),
+        ("build.json", b'{"format": 2}', "build.json: format 2; this version reads 1"),
+        ("SHA256SUMS", None, "is not finished"),
+        ("SHA256SUMS", b"abc\n", "SHA256SUMS:1: expected a hash, two spaces and a path"),
+        ("split.yaml", None, "split.yaml: cannot be read"),
+        ("split.yaml", b"format: 1\n", "split.yaml:1: a split lacks"),
+    ],
+)
+def test_what_cannot_be_verified_at_all_is_refused(bundles, path, content, message):
+    if content is None:
+        (bundles / path).unlink()
+    else:
+        (bundles / path).write_bytes(content)
+    with pytest.raises(BenchmarkError, match=message):
+        verify(bundles, LIBRARY)
+
+
+def test_what_is_no_split_is_refused(tmp_path):
+    with pytest.raises(BenchmarkError, match="unknown split 'interpolation/arm4/reach'; did you"):
+        verify("interpolation/arm4/reach", LIBRARY)
+    with pytest.raises(BenchmarkError, match="is no built split"):
+        verify(tmp_path, LIBRARY)

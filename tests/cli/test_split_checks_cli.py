@@ -1,0 +1,223 @@
+"""``morphgen split audit``, ``build``, ``verify`` and ``stats``: what they print and refuse."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from commands import tree
+from splits import TEST, TRAIN, combined, member, split
+
+from morphgen.benchmark.built import load_built
+from morphgen.benchmark.paper import PAPER
+from morphgen.benchmark.split import split_id
+from morphgen.benchmark.split_file import split_names, split_text
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a split's file; return its name."""
+
+    def written(made, name="some.yaml"):
+        (tmp_path / name).write_text(split_text(made))
+        return name
+
+    return written
+
+
+def leaky():
+    """A split whose test robots are all known in some way."""
+    twin = member(TRAIN[0], "twin")
+    near = member(f"{TRAIN[1]} ee.size=100.1mm", "near")
+    return combined(test=[*TEST, twin, near, "base=planar ee=sphere"])
+
+
+def test_a_sound_split_passes_the_audit(run, write):
+    code, out, err = run("split", "audit", write(combined()))
+    assert (code, err) == (0, "")
+    header, _, row, verdict = out.splitlines()
+    assert header.split("  ")[0] == "test robot"
+    assert [row.count(name) for name in ("planar-plane", "planar-cube")] == [1, 3]
+    assert verdict == "mine/some: passed: 0 error, 0 warning, 0 accepted"
+
+
+def test_a_leaky_split_fails_and_says_why(run, write):
+    code, out, err = run("split", "audit", write(leaky()))
+    assert (code, err) == (1, "")
+    lines = out.splitlines()
+    i = lines.index("error body-shared (1)")
+    assert lines[i + 1 : i + 3] == [
+        "  test robot twin: train robot gantry-plane has the same body, and learns the same task",
+        "    fix: leave it out of one side",
+    ]
+    for line in ("error body-near (1)", "error combination-seen (2)", "error part-unseen (1)"):
+        assert line in lines
+    assert lines[-1] == "mine/some: FAILED: 5 error, 0 warning, 0 accepted"
+
+
+def test_what_is_near_can_be_said(run, write):
+    path = write(split([*TRAIN, member(f"{TEST[0]} ee.size=0.2", "large")], TEST))
+    assert "body-near" not in run("split", "audit", path)[1]
+    assert "error body-near (1)" in run("split", "audit", path, "--near", "0.05,0.99")[1]
+
+
+def test_accepted_findings_are_listed_and_do_not_fail(run, write):
+    reasons = {"part-unseen": "a sphere on purpose"}
+    path = write(combined(test=["base=planar ee=sphere"], accepted=reasons))
+    code, out, _ = run("split", "audit", path)
+    assert code == 0
+    assert "accepted part-unseen (1): a sphere on purpose" in out
+    assert out.splitlines()[-1] == "mine/some: passed: 0 error, 0 warning, 1 accepted"
+
+
+def test_warnings_fail_if_asked_to(run, write):
+    path = write(combined(accepted={"hull": "nobody knows"}))
+    code, out, _ = run("split", "audit", path)
+    assert (code, "warning accepted-unused (1)" in out) == (0, True)
+    assert run("split", "audit", path, "--strict")[0] == 1
+
+
+def test_many_findings_are_cut_short(run, write):
+    many = [replace(member(TRAIN[0], f"robot-{i}"), body=f"{i:032d}") for i in range(14)]
+    _, out, _ = run("split", "audit", write(combined(train=[*TRAIN, *many])))
+    lines = out.splitlines()
+    i = lines.index("error body-changed (14)")
+    assert lines[i + 11] == "  and 4 more (--json lists all)"
+
+
+def test_an_audit_is_json_alone(run, write):
+    code, out, err = run("split", "audit", write(leaky()), "--json")
+    assert (code, err) == (1, "")
+    data = json.loads(out)
+    assert (data["split"], data["passed"]) == ("mine/some", False)
+    assert {each["code"] for each in data["findings"]} == {
+        "body-shared",
+        "body-near",
+        "combination-seen",
+        "part-unseen",
+    }
+    assert data["nearest"]["twin"]["tree"] == {"train": "gantry-plane", "value": 0.0}
+
+
+def test_a_missing_part_fails_the_audit_and_is_named(run, write):
+    wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
+    code, out, err = run("split", "audit", write(combined(train=[*TRAIN[::2], wrong])))
+    assert (code, err) == (1, "")
+    assert "error part-missing (1)" in out
+    assert "the library has no part 'cubw'; did you mean 'cube'" in out
+    assert "fix: name the folder of your parts with --library" in out
+
+
+def test_a_build_says_where_it_is_and_verifies(run, write):
+    path = write(combined())
+    code, out, err = run("split", "build", path, "--light")
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        "data/mine/some: 4 robots made, 0 were there",
+        "test it anywhere: morphgen split verify data/mine/some",
+    ]
+    first = tree(Path("data"))
+    code, out, _ = run("split", "build", path, "--light", "--json")
+    assert json.loads(out) == {"folder": "data/mine/some", "made": 0, "kept": 4}
+    assert tree(Path("data")) == first
+    assert len(load_built("data/mine/some").train) == 3
+    for what in (path, "data/mine/some"):
+        code, out, err = run("split", "verify", what)
+        assert (code, err) == (0, "")
+        assert out == f"mine/some, id {split_id(combined())}: all 4 robots are the same\n"
+
+
+def test_what_differs_is_printed_by_robot(run, write):
+    run("split", "build", write(combined()), "--out", "out")
+    folder = Path("out/mine/some/robots/planar-cube")
+    (folder / "robot.xml").write_text("<mujoco/>")
+    code, out, err = run("split", "verify", "out/mine/some")
+    assert (code, err) == (1, "")
+    assert out.splitlines() == [
+        f"mine/some, id {split_id(combined())}: 1 difference",
+        "  planar-cube: file robot.xml is not what SHA256SUMS was written for",
+    ]
+    code, out, _ = run("split", "verify", "out/mine/some", "--json")
+    data = json.loads(out)
+    assert (code, data["passed"]) == (1, False)
+    assert [each["where"] for each in data["differences"]] == ["planar-cube"]
+
+
+def test_stats_put_the_papers_figures_beside_ours(run):
+    code, out, err = run("split", "stats", "composition/ee-task", "extrapolation/primitives/reach")
+    assert (code, err) == (0, "")
+    _, _, task, primitives, _, _, source = out.splitlines()
+    assert [cell.strip() for cell in task.split("  ") if cell][:6] == [
+        "composition/ee-task",
+        "4",
+        "1",
+        "7.75 (7.75)",
+        "5.25 (5.25)",
+        "5.25 (-)",
+    ]
+    assert "6.6 (6.6)" in primitives
+    assert "(0.45)" in primitives
+    assert "arXiv 2505.14986" in source
+
+
+def test_splits_of_the_same_robots_share_a_row(run, write):
+    path = write(combined(name="mine/some/push"))
+    reach = combined(name="mine/some/reach")
+    sides = [tuple(replace(m, task="reach") for m in side) for side in (reach.train, reach.test)]
+    other = write(replace(reach, train=sides[0], test=sides[1]), "other.yaml")
+    code, out, _ = run("split", "stats", path, other, "--json")
+    (row,) = json.loads(out)["rows"]
+    assert code == 0
+    assert (row["robots"], row["splits"]) == ("mine/some", ["mine/some/push", "mine/some/reach"])
+    assert (row["ours"]["train"]["robots"], row["paper"]) == (3, None)
+
+
+def test_stats_can_be_markdown(run, write):
+    _, out, _ = run("split", "stats", write(combined()), "--markdown")
+    header, rule, row = out.splitlines()[:3]
+    assert header.startswith("| robots")
+    assert set(rule) <= set("|-:")
+    assert row.startswith("| mine/some")
+
+
+@pytest.mark.slow
+def test_all_scenarios_have_a_row_and_pass_their_audit(run):
+    _, out, _ = run("split", "stats", "--json")
+    rows = json.loads(out)["rows"]
+    assert {row["robots"] for row in rows} >= set(PAPER)
+    assert sum(len(row["splits"]) for row in rows) == len(split_names()) == 15
+    for name in split_names():
+        assert run("split", "audit", name, "--strict")[0] == 0, name
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("audit nowhere.yaml", "nowhere.yaml: no such file"),
+        ("audit composition/ee-tsk", "unknown split 'composition/ee-tsk'; did you mean"),
+        ("audit some.yaml --near 1", "--near 1: expected a tree distance and a cosine, such as"),
+        ("audit some.yaml --near a,b", "--near a,b: expected a tree distance and a cosine"),
+        ("audit some.yaml --near 2,0.5", "--near 2,0.5: a tree distance is from 0 to 1"),
+        ("audit some.yaml --jobs 0", "0 jobs: expected 1 or more"),
+        ("audit broken.yaml", "broken.yaml:"),
+        ("build some.yaml --light --picture", "say --light or --picture"),
+        ("build some.yaml --out file", "cannot write file/mine/some: Not a directory"),
+        ("build wrong.yaml --out out", "unknown part 'cubw'; did you mean 'cube'?"),
+        ("verify folder", "folder is no built split: it has no build.json; morphgen split build"),
+        ("verify nowhere", "unknown split 'nowhere'"),
+        ("stats wrong.yaml", "robot 'planar-cube': the library has no part 'cubw'"),
+        ("stats nowhere", "unknown split 'nowhere'"),
+    ],
+)
+def test_what_they_cannot_do_is_refused_in_a_line(run, write, tmp_path, argv, message):
+    write(combined())
+    wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
+    write(combined(train=[wrong]), "wrong.yaml")
+    (tmp_path / "broken.yaml").write_text("format: [1\n")
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    code, out, err = run("split", *argv.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("morphgen: ")
+    assert err.count("\n") == 1
+    assert message in err

@@ -1,0 +1,234 @@
+"""``morphgen split list``, ``show`` and ``new``: what they print, write and refuse."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from commands import tree
+
+from morphgen.benchmark.split import split_id
+from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.grammar.library import ENVIRONMENT
+
+INTERPOLATION = ("split", "new", "interpolation", "--grammar", "cubes", "--train", "3")
+COMPOSITION = ("split", "new", "composition", "--from", "base=gantry ee={plane,cube}")
+COMPOSITION += ("--from", "arm=lwr ee={plane,cube}")
+EXTRAPOLATION = ("split", "new", "extrapolation", "--train-category", "stick,nlink,prims")
+EXTRAPOLATION += ("--test-category", "chain", "--train", "6")
+TRAPS = {
+    "task": ("task: reach", "task: reech", "unknown 'reech'; did you mean 'reach'?"),
+    "syntax": ("regime: ", "regime: [", "no valid YAML: "),
+    "key": ("body: ", "boddy: ", "unknown key 'boddy'; did you mean 'body'?"),
+    "robot": ("size=0.1", "size=0.2", "the file was changed since it was written"),
+}
+
+
+def test_list_has_a_row_a_split(run):
+    code, out, err = run("split", "list")
+    assert (code, err) == (0, "")
+    header, _, *rows = out.splitlines()
+    assert header.split() == [
+        "name", "regime", "task", "train", "test", "categories", "summary",
+    ]  # fmt: skip
+    assert [row.split()[0] for row in rows] == split_names()
+    row = next(row for row in rows if row.startswith("interpolation/arm3/push-obstacles "))
+    assert row.split()[1:9] == [*"interpolation push (obstacles) 10 1 arm3 -> arm3".split()]  # noqa: SIM905
+    data = json.loads(run("split", "list", "--json")[1])
+    facts = next(each for each in data if each["name"] == "composition/ee-task")
+    assert facts["tasks"] == ["push", "reach"]
+    assert facts["train_categories"] == {"prims": 3, "composed": 1}
+    assert (facts["train"], facts["test"], facts["regime"]) == (4, 1, "composition")
+
+
+def test_show_prints_a_row_a_robot(run):
+    code, out, err = run("split", "show", "composition/ee-arm/reach")
+    split = read_split("composition/ee-arm/reach")
+    assert (code, err) == (0, "")
+    assert f"  id: {split_id(split)}\n" in out
+    assert "table 1: Composition, EE Arm" in out
+    assert "accepted part-unseen: the paper's own" in out
+    assert "\ntrain, 10: 7 prims, 3 composed\n" in out
+    assert "\ntest, 1: 1 composed\n" in out
+    for member in (*split.train, *split.test):
+        (row,) = [line for line in out.splitlines() if line.startswith(f"{member.name} ")]
+        assert row.split()[1:4] == ["reach", member.category, member.body[:8]]
+    assert "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size..." in out
+    full = run("split", "show", "composition/ee-arm/reach", "--full")[1]
+    assert all(member.derivation in full for member in split.train)
+    assert "{robots: 3, grammar: prims, pinned: prim=plane, seed: " in full
+
+
+def test_show_prints_json(run):
+    data = json.loads(run("split", "show", "extrapolation/arms/push", "--json")[1])
+    split = read_split("extrapolation/arms/push")
+    assert data["id"] == split_id(split)
+    assert data["train"][0]["derivation"] == split.train[0].derivation
+    assert data["statistics"] == split.statistics
+
+
+def test_new_says_what_it_made_and_what_is_next(run, tmp_path):
+    code, out, err = run(*INTERPOLATION, "--seed", 4)
+    name = "interpolation-cubes-reach-seed4"
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        f"{name}.yaml: 3 robots of cubes; test: 1 besides",
+        "  test: cubes-test-000000",
+        f"next: morphgen split audit {name}.yaml",
+    ]
+    assert list(tree(tmp_path)) == [f"{name}.yaml"]
+    split = read_split(f"{name}.yaml")
+    assert (split.name, split.regime, len(split.train)) == (name, "interpolation", 3)
+    assert run("split", "show", f"{name}.yaml")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("argv", "name", "counts"),
+    [
+        (INTERPOLATION, "interpolation-cubes-reach-seed0", (3, 1)),
+        (
+            (*INTERPOLATION, "--hull", "inside", "--task", "push", "--obstacles"),
+            "interpolation-cubes-inside-push-obstacles-seed0",
+            (3, 1),
+        ),
+        (COMPOSITION, "composition-ee-reach-seed0", (3, 1)),
+        (
+            (*EXTRAPOLATION, "--similarity", "<0.6", "--test", "2", "--task", "reach,push"),
+            "extrapolation-chain-reach-push-seed0",
+            (12, 4),
+        ),
+    ],
+)
+def test_every_regime_is_made_by_name(run, argv, name, counts):
+    data = json.loads(run(*argv, "--json")[1])
+    split = read_split(f"{name}.yaml")
+    assert data == [
+        {
+            "file": f"{name}.yaml",
+            "name": name,
+            "id": split_id(split),
+            "train": counts[0],
+            "test": counts[1],
+        }
+    ]
+    assert (len(split.train), len(split.test)) == counts
+
+
+def test_several_sizes_make_a_file_each(run):
+    code, out, _ = run(*INTERPOLATION[:-1], "1,2,4", "--name", "my/cubes", "--out", "splits")
+    assert code == 0
+    paths = [Path(f"splits/my/cubes-train{n}.yaml") for n in (1, 2, 4)]
+    assert [line.partition(":")[0] for line in out.splitlines()[::2]] == [*map(str, paths), "next"]
+    splits = [read_split(path) for path in paths]
+    assert [split.name for split in splits] == [f"my/cubes-train{n}" for n in (1, 2, 4)]
+    assert splits[0].train == splits[2].train[:1]
+    assert run(*INTERPOLATION[:-1], "1,2", "--out", "a.yaml")[0] == 0
+    assert Path("a-train1.yaml").is_file()
+    assert Path("a-train2.yaml").is_file()
+
+
+def test_the_same_order_gives_the_same_bytes_with_any_number_of_jobs(run, tmp_path):
+    assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml")[0] == 0
+    before = tree(tmp_path)
+    assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml", "--jobs", 2)[0] == 0
+    assert tree(tmp_path) == before
+
+
+def test_figures_are_added_when_asked_for(run):
+    run(*INTERPOLATION, "--out", "a.yaml", "--statistics")
+    run(*INTERPOLATION, "--out", "b.yaml")
+    a, b = read_split("a.yaml"), read_split("b.yaml")
+    assert a.statistics["train"]["links"] == 3
+    assert (b.statistics, split_id(b)) == ({}, split_id(a))
+
+
+def test_robots_that_are_trained_twice_are_told(run):
+    Path("two.grammar").write_text(
+        "robot -> gantry ee\nee -> @weight(30) plane(size=0.1) | plane(size=0.2)\n"
+    )
+    _, out, _ = run("split", "new", "interpolation", "--grammar", "two.grammar", "--train", 5)
+    split = read_split("interpolation-two-reach-seed0.yaml")
+    repeated = 5 - len({member.body for member in split.train})
+    assert repeated > 2
+    assert f"  {repeated} train robots have the body and task of an earlier one\n" in out
+
+
+def test_parts_and_grammars_of_the_users_library_are_found(run, monkeypatch):
+    Path("lib").mkdir()
+    Path("lib/mine.grammar").write_text("robot -> gantry plane(size=uniform(0.1, 0.3))\n")
+    words = ("split", "new", "interpolation", "--grammar", "mine", "--train", 2)
+    assert run(*words, "--library", "lib", "--out", "a.yaml")[0] == 0
+    monkeypatch.setenv(ENVIRONMENT, str(Path("lib").absolute()))
+    assert run(*words, "--out", "b.yaml")[0] == 0
+    assert Path("a.yaml").read_bytes() == Path("b.yaml").read_bytes()
+    data = yaml.safe_load(Path("a.yaml").read_text())
+    assert list(data["made"]["grammar"]) == ["mine"]
+
+
+def test_another_split_is_never_replaced(run, refused):
+    assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
+    message = refused(*INTERPOLATION, "--out", "a.yaml", "--seed", 1)
+    assert "a.yaml exists and says otherwise; choose another --name or --out" in message
+    Path("b-train2.yaml").write_text("thesis")
+    assert "b-train2.yaml exists" in refused(*INTERPOLATION[:-1], "1,2", "--out", "b.yaml")
+
+
+def test_an_interrupted_run_leaves_nothing(run, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    assert run(*INTERPOLATION)[0] == 130
+    assert tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ((*EXTRAPOLATION[:4], "stick,nlnk", *EXTRAPOLATION[5:]), "'nlnk'; did you mean 'nlink'?"),
+        ((*EXTRAPOLATION[:4], "stick,", *EXTRAPOLATION[5:]), "unknown grammar ''"),
+        ((*EXTRAPOLATION[:4], "chain", *EXTRAPOLATION[5:]), "chain: the category is on both sides"),
+        ((*EXTRAPOLATION, "--similarity", "0.6"), "--similarity '0.6': expected '<' or '>' and a"),
+        ((*INTERPOLATION, "--task", "pusch"), "'pusch' is no task; did you mean 'push'?"),
+        ((*INTERPOLATION, "--task", "push,push"), "'push' is named twice"),
+        ((*INTERPOLATION, "--train", "3,x"), "--train 3,x: expected a whole number, or several"),
+        ((*INTERPOLATION, "--train", "30,10"), "--train 30,10: expected sizes that grow"),
+        ((*INTERPOLATION, "--train", ""), "--train: say how many robots to train on"),
+        ((*EXTRAPOLATION, "--train", ""), "--train: say how many robots to train on"),
+        ((*INTERPOLATION, "--test", "0"), "--train and --test start at 1"),
+        ((*INTERPOLATION, "--seed", "-1"), "--seed at 0"),
+        ((*INTERPOLATION, "--jobs", "0"), "0 jobs: expected 1 or more"),
+        ((*INTERPOLATION, "--name", "../x"), "name '../x': use letters, digits"),
+        ((*INTERPOLATION, "--out", "file/x.yaml"), "cannot write file/x.yaml: "),
+        ((*INTERPOLATION, "--library", "nowhere"), "nowhere does not exist"),
+        ((*INTERPOLATION[:4], "broken.grammar"), "broken.grammar:1:"),
+        ((*COMPOSITION, "--from", "arm={ur5,ur55}"), "unknown arm 'ur55'; did you mean 'ur5'?"),
+        ((*COMPOSITION, "--from", "arm={ur5"), "a brace is not closed"),
+        ((*COMPOSITION, "--test", "4"), "of 4 test robots can be held out of 4 combinations"),
+        (("split", "show", "interpolation/arm3"), "unknown split 'interpolation/arm3'; did you"),
+        (("split", "show", "x.yaml"), "x.yaml: no such file"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(refused, tmp_path, argv, message):
+    (tmp_path / "file").write_text("a plain file")
+    (tmp_path / "broken.grammar").write_text("robot -> gantry plnae\n")
+    assert message in refused(*argv)
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_a_broken_file_is_refused_by_its_line(run, refused, trap):
+    old, new, message = TRAPS[trap]
+    assert run(*COMPOSITION, "--out", "a.yaml")[0] == 0
+    text = Path("a.yaml").read_text()
+    assert old in text
+    Path("a.yaml").write_text(text.replace(old, new, 1))
+    told = refused("split", "show", "a.yaml")
+    assert told.startswith("morphgen: a.yaml:")
+    assert message in told
+
+
+def test_what_is_missing_is_asked_for(run):
+    for argv in (("split",), ("split", "new"), ("split", "new", "interpolation")):
+        with pytest.raises(SystemExit) as stopped:
+            run(*argv)
+        assert stopped.value.code == 2

@@ -1,0 +1,34 @@
+"""Small splits that tests write in code."""
+
+from morphgen.benchmark.split import COMPOSED, Member, Split, robot_hash
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_words
+
+LIBRARY = default_library()
+
+
+def member(words, name=None, *, task="push", obstacles=False, category=COMPOSED):
+    """A member given by words of ``morphgen compose``."""
+    derivation, own = parse_words(words.split(), LIBRARY)
+    text = str(derivation)
+    robot = compose(parse_derivation(text), LIBRARY, name or own)
+    return Member(robot.name, category, text, task, obstacles, robot_hash(robot))
+
+
+def split(train, test, *, name="mine/some", regime="composition", **more):
+    """A split of members, or of words."""
+    sides = [
+        tuple(m if isinstance(m, Member) else member(m) for m in side) for side in (train, test)
+    ]
+    return Split(name, regime, "a split of a test", *sides, **more)
+
+
+TRAIN = ("base=gantry ee=plane", "base=planar ee=cube", "base=gantry ee=cylinder")
+TEST = ("base=planar ee=plane",)
+
+
+def combined(train=TRAIN, test=TEST, **more):
+    """A sound split by composition, of bodies without meshes."""
+    return split(train, test, **more)
