@@ -36,6 +36,10 @@ class BenchmarkError(MorphgenError):
     """Tokens, a similarity or a split that cannot be made as asked."""
 
 
+class TaskError(MorphgenError):
+    """A task that cannot be set up for a robot, or an action that is none."""
+
+
 class SimulationError(MorphgenError):
     """A simulator that cannot hold a scene, became unstable or died."""
 

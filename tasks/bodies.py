@@ -32,6 +32,8 @@ class Bodies:
     """Which links there are, shape (R, L), bool."""
     joint_of_link: torch.Tensor
     """Index of the independent joint that moves each link, (R, L), int64; -1 where none does."""
+    link_of_joint: torch.Tensor
+    """The link that each independent joint moves, shape (R, J), int64; padding is 0."""
     lower: torch.Tensor
     upper: torch.Tensor
     """Limits of the independent joints, shape (R, J); padding is 0."""
@@ -146,14 +148,15 @@ def _body(
     limits[:dof] = bounds(robot)
     home = np.zeros(joints)
     home[:dof] = robot.home
-    column = {k: i for i, k in enumerate(robot.independent)}
-    joint_of_link = np.full(max_links, -1)
-    for k, i in column.items():
+    joint_of_link, link_of_joint = np.full(max_links, -1), np.zeros(joints, dtype=np.int64)
+    for i, k in enumerate(robot.independent):
         joint_of_link[k + 1] = i
+        link_of_joint[i] = k + 1
     return {
         "tokens": made,
         "links": links,
         "joint_of_link": joint_of_link,
+        "link_of_joint": link_of_joint,
         "lower": limits[:, 0],
         "upper": limits[:, 1],
         "step": _steps(robot, joints),

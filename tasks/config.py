@@ -8,8 +8,8 @@ from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Seconds between two actions: 50 Hz."""
-BINS = tuple(sign * 2.0**-k for sign, ks in ((-1, range(5)), (1, range(4, -1, -1))) for k in ks)
-"""Discrete actions but for zero, as shares of a joint's step; exponentially spaced (paper)."""
+BINS = (-1.0, -1 / 2, -1 / 4, -1 / 8, -1 / 16, 0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+"""Discrete actions as shares of a joint's step, exponentially spaced about zero (paper)."""
 STEP_TURN, STEP_SLIDE = 0.2, 0.02
 """Largest change of a joint's target in a control step, rad and m, if it is fast enough."""
 

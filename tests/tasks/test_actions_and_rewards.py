@@ -1,0 +1,117 @@
+"""Actions become targets, and states become rewards."""
+
+import numpy as np
+import pytest
+import torch
+
+import morphgen
+from morphgen.errors import TaskError
+from morphgen.grammar.library import default_library
+from morphgen.tasks.actions import next_targets, shares_of
+from morphgen.tasks.bodies import bodies_of
+from morphgen.tasks.config import BINS, PushConfig, ReachConfig
+from morphgen.tasks.rewards import (
+    anybody_score,
+    beyond_limits,
+    moved_line,
+    push_terms,
+    reach_terms,
+)
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    robots = [morphgen.compose(words) for words in ("arm=ur5 ee=plane", "arm=panda ee=panda_hand")]
+    return bodies_of(robots, default_library(()).folders)
+
+
+def test_bins_are_symmetric_and_hold_zero():
+    assert len(BINS) == 11
+    assert BINS == tuple(sorted(BINS))
+    assert [-b for b in reversed(BINS)] == list(BINS)
+    assert BINS[5] == 0
+
+
+def test_continuous_actions_are_clipped_and_discrete_ones_looked_up():
+    shares = shares_of(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
+    assert shares.tolist() == [[1.0, -0.5]]
+    shares = shares_of(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
+    assert shares.tolist() == [[-1.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("actions", "kind", "words"),
+    [
+        (torch.zeros(1, 3), "continuous", r"shape \(1, 3\); expected \(1, 2\)"),
+        (torch.tensor([[0.0, np.nan]]), "continuous", "environment 0, link 1 is not finite"),
+        (torch.tensor([[0, 11]]), "discrete", "environment 0, link 1: .* 0 to 10"),
+        (torch.tensor([[0, -1]]), "discrete", "from 0 to 10"),
+        (torch.tensor([[0.0, 1.0]]), "discrete", "whole numbers"),
+    ],
+)
+def test_what_is_no_action_is_refused(actions, kind, words):
+    with pytest.raises(TaskError, match=words):
+        shares_of(actions, kind, (1, 2), CPU)
+
+
+def test_targets_move_by_the_step_of_each_joint_from_the_targets_before(bodies):
+    body = torch.tensor([0, 1, 1])
+    mask = bodies.action_mask(fingers=True)[body]
+    before = bodies.home[body]
+    shares = torch.ones(3, bodies.max_links)
+    after = next_targets(bodies, body, before, shares, mask)
+    expected = torch.minimum(before + bodies.step[body], bodies.upper[body])
+    assert torch.equal(after, expected)
+    assert (after[0, 6:] == 0).all()
+
+
+def test_targets_stay_within_limits_and_masked_links_do_not_move(bodies):
+    body = torch.tensor([1])
+    mask = bodies.action_mask(fingers=False)[body]
+    targets = bodies.home[body]
+    for _ in range(400):
+        targets = next_targets(bodies, body, targets, torch.ones(1, bodies.max_links), mask)
+    moved = bodies.moves_tool[1]
+    assert torch.equal(targets[0, moved], bodies.upper[1, moved])
+    assert torch.equal(targets[0, ~moved], bodies.home[1, ~moved])
+
+
+def test_terms_of_reach():
+    config = ReachConfig()
+    distance = torch.tensor([0.029, 0.031])
+    beyond = beyond_limits(
+        torch.tensor([[1.5, 0.0], [0.0, -2.5]]), torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 2])
+    )
+    assert beyond.tolist() == pytest.approx([0.5, 0.5])
+    terms = reach_terms(config, distance, beyond, torch.tensor([10.0, 0.0]))
+    assert terms["near"].tolist() == [config.near_weight, 0.0]
+    assert terms["distance"].tolist() == pytest.approx([-0.029, -0.031])
+    assert terms["joint_limits"].tolist() == pytest.approx([-0.5, -0.5])
+    assert terms["joint_acceleration"].tolist() == pytest.approx([-1e-4, 0.0])
+    score = anybody_score(config, distance)
+    assert score.tolist() == pytest.approx([200.0, -50 * 0.031**2])
+
+
+def test_terms_of_push():
+    success = torch.tensor([True, False])
+    terms = push_terms(
+        PushConfig(),
+        to_go=torch.tensor([0.0, 0.3]),
+        approach=torch.tensor([0.1, 0.2]),
+        beyond=torch.zeros(2),
+        success=success,
+    )
+    assert terms["success"].tolist() == [10.0, 0.0]
+    assert terms["distance"].tolist() == pytest.approx([0.0, -0.3])
+    assert terms["approach"].tolist() == pytest.approx([-0.05, -0.1])
+
+
+def test_the_line_moves_over_the_first_half_of_training_and_then_stays():
+    line = torch.tensor([0.2, 0.1])
+    places = [moved_line(PushConfig(), line, p / 100)[0].item() for p in range(101)]
+    assert places[0] == pytest.approx(0.02)
+    assert places == sorted(places)
+    assert places[50:] == [pytest.approx(0.2)] * 51
+    assert len(set(places)) == 51
