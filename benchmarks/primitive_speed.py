@@ -36,7 +36,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tabulate import tabulate
 from tqdm import tqdm
-from worlds import Make, MujocoWorld, PybulletWorld, World
 
 import morphgen
 from morphgen.checks.self_collision import SelfCollision
@@ -50,6 +49,7 @@ from morphgen.model.kinematics import (
     random_configurations,
 )
 from morphgen.model.robot import Robot, sorted_pair
+from worlds import Make, MujocoWorld, PybulletWorld, World
 
 Array = NDArray[np.float64]
 

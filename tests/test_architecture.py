@@ -10,7 +10,18 @@ import pytest
 import morphgen
 
 PACKAGE = Path(morphgen.__file__).parent
-ROOMS = ("errors", "model", "formats", "checks", "grammar", "fitting", "benchmark", "api", "cli")
+ROOMS = (
+    "errors",
+    "processes",
+    "model",
+    "formats",
+    "checks",
+    "grammar",
+    "fitting",
+    "benchmark",
+    "api",
+    "cli",
+)
 """Rooms of the package, the lowest first; each may import itself and those below."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 SIMULATORS_AND_MESHES = (

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.benchmark.extrapolation import parse_bound
-from morphgen.benchmark.processes import Progress, unseen
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import SIDES, Member, Side, Split
@@ -17,6 +16,7 @@ from morphgen.benchmark.survey import Fault, Survey, Surveyed, survey
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
+from morphgen.processes import Progress, unseen
 
 
 @dataclass(frozen=True)

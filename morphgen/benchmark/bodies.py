@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.benchmark.processes import mapped
 from morphgen.benchmark.similarity import Features, features
 from morphgen.benchmark.split import COMPOSED, Member, Task, robot_hash
 from morphgen.checks import check
@@ -22,6 +21,7 @@ from morphgen.grammar.model import Grammar, grammar_names
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import draw
 from morphgen.model.robot import Robot
+from morphgen.processes import mapped
 
 Progress = Callable[[int], None]
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from morphgen.benchmark.built import (
     BUNDLES,
     README,
@@ -36,17 +34,16 @@ from morphgen.benchmark.contents import (
     sums_text,
     tokens_npz,
 )
-from morphgen.benchmark.processes import Progress, mapped, unseen
 from morphgen.benchmark.robot_folder import differences, hashes, is_current, write_robot
 from morphgen.benchmark.split import Member, Split, member_robot
 from morphgen.benchmark.split_file import split_text
 from morphgen.errors import BenchmarkError
-from morphgen.formats.bundle import bundle_folder, partial_of, write_atomic
+from morphgen.formats.bundle import bundle_folder
+from morphgen.formats.files import LOCK, alone, partial_of, write_atomic
 from morphgen.grammar.library import Library
+from morphgen.processes import Progress, mapped, unseen
 
 __all__ = ["LOCK", "BuildReport", "build", "home_of", "load_built"]
-
-LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def build(
     firsts = bodies(split)
     with _writing(home):
         _prepare(home, split, settings)
-        with _alone(home):
+        with alone(home):
             (home / SUMS).unlink(missing_ok=True)
             _sweep(home / BUNDLES)
             maker = _Maker(library.folders, home, settings)
@@ -177,9 +174,7 @@ def _finish(home: Path, split: Split, settings: Settings, made: Mapping[str, _Ma
     """Write what is there once, the sums last."""
     known = {body: one.body for body, one in made.items()}
     write_atomic(home / ROBOTS, records_text(split, known))
-    partial = partial_of(home / TOKENS)
-    partial.write_bytes(tokens_npz(split, known))
-    partial.replace(home / TOKENS)
+    write_atomic(home / TOKENS, tokens_npz(split, known))
     write_atomic(home / README, readme_text(split, settings))
     single = (README, ROBOTS, SETTINGS, SPLIT, TOKENS)
     sums = {name: hashlib.sha256((home / name).read_bytes()).hexdigest() for name in single}
@@ -197,18 +192,3 @@ def _writing(home: Path) -> Iterator[None]:
     except OSError as error:
         place = error.filename or home
         raise BenchmarkError(f"cannot write {place}: {error.strerror}") from error
-
-
-@contextmanager
-def _alone(home: Path) -> Iterator[None]:
-    """Hold a folder against a second run; a killed one holds nothing."""
-    lock = FileLock(home / LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise BenchmarkError(f"{home} is being written by another run; wait for its end") from error
-    try:
-        yield
-    finally:
-        lock.release()
-        (home / LOCK).unlink(missing_ok=True)

@@ -18,11 +18,11 @@ from morphgen.formats.bundle import (
     PICTURE,
     URDF,
     file_findings,
-    replacing_folder,
     split_colours,
     write_bundle,
 )
 from morphgen.formats.card import card_of, card_text
+from morphgen.formats.files import replacing_folder
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.robot_set import DERIVATION, light_urdf
 from morphgen.model.robot import Robot

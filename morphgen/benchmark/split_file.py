@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -15,7 +14,7 @@ import yaml
 from morphgen.benchmark.split import FORMAT, Member, Split, split_id
 from morphgen.benchmark.split_reader import MEMBER, ROBOT_NAME, SplitFile, parse_split
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.formats.bundle import partial_of
+from morphgen.formats.files import write_atomic
 
 SUFFIX = ".yaml"
 _HEAD = (
@@ -98,17 +97,11 @@ def write_split(split: Split, path: Path) -> None:
     Raises:
         BenchmarkError: If it cannot be written.
     """
-    text = split_text(split)
-    partial = partial_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        write_atomic(path, split_text(split))
     except OSError as error:
         raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
 
 
 def split_text(split: Split) -> str:

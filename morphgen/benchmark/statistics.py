@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from morphgen.benchmark.processes import Progress, unseen
 from morphgen.benchmark.split import Member, Split
 from morphgen.benchmark.survey import Facts, Fault, Survey, Surveyed, survey
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
+from morphgen.processes import Progress, unseen
 
 DIGITS = 4
 """Decimals of the figures."""

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.processes import Progress, mapped, unseen
 from morphgen.benchmark.similarity import MEASURES, Features, features
 from morphgen.benchmark.split import Member, Split, robot_hash
 from morphgen.errors import MorphgenError, nearest
@@ -24,6 +23,7 @@ from morphgen.grammar.conditions import Properties
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
+from morphgen.processes import Progress, mapped, unseen
 
 Array = NDArray[np.float64]
 

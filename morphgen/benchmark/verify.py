@@ -30,13 +30,13 @@ from morphgen.benchmark.contents import (
     sided,
     token_tables,
 )
-from morphgen.benchmark.processes import Progress, mapped, unseen
 from morphgen.benchmark.robot_folder import differences, hashes, same
 from morphgen.benchmark.split import Member, Split, member_robot, split_id
 from morphgen.benchmark.split_file import find_split, read_split_file
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.library import Library
+from morphgen.processes import Progress, mapped, unseen
 
 FITTED_TOLERANCE = 1e-3
 """How far the numbers of a link's primitive may be off: it may have been sought anew, here."""

@@ -235,8 +235,7 @@ def _statistics(measure: str, matrices: Matrices) -> str:
 
 def _write(args: argparse.Namespace, names: Sequence[str], matrices: Matrices) -> list[str]:
     """Write what was asked for; return where."""
-    from morphgen.errors import FormatError
-    from morphgen.formats.bundle import partial_of
+    from morphgen.formats.files import save
 
     made = {
         path: content(names, matrices)
@@ -244,14 +243,7 @@ def _write(args: argparse.Namespace, names: Sequence[str], matrices: Matrices) -
         if path is not None
     }
     for path, data in made.items():
-        partial = partial_of(path)
-        try:
-            partial.write_bytes(data)
-            partial.replace(path)
-        except OSError as error:
-            raise FormatError(f"cannot write {path}: {error.strerror}") from error
-        finally:
-            partial.unlink(missing_ok=True)
+        save(path, data)
     return [str(path) for path in made]
 
 

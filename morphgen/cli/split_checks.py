@@ -17,9 +17,9 @@ from morphgen.cli.options import Subparsers, add_json, add_library, library_of
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit, Near
     from morphgen.benchmark.paper import Figures
-    from morphgen.benchmark.processes import Progress
     from morphgen.benchmark.split import Split
     from morphgen.model.findings import Finding
+    from morphgen.processes import Progress
 
 LISTED = 10
 """Findings of one code, or differences, that are printed."""

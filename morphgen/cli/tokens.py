@@ -117,18 +117,9 @@ def _robot(words: list[str], library: Library) -> Robot:
 
 def _write(path: Path, tokens: Array, robot: Robot, max_links: int) -> None:
     from morphgen.benchmark.tokens import npz
-    from morphgen.errors import FormatError
-    from morphgen.formats.bundle import partial_of
+    from morphgen.formats.files import save
 
-    content = npz(tokens, [link.name for link in robot.links], robot.name, max_links)
-    partial = partial_of(path)
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    save(path, npz(tokens, [link.name for link in robot.links], robot.name, max_links))
 
 
 def _text(tokens: Array, robot: Robot, max_links: int) -> str:

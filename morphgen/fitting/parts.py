@@ -7,7 +7,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
-from morphgen.errors import FormatError
 from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import quality
@@ -21,7 +20,7 @@ from morphgen.fitting.stored import (
     shapes_scale,
     stored_text,
 )
-from morphgen.formats.bundle import write_atomic
+from morphgen.formats.files import save
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
@@ -82,10 +81,7 @@ def store_part(manifest: Manifest) -> Path:
         shapes = link_shapes(body.link(row.link))
         fits[shapes_key(shapes)] = _stored(row.link, shapes, row.fit)
     path = manifest.path.with_name(manifest.path.stem + SUFFIX)
-    try:
-        write_atomic(path, stored_text(fits))
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+    save(path, stored_text(fits))
     return path
 
 

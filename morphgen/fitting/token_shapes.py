@@ -22,7 +22,7 @@ from morphgen.fitting.stored import (
     shapes_scale,
     stored_fit,
 )
-from morphgen.formats.bundle import write_atomic
+from morphgen.formats.files import write_atomic
 from morphgen.model.geometry import Shape
 from morphgen.model.inertia import union_moments
 from morphgen.model.robot import Robot

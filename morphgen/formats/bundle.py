@@ -5,10 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +17,7 @@ from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_frames, card_of, card_text
+from morphgen.formats.files import replacing_folder
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
 from morphgen.formats.urdf import read_urdf, with_frames
@@ -60,18 +58,6 @@ def require_replaceable(folder: Path) -> None:
     """
     if folder.exists() and not (folder / CARD).is_file():
         raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
-
-
-def write_atomic(path: Path, text: str) -> None:
-    """Write a file by way of ``partial_of`` it, so that it is never half there."""
-    partial = partial_of(path)
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
-
-
-def partial_of(path: Path) -> Path:
-    """Where a file is written before it takes its place."""
-    return path.with_name(f".{path.name}.partial")
 
 
 def write_bundle(
@@ -226,39 +212,3 @@ def _mesh_bytes(mesh: trimesh.Trimesh) -> tuple[bytes, str]:
 def _safe(stem: str) -> str:
     base = stem.rsplit("-", 1)[0] if len(stem.rsplit("-", 1)[-1]) == 8 else stem
     return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in base)
-
-
-@contextmanager
-def replacing_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside ``folder`` that takes its place if the block succeeds."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise FormatError(f"cannot write to {folder.parent}: {error.strerror}") from error
-    try:
-        partial.chmod(0o755)
-        yield partial
-        if folder.exists():
-            _swap(folder, partial)
-        else:
-            partial.rename(folder)
-    except OSError as error:
-        raise FormatError(f"cannot write {folder}: {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _swap(folder: Path, partial: Path) -> None:
-    """Put ``partial`` in the place of ``folder``, which stays if that fails."""
-    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    old = aside / folder.name
-    try:
-        folder.rename(old)
-        partial.rename(folder)
-    except BaseException:
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        shutil.rmtree(aside)
-        raise
-    shutil.rmtree(aside)

@@ -11,7 +11,7 @@ from typing import Any
 
 from morphgen.errors import MissingDependencyError, MorphgenError
 from morphgen.grammar.robot_set import Maker, Record, SetPlan, Work
-from morphgen.grammar.workers import CHUNK
+from morphgen.processes import CHUNK
 
 PATIENCE = 5.0
 """Seconds to wait for an answer from the cluster's address; Ray itself waits for minutes."""

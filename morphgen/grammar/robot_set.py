@@ -14,16 +14,15 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from morphgen.errors import FormatError
-from morphgen.formats.bundle import URDF, partial_of, replacing_folder, write_atomic, write_bundle
+from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.card import rounded
+from morphgen.formats.files import alone, partial_of, replacing_folder, write_atomic
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import Library, default_library
@@ -37,7 +36,6 @@ SETTINGS = "set.json"
 GRAMMAR = "grammar.grammar"
 DERIVATION = "derivation.txt"
 JOURNAL = ".journal.jsonl"
-LOCK = ".lock"
 
 Record = dict[str, Any]
 """A line of the index."""
@@ -100,7 +98,7 @@ def make_set(
         SamplingError: If a robot's conditions cannot be met.
     """
     _prepare(plan)
-    with _alone(plan.folder):
+    with alone(plan.folder):
         done = _finished(plan)
         missing = [i for i in range(n) if i not in done]
         progress(n - len(missing))
@@ -274,20 +272,3 @@ def _write_index(plan: SetPlan, made: int, kept: int) -> SetReport:
                 duplicates.append((record["name"], earlier))
     partial.replace(plan.folder / INDEX)
     return SetReport(made, kept, dict(rejected), duplicates)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold a folder against a second run; a killed one holds nothing."""
-    lock = FileLock(folder / LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise FormatError(f"{folder} is being written by another run; wait for its end") from error
-    except OSError as error:
-        raise FormatError(f"cannot write to {folder}: {error.strerror}") from error
-    try:
-        yield
-    finally:
-        lock.release()
-        (folder / LOCK).unlink(missing_ok=True)

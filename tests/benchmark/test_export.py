@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
-from commands import start, tree
-from splits import LIBRARY, combined, member, split
 
+from commands import start, tree
 from morphgen.benchmark.built import Robots
 from morphgen.benchmark.contents import BUNDLED, Settings
 from morphgen.benchmark.export import build, load_built
@@ -25,6 +24,7 @@ from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_robot
 from morphgen.grammar.robot_set import light_urdf
+from splits import LIBRARY, combined, member, split
 
 LIGHT = Settings(light=True)
 
@@ -311,7 +311,7 @@ def test_a_name_of_two_bodies_is_refused(tmp_path):
 
 def test_a_second_run_into_the_same_folder_is_refused(tmp_path, made):
     def again(done, total):
-        with pytest.raises(BenchmarkError, match="is being written by another run"):
+        with pytest.raises(FormatError, match="is being written by another run"):
             build(made, tmp_path, LIBRARY, settings=LIGHT)
 
     report = build(made, tmp_path, LIBRARY, settings=LIGHT, progress=again)

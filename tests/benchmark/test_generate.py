@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grammars import grammar, shipped
 from scipy.spatial import Delaunay
 
 import morphgen
+from grammars import grammar, shipped
 from morphgen.benchmark import bodies, generate
 from morphgen.benchmark.bodies import Composed, Drawn, Maker, make_all
 from morphgen.benchmark.composition import composition, expand

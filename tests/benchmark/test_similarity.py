@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import arm
 
 import morphgen
 from morphgen.benchmark import similarity
@@ -24,6 +23,7 @@ from morphgen.benchmark.tokens import padded, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Mesh, Shape
+from robots import arm
 
 REQUESTS = ("arm=lwr ee=plane", "arm=lwr ee=claw", "arm3", "chain beads=2", "cubes")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import yaml
-from commands import tree
 from hypothesis import given
 from hypothesis import strategies as st
 
+from commands import tree
 from morphgen.benchmark.split import Member, Split, split_id
 from morphgen.benchmark.split_file import (
     find_split,

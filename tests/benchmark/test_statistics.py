@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splits import LIBRARY, combined, member, split
 
 from morphgen.benchmark.paper import PAPER, figures_of, robot_set
 from morphgen.benchmark.similarity import cosine, features
@@ -14,6 +13,7 @@ from morphgen.benchmark.statistics import statistics
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import reach
+from splits import LIBRARY, combined, member, split
 
 
 def test_counts_are_means_over_the_robots_of_a_side():

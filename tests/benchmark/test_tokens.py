@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import arm
 
 import morphgen
 from morphgen.benchmark.token_layout import decode_position, encode_position
@@ -32,6 +31,7 @@ from morphgen.model import rotation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from robots import arm
 
 FIELDS = {field.name: field.columns for field in LAYOUT}
 COMPOSED = (

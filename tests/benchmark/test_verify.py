@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splits import LIBRARY, TRAIN, combined, member, split
 
 from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
@@ -16,6 +15,7 @@ from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.benchmark.token_layout import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
+from splits import LIBRARY, TRAIN, combined, member, split
 
 LIGHT = Settings(light=True)
 

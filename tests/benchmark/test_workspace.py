@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import arm
 
 import morphgen
 from morphgen.benchmark.workspace import overlap, shoulder, tool_positions, workspace
@@ -14,6 +13,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, random_configurations, reach
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.scaling import scaled
+from robots import arm
 
 LWR = "arm=lwr ee=plane"
 

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
-from robots import arm
 
 from morphgen.checks.self_collision import (
     PENETRATION,
@@ -19,6 +18,7 @@ from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
+from robots import arm
 
 BALL = (Shape(Sphere(0.05)),)
 

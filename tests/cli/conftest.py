@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from commands import tree
 
+from commands import tree
 from morphgen.cli import main
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import ENVIRONMENT

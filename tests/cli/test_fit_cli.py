@@ -8,10 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import trimesh
-from commands import tree
-from parts import write_part
-from robots import arm
 
+from commands import tree
 from morphgen.fitting import parts as fitting_parts
 from morphgen.formats import bundle
 from morphgen.formats.bundle import read_bundle, write_bundle
@@ -20,6 +18,8 @@ from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import Link
+from parts import write_part
+from robots import arm
 
 FIGURES = {
     "iou",

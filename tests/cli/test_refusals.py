@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commands import start, tree
-from parts import write_part
-from robots import arm
 
+from commands import start, tree
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
+from parts import write_part
+from robots import arm
 
 LINK = '<link name="a">{}</link>'
 SHAPE = '<visual><geometry><mesh filename="{}"/></geometry></visual>'

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import tree
-from robots import arm
 
 import morphgen
+from commands import tree
 from morphgen.benchmark.similarity import MEASURES, features, matrix
 from morphgen.cli import similarity as command
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
+from robots import arm
 
 ARGUMENTS = ("robots", "--measure", "all")
 

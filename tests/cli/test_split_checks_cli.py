@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commands import tree
-from splits import TEST, TRAIN, combined, member, split
 
+from commands import tree
 from morphgen.benchmark.built import load_built
 from morphgen.benchmark.paper import PAPER
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
+from splits import TEST, TRAIN, combined, member, split
 
 
 @pytest.fixture

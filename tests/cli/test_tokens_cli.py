@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import tree
-from robots import arm
 
 import morphgen
+from commands import tree
 from morphgen.benchmark.tokens import LAYOUT, robot_of_tokens, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
+from robots import arm
 
 WORDS = ("base=gantry", "ee=plane")
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from robots import arm
 
 from morphgen.errors import FormatError
 from morphgen.formats import bundle
 from morphgen.formats.bundle import file_findings, read_bundle, write_bundle
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.robot import Link, Robot
+from robots import arm
 
 
 def files(folder):

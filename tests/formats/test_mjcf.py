@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
-from robots import arm, rod
 
 from morphgen.errors import FormatError
 from morphgen.formats.mjcf import mjcf_text, to_spec
@@ -21,6 +20,7 @@ from morphgen.model.kinematics import (
     random_configurations,
 )
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
+from robots import arm, rod
 
 
 def no_file(mesh):

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import arm
 
 from morphgen.errors import FormatError
 from morphgen.formats.urdf import UnsoundError, read_urdf, with_frames
@@ -12,6 +11,7 @@ from morphgen.formats.urdf_text import number, urdf_text
 from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.kinematics import frame_pose, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
+from robots import arm
 
 
 def no_mesh(mesh):

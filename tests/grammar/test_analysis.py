@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
 
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import count, enumerate_structures, faults, variables
 from morphgen.grammar.derive import Random, derive

@@ -1,8 +1,8 @@
 """Every category of the benchmark, as `morphgen sample` draws it."""
 
 import pytest
-from grammars import CATEGORIES, LIBRARY, benchmark_counts, shipped, unphysical
 
+from grammars import CATEGORIES, LIBRARY, benchmark_counts, shipped, unphysical
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.formats.bundle import read_bundle, write_bundle

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grammars import LIBRARY
-from robots import arm
 
+from grammars import LIBRARY
 from morphgen.errors import GrammarError
 from morphgen.grammar.compose import join
 from morphgen.grammar.conditions import (
@@ -18,6 +17,7 @@ from morphgen.grammar.conditions import (
 )
 from morphgen.grammar.request import parse_request
 from morphgen.grammar.syntax import parse_condition
+from robots import arm
 
 
 def true_of(text, robot):

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
 
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.derive import MAX_PARTS, EndlessError, First, Random, Recorded, derive
 

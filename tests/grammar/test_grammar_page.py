@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 import pytest
-from grammars import LIBRARY, shipped, unphysical
 
+from grammars import LIBRARY, shipped, unphysical
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults
 from morphgen.grammar.conditions import PROPERTIES

@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from broken import with_joint
-from parts import PINCER
-from robots import arm
 
+from broken import with_joint
 from morphgen.checks import check
 from morphgen.checks.self_collision import self_collisions
 from morphgen.errors import FormatError
@@ -16,6 +14,8 @@ from morphgen.grammar.imported import import_robot
 from morphgen.model.geometry import IDENTITY, Box
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.tree import renamed
+from parts import PINCER
+from robots import arm
 
 
 @pytest.fixture

@@ -1,10 +1,10 @@
 """A manifest is read as it is written, or refused with the file and the key."""
 
 import pytest
-from parts import MANIFEST, write_part
 
 from morphgen.errors import PartError
 from morphgen.grammar.manifest import PackageSource, Placement, read_manifest
+from parts import MANIFEST, write_part
 
 REAL = {
     "file": None,

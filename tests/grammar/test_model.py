@@ -1,8 +1,8 @@
 """Grammars are files that include each other; printed, they are the same grammar."""
 
 import pytest
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
 
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.derive import First, derive
 from morphgen.grammar.model import (

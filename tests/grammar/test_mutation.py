@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
 
+from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.formats.card import rounded
 from morphgen.grammar import mutation

@@ -4,7 +4,6 @@ import importlib.metadata
 import math
 
 import pytest
-from parts import PINCER, write_part
 
 from morphgen.errors import PartError
 from morphgen.formats.resolve import PackageFinder
@@ -14,6 +13,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box
+from parts import PINCER, write_part
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
 

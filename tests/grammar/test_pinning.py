@@ -1,8 +1,8 @@
 """``key=value`` words make some of a grammar's choices."""
 
 import pytest
-from grammars import LIBRARY, grammar, shipped
 
+from grammars import LIBRARY, grammar, shipped
 from morphgen.errors import MorphgenError
 from morphgen.grammar.derive import First, derive
 from morphgen.grammar.pinning import pin

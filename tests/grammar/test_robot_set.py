@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pandas
 import pytest
+
 from commands import start, tree
 from grammars import shipped
-
-from morphgen.errors import FormatError, MorphgenError
+from morphgen.errors import FormatError
 from morphgen.grammar.model import grammar_text
 from morphgen.grammar.robot_set import (
     GRAMMAR,
@@ -279,18 +279,6 @@ def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
 def test_a_condition_that_cannot_be_met_stops_the_set(tmp_path, work):
     with pytest.raises(SamplingError, match=r"500 failed at: where \(mass > 900\)"):
         make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, work)
-
-
-def test_a_worker_that_dies_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr("morphgen.grammar.workers._start", _die)
-    with pytest.raises(MorphgenError, match=r"a worker died .*what is done is kept: run again"):
-        make_set(plan(tmp_path / "s"), 2, make_in_processes(1))
-
-
-def _die(plan):
-    import os
-
-    os._exit(3)
 
 
 def test_meshes_of_a_light_robot_are_named_where_their_package_has_them(tmp_path):

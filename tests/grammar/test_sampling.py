@@ -4,10 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
-from grammars import LIBRARY, grammar, shipped, unphysical
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from grammars import LIBRARY, grammar, shipped, unphysical
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.urdf_text import urdf_text

@@ -3,7 +3,6 @@
 import mujoco
 import numpy as np
 import pytest
-from robots import arm
 
 from morphgen.api import compose
 from morphgen.formats.mjcf import to_spec
@@ -17,6 +16,7 @@ from morphgen.model.dynamics import (
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
+from robots import arm
 
 
 def random_robot(rng):

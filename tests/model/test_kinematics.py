@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from robots import arm
 
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
@@ -16,6 +15,7 @@ from morphgen.model.kinematics import (
     reach,
 )
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from robots import arm
 
 
 def planar(lengths=(0.5, 0.3)):

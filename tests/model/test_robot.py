@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import pytest
-from robots import arm
 
 from morphgen.errors import RobotError
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.tree import renamed, subtree
+from robots import arm
 
 
 def test_two_links_of_one_name():

@@ -29,7 +29,7 @@ def bodies():
 
 def test_bins_are_symmetric_and_hold_zero():
     assert len(BINS) == 11
-    assert BINS == tuple(sorted(BINS))
+    assert tuple(sorted(BINS)) == BINS
     assert [-b for b in reversed(BINS)] == list(BINS)
     assert BINS[5] == 0
 

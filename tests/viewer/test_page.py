@@ -3,11 +3,11 @@
 import urllib.request
 
 import pytest
-from robots import arm
 
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.viewer.page import serve
+from robots import arm
 
 
 def test_a_bundle_is_served(tmp_path):

@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from threading import Thread
 from typing import Any, TypeVar
 
-from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.errors import MorphgenError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -43,11 +43,10 @@ def mapped(
         progress: Told how many results there are, and how many there will be.
 
     Raises:
-        BenchmarkError: If ``jobs`` is below 1.
-        MorphgenError: What the work raises, or that a process died.
+        MorphgenError: If ``jobs`` is below 1, what the work raises, or that a process died.
     """
     if jobs < 1:
-        raise BenchmarkError(f"{jobs} jobs: expected 1 or more")
+        raise MorphgenError(f"{jobs} jobs: expected 1 or more")
     chunks = [things[i : i + CHUNK] for i in range(0, len(things), CHUNK)]
     jobs = min(jobs, len(chunks))
     results = map(work, things) if jobs <= 1 else _in_processes(work, chunks, jobs)
@@ -75,7 +74,10 @@ def _result(future: Future[list[R]]) -> list[R]:
     try:
         return future.result()
     except BrokenProcessPool as error:
-        raise MorphgenError("a worker died, perhaps for want of memory; try fewer jobs") from error
+        raise MorphgenError(
+            "a worker died, perhaps for want of memory; what is done is kept: run again, or with "
+            "fewer jobs"
+        ) from error
 
 
 def _start(work: Callable[[Any], object]) -> None:

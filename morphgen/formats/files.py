@@ -1,0 +1,106 @@
+"""Files and folders that are never half there, and folders that one run has to itself."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from morphgen.errors import FormatError
+
+LOCK = ".lock"
+"""The file that a run holds in its folder."""
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a file by way of ``partial_of`` it, so that it is never half there.
+
+    Raises:
+        OSError: If it cannot be written; then nothing is left behind.
+    """
+    partial = partial_of(path)
+    try:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        partial.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            partial.unlink()
+        raise
+
+
+def save(path: Path, content: str | bytes) -> None:
+    """``write_atomic`` for a file that the user named.
+
+    Raises:
+        FormatError: If it cannot be written.
+    """
+    try:
+        write_atomic(path, content)
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+
+
+def partial_of(path: Path) -> Path:
+    """Where a file is written before it takes its place."""
+    return path.with_name(f".{path.name}.partial")
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a folder against a second run; a killed one holds nothing.
+
+    Raises:
+        FormatError: If another run holds it, or it cannot be written.
+    """
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise FormatError(f"{folder} is being written by another run; wait for its end") from error
+    except OSError as error:
+        raise FormatError(f"cannot write to {folder}: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+        (folder / LOCK).unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside ``folder`` that takes its place if the block succeeds."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise FormatError(f"cannot write to {folder.parent}: {error.strerror}") from error
+    try:
+        partial.chmod(0o755)
+        yield partial
+        if folder.exists():
+            _swap(folder, partial)
+        else:
+            partial.rename(folder)
+    except OSError as error:
+        raise FormatError(f"cannot write {folder}: {error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _swap(folder: Path, partial: Path) -> None:
+    """Put ``partial`` in the place of ``folder``, which stays if that fails."""
+    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    old = aside / folder.name
+    try:
+        folder.rename(old)
+        partial.rename(folder)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        shutil.rmtree(aside)
+        raise
+    shutil.rmtree(aside)

@@ -1,0 +1,183 @@
+"""Which configurations are free of collisions in a scene."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from morphgen.checks.self_collision import SelfCollision
+from morphgen.errors import BenchmarkError
+from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.kinematics import random_configurations
+from morphgen.model.robot import Joint, Link, Pair, Robot
+from morphgen.tasks.bodies import TOOL
+from morphgen.tasks.sim.base import Scene
+
+Array = NDArray[np.float64]
+
+TRIES = 1000
+"""Configurations tested for each free one that is needed, before giving up."""
+
+_GROUND_SIZE = (200.0, 200.0, 20.0)
+"""The ground is the top of a box, metres."""
+_POINT = 1e-3
+"""Radius of the ball that stands for the point of the tool, metres."""
+_CHUNK = 256
+
+
+class FreeSpace:
+    """A scene's robot, ground and obstacles, compiled once and tested at many configurations.
+
+    A configuration is free if nothing penetrates (deeper than ``self_collision.PENETRATION``):
+    links each other, but for ``Robot.ignore_pairs``; links the ground, but for the root link and
+    those fixed to it; any link an obstacle. Nor is the point of the tool in an obstacle, also where
+    no link is, as between the fingers of a hand. What can be pushed is no obstacle.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Compile.
+
+        Args:
+            scene: Robot, where its root is, ground and obstacles; its block counts as nothing.
+
+        Raises:
+            MeshError: If a collision mesh cannot be read.
+            RobotError: If MuJoCo refuses a shape.
+        """
+        self.scene = scene
+        taken = {link.name for link in scene.robot.links}
+        self._obstacles = [_unused(f"obstacle{k}", taken) for k in range(len(scene.obstacles))]
+        self._tested = SelfCollision(_with_surroundings(scene, self._obstacles))
+
+    def free(self, q: ArrayLike) -> NDArray[np.bool_]:
+        """Whether configurations are free.
+
+        Args:
+            q: Independent joint positions, shape (n, dof), rad or m.
+
+        Returns:
+            Shape (n,).
+
+        Raises:
+            ValueError: If ``q`` has another shape.
+        """
+        return np.array([not found for found in self._each(q)], dtype=np.bool_)
+
+    def obstacle_hits(self, q: ArrayLike) -> NDArray[np.bool_]:
+        """Which obstacles the robot penetrates, whatever else it does.
+
+        Args:
+            q: Independent joint positions, shape (n, dof), rad or m.
+
+        Returns:
+            Shape (n, number of obstacles).
+
+        Raises:
+            ValueError: If ``q`` has another shape.
+        """
+        rows = [{name for pair in found for name in pair} for found in self._each(q)]
+        hits = [[name in row for name in self._obstacles] for row in rows]
+        return np.array(hits, dtype=np.bool_).reshape(len(rows), len(self._obstacles))
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[Array, int]:
+        """Draw free configurations, uniformly within the joint limits.
+
+        The first few of many are the same as few; ``rng`` is left anywhere.
+
+        Args:
+            n: How many.
+            rng: Where they come from.
+
+        Returns:
+            The free ones in the order in which they were drawn, shape (n, dof), and how many were
+            tested until then.
+
+        Raises:
+            BenchmarkError: If fewer are found in ``TRIES`` times n.
+            ValueError: If the limits of a joint are no range.
+        """
+        kept: list[Array] = []
+        collisions: Counter[Pair] = Counter()
+        tried = 0
+        while len(kept) < n:
+            if tried >= n * TRIES:
+                raise self._too_few(len(kept), n, tried, collisions)
+            q = random_configurations(self.scene.robot, _CHUNK, rng)[: n * TRIES - tried]
+            for row, found in zip(q, self._each(q), strict=True):
+                tried += 1
+                collisions.update(found.keys())
+                if not found:
+                    kept.append(row)
+                    if len(kept) == n:
+                        break
+        return np.array(kept).reshape(n, self.scene.robot.dof), tried
+
+    def _too_few(self, found: int, n: int, tried: int, collisions: Counter[Pair]) -> BenchmarkError:
+        ((a, b), times), *_ = collisions.most_common(1)
+        return BenchmarkError(
+            f"robot {self.scene.robot.name!r}: only {found} of {tried:,} random configurations are "
+            f"free of collisions (acceptance rate {found / tried:.2g}), {n} are needed; most often "
+            f"{a!r} and {b!r} collide, in {times / tried:.0%}: lift the robot off the ground, by a "
+            "base or its place in the world, or narrow the limits of its joints"
+        )
+
+    def _each(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
+        q = np.asarray(q, dtype=np.float64)
+        robot = self.scene.robot
+        if q.ndim != 2 or q.shape[1] != robot.dof:
+            raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
+        held = np.zeros((len(q), len(self._obstacles)))
+        return self._tested.each(np.concatenate([q, held], axis=1))
+
+
+def _with_surroundings(scene: Scene, obstacles: Sequence[str]) -> Robot:
+    """The robot with the ground and obstacles as links of its own, so that they are tested alike.
+
+    The ground is fixed to the root, and what is fixed to each other is never tested. An obstacle
+    is to be tested against the root too, so each is on a slide of its own, which stays at zero.
+    """
+    robot = scene.robot
+    links = {link.name for link in robot.links}
+    joints = {joint.name for joint in robot.joints}
+    world = Link(_unused("world", links))
+    to_root = Joint(
+        _unused("to_root", joints), "fixed", world.name, robot.root.name, scene.T_world_root
+    )
+    still: list[Link] = []
+    attached: list[Joint] = []
+    if scene.ground:
+        slab = Shape(Box(_GROUND_SIZE), Pose((0.0, 0.0, -_GROUND_SIZE[2] / 2)))
+        still.append(Link(_unused("ground", links), collisions=(slab,)))
+        attached.append(Joint(_unused("to_ground", joints), "fixed", world.name, still[-1].name))
+    for name, block in zip(obstacles, scene.obstacles, strict=True):
+        still.append(Link(name, collisions=(Shape(Box(block.size), block.pose),)))
+        attached.append(
+            Joint(_unused(f"to_{name}", joints), "prismatic", world.name, name, limits=(0.0, 0.0))
+        )
+    ignored = [*robot.ignore_pairs, *combinations([link.name for link in still], 2)]
+    point: list[Link] = []
+    for frame in robot.frames:
+        if frame.name == TOOL and obstacles:
+            ball = Shape(Sphere(_POINT), frame.T_link_frame)
+            point.append(Link(_unused("point", links), collisions=(ball,)))
+            attached.append(Joint(_unused("to_point", joints), "fixed", frame.link, point[-1].name))
+            others = [link.name for link in (*robot.links, *still) if link.name not in obstacles]
+            ignored += [(point[-1].name, other) for other in others]
+    return replace(
+        robot,
+        links=(world, *robot.links, *still, *point),
+        joints=(to_root, *robot.joints, *attached),
+        home=(*robot.home, *(0.0 for _ in obstacles)),
+        ignore_pairs=tuple(ignored),
+    )
+
+
+def _unused(name: str, taken: set[str]) -> str:
+    while name in taken:
+        name += "_"
+    return name

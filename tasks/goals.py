@@ -1,0 +1,240 @@
+"""Goal sets: tool poses that are known to be reachable, each with a configuration that proves it.
+
+The configurations are the starts of episodes too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+import warnings
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from platformdirs import user_cache_path
+
+from morphgen.benchmark.split import robot_hash
+from morphgen.benchmark.workspace import shoulder
+from morphgen.errors import BenchmarkError
+from morphgen.formats.mjcf import to_spec
+from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.kinematics import bounds, frame_pose, movable_positions
+from morphgen.model.robot import Robot
+from morphgen.tasks.bodies import TOOL
+from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.obstacles import draw_obstacles
+from morphgen.tasks.sim.base import Block, Scene
+
+Array = NDArray[np.float64]
+
+FORMAT = 1
+"""Of a stored set; a change of how sets are drawn needs another."""
+EXACT = 1e-6
+"""Largest deviation of a goal from its witness's tool, metres and of a quaternion."""
+
+
+@dataclass(frozen=True, eq=False)
+class GoalSet:
+    """Goals of a robot, which are its starts too, and the obstacles that they are free of."""
+
+    robot: str
+    key: str
+    """Hash of all that the set follows from: 64 hexadecimal digits."""
+    q: Array
+    """Witnesses: free configurations, shape (G, dof), rad or m."""
+    poses: Array
+    """Of the tool at them in the world: (x, y, z, qw, qx, qy, qz), qw >= 0, shape (G, 7)."""
+    obstacles: tuple[Block, ...]
+    tried: int
+    """Random configurations that were tested."""
+    accepted: int
+    """How many of these are free: G."""
+    seed: int
+
+
+def goal_set(
+    robot: Robot,
+    config: ReachConfig,
+    *,
+    obstacles: bool,
+    seed: int,
+    T_world_root: Pose = IDENTITY,
+    cache: Path | None = None,
+) -> GoalSet:
+    """A robot's goal set, from the cache or made and kept there.
+
+    Configurations are drawn uniformly within the joint limits; what collides, with the ground and
+    obstacles too, is drawn again. The same body, pairs to ignore, seed, place, goals and obstacles
+    give the same set, whatever the robot is called; fewer goals are the first of more.
+
+    Args:
+        robot: The body, with a tool.
+        config: How many goals, and what obstacles.
+        obstacles: Whether there are any.
+        seed: Of all that is drawn, at least 0.
+        T_world_root: Where the robot stands; the ground is at z = 0.
+        cache: Folder of stored sets; by default ``goals`` in the user's cache.
+
+    Raises:
+        BenchmarkError: If the set cannot be drawn: the robot has no tool that moves, hardly a free
+            configuration, or no room for obstacles; or if its file is broken.
+        MeshError: If a mesh cannot be read.
+    """
+    if seed < 0 or config.goals < 1:
+        raise BenchmarkError(
+            f"{config.goals} goals with seed {seed}: at least one goal, and no negative seed"
+        )
+    shoulder(robot)  # refuses a robot whose tool does not move
+    body = robot_hash(robot)
+    key = _key(robot, body, config, obstacles, seed, T_world_root)
+    folder = user_cache_path("morphgen") / "goals" if cache is None else cache
+    path = folder / f"{key}.npz"
+    if path.is_file():
+        return _read(path, robot, config, obstacles, seed, key)
+    seeds = np.random.SeedSequence([seed, int(body, 16), int(obstacles)])
+    of_goals, of_obstacles = (np.random.default_rng(child) for child in seeds.spawn(2))
+    placed: tuple[Block, ...] = ()
+    if obstacles:
+        count, size = config.obstacles, config.obstacle_size
+        placed = draw_obstacles(robot, count, size, of_obstacles, T_world_root=T_world_root)
+    space = FreeSpace(Scene(robot, T_world_root, obstacles=placed))
+    q, tried = space.draw(config.goals, of_goals)
+    poses = _vectors(T_world_root.matrix @ frame_pose(robot, q, TOOL))
+    made = GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
+    _keep(path, made)
+    return made
+
+
+def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
+    """Prove that every goal can be taken.
+
+    Tool poses are MuJoCo's, not those of our kinematics, which the goals are made with.
+
+    Args:
+        goals: The set.
+        robot: The body.
+        scene: Where it stands, and among which obstacles.
+
+    Returns:
+        What is wrong, a line each: a witness out of limits or in collision, or whose tool is not
+        at the goal; a set of another robot or other obstacles.
+
+    Raises:
+        FormatError: If MJCF cannot express the robot.
+        MeshError: If a mesh cannot be read.
+    """
+    if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
+        return [
+            f"witnesses {goals.q.shape} and poses {goals.poses.shape} are no goals of robot "
+            f"{robot.name!r} with {robot.dof} joints"
+        ]
+    wrong = []
+    if scene.obstacles != goals.obstacles:
+        wrong.append("the obstacles of the scene are not those of the goal set")
+    names = [robot.joints[k].name for k in robot.independent]
+    low, high = bounds(robot).T
+    outside = (goals.q < low) | (goals.q > high) | ~np.isfinite(goals.q)
+    for i, j in np.argwhere(outside).tolist():
+        wrong.append(
+            f"goal {i}: joint {names[j]!r} is at {goals.q[i, j]:g}, outside "
+            f"({low[j]:g}, {high[j]:g})"
+        )
+    usable = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
+    free = FreeSpace(replace(scene, robot=robot)).free(goals.q[usable])
+    wrong += [f"goal {i}: its witness is in collision" for i in usable[~free].tolist()]
+    tools = _vectors(scene.T_world_root.matrix @ _mujoco_tools(robot, goals.q[usable]))
+    for i, tool in zip(usable.tolist(), tools, strict=True):
+        away, turned = _deviation(goals.poses[i], tool)
+        if not (away <= EXACT and turned <= EXACT):
+            wrong.append(
+                f"goal {i}: the tool of its witness is {away:.2g} m away, and its quaternion "
+                f"{turned:.2g}"
+            )
+    return wrong
+
+
+def _deviation(a: Array, b: Array) -> tuple[float, float]:
+    """Distance of two poses (7,), metres, and of their quaternions, whose sign means nothing."""
+    turned = min(float(np.linalg.norm(a[3:] - sign * b[3:])) for sign in (1, -1))
+    return float(np.linalg.norm(a[:3] - b[:3])), turned
+
+
+def _mujoco_tools(robot: Robot, q: Array) -> Array:
+    """Pose of the tool in the root frame, as MuJoCo has it, shape (n, 4, 4)."""
+    bare = robot.with_links([replace(link, visuals=(), collisions=()) for link in robot.links])
+    model = to_spec(bare).compile()
+    data = mujoco.MjData(model)
+    at = [model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable]
+    T_root_tool = np.tile(np.eye(4), (len(q), 1, 1))
+    for T, positions in zip(T_root_tool, movable_positions(robot, q), strict=True):
+        data.qpos[at] = positions
+        mujoco.mj_kinematics(model, data)
+        T[:3, :3] = data.site(TOOL).xmat.reshape(3, 3)
+        T[:3, 3] = data.site(TOOL).xpos
+    return T_root_tool
+
+
+def _vectors(T: Array) -> Array:
+    """Poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
+    poses = [Pose.from_matrix(each) for each in T]
+    return np.array([[*pose.position, *pose.quaternion] for pose in poses]).reshape(len(T), 7)
+
+
+def _key(
+    robot: Robot, body: str, config: ReachConfig, obstacles: bool, seed: int, T_world_root: Pose
+) -> str:
+    index = robot.link_index
+    ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)
+    boxes = [config.obstacles, *map(float, config.obstacle_size)] if obstacles else None
+    place = [*map(float, T_world_root.position), *map(float, T_world_root.quaternion)]
+    parts = [FORMAT, body, ignored, config.goals, boxes, seed, place]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _keep(path: Path, goals: GoalSet) -> None:
+    boxes = [
+        [*block.size, *block.pose.position, *block.pose.quaternion] for block in goals.obstacles
+    ]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+            partial = Path(folder) / path.name
+            np.savez(
+                partial,
+                key=np.array(goals.key),
+                q=goals.q,
+                poses=goals.poses,
+                obstacles=np.array(boxes, dtype=np.float64).reshape(len(boxes), 10),
+                tried=np.array(goals.tried),
+            )
+            partial.replace(path)
+    except OSError as error:
+        warnings.warn(f"cannot keep goals in {path}: {error.strerror}", stacklevel=3)
+
+
+def _read(
+    path: Path, robot: Robot, config: ReachConfig, obstacles: bool, seed: int, key: str
+) -> GoalSet:
+    names = ("key", "q", "poses", "obstacles", "tried")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            stored_key, q, poses, boxes, tried = (np.asarray(data[name]) for name in names)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise BenchmarkError(f"{path}: no goal set: {error}; delete it") from error
+    count = config.obstacles if obstacles else 0
+    if str(stored_key) != key or len(q) != config.goals or len(boxes) != count:
+        raise BenchmarkError(
+            f"{path}: {len(q)} goals and {len(boxes)} obstacles of key {stored_key}, not what its "
+            "name says; delete it"
+        )
+    blocks = tuple(
+        Block((row[0], row[1], row[2]), Pose((row[3], row[4], row[5]), tuple(row[6:])))
+        for row in boxes.tolist()
+    )
+    return GoalSet(robot.name, key, q, poses, blocks, int(tried), len(q), seed)

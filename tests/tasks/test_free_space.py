@@ -1,0 +1,203 @@
+"""Which configurations are free, against spheres worked out by hand and against MuJoCo's plane."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from morphgen.checks.self_collision import PENETRATION
+from morphgen.errors import BenchmarkError
+from morphgen.formats.mjcf import to_spec
+from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.kinematics import movable_positions, random_configurations
+from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.tasks import free_space as module
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.sim.base import Block, Scene
+from tasks.scenes import push_scene, reach_scene, real_arm_scene
+
+DEEP, SHALLOW = 2 * PENETRATION, PENETRATION / 2
+HALF_TURN = Pose.from_xyz_rpy((0.0, 0.0, 1.0), (np.pi, 0.0, 0.0))
+SLAB = Block((0.2, 0.2, 0.2), Pose((0.5, 0.0, 0.5)))
+
+
+def lift(**changes):
+    """A ball of 0.1 m on a vertical slide, starting 0.5 m above a plate on the ground."""
+    plate = Link("plate", collisions=(Shape(Box((0.1, 0.1, 0.1))),))
+    ball = Link("ball", collisions=(Shape(Sphere(0.1)),))
+    slide = Joint("z", "prismatic", "plate", "ball", Pose((0, 0, 0.5)), (0, 0, 1), (-1.0, 1.0))
+    made = Robot("lift", (plate, ball), (slide,), (Frame("tool", "ball"),), (0.0,))
+    return replace(made, **changes)
+
+
+def aside():
+    """The same, 0.5 m beside its plate."""
+    (slide,) = lift().joints
+    return lift(joints=(replace(slide, T_parent_joint=Pose((0.5, 0.0, 0.5))),))
+
+
+def free(scene, *q):
+    return FreeSpace(scene).free([[value] for value in q]).tolist()
+
+
+def test_links_may_touch_the_ground_and_not_go_into_it():
+    lowest = -0.5 + 0.1
+    assert free(Scene(aside()), 0.0, lowest - SHALLOW, lowest - DEEP) == [True, True, False]
+    assert free(Scene(aside(), ground=False), lowest - DEEP) == [True]
+
+
+def test_the_ground_is_solid_however_deep_a_link_is():
+    assert free(Scene(aside(), Pose((0.0, 0.0, -3.0))), 0.0) == [False]
+
+
+def test_the_root_and_what_is_fixed_to_it_may_be_in_the_ground():
+    foot = Link("foot", collisions=(Shape(Sphere(0.2)),))
+    fixed = Joint("to_foot", "fixed", "plate", "foot", Pose((0.0, 0.5, 0.0)))
+    robot = aside()
+    robot = replace(robot, links=(*robot.links, foot), joints=(*robot.joints, fixed))
+    assert free(Scene(robot), 0.0) == [True]
+
+
+def test_links_may_not_go_into_each_other_unless_their_pair_is_ignored():
+    touching = -0.5 + 0.05 + 0.1
+    q = (touching - SHALLOW, touching - DEEP)
+    assert free(Scene(lift(), Pose((0.0, 0.0, 0.3))), *q) == [True, False]
+    known = lift(ignore_pairs=(("ball", "plate"),))
+    assert free(Scene(known, Pose((0.0, 0.0, 0.3))), *q) == [True, True]
+
+
+def test_links_may_not_go_into_obstacles():
+    scene = Scene(aside(), obstacles=(replace(SLAB, pose=Pose((0.5, 0.0, 1.0))),))
+    touching = 1.0 - 0.1 - 0.1 - 0.5
+    assert free(scene, touching + SHALLOW, touching + DEEP) == [True, False]
+
+
+def test_obstacles_are_hit_by_name_and_may_touch_each_other_and_the_ground():
+    near, far = SLAB, replace(SLAB, pose=Pose((0.5, 0.0, 0.35)))
+    sunk = Block((1.0, 1.0, 1.0), Pose((5.0, 0.0, 0.0)))
+    space = FreeSpace(Scene(aside(), obstacles=(near, sunk, far)))
+    hits = space.obstacle_hits([[0.0], [0.15], [-0.2], [0.5]])
+    assert hits.tolist() == [
+        [True, False, True],
+        [True, False, False],
+        [False, False, True],
+        [False, False, False],
+    ]
+    assert space.free([[0.5]]).all()
+
+
+def test_an_obstacle_in_the_base_leaves_nothing_free():
+    """The base stands still, and simulators do not test what does; so this has to."""
+    inside = Block((0.05, 0.05, 0.05))
+    assert free(Scene(aside(), obstacles=(inside,)), 0.0, 0.5) == [False, False]
+
+
+def test_the_point_of_a_tool_is_in_no_obstacle_though_no_link_is():
+    fingertip = Frame("tool", "ball", Pose((0.0, 0.0, 0.3)))
+    robot = replace(aside(), frames=(fingertip,))
+    thin = Block((0.1, 0.1, 0.1), Pose((0.5, 0.0, 0.9)))
+    assert free(Scene(robot, obstacles=(thin,)), 0.0, 0.1, 0.2) == [True, False, True]
+    assert free(Scene(replace(robot, frames=()), obstacles=(thin,)), 0.1) == [True]
+    below = replace(aside(), frames=(Frame("tool", "ball", Pose((0.0, 0.0, -0.3))),))
+    assert free(Scene(below, obstacles=(thin,)), -0.25) == [True]
+
+
+def test_the_robot_is_where_the_scene_puts_it():
+    """Upside down the slide goes down."""
+    assert free(Scene(aside(), HALF_TURN), 0.0, 0.5, -0.5) == [True, False, True]
+    assert free(Scene(aside(), Pose((0.0, 0.0, 1.0))), 0.5, -0.5) == [True, True]
+
+
+def test_what_can_be_pushed_is_no_obstacle():
+    block = replace(SLAB, mass=0.1)
+    assert free(Scene(aside(), block=block), 0.0) == [True]
+    assert free(Scene(aside(), obstacles=(block,)), 0.0) == [False]
+
+
+def test_a_robot_may_use_any_names():
+    links = tuple(
+        replace(link, name=name)
+        for link, name in zip(aside().links, ("world", "ground"), strict=True)
+    )
+    joint = replace(aside().joints[0], name="to_root", parent="world", child="ground")
+    robot = Robot("r", links, (joint,), (Frame("tool", "ground"),), (0.0,))
+    assert free(Scene(robot, obstacles=(SLAB,)), 0.0, -0.41, 0.9) == [False, False, True]
+
+
+def test_configurations_have_the_shape_of_the_robot():
+    with pytest.raises(ValueError, match=r"needs \(n, 1\)"):
+        FreeSpace(Scene(aside())).free([0.0])
+    with pytest.raises(ValueError, match=r"needs \(n, 1\)"):
+        FreeSpace(Scene(aside(), obstacles=(SLAB,))).free([[0.0, 0.0]])
+    assert FreeSpace(Scene(aside())).free(np.zeros((0, 1))).tolist() == []
+
+
+@pytest.mark.filterwarnings("ignore:Attach conflict")
+@pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
+def test_mujoco_with_a_plane_and_geoms_of_its_own_agrees(scene):
+    """A model built another way: what is written as MJCF, in a world with a true plane."""
+    scene = scene()
+    robot = scene.robot
+    q = random_configurations(robot, 300, np.random.default_rng(1))
+    found = FreeSpace(scene).free(q)
+    assert 0.1 < found.mean() < 0.95
+    assert found.tolist() == [not hit for hit in plane_hits(scene, q)]
+
+
+def plane_hits(scene, q):
+    robot = scene.robot
+    spec = mujoco.MjSpec()
+    place = {"pos": scene.T_world_root.position, "quat": scene.T_world_root.quaternion}
+    spec.attach(to_spec(robot), frame=spec.worldbody.add_frame(**place), prefix="robot/")
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    for block in scene.obstacles:
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[edge / 2 for edge in block.size],
+            pos=block.pose.position,
+            quat=block.pose.quaternion,
+        )
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    at = [model.joint(f"robot/{robot.joints[k].name}").qposadr[0] for k in robot.movable]
+    for positions in movable_positions(robot, q):
+        data.qpos[at] = positions
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        yield bool((data.contact.dist < -PENETRATION).any())
+
+
+def test_draws_are_free_uniform_and_the_first_of_more():
+    space = FreeSpace(Scene(aside()))
+    q, tried = space.draw(400, np.random.default_rng(0))
+    assert q.shape == (400, 1)
+    assert space.free(q).all()
+    assert 400 / tried == pytest.approx(1.4 / 2, abs=0.05)
+    assert np.histogram(q, 4, (-0.4, 1.0))[0] == pytest.approx(100, abs=35)
+    few, fewer = space.draw(30, np.random.default_rng(0))
+    assert (few == q[:30]).all()
+    assert fewer < tried
+
+
+def test_a_drawn_count_is_that_of_all_that_were_tested(monkeypatch):
+    monkeypatch.setattr(module, "_CHUNK", 7)
+    space = FreeSpace(Scene(aside()))
+    q, tried = space.draw(50, np.random.default_rng(0))
+    all_drawn = random_configurations(aside(), tried, np.random.default_rng(0))
+    verdicts = space.free(all_drawn)
+    assert verdicts.sum() == 50
+    assert verdicts[-1]
+    assert (all_drawn[verdicts] == q).all()
+
+
+def test_a_robot_that_is_never_free_is_named_with_what_collides(monkeypatch):
+    monkeypatch.setattr(module, "TRIES", 20)
+    with pytest.raises(BenchmarkError) as caught:
+        FreeSpace(Scene(aside(), Pose((0.0, 0.0, -3.0)))).draw(10, np.random.default_rng(0))
+    text = str(caught.value)
+    assert "'lift': only 0 of 200 random" in text
+    assert "rate 0)" in text
+    assert "'ball' and 'ground' collide, in 100%" in text

@@ -1,0 +1,319 @@
+"""Goal sets, and the faults of the released code that they must not have."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morphgen.benchmark.workspace import shoulder, workspace
+from morphgen.checks.self_collision import ignore_pairs
+from morphgen.errors import BenchmarkError
+from morphgen.model.geometry import Box, Pose, Shape
+from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.model.robot import Link
+from morphgen.tasks import free_space, obstacles
+from morphgen.tasks import goals as module
+from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.goals import certify, goal_set
+from morphgen.tasks.obstacles import KEPT, draw_obstacles
+from morphgen.tasks.sim.base import Scene
+from robots import arm
+from tasks.scenes import robot
+
+CONFIG = ReachConfig(goals=12)
+LIFTED = Pose.from_xyz_rpy((0.2, -0.1, 0.4), (0.0, 0.0, 1.0))
+WORDS = (
+    "arm=ur5 ee=plane",
+    "arm=panda ee=panda_hand",
+    "chain beads=3",
+    "prims",
+    "arm=arm3 ee=claw",
+)
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return tmp_path / "goals"
+
+
+@pytest.fixture(scope="module")
+def body():
+    return replace(arm(), ignore_pairs=ignore_pairs(arm()))
+
+
+def made(body, cache, *, obstacles=False, seed=0, config=CONFIG, at=LIFTED):
+    return goal_set(body, config, obstacles=obstacles, seed=seed, T_world_root=at, cache=cache)
+
+
+def scene_of(body, found, at=LIFTED):
+    return Scene(body, at, obstacles=found.obstacles)
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("words", WORDS)
+@pytest.mark.parametrize("boxes", [False, True])
+def test_every_goal_is_proven_by_its_witness(words, boxes, cache):
+    body = robot(words)
+    found = made(body, cache, obstacles=boxes, at=Pose())
+    assert found.q.shape == (12, body.dof)
+    assert found.poses.shape == (12, 7)
+    assert (found.poses[:, 3] >= 0).all()
+    assert len(found.obstacles) == (3 if boxes else 0)
+    assert certify(found, body, scene_of(body, found, Pose())) == []
+    assert 12 == found.accepted <= found.tried
+    assert len(np.unique(found.q, axis=0)) == 12
+
+
+def test_goals_are_in_the_world(body, cache):
+    here, there = (made(body, cache, at=at) for at in (Pose(), LIFTED))
+    expected = LIFTED.matrix @ frame_pose(body, there.q)
+    assert there.poses[:, :3] == pytest.approx(expected[:, :3, 3])
+    assert certify(there, body, scene_of(body, there)) == []
+    assert certify(there, body, scene_of(body, there, Pose())) != []
+    assert here.key != there.key
+
+
+@pytest.mark.parametrize("words", WORDS)
+def test_goals_are_never_inside_an_obstacle(words, cache):
+    """Neither the witness's links nor the tool's point, which may be where no link is."""
+    body = robot(words)
+    config = replace(CONFIG, goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
+    found = made(body, cache, obstacles=True, config=config, at=Pose())
+    assert not FreeSpace(scene_of(body, found, Pose())).obstacle_hits(found.q).any()
+    for box in found.obstacles:
+        T = box.pose.inverse().matrix
+        inside = np.abs(found.poses[:, :3] @ T[:3, :3].T + T[:3, 3]) <= np.array(box.size) / 2
+        assert not inside.all(axis=1).any()
+
+
+@pytest.mark.parametrize("at", [Pose(), Pose((4.0, -3.0, 0.4))])
+@pytest.mark.parametrize("words", WORDS)
+def test_obstacles_are_in_the_workspace_and_leave_the_robot_at_home(words, at, cache):
+    body = robot(words)
+    found = made(body, cache, obstacles=True, at=at, config=replace(CONFIG, obstacles=6))
+    space = FreeSpace(scene_of(body, found, at))
+    assert not space.obstacle_hits([body.home]).any()
+    reach, centre = workspace(body).reach, np.array(at.apply(shoulder(body)))
+    for box in found.obstacles:
+        assert all(0.06 * reach <= edge <= 0.15 * reach for edge in box.size)
+        assert box.pose.position[2] >= box.size[2] / 2
+        assert np.linalg.norm(centre - box.pose.position) <= reach
+    q, _ = FreeSpace(Scene(body, at)).draw(300, np.random.default_rng(9))
+    assert space.free(q).mean() > KEPT - 0.15
+
+
+def test_obstacles_that_leave_too_little_are_passed_over(body, monkeypatch):
+    def left(share):
+        monkeypatch.setattr(obstacles, "KEPT", share)
+        boxes = draw_obstacles(body, 8, (0.5, 0.7), np.random.default_rng(0), T_world_root=LIFTED)
+        q, _ = FreeSpace(Scene(body, LIFTED)).draw(200, np.random.default_rng(1))
+        return FreeSpace(Scene(body, LIFTED, obstacles=boxes)).free(q).mean()
+
+    assert left(0.0) < 0.6
+    assert left(0.7) > 0.6
+
+
+def test_no_room_for_obstacles_is_an_error_not_fewer(body, cache):
+    config = replace(CONFIG, obstacles=2, obstacle_size=(3.0, 4.0))
+    with pytest.raises(BenchmarkError, match=r"'arm': of 32 boxes .* only 0 .* fewer or smaller"):
+        made(body, cache, obstacles=True, config=config)
+    assert not cache.exists()
+
+
+@pytest.mark.parametrize(
+    ("count", "size"), [(0, (0.06, 0.15)), (1, (0.0, 0.1)), (1, (0.2, 0.1)), (1, (0.1, np.inf))]
+)
+def test_obstacles_that_are_none_are_refused(body, cache, count, size):
+    config = replace(CONFIG, obstacles=count, obstacle_size=size)
+    with pytest.raises(BenchmarkError, match=f"{count} obstacles of size"):
+        made(body, cache, obstacles=True, config=config)
+    assert len(made(body, cache, config=config).q) == 12
+
+
+def test_the_cache_knows_the_seed(body, cache):
+    first, second = made(body, cache, seed=0), made(body, cache, seed=1)
+    assert not np.isin(first.q, second.q).any()
+    assert (made(body, cache, seed=1).q == second.q).all()
+    assert made(body, cache, seed=1).seed == 1
+    assert len(files(cache)) == 2
+
+
+def changes(body):
+    return {
+        "obstacles": {"obstacles": True},
+        "goals": {"config": replace(CONFIG, goals=13)},
+        "place": {"at": Pose((0.0, 0.0, 0.4))},
+        "body": {"body": replace(body, home=(0.0, *body.home[1:]))},
+        "pairs": {"body": replace(body, ignore_pairs=(*body.ignore_pairs, ("base", "slider")))},
+        "number of obstacles": {"obstacles": True, "config": replace(CONFIG, obstacles=2)},
+        "size of obstacles": {
+            "obstacles": True,
+            "config": replace(CONFIG, obstacle_size=(0.06, 0.1)),
+        },
+    }
+
+
+def test_the_cache_knows_all_that_matters_and_nothing_else(body, cache):
+    keys = [
+        made(**{"body": body, "cache": cache, **change}).key for change in changes(body).values()
+    ]
+    keys.append(made(body, cache).key)
+    assert len(set(keys)) == len(keys)
+    count = len(files(cache))
+    same = replace(CONFIG, near=0.1, steps=5, obstacles=7)
+    other = replace(body, name="other")
+    assert made(other, cache, config=same).robot == "other"
+    assert (made(other, cache).q == made(body, cache).q).all()
+    assert len(files(cache)) == count
+
+
+def test_a_stored_set_is_the_one_that_was_made(body, cache, monkeypatch):
+    fresh = made(body, cache, obstacles=True)
+
+    def forbidden(*_):
+        raise AssertionError("it was made again")
+
+    monkeypatch.setattr(module, "FreeSpace", forbidden)
+    stored = made(body, cache, obstacles=True)
+    for name in ("robot", "key", "obstacles", "tried", "accepted", "seed"):
+        assert getattr(stored, name) == getattr(fresh, name)
+    assert (stored.q == fresh.q).all()
+    assert (stored.poses == fresh.poses).all()
+
+
+def test_every_run_gives_the_same_bytes(body, tmp_path):
+    made(body, tmp_path / "here", obstacles=True)
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
+        "from dataclasses import replace; from robots import arm; "
+        "from morphgen.checks.self_collision import ignore_pairs; "
+        "from morphgen.model.geometry import Pose; from morphgen.tasks.config import ReachConfig; "
+        "from morphgen.tasks.goals import goal_set; "
+        "body = replace(arm(), ignore_pairs=ignore_pairs(arm())); "
+        "at = Pose.from_xyz_rpy((0.2, -0.1, 0.4), (0.0, 0.0, 1.0)); "
+        "goal_set(body, ReachConfig(goals=12), obstacles=True, seed=0, T_world_root=at, "
+        "cache=Path(sys.argv[1]))"
+    )
+    tests = Path(__file__).parents[1]
+    run = [sys.executable, "-c", code, str(tmp_path / "there"), str(tests)]
+    subprocess.run(run, check=True, env={**os.environ, "PYTHONHASHSEED": "7"})
+    assert files(tmp_path / "here") == files(tmp_path / "there")
+    assert len(files(tmp_path / "here")) == 1
+
+
+def test_fewer_goals_are_the_first_of_more(body, cache):
+    few = made(body, cache)
+    more = made(body, cache, config=replace(CONFIG, goals=30))
+    assert (more.q[:12] == few.q).all()
+
+
+def test_a_failed_sample_does_not_truncate_the_set(cache):
+    """Three of four configurations of this arm collide, and every set is full."""
+    body = robot("arm=ur5 ee=plane")
+    found = made(body, cache, at=Pose())
+    assert found.tried > 2 * found.accepted
+    assert len(found.q) == 12
+
+
+def test_a_robot_without_enough_goals_is_refused_with_its_acceptance_rate(body, cache, monkeypatch):
+    monkeypatch.setattr(free_space, "TRIES", 20)
+    with pytest.raises(BenchmarkError) as caught:
+        made(body, cache, at=Pose((0.0, 0.0, -5.0)))
+    text = str(caught.value)
+    assert "robot 'arm': only 0 of 240 random configurations" in text
+    assert "acceptance rate 0), 12 are needed" in text
+    assert "lift the robot off the ground" in text
+    assert not cache.exists()
+
+
+def test_a_tool_that_does_not_move_is_refused(body, cache):
+    fixed = replace(body, frames=(replace(body.frame("tool"), link="base"),))
+    with pytest.raises(BenchmarkError, match="no joint moves its tool"):
+        made(fixed, cache)
+    with pytest.raises(BenchmarkError, match="no frame 'tool'"):
+        made(replace(body, frames=()), cache)
+
+
+@pytest.mark.parametrize(("goals", "seed"), [(0, 0), (5, -1)])
+def test_numbers_that_mean_nothing_are_refused(body, cache, goals, seed):
+    with pytest.raises(BenchmarkError, match=f"{goals} goals with seed {seed}"):
+        made(body, cache, seed=seed, config=replace(CONFIG, goals=goals))
+
+
+@pytest.mark.parametrize("keep", [0, 100, -200])
+def test_a_broken_file_is_named(body, cache, keep):
+    made(body, cache)
+    (path,) = cache.iterdir()
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(BenchmarkError, match=f"{path.name}: no goal set: .*; delete it"):
+        made(body, cache)
+
+
+def test_a_changed_byte_is_noticed(body, cache):
+    found = made(body, cache)
+    (path,) = cache.iterdir()
+    data = path.read_bytes()
+    assert found.q.tobytes() in data
+    at = data.index(found.q.tobytes()) + 5
+    path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    with pytest.raises(BenchmarkError, match="delete it"):
+        made(body, cache)
+
+
+def test_a_file_under_another_name_is_noticed(body, cache):
+    first, second = made(body, cache), made(body, cache, seed=1)
+    (cache / f"{first.key}.npz").replace(cache / f"{second.key}.npz")
+    with pytest.raises(BenchmarkError, match=f"12 goals and 0 obstacles of key {first.key}"):
+        made(body, cache, seed=1)
+
+
+def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.warns(UserWarning, match="cannot keep goals"):
+        found = made(body, tmp_path / "file" / "goals")
+    assert len(found.q) == 12
+
+
+def test_the_users_cache_is_the_default(body, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / name)
+    found = made(body, None)
+    assert (tmp_path / "morphgen" / "goals" / f"{found.key}.npz").is_file()
+
+
+def test_a_certificate_names_every_fault(body, cache):
+    found = made(body, cache, obstacles=True)
+    scene = scene_of(body, found)
+
+    def faults(**changes):
+        return certify(replace(found, **changes), body, scene)
+
+    q, poses = found.q.copy(), found.poses.copy()
+    q[3, 1] = bounds(body)[1, 1] + 0.1
+    assert faults(q=q)[0].startswith("goal 3: joint 'elbow' is at 2.1, outside (-2, 2)")
+    q[3, 1] = np.nan
+    assert len(faults(q=q)) == 1
+    poses[4, 0] += 2e-6
+    assert [line.split(":")[0] for line in faults(poses=poses)] == ["goal 4"]
+    poses = found.poses.copy()
+    poses[5, 4:] *= -1
+    assert "goal 5: the tool" in faults(poses=poses)[0]
+    assert faults(poses=found.poses * [1, 1, 1, -1, -1, -1, -1]) == []
+    assert faults(obstacles=()) == ["the obstacles of the scene are not those of the goal set"]
+    assert "no goals of robot 'arm'" in faults(q=found.q[:, :2])[0]
+    assert "no goals of robot 'arm'" in faults(poses=found.poses[1:])[0]
+
+
+def test_a_certificate_notices_a_collision(body, cache):
+    found = made(body, cache)
+    around = Shape(Box((2.0, 2.0, 2.0)))
+    walled = body.with_links([Link("base", body.link("base").inertial, (), (around,))])
+    lines = certify(found, walled, scene_of(walled, found))
+    assert "goal 0: its witness is in collision" in lines
