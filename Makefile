@@ -23,7 +23,7 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	# The folders beside morphgen/ install as its sub-packages; mypy sees them so through links.
 	rm -rf build/types && mkdir -p build/types/morphgen
-	ln -s $(CURDIR)/morphgen/* $(CURDIR)/tasks $(CURDIR)/viewer build/types/morphgen/
+	ln -s $(CURDIR)/morphgen/* $(CURDIR)/rl $(CURDIR)/tasks $(CURDIR)/viewer build/types/morphgen/
 	$(BIN)/mypy
 
 view: demo

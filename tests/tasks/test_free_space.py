@@ -15,7 +15,7 @@ from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space as module
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
-from tasks.scenes import push_scene, reach_scene, real_arm_scene
+from scenes import push_scene, reach_scene, real_arm_scene
 
 DEEP, SHALLOW = 2 * PENETRATION, PENETRATION / 2
 HALF_TURN = Pose.from_xyz_rpy((0.0, 0.0, 1.0), (np.pi, 0.0, 0.0))
@@ -147,9 +147,11 @@ def test_mujoco_with_a_plane_and_geoms_of_its_own_agrees(scene):
 
 def plane_hits(scene, q):
     robot = scene.robot
-    spec = mujoco.MjSpec()
+    spec, child = mujoco.MjSpec(), to_spec(robot)
+    # Else MuJoCo writes a log of the conflict into the working directory.
+    spec.option.timestep, spec.option.integrator = child.option.timestep, child.option.integrator
     place = {"pos": scene.T_world_root.position, "quat": scene.T_world_root.quaternion}
-    spec.attach(to_spec(robot), frame=spec.worldbody.add_frame(**place), prefix="robot/")
+    spec.attach(child, frame=spec.worldbody.add_frame(**place), prefix="robot/")
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     for block in scene.obstacles:
         spec.worldbody.add_geom(

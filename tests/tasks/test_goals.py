@@ -23,7 +23,7 @@ from morphgen.tasks.goals import certify, goal_set
 from morphgen.tasks.obstacles import KEPT, draw_obstacles
 from morphgen.tasks.sim.base import Scene
 from robots import arm
-from tasks.scenes import robot
+from scenes import robot
 
 CONFIG = ReachConfig(goals=12)
 LIFTED = Pose.from_xyz_rpy((0.2, -0.1, 0.4), (0.0, 0.0, 1.0))

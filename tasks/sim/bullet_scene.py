@@ -1,0 +1,282 @@
+"""One scene in a PyBullet client of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from morphgen.errors import MissingDependencyError, SimulationError
+from morphgen.formats.bundle import URDF, write_bundle
+from morphgen.formats.picture import quiet
+from morphgen.model.geometry import Pose
+from morphgen.model.robot import Robot
+from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+
+try:
+    with quiet():
+        import pybullet
+except ImportError as error:
+    raise MissingDependencyError(
+        "the simulator PyBullet is not installed: pip install pybullet (it has wheels up to "
+        "Python 3.11), or take another simulator"
+    ) from error
+
+MAX_CLIENTS = 1024
+"""Clients that PyBullet has in a process."""
+UNLIMITED = 1e6
+"""Effort of a joint without a largest one, N m or N."""
+FRICTION = 1.0
+"""Of the ground, robots and obstacles. PyBullet multiplies two: a block's own is what acts."""
+VELOCITY_GAIN = 0.6
+"""Share of the missing velocity that motors make up in a physics step: all of it at once would ask
+for more than their effort, a small one would leave Coriolis forces to themselves."""
+ITERATIONS = 200
+"""Of the constraint solver; with PyBullet's 50 light chains and wrists are centimetres off."""
+_LINKS, _ROOT, _STATIC, _BLOCK = 1, 2, 4, 8
+"""Collision groups: what moves of the robot, what is held of it, ground and obstacles, block."""
+
+
+class BulletScene:
+    """A robot with what surrounds it.
+
+    Motors. PyBullet's position control, v' = v - kd v + kp e / dt at every physics step, is the
+    wanted law only where nothing else moves the joint: the v on the right already has the step's
+    gravity and Coriolis acceleration, of which kd takes only a part away. So motors make for a
+    velocity, within the effort, during a control step, and ``BulletBatch`` says which. The robot
+    carries its own weight: the world has no gravity, and the block is pulled by its weight as a
+    force. One call makes all substeps; the motors act anew in each, but PyBullet reckons their
+    impulse limits with the whole call's time, hence efforts are divided by ``SUBSTEPS``. A mimic
+    joint is a motor with its leader's target.
+
+    Friction. By default PyBullet limits it along two axes apart, so that a block that slides askew
+    stops 30 % too early and turns aside; ``enableConeFriction`` makes it Coulomb's.
+
+    Resets. What outlives a change of state are contact points and the pairs, in the order of their
+    making, that the broad phase has found; ``saveState`` and ``restoreState`` keep them. Giving
+    every part its collision group again makes its broad-phase entry anew, without pairs, and
+    ``deterministicOverlappingPairs`` then orders pairs by entry. After both, a used client gives
+    the bits of a fresh one; nothing else was needed.
+    """
+
+    def __init__(self, scene: Scene, urdf: Path, body: Robot, contacts: Contacts) -> None:
+        """Load.
+
+        Args:
+            scene: What to load.
+            urdf: The file of ``body``, as ``export`` writes it.
+            body: The scene's robot as ``rigid_bodies``.
+            contacts: What may touch what.
+
+        Raises:
+            SimulationError: If PyBullet has no client left, or cannot load the robot.
+        """
+        self._scene, self._contacts = scene, contacts
+        self.id: int = pybullet.connect(pybullet.DIRECT)
+        if self.id < 0:
+            raise SimulationError(
+                f"PyBullet has no client left: a process has {MAX_CLIENTS}, one for each "
+                "environment; use more worker processes or fewer environments"
+            )
+        self._client = {"physicsClientId": self.id}
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=TIMESTEP * SUBSTEPS,
+            numSolverIterations=ITERATIONS,
+            numSubSteps=SUBSTEPS,
+            deterministicOverlappingPairs=1,
+            enableConeFriction=1,
+            **self._client,
+        )
+        self._groups: list[tuple[int, int, int, int]] = []
+        self._load_robot(urdf, body)
+        self._load_surroundings()
+
+    def _load_robot(self, urdf: Path, body: Robot) -> None:
+        flags = pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER
+        if self._contacts.self_collision:
+            flags |= pybullet.URDF_USE_SELF_COLLISION
+        try:
+            with quiet():
+                self.robot: int = pybullet.loadURDF(
+                    str(urdf),
+                    *_pose(self._scene.T_world_root),
+                    useFixedBase=True,
+                    flags=flags,
+                    **self._client,
+                )
+        except pybullet.error as error:
+            raise SimulationError(
+                f"robot {body.name!r}: PyBullet cannot load it: {error}"
+            ) from error
+        count = pybullet.getNumJoints(self.robot, **self._client)
+        infos = [pybullet.getJointInfo(self.robot, i, **self._client) for i in range(count)]
+        joints = {info[1].decode(): info[0] for info in infos}
+        links = {body.root.name: -1} | {info[12].decode(): info[0] for info in infos}
+        self.driven = [joints[body.joints[k].name] for k in body.movable]
+        self._efforts = [_effort(body, k) / SUBSTEPS for k in body.movable]
+        self._held = _held(body)
+        for name, link in links.items():
+            pybullet.changeDynamics(
+                self.robot,
+                link,
+                lateralFriction=FRICTION,
+                linearDamping=0,
+                angularDamping=0,
+                jointDamping=0,
+                **self._client,
+            )
+            self._assign(self.robot, link, _ROOT if name in self._held else _LINKS)
+        if self._contacts.self_collision:
+            for a, b in body.ignore_pairs:
+                pybullet.setCollisionFilterPair(
+                    self.robot, self.robot, links[a], links[b], 0, **self._client
+                )
+        self._motors: dict[str, Any] = {
+            "forces": self._efforts,
+            "velocityGains": [VELOCITY_GAIN] * len(self.driven),
+            **self._client,
+        }
+
+    def _load_surroundings(self) -> None:
+        if self._scene.ground:
+            plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **self._client)
+            self._add(pybullet.createMultiBody(0, plane, **self._client), FRICTION, _STATIC)
+        for obstacle in self._scene.obstacles:
+            self._add(self._box(obstacle), obstacle.friction, _STATIC)
+        block = self._scene.block
+        self.block = -1
+        self._weight: tuple[float, float, float] | None = None
+        if block is not None:
+            self.block = self._add(self._box(block), block.friction, _BLOCK)
+            if block.mass > 0:
+                self._weight = (0.0, 0.0, -GRAVITY * block.mass)
+
+    def _box(self, block: Block) -> int:
+        half = [edge / 2 for edge in block.size]
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
+        position, quaternion = _pose(block.pose)
+        body: int = pybullet.createMultiBody(
+            block.mass,
+            shape,
+            basePosition=position,
+            baseOrientation=quaternion,
+            **self._client,
+        )
+        return body
+
+    def _add(self, body: int, friction: float, group: int) -> int:
+        pybullet.changeDynamics(
+            body, -1, lateralFriction=friction, linearDamping=0, angularDamping=0, **self._client
+        )
+        self._assign(body, -1, group)
+        return body
+
+    def _assign(self, body: int, link: int, group: int) -> None:
+        robot = _LINKS | _ROOT
+        surroundings = _STATIC | _BLOCK if self._contacts.scene else 0
+        mask = {
+            _LINKS: robot | surroundings,
+            _ROOT: _LINKS | (surroundings & _BLOCK),
+            _STATIC: _BLOCK | (_LINKS if self._contacts.scene else 0),
+            _BLOCK: _STATIC | (robot if self._contacts.scene else 0),
+        }[group]
+        self._groups.append((body, link, group, mask))
+
+    def reset(self, positions: Sequence[float], block_pose: Sequence[float]) -> None:
+        """Put everything at rest, as if it had never moved.
+
+        Args:
+            positions: Of all movable joints.
+            block_pose: (x, y, z, qw, qx, qy, qz) of the block; ignored if there is none.
+        """
+        for joint, position in zip(self.driven, positions, strict=True):
+            pybullet.resetJointState(self.robot, joint, position, **self._client)
+        if self.block >= 0:
+            x, y, z, qw, qx, qy, qz = block_pose
+            pybullet.resetBasePositionAndOrientation(
+                self.block, (x, y, z), (qx, qy, qz, qw), **self._client
+            )
+            pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
+            self._block_position = (x, y, z)
+        for entry in self._groups:
+            pybullet.setCollisionFilterGroupMask(*entry, **self._client)
+
+    def step(self, velocities: list[float]) -> None:
+        """One control step with the velocities of all movable joints."""
+        if velocities:
+            pybullet.setJointMotorControlArray(
+                self.robot,
+                self.driven,
+                pybullet.VELOCITY_CONTROL,
+                targetVelocities=velocities,
+                **self._motors,
+            )
+        if self._weight is not None:
+            pybullet.applyExternalForce(
+                self.block,
+                -1,
+                self._weight,
+                self._block_position,
+                pybullet.WORLD_FRAME,
+                **self._client,
+            )
+        pybullet.stepSimulation(**self._client)
+
+    def joint_states(self) -> Sequence[tuple[float, float]]:
+        """Position and velocity, and more, of the movable joints."""
+        if not self.driven:
+            return ()
+        states: Sequence[tuple[float, float]] = pybullet.getJointStates(
+            self.robot, self.driven, **self._client
+        )
+        return states
+
+    def block_state(self) -> tuple[float, ...]:
+        """Position, quaternion (x, y, z, w), linear and angular velocity of the block."""
+        position, quaternion = pybullet.getBasePositionAndOrientation(self.block, **self._client)
+        linear, angular = pybullet.getBaseVelocity(self.block, **self._client)
+        self._block_position = position
+        return (*position, *quaternion, *linear, *angular)
+
+    def close(self) -> None:
+        """Free the client; a second time does nothing."""
+        if self.id >= 0:
+            pybullet.disconnect(**self._client)
+            self.id = -1
+
+
+def export(robot: Robot, folder: Path) -> tuple[Path, Robot]:
+    """Write what ``BulletScene`` loads.
+
+    Returns:
+        The URDF and the robot in it, as ``rigid_bodies``.
+
+    Raises:
+        FormatError: If a robot cannot be written.
+        MeshError: If a collision mesh cannot be read.
+    """
+    body = rigid_bodies(robot)
+    return write_bundle(body, folder, picture=False) / URDF, body
+
+
+def _pose(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    w, x, y, z = pose.quaternion
+    return pose.position, (x, y, z, w)
+
+
+def _held(body: Robot) -> set[str]:
+    """The root link and what fixed joints attach to it."""
+    held = {body.root.name}
+    for joint in body.joints:
+        if not joint.is_movable and joint.parent in held:
+            held.add(joint.child)
+    return held
+
+
+def _effort(body: Robot, k: int) -> float:
+    """Largest effort of a movable joint; a mimic joint without its own has its leader's."""
+    joint = body.joints[k]
+    while not joint.effort and joint.mimic is not None:
+        joint = body.joints[body.joint_index[joint.mimic.joint]]
+    return joint.effort or UNLIMITED

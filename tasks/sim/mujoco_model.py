@@ -1,0 +1,223 @@
+"""Scenes as MuJoCo models, and where in a model's state a task's numbers are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.errors import SimulationError
+from morphgen.formats.mjcf import to_spec
+from morphgen.model.dynamics import BANDWIDTH
+from morphgen.model.geometry import IDENTITY
+from morphgen.model.robot import Robot, sorted_pair
+from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+GAIN = 1 / (1 - 2 * BANDWIDTH * TIMESTEP)
+"""What the gains of the law are multiplied by.
+
+MuJoCo integrates damping implicitly, v' = (v + dt s e) / (1 + dt d) at unit inertia. With
+s = ``GAIN`` omega^2 and d = ``GAIN`` 2 omega this is v' = v + dt (omega^2 e - 2 omega v), as in
+other simulators.
+"""
+PASSIVE = 0.2
+"""Share of the damping that the joints have, and not the actuators; see ``PositionControl``."""
+IMPEDANCE_RATIO = 10.0
+"""How much harder friction is than the normal direction of a contact (MuJoCo's ``impratio``)."""
+
+_BY_LINKS, _BY_SCENE, _BY_BLOCK = 1, 2, 4
+"""Collision bits: links with links; links with the scene; the block with ground and obstacles."""
+_OBSTACLE_PRIORITY, _BLOCK_PRIORITY = 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A compiled scene."""
+
+    robot: Robot
+    model: mujoco.MjModel
+    movable_q_at: Indices
+    """Where ``qpos`` has the movable joints, in the order of ``robot.movable``."""
+    movable_qd_at: Indices
+    """Where ``qvel`` has them."""
+    q_at: Indices
+    """Where ``qpos`` has the independent joints."""
+    qd_at: Indices
+    """Where ``qvel`` has them."""
+    block: int | None
+    """Body of the block."""
+
+    @property
+    def block_moves(self) -> bool:
+        """Whether the block has mass: it is then free, and otherwise a mocap body."""
+        return self.block is not None and self.model.body_mocapid[self.block] < 0
+
+    def block_pose_in(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """The block's position (3,) and quaternion (4,), views into the data of this model."""
+        if self.block_moves:
+            at = int(self.model.jnt_qposadr[self.model.body_jntadr[self.block]])
+            return data.qpos[at : at + 3], data.qpos[at + 3 : at + 7]
+        mocap = int(self.model.body_mocapid[self.block])
+        return data.mocap_pos[mocap], data.mocap_quat[mocap]
+
+    @property
+    def block_qd_at(self) -> int:
+        """Where ``qvel`` begins to have the velocity of a block that moves."""
+        return int(self.model.body_dofadr[self.block])
+
+
+def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
+    """Compile scenes; those that differ in nothing but where the block begins share a model.
+
+    Contacts are elliptic cones, solved with Newton's method; damping is integrated implicitly, as
+    in every MJCF of morphgen. MuJoCo's default contact, critically damped in 20 ms, is four steps
+    long, which is stable: blocks come to rest. A pyramidal cone would hold more along its edges
+    than between them, and friction no harder than the normal direction lets a pushed block creep.
+    What is solved to MuJoCo's default tolerance takes two or three iterations.
+
+    MuJoCo takes the larger friction of two geoms of one priority, and otherwise that of the higher
+    priority: the block's friction counts whatever it touches, an obstacle's for links, and links
+    have 1 on the ground and on each other.
+
+    Which links touch each other is up to ``Robot.ignore_pairs`` alone: MuJoCo's own exception for
+    neighbours is off. It never tests what stands still against what stands still: the root link
+    and those fixed to it do not touch the ground, obstacles or a block without mass.
+
+    Args:
+        scenes: One for every environment; equal robots are read once if they are one object.
+        contacts: What may touch what.
+
+    Raises:
+        SimulationError: If MuJoCo refuses a scene.
+        FormatError: If MJCF cannot express a robot.
+        MeshError: If a mesh cannot be read.
+    """
+    specs: dict[int, tuple[Robot, mujoco.MjSpec]] = {}
+    models: dict[object, World] = {}
+    found = []
+    for env, scene in enumerate(scenes):
+        block = replace(scene.block, pose=IDENTITY) if scene.block is not None else None
+        key = (id(scene.robot), scene.T_world_root, block, scene.obstacles, scene.ground)
+        if key not in models:
+            if id(scene.robot) not in specs:
+                specs[id(scene.robot)] = _robot_spec(scene.robot, contacts)
+            robot, spec = specs[id(scene.robot)]
+            try:
+                models[key] = _world(scene, robot.root.name, spec.copy())
+            except ValueError as error:
+                reason = " ".join(str(error).split())
+                raise SimulationError(
+                    f"environment {env}, robot {robot.name!r}: MuJoCo refuses the scene: {reason}"
+                ) from error
+        found.append(models[key])
+    return found
+
+
+def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]:
+    """The robot, with a root that can be moved, and its spec, without what is only seen.
+
+    Joints have no friction of their own: the law of the position control says how they move.
+    """
+    robot = _with_own_root(robot)
+    bare = replace(
+        robot,
+        links=tuple(replace(link, visuals=()) for link in robot.links),
+        joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints),
+    )
+    spec = to_spec(bare)
+    for actuator in spec.actuators:
+        damping = -GAIN * actuator.biasprm[2]
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        actuator.gainprm[0] *= GAIN
+        actuator.biasprm[1] *= GAIN
+        actuator.biasprm[2] = -(1 - PASSIVE) * damping
+        spec.joint(actuator.target).damping[0] = PASSIVE * damping
+    for geom in spec.geoms:
+        geom.contype = _BY_LINKS if contacts.self_collision else 0
+        geom.conaffinity = geom.contype | (_BY_SCENE if contacts.scene else 0)
+    option = spec.option
+    option.timestep = TIMESTEP
+    option.gravity = [0.0, 0.0, -GRAVITY]
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = IMPEDANCE_RATIO
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return robot, spec
+
+
+def _with_own_root(robot: Robot) -> Robot:
+    """The robot; a root named ``world`` is renamed, which MuJoCo would take for the world."""
+    if robot.root.name != "world":
+        return robot
+    root = "world_"
+    while root in robot.link_index:
+        root += "_"
+
+    def renamed(name: str) -> str:
+        return root if name == "world" else name
+
+    return replace(
+        robot,
+        links=(replace(robot.root, name=root), *robot.links[1:]),
+        joints=tuple(replace(joint, parent=renamed(joint.parent)) for joint in robot.joints),
+        frames=tuple(replace(frame, link=renamed(frame.link)) for frame in robot.frames),
+        ignore_pairs=tuple(
+            sorted(sorted_pair(renamed(a), renamed(b)) for a, b in robot.ignore_pairs)
+        ),
+    )
+
+
+def _world(scene: Scene, root: str, spec: mujoco.MjSpec) -> World:
+    held = spec.body(root)
+    held.pos, held.quat = scene.T_world_root.position, scene.T_world_root.quaternion
+    if scene.ground:
+        plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+        plane.contype, plane.conaffinity = _BY_SCENE | _BY_BLOCK, 0
+    for obstacle in scene.obstacles:
+        geom = _add_box(spec.worldbody, obstacle, _OBSTACLE_PRIORITY)
+        geom.pos, geom.quat = obstacle.pose.position, obstacle.pose.quaternion
+        geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
+    body = _add_block(spec, scene.block) if scene.block is not None else None
+    model = spec.compile()
+    robot = scene.robot
+    joints = {k: model.joint(robot.joints[k].name) for k in robot.movable}
+    return World(
+        robot,
+        model,
+        movable_q_at=_addresses(joints[k].qposadr for k in robot.movable),
+        movable_qd_at=_addresses(joints[k].dofadr for k in robot.movable),
+        q_at=_addresses(joints[k].qposadr for k in robot.independent),
+        qd_at=_addresses(joints[k].dofadr for k in robot.independent),
+        block=body.id if body is not None else None,
+    )
+
+
+def _add_block(spec: mujoco.MjSpec, block: Block) -> mujoco.MjsBody:
+    body = spec.worldbody.add_body(mocap=block.mass <= 0)
+    if block.mass > 0:
+        body.add_freejoint()
+        x, y, z = (edge * edge for edge in block.size)
+        body.explicitinertial = True
+        body.mass = block.mass
+        body.inertia = [block.mass * total / 12 for total in (y + z, x + z, x + y)]
+    geom = _add_box(body, block, _BLOCK_PRIORITY)
+    geom.contype, geom.conaffinity = _BY_SCENE, _BY_BLOCK
+    return body
+
+
+def _add_box(body: mujoco.MjsBody, block: Block, priority: int) -> mujoco.MjsGeom:
+    geom = body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=[edge / 2 for edge in block.size], priority=priority
+    )
+    geom.friction[0] = block.friction
+    return geom
+
+
+def _addresses(values: Iterable[NDArray[np.int32]]) -> Indices:
+    return np.array([int(value[0]) for value in values], dtype=np.int64)

@@ -1,0 +1,102 @@
+"""What a task reads of MuJoCo: joints and blocks of all environments as tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.tasks.sim.mujoco_gather import Gathered
+from morphgen.tasks.sim.mujoco_model import World
+
+Array = NDArray[np.float64]
+
+MAX_SPEED = 1e4
+"""Velocity from which a simulation counts as exploded, SI units."""
+_FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
+
+
+class State:
+    """The tensors that a task reads, gathered from the data of all environments at once."""
+
+    def __init__(self, found: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
+        """Prepare; ``read`` fills the tensors.
+
+        Args:
+            found: Model of every environment, n of them.
+            data: Its data.
+        """
+        n, joints = len(found), max(world.robot.dof for world in found)
+        blocks = [i for i, world in enumerate(found) if world.block is not None]
+        poses = [view for i in blocks for view in found[i].block_pose_in(data[i])]
+        self._positions = Gathered([*(one.qpos for one in data), *poses])
+        self._velocities = Gathered([one.qvel for one in data])
+        self._warnings = [one.warning.number for one in data]
+        self._q_at = np.full((n, joints), -1)
+        self._qd_at = np.full((n, joints), -1)
+        self._pose_at = np.full((n, 7), -1)
+        self._velocity_at = np.full((n, 6), -1)
+        for i, world in enumerate(found):
+            dof = world.robot.dof
+            self._q_at[i, :dof] = self._positions.begin[i] + world.q_at
+            self._qd_at[i, :dof] = self._velocities.begin[i] + world.qd_at
+            if world.block_moves:
+                self._velocity_at[i] = self._velocities.begin[i] + world.block_qd_at + np.arange(6)
+        for k, i in enumerate(blocks):
+            self._pose_at[i, :3] = self._positions.begin[n + 2 * k] + np.arange(3)
+            self._pose_at[i, 3:] = self._positions.begin[n + 2 * k + 1] + np.arange(4)
+        self._has_blocks = bool(blocks)
+        self.q, self.qd = torch.zeros(n, joints), torch.zeros(n, joints)
+        self.block_pose, self.block_velocity = torch.zeros(n, 7), torch.zeros(n, 6)
+
+    @property
+    def velocities(self) -> Array:
+        """All of ``qvel`` of all environments as it was read, and a zero."""
+        return self._velocities.flat
+
+    def joints(self) -> tuple[Array, Array]:
+        """Positions and velocities of the independent joints as they were read, (n, J)."""
+        return self._positions.flat[self._q_at], self._velocities.flat[self._qd_at]
+
+    def read(self) -> None:
+        """Bring the tensors up to date."""
+        self._positions.read()
+        self._velocities.read()
+        self.q.numpy()[:], self.qd.numpy()[:] = self.joints()
+        if self._has_blocks:
+            pose = self._positions.flat[self._pose_at]
+            velocity = self._velocities.flat[self._velocity_at]
+            quaternion, spin = pose[:, 3:], velocity[:, 3:]
+            quaternion[quaternion[:, 0] < 0] *= -1
+            self.block_pose.numpy()[:] = pose
+            # MuJoCo has a free body's angular velocity in the axes of the body.
+            spin[:] = _rotated(quaternion, spin)
+            self.block_velocity.numpy()[:] = velocity
+
+    def fault(self) -> tuple[int, str] | None:
+        """The first environment whose numbers mean nothing any more, and what it has."""
+        warnings = np.array(self._warnings)
+        speeds = np.abs(self._velocities.flat)
+        if speeds.max() <= MAX_SPEED and not warnings.any():
+            return None
+        begin = self._velocities.begin
+        slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
+        env = int(np.flatnonzero(~np.array(slow) | warnings.any(axis=1))[0])
+        if warnings[env, _FULL].any():
+            return env, "its contacts do not fit into MuJoCo's memory"
+        return env, f"unstable: a velocity is not finite or beyond {MAX_SPEED:g}"
+
+    def forget(self) -> None:
+        """Let go of the environments' data."""
+        self._positions, self._velocities, self._warnings = Gathered(()), Gathered(()), []
+
+
+def _rotated(quaternions: Array, vectors: Array) -> Array:
+    """Vectors (n, 3) turned by quaternions (w, x, y, z), shape (n, 4)."""
+    w, axis = quaternions[:, :1], quaternions[:, 1:]
+    turn = 2 * np.cross(axis, vectors)
+    return np.asarray(vectors + w * turn + np.cross(axis, turn))

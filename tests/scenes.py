@@ -1,0 +1,41 @@
+"""Little scenes that the tests of every simulator share."""
+
+from functools import cache
+
+import morphgen
+from morphgen.model.geometry import Pose
+from morphgen.tasks.sim.base import Block, Scene
+
+
+@cache
+def robot(request):
+    """A robot with primitive collision shapes; the same request gives the same object."""
+    return morphgen.compose(request, geometry="primitive")
+
+
+def reach_scene():
+    """An arm of primitives with a claw, whose fingers mimic each other, above the ground."""
+    return Scene(robot("arm=arm3 ee=claw"))
+
+
+def real_arm_scene():
+    """A UR5 with a plane for a hand, on a plinth."""
+    return Scene(robot("arm=ur5 ee=plane"), Pose((0.0, 0.0, 0.3)))
+
+
+def push_scene(mass=0.1, friction=1.0):
+    """A gantry with a vertical plane, a block in front of it, and two obstacles out of its way."""
+    edge = 0.15
+    return Scene(
+        robot("prims"),
+        block=Block((edge, edge, edge), Pose((0.0, 0.0, edge / 2)), mass, friction),
+        obstacles=(
+            Block((0.1, 0.1, 0.1), Pose((0.5, 0.2, 0.05))),
+            Block((0.1, 0.1, 0.2), Pose.from_xyz_rpy((-0.5, 0.2, 0.1), (0.0, 0.0, 0.5))),
+        ),
+    )
+
+
+def mixed_scenes():
+    """One of each: three bodies, with and without a block."""
+    return [reach_scene(), push_scene(), real_arm_scene()]

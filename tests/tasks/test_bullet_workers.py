@@ -1,0 +1,289 @@
+"""PyBullet in several processes: the same bits, and nothing left behind however it ends."""
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import textwrap
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import torch
+
+from morphgen.errors import SimulationError
+from morphgen.tasks.sim import bullet_workers
+from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.bullet import BulletSimulation
+from morphgen.tasks.sim.bullet_workers import BulletWorkers, divide
+from scenes import mixed_scenes, push_scene
+
+TESTS = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def workers():
+    simulation = BulletWorkers([*mixed_scenes(), *mixed_scenes()[:2]], workers=2)
+    yield simulation
+    simulation.close()
+
+
+def starts(simulation):
+    q = torch.zeros_like(simulation.q)
+    pose = torch.zeros_like(simulation.block_pose)
+    for env, scene in enumerate(simulation.scenes):
+        q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
+        pose[env] = torch.tensor([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
+    return torch.arange(len(q)), q, pose
+
+
+def state(simulation):
+    parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
+    return torch.cat(parts, dim=1).clone()
+
+
+def keep_stepping(simulation, q):
+    while True:
+        simulation.step(q)
+
+
+def is_running(pid):
+    """Whether a process runs; a zombie does not."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"
+
+
+def eventually(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def pids(simulation):
+    return [worker.process.pid for worker in simulation._workers]
+
+
+@pytest.fixture
+def scratch(tmp_path, monkeypatch):
+    """Where temporary folders of this test and its processes are made."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
+def leftovers(scratch, pid):
+    """Folders, and shared memory of a process, that a simulation could leave behind."""
+    return [*scratch.glob("morphgen-*"), *Path("/dev/shm").glob(f"*{pid}*")]
+
+
+def test_workers_give_the_bits_of_one_process(workers):
+    alone = BulletSimulation(workers.scenes)
+    generator = torch.Generator().manual_seed(0)
+    envs, q, pose = starts(alone)
+    for simulation in (alone, workers):
+        simulation.reset(envs, q, pose)
+    assert torch.equal(state(workers), state(alone))
+    for step in range(40):
+        q = q + 0.03 * torch.randn(q.shape, generator=generator)
+        for simulation in (alone, workers):
+            simulation.step(q)
+            if step == 20:
+                simulation.reset(envs[1:4], q[1:4], pose[1:4])
+        assert torch.equal(state(workers), state(alone)), step
+    alone.close()
+
+
+def test_wrong_arguments_leave_the_workers_at_work(workers):
+    envs, q, pose = starts(workers)
+    workers.reset(envs, q, pose)
+    with pytest.raises(ValueError, match=r"environment 0 .*targets"):
+        workers.step(q * torch.nan)
+    with pytest.raises(ValueError, match="shape"):
+        workers.step(q[:1])
+    workers.step(q)
+    assert workers.q[0, : workers.scenes[0].robot.dof].any()
+
+
+def test_errors_of_a_worker_are_raised_here():
+    """The weight of such a block is not finite."""
+    block = Block((0.1, 0.1, 0.1), mass=1e308)
+    scenes = [push_scene(), Scene(push_scene().robot, block=block)]
+    with closing(BulletWorkers(scenes, workers=2)) as simulation:
+        envs, q, pose = starts(simulation)
+        simulation.reset(envs, q, pose)
+        with pytest.raises(SimulationError, match=r"environment 1 \('prims'\) became unstable"):
+            simulation.step(q)
+        simulation.reset(envs, q, pose)
+        assert torch.isfinite(state(simulation)).all()
+
+
+def test_a_robot_that_cannot_be_loaded_is_named_here(monkeypatch, scratch):
+    original = bullet_workers.export_robots
+
+    def lost(scenes, folder):
+        return [(path.with_name("none.urdf"), body) for path, body in original(scenes, folder)]
+
+    monkeypatch.setattr(bullet_workers, "export_robots", lost)
+    with pytest.raises(SimulationError, match="robot 'prims': PyBullet cannot load it"):
+        BulletWorkers([push_scene()], workers=1)
+    assert leftovers(scratch, os.getpid()) == []
+
+
+def test_a_killed_worker_is_reported_at_once_and_all_is_freed(scratch):
+    simulation = BulletWorkers([push_scene(), push_scene()], workers=2)
+    envs, q, pose = starts(simulation)
+    simulation.reset(envs, q, pose)
+    simulation.step(q)
+    running = pids(simulation)
+    os.kill(running[1], signal.SIGKILL)
+    begin = time.monotonic()
+    with pytest.raises(SimulationError, match=r"worker 1 .* died \(exit code -9\)"):
+        keep_stepping(simulation, q)
+    assert time.monotonic() - begin < 1.0
+    assert not any(map(is_running, running))
+    assert leftovers(scratch, os.getpid()) == []
+    with pytest.raises(SimulationError, match="closed"):
+        simulation.step(q)
+    simulation.close()
+
+
+def test_a_worker_killed_in_the_middle_of_a_step_is_reported():
+    scenes = [push_scene() for _ in range(8)]
+    simulation = BulletWorkers(scenes, workers=1)
+    envs, q, pose = starts(simulation)
+    simulation.reset(envs, q, pose)
+    (pid,) = pids(simulation)
+    killer = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            f"""if True:
+        import os, time
+        time.sleep(0.3)
+        os.kill({pid}, 9)""",
+        ]
+    )
+    with pytest.raises(SimulationError, match="died"):
+        keep_stepping(simulation, q)
+    killer.wait()
+
+
+def test_nothing_is_left_after_closing(scratch):
+    simulation = BulletWorkers([push_scene(), push_scene()], workers=2)
+    running = pids(simulation)
+    kept = simulation.q
+    simulation.close()
+    simulation.close()
+    assert not any(map(is_running, running))
+    assert leftovers(scratch, os.getpid()) == []
+    assert not kept.any()
+    with pytest.raises(SimulationError, match="closed"):
+        simulation.reset(*starts(simulation))
+
+
+def test_a_forgotten_simulation_ends_its_workers(scratch):
+    simulation = BulletWorkers([push_scene()], workers=1)
+    running = pids(simulation)
+    del simulation
+    gc.collect()
+    assert not any(map(is_running, running))
+    assert leftovers(scratch, os.getpid()) == []
+
+
+SCRIPT = """
+import sys
+
+def main():
+    sys.path.insert(0, sys.argv[1])
+    from scenes import push_scene
+    from tasks.test_bullet_workers import pids, starts
+    from morphgen.tasks.sim.bullet_workers import BulletWorkers
+
+    simulation = BulletWorkers([push_scene(), push_scene()], workers=2)
+    envs, q, pose = starts(simulation)
+    simulation.reset(envs, q, pose)
+    print(*pids(simulation), flush=True)
+"""
+MAIN = """
+if __name__ == "__main__":
+    main()
+"""
+
+
+def script(tmp_path, ending):
+    """Start a process that simulates with two workers; it writes their ids, then goes on."""
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT + textwrap.indent(textwrap.dedent(ending), " " * 4) + MAIN)
+    process = subprocess.Popen(
+        [sys.executable, str(path), str(TESTS)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    return process, [int(word) for word in process.stdout.readline().split()]
+
+
+FOREVER = """
+while True:
+    simulation.step(q)
+"""
+
+
+def test_an_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
+    process, running = script(tmp_path, "raise RuntimeError('on purpose')")
+    _, errors = process.communicate(timeout=20)
+    assert "on purpose" in errors
+    assert len(running) == 2
+    assert not any(map(is_running, running))
+    assert leftovers(scratch, process.pid) == []
+
+
+@pytest.mark.parametrize("ending", [FOREVER, FOREVER.replace("simulation.step(q)", "pass")])
+def test_ctrl_c_ends_the_workers(tmp_path, scratch, ending):
+    """Which a terminal sends to all processes of the foreground."""
+    process, running = script(tmp_path, ending)
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode in (1, -signal.SIGINT)
+    assert errors.count("Traceback") == 1
+    assert "KeyboardInterrupt" in errors
+    assert len(running) == 2
+    assert not any(map(is_running, running))
+    assert leftovers(scratch, process.pid) == []
+
+
+def test_workers_end_when_the_parent_is_killed(tmp_path, scratch):
+    process, running = script(tmp_path, FOREVER)
+    process.kill()
+    process.communicate(timeout=20)
+    assert len(running) == 2
+    assert eventually(lambda: not any(map(is_running, running)))
+    assert list(Path("/dev/shm").glob(f"*{process.pid}*")) == []
+
+
+def test_the_work_is_shared_evenly():
+    scenes = [scene for scene in mixed_scenes() for _ in range(10)]
+    shares = divide(scenes, 3)
+    assert sorted(env for share in shares for env in share) == list(range(30))
+    loads = [sum(5 + len(scenes[env].robot.movable) for env in share) for share in shares]
+    assert max(loads) - min(loads) <= 14
+    assert divide(scenes[:2], 5) == [[0], [1]]
+
+
+@pytest.mark.parametrize(("scenes", "workers"), [([], 2), ([1], 0)])
+def test_workers_need_something_to_do(scenes, workers):
+    with pytest.raises(ValueError, match="both must be at least 1"):
+        BulletWorkers(scenes, workers=workers)

@@ -1,0 +1,383 @@
+"""MuJoCo behind the protocol: the law of control, contacts, forgetting, the same bits."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from morphgen.checks.self_collision import attached_pairs
+from morphgen.errors import SimulationError
+from morphgen.model.dynamics import BANDWIDTH
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import bounds, movable_positions
+from morphgen.model.robot import Frame
+from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from robots import arm
+from scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
+
+NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
+OUTPUTS = ("q", "qd", "block_pose", "block_velocity")
+
+
+def outputs(sim, env=0):
+    """What an environment reports, without the padding."""
+    dof = sim.scenes[env].robot.dof
+    return [
+        getattr(sim, name)[env, : dof if name.startswith("q") else None].clone() for name in OUTPUTS
+    ]
+
+
+def same_bits(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def drive(sim, steps=25, seed=0):
+    """Random targets near where all are now, the same for an environment wherever it is."""
+    start = sim.q.clone()
+    for k in range(steps):
+        rng = np.random.default_rng([seed, k])
+        sim.step(start + torch.from_numpy(rng.uniform(-0.3, 0.3, 32)).float()[: start.shape[1]])
+
+
+def put_back(sim, envs, home):
+    q, pose = home
+    sim.reset(torch.tensor(envs), q[envs], pose[envs])
+
+
+def held(sim, steps):
+    q = sim.q.clone()
+    for _ in range(steps):
+        sim.step(q)
+    return sim
+
+
+def block_scene(block, **rest):
+    return Scene(robot("prims"), Pose((5.0, 0.0, 0.0)), block=block, **rest)
+
+
+def test_the_first_state_is_home():
+    sim = MujocoSimulation(mixed_scenes())
+    assert sim.q.dtype == sim.block_pose.dtype == torch.float32
+    joints = max(scene.robot.dof for scene in sim.scenes)
+    assert sim.q.shape == sim.qd.shape == (3, joints)
+    for i, scene in enumerate(sim.scenes):
+        assert sim.q[i, : scene.robot.dof].tolist() == pytest.approx(scene.robot.home)
+        assert not sim.q[i, scene.robot.dof :].any()
+        expected = (*scene.block.pose.position, *scene.block.pose.quaternion) if scene.block else 0
+        assert sim.block_pose[i].tolist() == pytest.approx(expected or [0.0] * 7)
+
+
+@pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
+def test_home_is_held(scene):
+    sim = MujocoSimulation([scene()])
+    start = sim.q.clone()
+    held(sim, 300)
+    assert (sim.q - start).abs().max() < 1e-4
+    assert sim.qd.abs().max() < 1e-4
+
+
+def test_joints_follow_the_law():
+    sim = MujocoSimulation([real_arm_scene()], NOTHING_TOUCHES)
+    home = sim.q[0].double().numpy()
+    target = home + np.array([0.05, -0.04, 0.05, 0.03, -0.05, 0.05])
+    q, v = home.copy(), np.zeros(6)
+    for _ in range(30):
+        sim.step(torch.from_numpy(target[None]).float())
+        for _ in range(SUBSTEPS):
+            v += TIMESTEP * (BANDWIDTH**2 * (target - q) - 2 * BANDWIDTH * v)
+            q += TIMESTEP * v
+        assert sim.q[0].numpy() == pytest.approx(q, abs=1.5e-3)
+    assert sim.q[0].numpy() == pytest.approx(target, abs=1e-4)
+
+
+def test_effort_limits_what_a_joint_lifts():
+    strong = real_arm_scene().robot
+    joints = tuple(replace(j, effort=5.0) if j.effort else j for j in strong.joints)
+    sim = MujocoSimulation(
+        [Scene(each, ground=False) for each in (strong, replace(strong, joints=joints))],
+        NOTHING_TOUCHES,
+    )
+    targets = sim.q + torch.tensor([0.3, 0, 0, 0, 0, 0])
+    for _ in range(5):
+        sim.step(targets)
+    moved = (sim.q[:, 0] - sim.scenes[0].robot.home[0]).tolist()
+    assert moved[0] > 0.15
+    assert 0 < moved[1] < 0.05
+
+
+def test_a_far_target_is_approached_no_faster_than_the_joint_may():
+    body = robot("prims")
+    sim = MujocoSimulation([Scene(body)], NOTHING_TOUCHES)
+    target, fastest = sim.q.clone(), 0.0
+    target[0, 0] = 5.0
+    for _ in range(25):
+        sim.step(target)
+        fastest = max(fastest, sim.qd[0, 0].item())
+    assert 0.9 < fastest / body.joints[body.independent[0]].velocity < 1.35
+
+
+def test_mimic_joints_follow_and_root_poses_and_orders_are_kept():
+    body = arm()
+    body = replace(body, ignore_pairs=attached_pairs(body))
+    at = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.1, 0.2, 0.3))
+    sim = MujocoSimulation([Scene(body, at)], NOTHING_TOUCHES)
+    target = torch.tensor([[0.5, 0.4, 0.02, 0.03]])
+    for _ in range(60):
+        sim.step(target)
+    assert sim.q[0].tolist() == pytest.approx(target[0].tolist(), abs=1e-3)
+    model, data = sim._worlds[0].model, sim._data[0]
+    assert data.joint("right").qpos[0] == pytest.approx(-0.03, abs=1e-3)
+    assert data.body("base").xpos == pytest.approx(at.position)
+    assert model.body("base").dofnum == 0
+
+
+def test_a_root_named_world_is_a_link_like_any_other():
+    plain = reach_scene().robot
+    first = plain.root.name
+
+    def named(name):
+        return "world" if name == first else name
+
+    body = replace(
+        plain,
+        links=(replace(plain.root, name="world"), *plain.links[1:]),
+        joints=tuple(replace(j, parent=named(j.parent)) for j in plain.joints),
+        frames=tuple(Frame(f.name, named(f.link), f.T_link_frame) for f in plain.frames),
+        ignore_pairs=tuple(sorted(tuple(sorted(map(named, p))) for p in plain.ignore_pairs)),
+    )
+    at = Pose((0.0, 0.0, 0.4))
+    sims = [MujocoSimulation([Scene(each, at)]) for each in (plain, body)]
+    for sim in sims:
+        drive(sim)
+    assert same_bits(outputs(sims[0]), outputs(sims[1]))
+
+
+def test_what_was_before_a_reset_leaves_no_bit():
+    scenes = mixed_scenes()
+    fresh, used = MujocoSimulation(scenes), MujocoSimulation(scenes)
+    home = fresh.q.clone(), fresh.block_pose.clone()
+    drive(used, 40, seed=5)
+    put_back(used, [0, 1, 2], home)
+    for i in range(3):
+        assert same_bits(outputs(used, i), outputs(fresh, i))
+    drive(used, 60)
+    drive(fresh, 60)
+    for i in range(3):
+        assert same_bits(outputs(used, i), outputs(fresh, i))
+
+
+def test_a_reset_of_one_moves_no_other():
+    one, other = (MujocoSimulation(mixed_scenes()) for _ in range(2))
+    home = one.q.clone(), one.block_pose.clone()
+    for sim in (one, other):
+        drive(sim, 20)
+    before = outputs(one, 2)
+    put_back(one, [0, 1], home)
+    assert same_bits(outputs(one, 2), before)
+    target = home[0]
+    for sim in (one, other):
+        sim.step(target)
+    assert same_bits(outputs(one, 2), outputs(other, 2))
+
+
+def test_bits_depend_neither_on_the_batch_nor_on_threads():
+    alone = [MujocoSimulation([scene]) for scene in mixed_scenes()]
+    batches = [MujocoSimulation(mixed_scenes() * 17, threads=threads) for threads in (1, 2, 3)]
+    for sim in (*alone, *batches):
+        drive(sim, 50)
+    for batch in batches:
+        for i in range(51):
+            assert same_bits(outputs(batch, i), outputs(alone[i % 3]))
+        batch.close()
+
+
+def test_a_block_falls_freely_and_comes_to_rest():
+    edge = 0.1
+    sim = MujocoSimulation([block_scene(Block((edge,) * 3, Pose((0, 0, 1.0)), 0.1))])
+    held(sim, 10)
+    fallen = GRAVITY * TIMESTEP**2 * 40 * 41 / 2
+    assert sim.block_pose[0, 2] == pytest.approx(1.0 - fallen, abs=1e-5)
+    assert sim.block_velocity[0, 2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
+    held(sim, 100)
+    assert sim.block_pose[0, 2] == pytest.approx(edge / 2, abs=2e-4)
+    assert sim.block_velocity.abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.6])
+def test_friction_is_the_blocks(friction):
+    """On a slope that is a tenth steeper than friction holds, or flatter."""
+    travelled = []
+    for share in (0.9, 1.1):
+        angle = math.atan(friction * share)
+        ramp = Pose.from_xyz_rpy((0, 0, 3.0), (angle, 0, 0))
+        block = Block((0.1,) * 3, ramp @ Pose((0, 0, 0.1)), 0.1, friction)
+        sim = MujocoSimulation(
+            [block_scene(block, obstacles=(Block((2, 4, 0.1), ramp, friction=0.9),))]
+        )
+        held(sim, 50)
+        before = sim.block_pose[0, :3].clone()
+        held(sim, 25)
+        travelled.append((sim.block_pose[0, :3] - before).norm().item())
+    slide = GRAVITY * (math.sin(angle) - friction * math.cos(angle))
+    assert travelled[0] < 1e-3
+    assert travelled[1] == pytest.approx(slide / 2 * (1.5**2 - 1), rel=0.05)
+
+
+def test_spin_is_in_the_world_frame():
+    """A block that leans on an edge topples about the world's x, however it is turned itself."""
+    lean = Pose.from_xyz_rpy((0, 0, 0.15), (-0.9, 0, 0))
+    turned = lean @ Pose.from_xyz_rpy((0, 0, 0), (0, 0, math.pi / 2))
+    spins = []
+    for pose in (lean, turned):
+        sim = held(MujocoSimulation([block_scene(Block((0.2,) * 3, pose, 0.1))]), 8)
+        spins.append(sim.block_velocity[0, 3:].tolist())
+    assert abs(spins[0][0]) > 0.5
+    assert spins[1] == pytest.approx(spins[0], abs=0.02)
+
+
+def test_a_block_without_mass_stays_where_it_is_put():
+    block = Block((0.1,) * 3, Pose((0.0, 0.0, 0.5)))
+    sim = MujocoSimulation([block_scene(block)])
+    pose = torch.tensor([[0.1, 0.2, 0.7, 0.0, 1.0, 0.0, 0.0]])
+    sim.reset(torch.tensor([0]), sim.q.clone(), pose)
+    held(sim, 5)
+    assert torch.equal(sim.block_pose, pose)
+    assert not sim.block_velocity.any()
+
+
+@pytest.mark.parametrize(
+    ("contacts", "lowest"), [(Contacts(), -0.02), (Contacts(scene=False), -10.0)]
+)
+def test_links_touch_the_ground_if_asked(contacts, lowest):
+    sim = MujocoSimulation([Scene(robot("prims"), Pose((0, 0, -0.5)))], contacts)
+    q = sim.q.clone()
+    depth = sim.scenes[0].robot.joint_index["gantry_z"]
+    column = sim.scenes[0].robot.independent.index(depth)
+    for _ in range(60):
+        q[0, column] = max(q[0, column] - 0.02, 0.2)
+        sim.step(q)
+    reached = sim.q[0, column].item()
+    assert (reached < 0.21) == (lowest < -1)
+
+
+def test_links_touch_each_other_if_asked_and_not_ignored():
+    body = robot("arm=panda ee=panda_hand")
+    q = np.clip(np.array([0, 1.2, 0, -3.0, 0, 0.2, 0.8, 0.0]), *bounds(body).T)
+    counts = []
+    for contacts in (Contacts(), Contacts(self_collision=False)):
+        sim = MujocoSimulation([Scene(body, ground=False)], contacts)
+        held(sim, 1)
+        assert sim._data[0].ncon == 0
+        sim.reset(torch.tensor([0]), torch.from_numpy(q[None]).float(), torch.zeros(1, 7))
+        held(sim, 1)
+        counts.append(sim._data[0].ncon)
+    assert counts[0] > 0
+    assert counts[1] == 0
+
+
+def test_what_explodes_is_named_and_can_be_reset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sim = MujocoSimulation(mixed_scenes(), threads=2)
+    home = sim.q.clone(), sim.block_pose.clone()
+    sim.step(home[0])
+    sim._data[1].qvel[0] = math.nan
+    name = sim.scenes[1].robot.name
+    with pytest.raises(SimulationError, match=rf"environment 1 \(robot '{name}', 2 steps"):
+        sim.step(home[0])
+    assert sim.q[[0, 2]].isfinite().all()
+    put_back(sim, [1], home)
+    sim.step(home[0])
+    sim._data[2].qvel[:] = 1e6
+    with pytest.raises(SimulationError, match=r"environment 2 .*beyond 10000"):
+        sim.step(home[0])
+    assert list(Path(tmp_path).iterdir()) == []
+
+
+def test_targets_that_are_not_finite_move_nothing():
+    sim = MujocoSimulation(mixed_scenes())
+    before = [outputs(sim, i) for i in range(3)]
+    targets = sim.q.clone()
+    targets[1, 2] = math.inf
+    with pytest.raises(ValueError, match=r"environment 1 .*target is not finite"):
+        sim.step(targets)
+    assert all(same_bits(outputs(sim, i), before[i]) for i in range(3))
+
+
+def test_what_mujoco_refuses_is_one_line():
+    scene = block_scene(Block((0.1, 0.0, 0.1), mass=0.1))
+    with pytest.raises(
+        SimulationError, match=r"environment 1, robot 'prims.*MuJoCo refuses"
+    ) as info:
+        MujocoSimulation([reach_scene(), scene])
+    assert "\n" not in str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("envs", "q", "pose", "words"),
+    [
+        ([0], (1, 5), torch.zeros(1, 7), "no pose of a block"),
+        ([0], (1, 5), torch.full((1, 7), math.nan), "reset to"),
+        ([0], (1, 4), torch.zeros(1, 7), r"\(1, 5\)"),
+        ([0, 0], (1, 5), torch.zeros(1, 7), r"\(2, 5\)"),
+        ([1], (1, 5), torch.zeros(1, 7), "there are 1"),
+        ([-1], (1, 5), torch.zeros(1, 7), "there are 1"),
+    ],
+)
+def test_resets_that_mean_nothing_are_refused(envs, q, pose, words):
+    sim = MujocoSimulation([push_scene()])
+    with pytest.raises(ValueError, match=words):
+        sim.reset(torch.tensor(envs), torch.zeros(q), pose)
+
+
+def test_targets_have_one_shape():
+    sim = MujocoSimulation([push_scene()] * 2)
+    with pytest.raises(ValueError, match=r"\(5,\), not \(2, 5\)"):
+        sim.step(torch.zeros(5))
+
+
+def test_closed_is_closed():
+    sim = MujocoSimulation([reach_scene()], threads=2)
+    sim.close()
+    sim.close()
+    with pytest.raises(SimulationError, match="closed"):
+        sim.step(sim.q)
+
+
+def test_equal_scenes_share_a_model():
+    scenes = [push_scene(), push_scene(), push_scene(mass=0.2), reach_scene()]
+    moved = replace(scenes[0], block=replace(scenes[0].block, pose=Pose((0.3, 0, 0.1))))
+    sim = MujocoSimulation([*scenes, moved])
+    models = [id(world.model) for world in sim._worlds]
+    assert models[0] == models[1] == models[4]
+    assert len(set(models)) == 3
+
+
+@pytest.mark.parametrize("request_", ["chain beads=7", "arm=widowx ee=widowx_gripper"])
+def test_full_speed_back_and_forth_is_stable(request_):
+    """Light links that strong motors move, at the limits of effort."""
+    body = robot(request_)
+    sim = MujocoSimulation([Scene(body, block=Block((0.1,) * 3, Pose((0.4, 0.2, 0.05)), 0.1))])
+    rng = np.random.default_rng(3)
+    target, limits = np.array(body.home), bounds(body)
+    for k in range(200):
+        if k % 3 == 0:
+            sign = rng.choice([-1, 1], size=body.dof)
+        speed = [min(body.joints[j].velocity or 10.0, 10.0) for j in body.independent]
+        target = np.clip(target + 0.02 * sign * np.array(speed), *limits.T)
+        sim.step(torch.from_numpy(target[None]).float())
+        assert sim.qd.abs().max() < 40
+
+
+def test_movable_joints_are_where_the_robot_says():
+    scene = reach_scene()
+    sim = MujocoSimulation([scene])
+    q = torch.from_numpy(np.random.default_rng(0).uniform(*bounds(scene.robot).T)[None]).float()
+    sim.reset(torch.tensor([0]), q, torch.zeros(1, 7))
+    assert torch.equal(sim.q, q)
+    expected = movable_positions(scene.robot, q[0].double().numpy())
+    found = [sim._data[0].joint(scene.robot.joints[k].name).qpos[0] for k in scene.robot.movable]
+    assert found == pytest.approx(expected)

@@ -1,0 +1,37 @@
+"""Fewer bodies, the same motion and contacts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morphgen.model.dynamics import mass_matrix
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from robots import arm
+from scenes import robot
+
+
+@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain"])
+def test_fewer_bodies_move_alike(request_):
+    body = robot(request_)
+    merged = rigid_bodies(body)
+    rng = np.random.default_rng(0)
+    for q in rng.normal(size=(3, body.dof)):
+        np.testing.assert_allclose(mass_matrix(merged, q), mass_matrix(body, q), atol=1e-9)
+    shapes = sum(len(link.collisions) for link in body.links)
+    assert sum(len(link.collisions) for link in merged.links) == shapes
+    assert len(merged.links) <= len(body.links)
+    assert merged.home == body.home
+
+
+def test_links_that_ignore_others_are_not_joined():
+    """A fixed finger that may touch what its palm may not stays a body of its own."""
+    body = arm()
+    fixed = replace(body.joints[3], kind="fixed", limits=None)
+    moving = replace(body.joints[4], mimic=None)
+    joints = (*body.joints[:3], fixed, moving)
+    body = replace(body, joints=joints, ignore_pairs=(("base", "left"),))
+    assert {"left", "slider"} <= {link.name for link in rigid_bodies(body).links}
+    joined = rigid_bodies(replace(body, ignore_pairs=()))
+    assert "left" not in {link.name for link in joined.links}
+    assert joined.mass == pytest.approx(body.mass)

@@ -1,0 +1,142 @@
+"""The same targets in PyBullet and in MuJoCo lead to the same places."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
+from morphgen.tasks.sim.base import Block, Contacts, Scene
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from scenes import push_scene, robot
+
+pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+from morphgen.tasks.sim.bullet import BulletSimulation
+
+SIMULATIONS = (MujocoSimulation, BulletSimulation)
+IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
+SECOND = round(1 / CONTROL_PERIOD)
+
+SOME = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm3", "prims", "chain beads=2")
+OF_THE_PAPER = (
+    "arm=ur5 ee=stick",
+    "arm=ur5 ee=sake_ez",
+    "arm=ur5 ee=rethink",
+    "arm=kinova_gen3 ee=robotiq_2f85",
+    "arm=jaco2 ee=jaco_fingers",
+    "arm=xarm7 ee=robotiq_2f85",
+    "arm=lwr ee=panda_hand",
+    "arm=yumi_right ee=yumi_gripper",
+    "arm=widowx ee=widowx_gripper",
+    "arm5",
+    "stick",
+    "nlink",
+    "cubes",
+    "prims prim=cylinder",
+    "prims prim=sphere",
+    "chain beads=3",
+)
+FAST = [pytest.param(words, id=words) for words in SOME]
+SLOW = [pytest.param(words, id=words, marks=pytest.mark.slow) for words in OF_THE_PAPER]
+
+
+def largest_steps(body):
+    """How far the benchmark moves a target at once, shape (dof,)."""
+    joints = [body.joints[k] for k in body.independent]
+    most = [STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN for joint in joints]
+    fast = [(joint.velocity or np.inf) * CONTROL_PERIOD for joint in joints]
+    return np.minimum(most, fast)
+
+
+def smooth_walk(body, seed, steps=SECOND):
+    """Targets that start at home and drift, slowly turning, as fast as the benchmark lets them."""
+    rng = np.random.default_rng(seed)
+    target, action, path = np.array(body.home), np.zeros(body.dof), []
+    for _ in range(steps):
+        action = 0.9 * action + 0.3 * rng.normal(size=body.dof)
+        moved = target + largest_steps(body) * np.clip(action, -1, 1)
+        target = np.clip(moved, *bounds(body).T)
+        path.append(target)
+    return np.array(path)
+
+
+def begun(simulation, scene, q, contacts=None):
+    """A simulation of one scene at a state."""
+    sim = simulation([scene], contacts)
+    block = scene.block.pose if scene.block is not None else Pose()
+    sim.reset(
+        torch.tensor([0]),
+        torch.tensor([q], dtype=torch.float32),
+        torch.tensor([(*block.position, *block.quaternion)], dtype=torch.float32),
+    )
+    return sim
+
+
+def positions(simulation, scene, targets, contacts):
+    """Where targets lead: q after every step, (steps, dof)."""
+    sim = begun(simulation, scene, scene.robot.home, contacts)
+    path = []
+    for target in torch.from_numpy(targets).float():
+        sim.step(target[None])
+        path.append(sim.q[0].double().numpy().copy())
+    sim.close()
+    return np.array(path)
+
+
+@pytest.mark.parametrize("words", [*FAST, *SLOW])
+def test_tools_go_the_same_way_in_free_space(words):
+    body = robot(words)
+    for seed in range(3):
+        targets = smooth_walk(body, seed)
+        mujoco, bullet = (
+            frame_pose(body, positions(each, Scene(body, ground=False), targets, IN_FREE_SPACE))
+            for each in SIMULATIONS
+        )
+        apart = np.linalg.norm(mujoco[:, :3, 3] - bullet[:, :3, 3], axis=1)
+        assert apart.max() < 0.01, f"seed {seed}: {1e3 * apart.max():.1f} mm"
+        home = frame_pose(body, body.home)[:3, 3]
+        assert np.linalg.norm(mujoco[:, :3, 3] - home, axis=1).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("edge", "mass", "turn"),
+    [(0.15, 0.1, (0, 0, 0.4)), (0.15, 0.1, (0.2, 0.1, 0.0)), (0.06, 0.5, (0.0, 0.3, 1.0))],
+)
+def test_a_dropped_block_comes_to_rest_alike(edge, mass, turn):
+    start = Pose.from_xyz_rpy((0.3, -0.4, edge + 0.05), turn)
+    scene = Scene(robot("prims"), Pose((5, 0, 0)), Block((edge,) * 3, start, mass))
+    ends = []
+    for simulation in SIMULATIONS:
+        sim = begun(simulation, scene, scene.robot.home)
+        q = sim.q.clone()
+        for _ in range(2 * SECOND):
+            sim.step(q)
+        assert sim.block_velocity.abs().max() < 0.01
+        ends.append(sim.block_pose[0].clone())
+        sim.close()
+    assert ends[0][2].item() == pytest.approx(edge / 2, abs=1e-3)
+    assert ends[1][2].item() == pytest.approx(edge / 2, abs=1e-3)
+    assert (ends[0][:2] - ends[1][:2]).norm() < 0.02
+    assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
+
+
+@pytest.mark.parametrize("friction", [0.5, 1.0])
+@pytest.mark.parametrize("aside", [0.0, 0.03])
+def test_a_block_is_pushed_alike(friction, aside):
+    """By the gantry's plate, upright behind it and off the ground, at 0.2 m/s."""
+    scene = replace(push_scene(friction=friction), obstacles=())
+    ends = []
+    for simulation in SIMULATIONS:
+        sim = begun(simulation, scene, (aside, -0.2, 0.62, np.pi / 2, 0.0))
+        target = sim.q.clone()
+        for _ in range(2 * SECOND):
+            target[0, 1] += 0.2 * CONTROL_PERIOD
+            sim.step(target)
+        ends.append(sim.block_pose[0].clone())
+        sim.close()
+    assert ends[0][1] > 0.2
+    assert (ends[0][:3] - ends[1][:3]).norm() < 0.02
+    assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
