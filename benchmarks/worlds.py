@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.mjcf import TIMESTEP, to_spec
-from morphgen.formats.picture import quiet
+from morphgen.formats.quiet import quiet
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import DEFAULT_EFFORT, Robot
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import FormatError
-from morphgen.formats.picture import quiet
+from morphgen.formats.quiet import quiet
 from morphgen.model.geometry import Pose
 
 Array = NDArray[np.float64]

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -18,6 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import MissingDependencyError
+from morphgen.formats.quiet import quiet
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
@@ -74,22 +72,6 @@ def render(
     if find_spec("pybullet") is not None:
         return _render_pybullet(robot, urdf, configuration, view, size)
     return _render_mujoco(robot, mjcf, configuration, view, size)
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep what C code prints to the process's standard streams from the terminal."""
-    saved = [os.dup(fd) for fd in (1, 2)]
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for fd in (1, 2):
-            os.dup2(sink, fd)
-        yield
-    finally:
-        for fd, original in zip((1, 2), saved, strict=True):
-            os.dup2(original, fd)
-            os.close(original)
-        os.close(sink)
 
 
 def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:

@@ -8,7 +8,7 @@ from typing import Any
 
 from morphgen.errors import MissingDependencyError, SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.formats.picture import quiet
+from morphgen.formats.quiet import quiet
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
