@@ -11,6 +11,7 @@ from morphgen.rl.references import InverseKinematics, Random, Zero, as_actions
 from morphgen.tasks.batch import ReachBatch
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.config import BINS, ReachConfig
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals import goal_set
 from morphgen.tasks.kinematics import tool_poses
 from morphgen.tasks.sim.base import Scene
@@ -135,6 +136,12 @@ def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
     assert steps[-1].score[steps[-1].success].unique().tolist() == [CONFIG.score_near]
     steps = run(made(body=body, kind=kind), Random(0), CONFIG.steps)
     assert steps[-1].success.float().mean() <= 0.2
+
+
+def test_inverse_kinematics_goes_around_what_is_in_the_way(made, robots):
+    spaces = [FreeSpace(Scene(robot)) for robot in robots]
+    steps = run(made(body=(1,) * 8 + (2,) * 4), InverseKinematics(0, spaces), CONFIG.steps)
+    assert steps[-1].success.float().mean() >= 0.9
 
 
 def test_the_reward_is_the_sum_of_its_terms(made):
