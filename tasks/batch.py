@@ -98,13 +98,20 @@ class ReachBatch:
         self.goal = torch.zeros(n, 7, device=self.device)
         self.witness = torch.zeros(n, bodies.max_joints, device=self.device)
         self.elapsed = torch.zeros(n, dtype=torch.int64, device=self.device)
-        self._qd = torch.zeros(n, bodies.max_joints, device=self.device)
+        self._joints = simulation.q.shape[1]
+        self._qd = torch.zeros(n, self._joints, device=self.device)
         self._obstacles, self._obstacle_mask = _obstacle_tokens(self._sets, self.device)
 
     @property
     def num_envs(self) -> int:
         """How many environments."""
         return len(self.body)
+
+    @property
+    def q(self) -> torch.Tensor:
+        """Positions of the independent joints, shape (n, J); J is that of ``bodies``."""
+        found = self.simulation.q
+        return torch.nn.functional.pad(found, (0, self.bodies.max_joints - self._joints))
 
     def reset(self) -> Observation:
         """Begin an episode everywhere."""
@@ -124,7 +131,7 @@ class ReachBatch:
         shape = (self.num_envs, self.bodies.max_links)
         shares = shares_of(actions, self.kind, shape, self.device)
         self.targets = next_targets(self.bodies, self.body, self.targets, shares, self.mask)
-        self.simulation.step(self.targets)
+        self.simulation.step(self.targets[:, : self._joints].contiguous())
         self.elapsed += 1
         distance = self.distances()
         terms = self._terms(distance)
@@ -148,7 +155,7 @@ class ReachBatch:
     def observe(self) -> Observation:
         """What agents see now."""
         return {
-            "tokens": link_tokens(self.bodies, self.body, self.simulation.q),
+            "tokens": link_tokens(self.bodies, self.body, self.q),
             "links": self.bodies.links[self.body],
             "actions": self.mask,
             "goal": self.goal.clone(),
@@ -158,7 +165,7 @@ class ReachBatch:
 
     def distances(self) -> torch.Tensor:
         """Of tools and goals, shape (n,), metres."""
-        tool = tool_poses(self.bodies.chain, self.body, self.simulation.q)
+        tool = tool_poses(self.bodies.chain, self.body, self.q)
         apart: torch.Tensor = torch.linalg.vector_norm(tool[:, :3] - self.goal[:, :3], dim=1)
         return apart
 
@@ -167,11 +174,11 @@ class ReachBatch:
         self.simulation.close()
 
     def _terms(self, distance: torch.Tensor) -> Terms:
-        q, qd = self.simulation.q, self.simulation.qd
+        qd = self.simulation.qd
         acceleration = (qd - self._qd).abs().sum(dim=1) / CONTROL_PERIOD
         self._qd = qd.clone()
         lower, upper = self.bodies.lower[self.body], self.bodies.upper[self.body]
-        return reach_terms(self.config, distance, beyond_limits(q, lower, upper), acceleration)
+        return reach_terms(self.config, distance, beyond_limits(self.q, lower, upper), acceleration)
 
     def _begin(self, envs: torch.Tensor) -> None:
         """Begin episodes: a start and a goal of the robot's set, never the same."""
@@ -185,7 +192,8 @@ class ReachBatch:
             witnesses[row, :dof] = torch.from_numpy(found.q[goal])
             goals[row] = torch.from_numpy(found.poses[goal])
         starts = starts.to(self.device)
-        self.simulation.reset(envs, starts, torch.zeros(len(envs), 7, device=self.device))
+        no_blocks = torch.zeros(len(envs), 7, device=self.device)
+        self.simulation.reset(envs, starts[:, : self._joints].contiguous(), no_blocks)
         self.targets[envs] = starts
         self.goal[envs] = goals.to(self.device)
         self.witness[envs] = witnesses.to(self.device)

@@ -121,10 +121,10 @@ def test_a_start_is_never_the_goals_own_configuration(made):
 def test_doing_nothing_moves_nothing(made):
     batch = made()
     batch.reset()
-    before = tool_poses(batch.bodies.chain, batch.body, batch.simulation.q)
+    before = tool_poses(batch.bodies.chain, batch.body, batch.q)
     for _ in range(CONFIG.steps - 1):
         batch.step(Zero().act(batch))
-    after = tool_poses(batch.bodies.chain, batch.body, batch.simulation.q)
+    after = tool_poses(batch.bodies.chain, batch.body, batch.q)
     assert (after - before)[:, :3].norm(dim=1).max() < 1e-3
 
 
