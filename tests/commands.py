@@ -1,6 +1,7 @@
 """Run the command line in another process, and see what it leaves on disk."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -21,4 +22,10 @@ def start(*argv, **environment):
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | environment,
+        preexec_fn=heed_ctrl_c,
     )
+
+
+def heed_ctrl_c():
+    """What is started in a shell's background ignores Ctrl-C, and so does all that it starts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

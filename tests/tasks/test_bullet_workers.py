@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from commands import heed_ctrl_c
 from morphgen.errors import SimulationError
 from morphgen.tasks.sim import bullet_workers
 from morphgen.tasks.sim.base import Block, Scene
@@ -231,6 +232,7 @@ def script(tmp_path, ending):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=heed_ctrl_c,
     )
     return process, [int(word) for word in process.stdout.readline().split()]
 
