@@ -38,13 +38,6 @@ class Task(Protocol):
     kind: str
 
 
-class Controller(Protocol):
-    """Decides on actions for a whole batch."""
-
-    def act(self, task: Task) -> torch.Tensor:
-        """Actions, shape (n, L)."""
-
-
 class Zero:
     """Does nothing."""
 

@@ -11,7 +11,6 @@ from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import BINS
 
 ActionKind = Literal["continuous", "discrete"]
-ACTION_KINDS: tuple[ActionKind, ...] = ("continuous", "discrete")
 
 
 def shares_of(

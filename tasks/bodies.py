@@ -15,10 +15,8 @@ from morphgen.benchmark.tokens import MAX_LINKS, padded, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import bounds
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
-
-TOOL = "tool"
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,17 +193,12 @@ def _scales(robot: Robot, max_links: int, joints: int) -> dict[str, np.ndarray]:
 
 def _chain(robot: Robot, joints: int) -> dict[str, np.ndarray]:
     frame = robot.frame(TOOL)
-    path = []
-    link = robot.link_index[frame.link]
-    while link > 0:
-        path.append(link - 1)
-        link = robot.parents[link]
     matrix, offset = robot.mimic_map
     row_of = {k: row for row, k in enumerate(robot.movable)}
     T = np.eye(4)
     origins, axes, slides, gains, offsets = [], [], [], [], []
     moves_tool = np.zeros(joints, dtype=bool)
-    for k in reversed(path):
+    for k in robot.joints_to(frame.link):
         joint = robot.joints[k]
         T = T @ joint.T_parent_joint.matrix
         if not joint.is_movable:

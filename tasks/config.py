@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 
@@ -61,11 +61,3 @@ class PushConfig:
     success_weight: float = 10.0
     approach_weight: float = 0.5
     """For the distance of tool and block: in the released code, not in the paper; never scored."""
-
-
-@dataclass(frozen=True)
-class TaskConfig:
-    """Both tasks, for batches that mix them."""
-
-    reach: ReachConfig = field(default_factory=ReachConfig)
-    push: PushConfig = field(default_factory=PushConfig)

@@ -14,8 +14,7 @@ from morphgen.checks.self_collision import SelfCollision
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
-from morphgen.model.robot import Joint, Link, Pair, Robot
-from morphgen.tasks.bodies import TOOL
+from morphgen.model.robot import TOOL, Joint, Link, Pair, Robot
 from morphgen.tasks.sim.base import Scene
 
 Array = NDArray[np.float64]

@@ -24,8 +24,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.kinematics import bounds, frame_pose, movable_positions
-from morphgen.model.robot import Robot
-from morphgen.tasks.bodies import TOOL
+from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import draw_obstacles

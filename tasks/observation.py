@@ -8,11 +8,6 @@ import torch
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.tasks.bodies import Bodies
 
-OBJECT_SIZE = 13
-"""Numbers of a block or an obstacle: pose (7), one-hot of its shape (3), its parameters (3)."""
-GOAL_SIZE = 7
-"""Position and quaternion (w, x, y, z) of a goal."""
-
 
 def joint_positions(bodies: Bodies, body: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     """The part of the tokens that moves: codes of the links' joint positions.

@@ -11,8 +11,7 @@ from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.kinematics import frame_pose
-from morphgen.model.robot import Robot
-from morphgen.tasks.bodies import TOOL
+from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 

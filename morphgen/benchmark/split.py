@@ -21,7 +21,15 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.model.geometry import Geometry, Mesh, Pose, Shape, dimensions
-from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
+from morphgen.model.robot import (
+    DEFAULT_EFFORT,
+    DEFAULT_VELOCITY,
+    TOOL,
+    Inertial,
+    Joint,
+    Link,
+    Robot,
+)
 from morphgen.model.rotation import to_matrix
 
 Regime = Literal["interpolation", "composition", "extrapolation"]
@@ -134,7 +142,7 @@ def robot_hash(robot: Robot) -> str:
     Raises:
         MeshError: If a mesh file cannot be read.
     """
-    tool = next((frame for frame in robot.frames if frame.name == "tool"), None)
+    tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
     where = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]
     joints = [_joint(joint, robot) for joint in robot.joints]
     return _digest([[_link(link) for link in robot.links], joints, _grid(robot.home), where])

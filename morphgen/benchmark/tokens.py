@@ -15,7 +15,7 @@ from morphgen.benchmark.token_layout import LAYOUT, MAX_LINKS, TOKEN_SIZE, Field
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.geometry import IDENTITY, Shape
 from morphgen.model.kinematics import movable_positions
-from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.model.robot import TOOL, Frame, Joint, Link, Robot
 
 __all__ = [
     "LAYOUT",
@@ -32,9 +32,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
-
-TOOL_FRAME = "tool"
-"""The frame whose link is the end-effector."""
 
 
 def tokens(
@@ -69,7 +66,7 @@ def tokens(
                 + nearest(name, robot.link_index)
             )
     codes = joint_codes(robot, robot.home if q is None else q)
-    tool = next((frame.link for frame in robot.frames if frame.name == TOOL_FRAME), None)
+    tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
     body = np.zeros((len(robot.links), TOKEN_SIZE))
     body[:, layout.INDEX.start] = np.arange(len(robot.links)) / (max_links - 1)
     body[:, layout.PARENT.start] = np.array(robot.parents) / (max_links - 1)
@@ -187,7 +184,7 @@ def robot_of_tokens(
         name,
         tuple(Link(n, collisions=(shapes[n],) if n in shapes else ()) for n in names),
         tuple(joint for joint, _ in read),
-        tuple(Frame(TOOL_FRAME, names[row.index]) for row in tools),
+        tuple(Frame(TOOL, names[row.index]) for row in tools),
         tuple(q for joint, q in read if joint.is_movable),
     )
     return robot, shapes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,12 +12,11 @@ from morphgen.errors import BenchmarkError, nearest
 from morphgen.model import rotation
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, forward_kinematics, reach
-from morphgen.model.robot import Joint, Robot
+from morphgen.model.robot import TOOL, Joint, Robot
 from morphgen.model.rotation import Quat, Vec3
 
 Array = NDArray[np.float64]
 
-TOOL = "tool"
 SAMPLES = 65_536
 CELLS = 10
 """Cells from the shoulder to the farthest point."""
@@ -144,7 +144,7 @@ def tool_positions(robot: Robot, q: Array) -> Array:
     row = {k: i for i, k in enumerate(robot.movable)}
     points = np.zeros((3, q.shape[1]))
     T_joint_point = robot.frame(TOOL).T_link_frame
-    for k in reversed(_path(robot)):
+    for k in reversed(robot.joints_to(robot.frame(TOOL).link)):
         joint = robot.joints[k]
         if joint.is_movable:
             gain, position = gains[row[k]], offsets[row[k]]
@@ -180,24 +180,14 @@ def _turn_from_z(axis: Vec3) -> Quat:
     return rotation.normalized((1 + z, -y, x, 0.0))
 
 
-def _path(robot: Robot) -> list[int]:
-    """Indices of the joints from the root to the tool."""
-    joints = []
-    link = robot.link_index[robot.frame(TOOL).link]
-    while link > 0:
-        joints.append(link - 1)
-        link = robot.parents[link]
-    return joints[::-1]
-
-
-def _tool_path(robot: Robot) -> list[int]:
+def _tool_path(robot: Robot) -> tuple[int, ...]:
     names = [frame.name for frame in robot.frames]
     if TOOL not in names:
         raise BenchmarkError(
             f"robot {robot.name!r} has no frame {TOOL!r}{nearest(TOOL, names)}; name the link at "
             "its working point: morphgen import FILE --tool LINK"
         )
-    path = _path(robot)
+    path = robot.joints_to(robot.frame(TOOL).link)
     if not _moving(robot, path):
         raise BenchmarkError(
             f"robot {robot.name!r}: no joint moves its tool, which is on link "
@@ -213,7 +203,7 @@ def _tool_path(robot: Robot) -> list[int]:
     return path
 
 
-def _moving(robot: Robot, path: list[int]) -> list[int]:
+def _moving(robot: Robot, path: Sequence[int]) -> list[int]:
     """Positions in q of the joints that move the tool, the nearest to the root first."""
     row = {k: i for i, k in enumerate(robot.movable)}
     gains, _ = robot.mimic_map
@@ -221,7 +211,7 @@ def _moving(robot: Robot, path: list[int]) -> list[int]:
     return list(dict.fromkeys(found))
 
 
-def _configurations(robot: Robot, path: list[int], samples: int) -> Array:
+def _configurations(robot: Robot, path: tuple[int, ...], samples: int) -> Array:
     """Uniform draws for the joints that move the tool, any for the others, shape (dof, n)."""
     moving = _moving(robot, path)
     low, high = bounds(robot)[moving].T[..., None]

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from morphgen.model.findings import Finding
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 
-TOOL = "tool"
 """Name of the frame that tasks move."""
 
 

@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
@@ -74,7 +74,7 @@ def add_parser(commands: Subparsers) -> None:
         metavar="N",
         help="compare collisions in so many configurations (default: 1000; with --out)",
     )
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    add_jobs(parser)
     parser.add_argument("--seed", type=int, default=0)
     add_library(parser)
     add_json(parser)

@@ -29,6 +29,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
 
 
+def add_jobs(parser: argparse.ArgumentParser) -> None:
+    """Let the user choose how many processes work."""
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
 def add_out(parser: argparse.ArgumentParser) -> None:
     """Let the user choose where bundles go, and their name."""
     parser.add_argument(

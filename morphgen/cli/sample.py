@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -30,7 +30,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     parser.add_argument("--light", action="store_true", help="URDF and derivation only")
     parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    add_jobs(parser)
     parser.add_argument(
         "--ray",
         metavar="ADDRESS",

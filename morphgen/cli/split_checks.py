@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit, Near
@@ -49,9 +49,7 @@ def _add_audit(verbs: Subparsers) -> None:
         "(default: 0.001,0.99999)",
     )
     parser.add_argument("--strict", action="store_true", help="warnings fail, too")
-    _add_jobs(parser)
-    add_library(parser)
-    add_json(parser)
+    _add_common(parser)
     parser.set_defaults(run=run_audit)
 
 
@@ -69,9 +67,7 @@ def _add_build(verbs: Subparsers) -> None:
     )
     parser.add_argument("--light", action="store_true", help="URDF and derivation only")
     parser.add_argument("--picture", action="store_true", help="draw preview.png of every robot")
-    _add_jobs(parser)
-    add_library(parser)
-    add_json(parser)
+    _add_common(parser)
     parser.set_defaults(run=run_build)
 
 
@@ -83,9 +79,7 @@ def _add_verify(verbs: Subparsers) -> None:
         "with all files of a split that was built. Exit code 1 if something differs.",
     )
     parser.add_argument("path", metavar="PATH", help="a split's file or name, or a built folder")
-    _add_jobs(parser)
-    add_library(parser)
-    add_json(parser)
+    _add_common(parser)
     parser.set_defaults(run=run_verify)
 
 
@@ -101,14 +95,14 @@ def _add_stats(verbs: Subparsers) -> None:
         "splits", nargs="*", metavar="SPLIT", help="files or names (default: all that are shipped)"
     )
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
-    _add_jobs(parser)
-    add_library(parser)
-    add_json(parser)
+    _add_common(parser)
     parser.set_defaults(run=run_stats)
 
 
-def _add_jobs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    add_jobs(parser)
+    add_library(parser)
+    add_json(parser)
 
 
 def run_audit(args: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
 
 if TYPE_CHECKING:
     from morphgen.benchmark.generate import Order
@@ -134,7 +134,7 @@ def _add_order(parser: argparse.ArgumentParser, train: str, default: str = "") -
     parser.add_argument(
         "--statistics", action="store_true", help="add what morphgen split stats says to the file"
     )
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    add_jobs(parser)
     add_library(parser)
     add_json(parser)
 

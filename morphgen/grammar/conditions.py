@@ -13,7 +13,7 @@ from morphgen.grammar.syntax import Expression, unknown
 from morphgen.grammar.values import Scope, evaluate, no_draw
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics, reach
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 
 _COMPARATORS: Mapping[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
@@ -35,7 +35,7 @@ class Properties:
     def reach(self) -> float:
         """Largest distance of the tool from the root's origin, metres; 0 without a tool."""
         robot = self._robot
-        return reach(robot) if any(frame.name == "tool" for frame in robot.frames) else 0.0
+        return reach(robot) if any(frame.name == TOOL for frame in robot.frames) else 0.0
 
     @cached_property
     def mass(self) -> float:
@@ -61,13 +61,8 @@ class Properties:
     def movable_to_tool(self) -> float:
         """Movable joints between the root and the tool; 0 without a tool."""
         robot = self._robot
-        link = next((frame.link for frame in robot.frames if frame.name == "tool"), None)
-        count = 0
-        while link is not None and robot.link_index[link] > 0:
-            joint = robot.joints[robot.link_index[link] - 1]
-            count += joint.is_movable
-            link = joint.parent
-        return count
+        link = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
+        return 0 if link is None else sum(robot.joints[k].is_movable for k in robot.joints_to(link))
 
     @cached_property
     def height(self) -> float:

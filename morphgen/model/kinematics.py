@@ -126,10 +126,8 @@ class _Path:
         self._start = np.array(named.T_link_frame.position)
         self._steps: list[tuple[int, int]] = []
         column = {k: i for i, k in enumerate(robot.movable)}
-        link = robot.link_index[named.link]
-        while link > 0:
-            self._steps.append((link - 1, column.get(link - 1, -1)))
-            link = robot.parents[link]
+        for k in reversed(robot.joints_to(named.link)):
+            self._steps.append((k, column.get(k, -1)))
 
     def distance(self, q: Array) -> Array:
         """Distance at configurations (..., dof), shape (...,), metres."""

@@ -19,6 +19,9 @@ JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "continuous", "prismatic", "fixed")
 Pair = tuple[str, str]
 
+TOOL = "tool"
+"""Name of the frame at a robot's working point."""
+
 DEFAULT_EFFORT = 100.0
 """What a joint without a largest effort is given where a file must name one, N m or N."""
 DEFAULT_VELOCITY = 1.0
@@ -247,6 +250,18 @@ class Robot:
                 matrix[row, column[joint.name]] = gain
             offset[row] = shift
         return matrix, offset
+
+    def joints_to(self, link: str) -> tuple[int, ...]:
+        """Indices of the joints on the way from the root to a link.
+
+        Raises:
+            RobotError: If there is no such link.
+        """
+        path, i = [], self.link_index[self.link(link).name]
+        while i > 0:
+            path.append(i - 1)
+            i = self.parents[i]
+        return tuple(reversed(path))
 
     @property
     def dof(self) -> int:
