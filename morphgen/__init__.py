@@ -1,22 +1,23 @@
 """morphgen: procedural robot morphologies with embedded tasks.
 
-``compose``, ``sample``, ``read``, ``write``, ``check`` and ``fix`` are loaded when first used, so
-that ``import morphgen`` costs nothing.
+``compose``, ``sample``, ``read``, ``write``, ``check``, ``fix`` and the room ``tasks`` are loaded
+when first used, so that ``import morphgen`` costs nothing.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from morphgen.api import check, compose, fix, read, sample, write
 
-__all__ = ["check", "compose", "fix", "read", "sample", "write"]
+__all__ = ["check", "compose", "fix", "read", "sample", "tasks", "write"]
 
 
 def __getattr__(name: str) -> object:
+    if name == "tasks":
+        return import_module("morphgen.tasks")
     if name in __all__:
-        from morphgen import api
-
-        return getattr(api, name)
+        return getattr(import_module("morphgen.api"), name)
     raise AttributeError(f"module 'morphgen' has no attribute {name!r}")

@@ -22,7 +22,7 @@ Progress = Callable[[int, int], None]
 """Told how much is done, and of how much."""
 
 CHUNK = 8
-"""Things that a worker does before it reports."""
+"""Things that a worker does before it reports, unless told otherwise."""
 
 _work: Callable[[Any], object] | None = None
 
@@ -32,7 +32,11 @@ def unseen(done: int, total: int) -> None:
 
 
 def mapped(
-    work: Callable[[T], R], things: Sequence[T], jobs: int, progress: Progress = unseen
+    work: Callable[[T], R],
+    things: Sequence[T],
+    jobs: int,
+    progress: Progress = unseen,
+    chunk: int = CHUNK,
 ) -> Iterator[R]:
     """Do work on every thing; results in the order of the things.
 
@@ -41,13 +45,14 @@ def mapped(
         things: What it is done to.
         jobs: Processes. No more are started than there is work for.
         progress: Told how many results there are, and how many there will be.
+        chunk: Things that a process does before it reports; fewer where one takes long.
 
     Raises:
         MorphgenError: If ``jobs`` is below 1, what the work raises, or that a process died.
     """
     if jobs < 1:
         raise MorphgenError(f"{jobs} jobs: expected 1 or more")
-    chunks = [things[i : i + CHUNK] for i in range(0, len(things), CHUNK)]
+    chunks = [things[i : i + chunk] for i in range(0, len(things), chunk)]
     jobs = min(jobs, len(chunks))
     results = map(work, things) if jobs <= 1 else _in_processes(work, chunks, jobs)
     for done, result in enumerate(results, 1):

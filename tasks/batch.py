@@ -1,9 +1,10 @@
-"""Reach over a batch of bodies: actions, physics, rewards and new episodes, in torch."""
+"""A batch of bodies at their tasks: actions, physics, rewards and new episodes, in torch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,16 +12,32 @@ import torch
 from morphgen.errors import TaskError
 from morphgen.tasks.actions import ActionKind, next_targets, shares_of
 from morphgen.tasks.bodies import Bodies
-from morphgen.tasks.config import CONTROL_PERIOD, ReachConfig
-from morphgen.tasks.goals import GoalSet
-from morphgen.tasks.kinematics import tool_poses
-from morphgen.tasks.observation import box_tokens, link_tokens
-from morphgen.tasks.rewards import Terms, anybody_score, beyond_limits, reach_terms
+from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
+from morphgen.tasks.episodes import Push, Reach, State, Verdict, chosen
+from morphgen.tasks.kinematics import tool_positions
+from morphgen.tasks.observation import box_tokens, link_tokens, of_links
+from morphgen.tasks.points import PointClouds
+from morphgen.tasks.rewards import Terms, beyond_limits
+from morphgen.tasks.settings import Setting
 from morphgen.tasks.sim.base import Simulation
 
 Observation = dict[str, torch.Tensor]
-"""``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool, ``goal`` (n, 7), ``obstacles``
-(n, O, 13) and ``obstacle_mask`` (n, O) bool."""
+"""``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``goal`` (n, 7) and ``goal_mask``
+(n,) bool for reach; ``object`` (n, 13), ``object_mask`` (n,) bool and ``line`` (n, 1) for push;
+``obstacles`` (n, O, 13) and ``obstacle_mask`` (n, O) bool. If asked for, ``velocity`` (n, L),
+``previous_action`` (n, L), ``points`` (n, P, 3) and ``point_mask`` (n, P) bool."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """What an observation also has; the paper has none of it but the points."""
+
+    velocity: bool = False
+    """Velocities of the links' independent joints, rad/s or m/s."""
+    previous_action: bool = False
+    """The action before, as shares of the joints' steps."""
+    points: int = 0
+    """Points of a point cloud of block and obstacles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,16 +55,17 @@ class Step:
     final_observation: Observation
     """After the action, whatever followed: to bootstrap from where time ran out."""
     success: torch.Tensor
-    """Whether the tool is near its goal, shape (n,), bool."""
+    """Whether the tool is near its goal, or the block across the line, shape (n,), bool."""
     distance: torch.Tensor
-    """Of the tool and its goal, shape (n,), metres."""
+    """Metres from success: of tool and goal, or of block and line, shape (n,)."""
     score: torch.Tensor
-    """See ``anybody_score``, shape (n,)."""
+    """See ``Verdict``, shape (n,)."""
     terms: Terms
+    """What the reward is the sum of."""
 
 
-class ReachBatch:
-    """Environments of reach; each has a body, its goals, and a stream of random numbers.
+class TaskBatch:
+    """Environments; each has a robot at a task, and a stream of random numbers.
 
     Robots stand at the origin of the world.
     """
@@ -55,12 +73,14 @@ class ReachBatch:
     def __init__(
         self,
         bodies: Bodies,
+        settings: Sequence[Setting],
         body: Sequence[int],
-        goals: Mapping[int, GoalSet],
         simulation: Simulation,
         *,
-        config: ReachConfig,
+        reach: ReachConfig | None = None,
+        push: PushConfig | None = None,
         kind: ActionKind = "continuous",
+        channels: Channels | None = None,
         seed: int = 0,
         first: int = 0,
     ) -> None:
@@ -68,11 +88,13 @@ class ReachBatch:
 
         Args:
             bodies: The robots.
-            body: Which of them each environment holds.
-            goals: By robot.
-            simulation: Of the same environments, with the obstacles of the goal sets.
-            config: The task.
+            settings: Of each of the robots.
+            body: Which robot each environment holds.
+            simulation: Of the environments, with the settings' scenes.
+            reach: Constants of reach.
+            push: Constants of push.
             kind: Of actions.
+            channels: What is observed besides.
             seed: Of all episodes.
             first: Number of the first environment: the same number and seed give the same episodes,
                 in whichever batch.
@@ -80,38 +102,74 @@ class ReachBatch:
         Raises:
             TaskError: If a robot has fewer than two goals.
         """
-        for i in sorted(set(body)):
-            if len(goals[i].q) < 2:
-                raise TaskError(f"robot {bodies.robots[i].name!r}: a goal set needs two goals")
-        self.bodies, self.config, self.kind = bodies, config, kind
-        self.simulation = simulation
-        self.device = bodies.device
-        self.body = torch.tensor(list(body), device=self.device)
-        self.mask = bodies.action_mask(fingers=False)[self.body]
-        self._sets = [goals[i] for i in body]
-        self._random = [
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(first + i,)))
-            for i in range(len(body))
+        self.bodies, self.settings, self.kind = bodies, tuple(settings), kind
+        self.simulation, self.device = simulation, bodies.device
+        reach, push = reach or ReachConfig(), push or PushConfig()
+        channels = channels or Channels()
+        n, joints, device = len(body), bodies.max_joints, self.device
+        self.body = torch.tensor(list(body), device=device)
+        own = [self.settings[i] for i in body]
+        self.pushes = torch.tensor([each.task == "push" for each in own], device=device)
+        fingers = self.pushes[:, None]
+        self.mask = torch.where(
+            fingers,
+            bodies.action_mask(fingers=True)[self.body],
+            bodies.action_mask(fingers=False)[self.body],
+        )
+        streams = [np.random.SeedSequence(seed, spawn_key=(first + i,)) for i in range(n)]
+        self._random = [np.random.default_rng(stream) for stream in streams]
+        self._reach = Reach(self.settings, self.body, reach, joints)
+        self._push = Push(self.settings, self.body, push, joints)
+        self._tasks: list[tuple[Reach | Push, torch.Tensor]] = [
+            (task, does)
+            for task, does in ((self._reach, ~self.pushes), (self._push, self.pushes))
+            if does.any()
         ]
-        n = len(body)
-        self.targets = torch.zeros(n, bodies.max_joints, device=self.device)
-        self.goal = torch.zeros(n, 7, device=self.device)
-        self.witness = torch.zeros(n, bodies.max_joints, device=self.device)
-        self.elapsed = torch.zeros(n, dtype=torch.int64, device=self.device)
+        self.longest = torch.where(self.pushes, push.steps, reach.steps)
+        """Control steps of an episode at most, shape (n,)."""
         self._joints = simulation.q.shape[1]
-        self._qd = torch.zeros(n, self._joints, device=self.device)
-        self._obstacles, self._obstacle_mask = _obstacle_tokens(self._sets, self.device)
+        self.targets = torch.zeros(n, joints, device=device)
+        self.elapsed = torch.zeros(n, dtype=torch.int64, device=device)
+        self._qd = torch.zeros(n, joints, device=device)
+        self._shares = torch.zeros(n, bodies.max_links, device=device)
+        self._lower, self._upper = bodies.lower[self.body], bodies.upper[self.body]
+        self._channels = channels
+        self._fixed = {
+            "links": bodies.links[self.body],
+            "actions": self.mask,
+            "goal_mask": ~self.pushes,
+            "object_mask": self.pushes,
+            **_obstacles(own, device),
+        }
+        self._points: PointClouds | None = None
+        if channels.points:
+            self._points = PointClouds([each.scene for each in own], channels.points, device)
+            self._fixed["point_mask"] = self._points.mask
 
     @property
     def num_envs(self) -> int:
-        """How many environments."""
+        """How many environments, n."""
         return len(self.body)
 
     @property
     def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J); J is that of ``bodies``."""
-        found = self.simulation.q
-        return torch.nn.functional.pad(found, (0, self.bodies.max_joints - self._joints))
+        """Positions of the independent joints, shape (n, J), rad or m; J is that of ``bodies``."""
+        return self._widened(self.simulation.q)
+
+    @property
+    def goal(self) -> torch.Tensor:
+        """Wanted pose of the tool, shape (n, 7); zeros for push."""
+        return self._reach.goal
+
+    @property
+    def witness(self) -> torch.Tensor:
+        """Joint positions that bring the tool to its goal, shape (n, J); zeros for push."""
+        return self._reach.witness
+
+    @property
+    def line(self) -> torch.Tensor:
+        """Where the block must cross now, y of its centre, shape (n,), metres; zeros for reach."""
+        return self._push.line
 
     def reset(self) -> Observation:
         """Begin an episode everywhere."""
@@ -128,90 +186,127 @@ class ReachBatch:
             TaskError: If the actions are none.
             SimulationError: If a simulation became unstable.
         """
-        shape = (self.num_envs, self.bodies.max_links)
-        shares = shares_of(actions, self.kind, shape, self.device)
-        self.targets = next_targets(self.bodies, self.body, self.targets, shares, self.mask)
+        self._act(actions)
         self.simulation.step(self.targets[:, : self._joints].contiguous())
         self.elapsed += 1
-        distance = self.distances()
-        terms = self._terms(distance)
-        truncated = self.elapsed >= self.config.steps
+        verdict = self._judge()
+        truncated = (self.elapsed >= self.longest) & ~verdict.terminated
         final = self.observe()
-        over = torch.nonzero(truncated)[:, 0]
+        over = torch.nonzero(truncated | verdict.terminated)[:, 0]
         if len(over):
             self._begin(over)
         return Step(
             observation=self.observe() if len(over) else final,
-            reward=torch.stack(list(terms.values())).sum(dim=0),
-            terminated=torch.zeros_like(truncated),
+            reward=torch.stack(list(verdict.terms.values())).sum(dim=0),
+            terminated=verdict.terminated,
             truncated=truncated,
             final_observation=final,
-            success=distance < self.config.near,
-            distance=distance,
-            score=anybody_score(self.config, distance),
-            terms=terms,
+            success=verdict.success,
+            distance=verdict.distance,
+            score=verdict.score,
+            terms=verdict.terms,
         )
 
     def observe(self) -> Observation:
         """What agents see now."""
-        return {
+        seen = {
             "tokens": link_tokens(self.bodies, self.body, self.q),
-            "links": self.bodies.links[self.body],
-            "actions": self.mask,
-            "goal": self.goal.clone(),
-            "obstacles": self._obstacles,
-            "obstacle_mask": self._obstacle_mask,
+            "goal": self._reach.goal.clone(),
+            "object": box_tokens(self.simulation.block_pose, self._push.size)
+            * self.pushes[:, None],
+            "line": self._push.line[:, None].clone(),
+            **self._fixed,
         }
+        if self._channels.velocity:
+            qd = self._widened(self.simulation.qd)
+            seen["velocity"] = of_links(self.bodies, self.body, qd)
+        if self._channels.previous_action:
+            seen["previous_action"] = self._shares.clone()
+        if self._points is not None:
+            seen["points"] = self._points(self.simulation.block_pose)
+        return seen
 
-    def distances(self) -> torch.Tensor:
-        """Of tools and goals, shape (n,), metres."""
-        tool = tool_poses(self.bodies.chain, self.body, self.q)
-        apart: torch.Tensor = torch.linalg.vector_norm(tool[:, :3] - self.goal[:, :3], dim=1)
-        return apart
+    def advance(self, progress: float) -> None:
+        """Move the line that blocks must cross, as the curriculum of push has it.
+
+        Args:
+            progress: Of the training, 0 to 1. Until this is called the line is in its place.
+        """
+        self._push.advance(progress)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next ``reset`` follows from: the streams of random numbers, and the line."""
+        streams = [stream.bit_generator.state for stream in self._random]
+        return {"random": streams, "line": self._push.line.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on as a batch of the same environments would; ``reset`` must follow.
+
+        Raises:
+            TaskError: If the state is of another number of environments.
+        """
+        if len(state["random"]) != self.num_envs:
+            raise TaskError(
+                f"the state is of {len(state['random'])} environments; there are {self.num_envs}"
+            )
+        for stream, saved in zip(self._random, state["random"], strict=True):
+            stream.bit_generator.state = saved
+        self._push.line = state["line"].to(self.device)
 
     def close(self) -> None:
         """Free the simulation."""
         self.simulation.close()
 
-    def _terms(self, distance: torch.Tensor) -> Terms:
-        qd = self.simulation.qd
-        acceleration = (qd - self._qd).abs().sum(dim=1) / CONTROL_PERIOD
+    def _act(self, actions: torch.Tensor) -> None:
+        shape = (self.num_envs, self.bodies.max_links)
+        self._shares = shares_of(actions, self.kind, shape, self.device) * self.mask
+        self.targets = next_targets(self.bodies, self.body, self.targets, self._shares, self.mask)
+
+    def _judge(self) -> Verdict:
+        q, qd = self.q, self._widened(self.simulation.qd)
+        state = State(
+            tool=tool_positions(self.bodies.chain, self.body, q),
+            block=self.simulation.block_pose[:, :3],
+            beyond=beyond_limits(q, self._lower, self._upper),
+            acceleration=(qd - self._qd).abs().sum(dim=1) / CONTROL_PERIOD,
+        )
         self._qd = qd.clone()
-        lower, upper = self.bodies.lower[self.body], self.bodies.upper[self.body]
-        return reach_terms(self.config, distance, beyond_limits(self.q, lower, upper), acceleration)
+        if len(self._tasks) == 1:
+            return self._tasks[0][0].judge(state)
+        return chosen(self.pushes, self._reach.judge(state), self._push.judge(state))
 
     def _begin(self, envs: torch.Tensor) -> None:
-        """Begin episodes: a start and a goal of the robot's set, never the same."""
-        starts = torch.zeros(len(envs), self.bodies.max_joints)
-        witnesses, goals = torch.zeros_like(starts), torch.zeros(len(envs), 7)
-        for row, env in enumerate(envs.tolist()):
-            found = self._sets[env]
-            start, goal = self._random[env].choice(len(found.q), size=2, replace=False)
-            dof = found.q.shape[1]
-            starts[row, :dof] = torch.from_numpy(found.q[start])
-            witnesses[row, :dof] = torch.from_numpy(found.q[goal])
-            goals[row] = torch.from_numpy(found.poses[goal])
-        starts = starts.to(self.device)
-        no_blocks = torch.zeros(len(envs), 7, device=self.device)
-        self.simulation.reset(envs, starts[:, : self._joints].contiguous(), no_blocks)
+        starts = torch.zeros(len(envs), self.bodies.max_joints, device=self.device)
+        blocks = torch.zeros(len(envs), 7, device=self.device)
+        for task, does in self._tasks:
+            rows = torch.nonzero(does[envs])[:, 0]
+            if len(rows):
+                own = [self._random[i] for i in envs[rows].tolist()]
+                starts[rows], blocks[rows] = task.begin(envs[rows], own)
+        if self._points is not None:
+            for env in envs.tolist():
+                self._points.begin(env, self._random[env])
+        self.simulation.reset(envs, starts[:, : self._joints].contiguous(), blocks)
         self.targets[envs] = starts
-        self.goal[envs] = goals.to(self.device)
-        self.witness[envs] = witnesses.to(self.device)
         self.elapsed[envs] = 0
         self._qd[envs] = 0
+        self._shares[envs] = 0
+
+    def _widened(self, values: torch.Tensor) -> torch.Tensor:
+        """Values of the simulation's joints, padded to those of ``bodies``."""
+        more = self.bodies.max_joints - self._joints
+        return torch.nn.functional.pad(values, (0, more)) if more else values
 
 
-def _obstacle_tokens(
-    sets: Sequence[GoalSet], device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _obstacles(settings: Sequence[Setting], device: torch.device) -> Observation:
     """Tokens of every environment's obstacles, (n, O, 13), and which there are, (n, O)."""
-    most = max(len(each.obstacles) for each in sets)
-    pose, size = torch.zeros(len(sets), most, 7), torch.zeros(len(sets), most, 3)
-    mask = torch.zeros(len(sets), most, dtype=torch.bool)
-    for i, each in enumerate(sets):
-        for k, block in enumerate(each.obstacles):
+    most = max(len(each.scene.obstacles) for each in settings)
+    pose, size = torch.zeros(len(settings), most, 7), torch.zeros(len(settings), most, 3)
+    mask = torch.zeros(len(settings), most, dtype=torch.bool)
+    for i, each in enumerate(settings):
+        for k, block in enumerate(each.scene.obstacles):
             pose[i, k] = torch.tensor([*block.pose.position, *block.pose.quaternion])
             size[i, k] = torch.tensor(block.size)
             mask[i, k] = True
     found = box_tokens(pose, size) * mask[..., None]
-    return found.to(device), mask.to(device)
+    return {"obstacles": found.to(device), "obstacle_mask": mask.to(device)}

@@ -93,6 +93,23 @@ class Chain:
     offset: torch.Tensor
     """Shape (R, D)."""
 
+    @cached_property
+    def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """What a joint's motion adds to its origin, two of shape (R, D, 4, 4).
+
+        They count by the sine and one minus the cosine of an angle (Rodrigues' formula); the first
+        by the position of a slide.
+        """
+        x, y, z = self.axis.unbind(-1)
+        o = torch.zeros_like(x)
+        cross = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*x.shape, 3, 3)
+        turns = ~self.slides[..., None, None]
+        first, second = (torch.zeros_like(self.origin[:, :-1]) for _ in range(2))
+        first[..., :3, :3] = cross * turns
+        first[..., :3, 3] = self.axis * self.slides[..., None]
+        second[..., :3, :3] = cross @ cross * turns
+        return self.origin[:, :-1] @ first, self.origin[:, :-1] @ second
+
 
 def bodies_of(
     robots: Sequence[Robot],

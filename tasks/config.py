@@ -47,8 +47,16 @@ class PushConfig:
     """y that the block must cross, metres; in proportion less for bodies that reach under 0.4 m."""
     start: float = -0.15
     """y that the block starts below, scaled likewise."""
+    start_depth: float = 0.05
+    """How far below at most, scaled likewise; even between (the paper gives no end)."""
+    starts: int = 100
+    """Starts of a robot's push set, as many as goals of a goal set."""
+    arm_x: tuple[float, float] = (0.4, 0.6)
+    """Range of x at the start for arms, in effective reach beyond the shoulder."""
+    free_x: tuple[float, float] = (-0.2, 0.2)
+    """The same for bodies that slide freely over the ground, metres, scaled likewise."""
     block_size: tuple[float, float] = (0.15, 0.2)
-    """Range of the block's edge: of an arm's effective reach, or metres for free bodies."""
+    """Range of the block's edge: of an arm's effective reach, or metres for bodies that slide."""
     block_mass: float = 0.1
     friction: float = 1.0
     obstacles: int = 3

@@ -10,11 +10,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from morphgen.checks.rigid import rigid_groups
 from morphgen.checks.self_collision import SelfCollision
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
-from morphgen.model.robot import TOOL, Joint, Link, Pair, Robot
+from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
+from morphgen.model.rotation import Vec3, normalized, to_rpy
 from morphgen.tasks.sim.base import Scene
 
 Array = NDArray[np.float64]
@@ -27,6 +29,17 @@ _GROUND_SIZE = (200.0, 200.0, 20.0)
 _POINT = 1e-3
 """Radius of the ball that stands for the point of the tool, metres."""
 _CHUNK = 256
+_MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
+    ("prismatic", (1.0, 0.0, 0.0)),
+    ("prismatic", (0.0, 1.0, 0.0)),
+    ("prismatic", (0.0, 0.0, 1.0)),
+    ("continuous", (0.0, 0.0, 1.0)),
+    ("continuous", (0.0, 1.0, 0.0)),
+    ("continuous", (1.0, 0.0, 0.0)),
+)
+"""Joints that put the block anywhere: x, y, z, then yaw, pitch and roll."""
+_AWAY = (0.0, 0.0, 1e4, 0.0, 0.0, 0.0)
+"""Where the block is when it is asked for nowhere."""
 
 
 class FreeSpace:
@@ -35,14 +48,15 @@ class FreeSpace:
     A configuration is free if nothing penetrates (deeper than ``self_collision.PENETRATION``):
     links each other, but for ``Robot.ignore_pairs``; links the ground, but for the root link and
     those fixed to it; any link an obstacle. Nor is the point of the tool in an obstacle, also where
-    no link is, as between the fingers of a hand. What can be pushed is no obstacle.
+    no link is, as between the fingers of a hand. The block, which can be pushed, is an obstacle
+    where a pose of it is given, and nowhere else; it may stand on the ground, or in it.
     """
 
     def __init__(self, scene: Scene) -> None:
         """Compile.
 
         Args:
-            scene: Robot, where its root is, ground and obstacles; its block counts as nothing.
+            scene: Robot, where its root is, ground, obstacles and block.
 
         Raises:
             MeshError: If a collision mesh cannot be read.
@@ -51,21 +65,45 @@ class FreeSpace:
         self.scene = scene
         taken = {link.name for link in scene.robot.links}
         self._obstacles = [_unused(f"obstacle{k}", taken) for k in range(len(scene.obstacles))]
-        self._tested = SelfCollision(_with_surroundings(scene, self._obstacles))
+        self._block = _unused("block", taken)
+        self._tested = SelfCollision(_with_surroundings(scene, self._obstacles, self._block))
 
-    def free(self, q: ArrayLike) -> NDArray[np.bool_]:
+    def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Whether configurations are free.
 
         Args:
             q: Independent joint positions, shape (n, dof), rad or m.
+            blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7); where
+                it penetrates an obstacle or the root link, nothing is free.
 
         Returns:
             Shape (n,).
 
         Raises:
-            ValueError: If ``q`` has another shape.
+            ValueError: If ``q`` or ``blocks`` has another shape, or the scene has no block.
         """
-        return np.array([not found for found in self._each(q)], dtype=np.bool_)
+        return np.array([not found for found in self._each(q, blocks)], dtype=np.bool_)
+
+    def room(self, blocks: ArrayLike) -> NDArray[np.bool_]:
+        """Whether the block penetrates nothing that stands still: no obstacle and no base.
+
+        Args:
+            blocks: Its poses in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7).
+
+        Returns:
+            Shape (n,).
+
+        Raises:
+            ValueError: If ``blocks`` has another shape, or the scene has no block.
+        """
+        robot = self.scene.robot
+        still = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
+        home = np.tile(robot.home, (len(np.asarray(blocks)), 1))
+        clear = [
+            not any(self._block in pair and still & {*pair} for pair in found)
+            for found in self._each(home, blocks)
+        ]
+        return np.array(clear, dtype=np.bool_)
 
     def obstacle_hits(self, q: ArrayLike) -> NDArray[np.bool_]:
         """Which obstacles the robot penetrates, whatever else it does.
@@ -125,20 +163,34 @@ class FreeSpace:
             "base or its place in the world, or narrow the limits of its joints"
         )
 
-    def _each(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
+    def _each(self, q: ArrayLike, blocks: ArrayLike | None = None) -> Iterator[dict[Pair, float]]:
         q = np.asarray(q, dtype=np.float64)
         robot = self.scene.robot
         if q.ndim != 2 or q.shape[1] != robot.dof:
             raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
         held = np.zeros((len(q), len(self._obstacles)))
-        return self._tested.each(np.concatenate([q, held], axis=1))
+        return self._tested.each(np.concatenate([q, held, self._placed(blocks, len(q))], axis=1))
+
+    def _placed(self, blocks: ArrayLike | None, n: int) -> Array:
+        """Positions of the block's joints, shape (n, 6), or (n, 0) if there is no block."""
+        if blocks is None:
+            return np.tile(_AWAY, (n, 1)) if self.scene.block else np.zeros((n, 0))
+        blocks = np.asarray(blocks, dtype=np.float64)
+        if self.scene.block is None or blocks.shape != (n, 7):
+            raise ValueError(
+                f"blocks have shape {blocks.shape}; {n} configurations need ({n}, 7), and a scene "
+                "with a block"
+            )
+        turns = [to_rpy(normalized((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
+        return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
 
 
-def _with_surroundings(scene: Scene, obstacles: Sequence[str]) -> Robot:
-    """The robot with the ground and obstacles as links of its own, so that they are tested alike.
+def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Robot:
+    """The robot with ground, obstacles and block as links of its own, so that all are tested alike.
 
     The ground is fixed to the root, and what is fixed to each other is never tested. An obstacle
     is to be tested against the root too, so each is on a slide of its own, which stays at zero.
+    The block has joints that put it anywhere.
     """
     robot = scene.robot
     links = {link.name for link in robot.links}
@@ -149,19 +201,30 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str]) -> Robot:
     )
     still: list[Link] = []
     attached: list[Joint] = []
-    if scene.ground:
-        slab = Shape(Box(_GROUND_SIZE), Pose((0.0, 0.0, -_GROUND_SIZE[2] / 2)))
+    if scene.ground is not None:
+        slab = Shape(Box(_GROUND_SIZE), Pose((0.0, 0.0, scene.ground - _GROUND_SIZE[2] / 2)))
         still.append(Link(_unused("ground", links), collisions=(slab,)))
         attached.append(Joint(_unused("to_ground", joints), "fixed", world.name, still[-1].name))
-    for name, block in zip(obstacles, scene.obstacles, strict=True):
-        still.append(Link(name, collisions=(Shape(Box(block.size), block.pose),)))
+    for name, box in zip(obstacles, scene.obstacles, strict=True):
+        still.append(Link(name, collisions=(Shape(Box(box.size), box.pose),)))
         attached.append(
             Joint(_unused(f"to_{name}", joints), "prismatic", world.name, name, limits=(0.0, 0.0))
         )
     ignored = [*robot.ignore_pairs, *combinations([link.name for link in still], 2)]
+    moved: list[Link] = []
+    if scene.block is not None:
+        if scene.ground is not None:
+            ignored.append((block, still[0].name))
+        for kind, axis in _MOTIONS:
+            last = len(moved) == len(_MOTIONS) - 1
+            name = block if last else _unused(f"carrier{len(moved)}", links)
+            cube = (Shape(Box(scene.block.size)),) if last else ()
+            parent = moved[-1].name if moved else world.name
+            moved.append(Link(name, collisions=cube))
+            attached.append(Joint(_unused(f"to_{name}", joints), kind, parent, name, axis=axis))
     point: list[Link] = []
     for frame in robot.frames:
-        if frame.name == TOOL and obstacles:
+        if frame.name == TOOL and (obstacles or moved):
             ball = Shape(Sphere(_POINT), frame.T_link_frame)
             point.append(Link(_unused("point", links), collisions=(ball,)))
             attached.append(Joint(_unused("to_point", joints), "fixed", frame.link, point[-1].name))
@@ -169,9 +232,9 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str]) -> Robot:
             ignored += [(point[-1].name, other) for other in others]
     return replace(
         robot,
-        links=(world, *robot.links, *still, *point),
+        links=(world, *robot.links, *still, *moved, *point),
         joints=(to_root, *robot.joints, *attached),
-        home=(*robot.home, *(0.0 for _ in obstacles)),
+        home=(*robot.home, *(0.0 for _ in obstacles), *(_AWAY if moved else ())),
         ignore_pairs=tuple(ignored),
     )
 

@@ -10,6 +10,7 @@ import json
 import tempfile
 import warnings
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from morphgen.benchmark.split import robot_hash
 from morphgen.benchmark.workspace import shoulder
 from morphgen.errors import BenchmarkError
 from morphgen.formats.mjcf import to_spec
-from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose, movable_positions
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import ReachConfig
@@ -32,7 +33,7 @@ from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
 
-FORMAT = 1
+FORMAT = 2
 """Of a stored set; a change of how sets are drawn needs another."""
 EXACT = 1e-6
 """Largest deviation of a goal from its witness's tool, metres and of a quaternion."""
@@ -48,7 +49,7 @@ class GoalSet:
     q: Array
     """Witnesses: free configurations, shape (G, dof), rad or m."""
     poses: Array
-    """Of the tool at them in the world: (x, y, z, qw, qx, qy, qz), qw >= 0, shape (G, 7)."""
+    """Of the tool at them in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0, shape (G, 7)."""
     obstacles: tuple[Block, ...]
     tried: int
     """Random configurations that were tested."""
@@ -63,13 +64,13 @@ def goal_set(
     *,
     obstacles: bool,
     seed: int,
-    T_world_root: Pose = IDENTITY,
+    ground: float = 0.0,
     cache: Path | None = None,
 ) -> GoalSet:
     """A robot's goal set, from the cache or made and kept there.
 
     Configurations are drawn uniformly within the joint limits; what collides, with the ground and
-    obstacles too, is drawn again. The same body, pairs to ignore, seed, place, goals and obstacles
+    obstacles too, is drawn again. The same body, pairs to ignore, seed, ground, goals and obstacles
     give the same set, whatever the robot is called; fewer goals are the first of more.
 
     Args:
@@ -77,7 +78,7 @@ def goal_set(
         config: How many goals, and what obstacles.
         obstacles: Whether there are any.
         seed: Of all that is drawn, at least 0.
-        T_world_root: Where the robot stands; the ground is at z = 0.
+        ground: Height of the ground in the root frame, metres.
         cache: Folder of stored sets; by default ``goals`` in the user's cache.
 
     Raises:
@@ -91,7 +92,7 @@ def goal_set(
         )
     shoulder(robot)  # refuses a robot whose tool does not move
     body = robot_hash(robot)
-    key = _key(robot, body, config, obstacles, seed, T_world_root)
+    key = _key(robot, body, config, obstacles, seed, ground)
     folder = user_cache_path("morphgen") / "goals" if cache is None else cache
     path = folder / f"{key}.npz"
     if path.is_file():
@@ -101,10 +102,10 @@ def goal_set(
     placed: tuple[Block, ...] = ()
     if obstacles:
         count, size = config.obstacles, config.obstacle_size
-        placed = draw_obstacles(robot, count, size, of_obstacles, T_world_root=T_world_root)
-    space = FreeSpace(Scene(robot, T_world_root, obstacles=placed))
+        placed = draw_obstacles(robot, count, size, of_obstacles, ground=ground)
+    space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
     q, tried = space.draw(config.goals, of_goals)
-    poses = _vectors(T_world_root.matrix @ frame_pose(robot, q, TOOL))
+    poses = _vectors(frame_pose(robot, q, TOOL))
     made = GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
     _keep(path, made)
     return made
@@ -136,18 +137,11 @@ def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
     wrong = []
     if scene.obstacles != goals.obstacles:
         wrong.append("the obstacles of the scene are not those of the goal set")
-    names = [robot.joints[k].name for k in robot.independent]
-    low, high = bounds(robot).T
-    outside = (goals.q < low) | (goals.q > high) | ~np.isfinite(goals.q)
-    for i, j in np.argwhere(outside).tolist():
-        wrong.append(
-            f"goal {i}: joint {names[j]!r} is at {goals.q[i, j]:g}, outside "
-            f"({low[j]:g}, {high[j]:g})"
-        )
+    wrong += [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
     usable = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
     free = FreeSpace(replace(scene, robot=robot)).free(goals.q[usable])
     wrong += [f"goal {i}: its witness is in collision" for i in usable[~free].tolist()]
-    tools = _vectors(scene.T_world_root.matrix @ _mujoco_tools(robot, goals.q[usable]))
+    tools = _vectors(tools_in_mujoco(robot, goals.q[usable]))
     for i, tool in zip(usable.tolist(), tools, strict=True):
         away, turned = _deviation(goals.poses[i], tool)
         if not (away <= EXACT and turned <= EXACT):
@@ -158,13 +152,22 @@ def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
     return wrong
 
 
+def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
+    """Joints that are out of their limits in configurations (n, dof): the row, and what is so."""
+    names = [robot.joints[k].name for k in robot.independent]
+    low, high = bounds(robot).T
+    outside = (q < low) | (q > high) | ~np.isfinite(q)
+    for i, j in np.argwhere(outside).tolist():
+        yield i, f"joint {names[j]!r} is at {q[i, j]:g}, outside ({low[j]:g}, {high[j]:g})"
+
+
 def _deviation(a: Array, b: Array) -> tuple[float, float]:
     """Distance of two poses (7,), metres, and of their quaternions, whose sign means nothing."""
     turned = min(float(np.linalg.norm(a[3:] - sign * b[3:])) for sign in (1, -1))
     return float(np.linalg.norm(a[:3] - b[:3])), turned
 
 
-def _mujoco_tools(robot: Robot, q: Array) -> Array:
+def tools_in_mujoco(robot: Robot, q: Array) -> Array:
     """Pose of the tool in the root frame, as MuJoCo has it, shape (n, 4, 4)."""
     bare = robot.with_links([replace(link, visuals=(), collisions=()) for link in robot.links])
     model = to_spec(bare).compile()
@@ -186,13 +189,12 @@ def _vectors(T: Array) -> Array:
 
 
 def _key(
-    robot: Robot, body: str, config: ReachConfig, obstacles: bool, seed: int, T_world_root: Pose
+    robot: Robot, body: str, config: ReachConfig, obstacles: bool, seed: int, ground: float
 ) -> str:
     index = robot.link_index
     ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)
     boxes = [config.obstacles, *map(float, config.obstacle_size)] if obstacles else None
-    place = [*map(float, T_world_root.position), *map(float, T_world_root.quaternion)]
-    parts = [FORMAT, body, ignored, config.goals, boxes, seed, place]
+    parts = [FORMAT, body, ignored, config.goals, boxes, seed, float(ground)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 

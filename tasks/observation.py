@@ -35,6 +35,12 @@ def link_tokens(bodies: Bodies, body: torch.Tensor, q: torch.Tensor) -> torch.Te
     return made
 
 
+def of_links(bodies: Bodies, body: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Values of independent joints (n, J) as those of the links that they move, shape (n, L)."""
+    joint = bodies.joint_of_link[body]
+    return torch.gather(values, 1, joint.clamp(min=0)) * (joint >= 0)
+
+
 def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
     """Tokens of boxes: pose (..., 7) and edges (..., 3) to (..., 13)."""
     shape = torch.zeros_like(size)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError
-from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace
@@ -31,7 +31,7 @@ def draw_obstacles(
     size: tuple[float, float],
     rng: np.random.Generator,
     *,
-    T_world_root: Pose = IDENTITY,
+    ground: float = 0.0,
 ) -> tuple[Block, ...]:
     """Place boxes where the tool goes.
 
@@ -47,7 +47,7 @@ def draw_obstacles(
         count: How many boxes.
         size: Range of their edges, relative to the reach.
         rng: Where they come from.
-        T_world_root: Where the robot stands.
+        ground: Height of the ground in the root frame, metres.
 
     Raises:
         BenchmarkError: If count or size is none, the robot has no workspace or hardly a free
@@ -62,13 +62,13 @@ def draw_obstacles(
     drawn = CANDIDATES * count
     edges = rng.uniform(low, high, (drawn, 3)) * workspace(robot).reach
     turns = rng.uniform(-math.pi, math.pi, drawn)
-    q, _ = FreeSpace(Scene(robot, T_world_root)).draw(PROBES + drawn, rng)
-    tools = T_world_root.matrix @ frame_pose(robot, q[PROBES:], TOOL)
+    q, _ = FreeSpace(Scene(robot, ground=ground)).draw(PROBES + drawn, rng)
+    tools = frame_pose(robot, q[PROBES:], TOOL)
     boxes = [
-        _box(place, edge, turn)
+        _box(place, edge, turn, ground)
         for place, edge, turn in zip(tools[:, :3, 3].tolist(), edges.tolist(), turns, strict=True)
     ]
-    space = FreeSpace(Scene(robot, T_world_root, obstacles=tuple(boxes)))
+    space = FreeSpace(Scene(robot, obstacles=tuple(boxes), ground=ground))
     at_home = space.obstacle_hits([robot.home])[0]
     hits = space.obstacle_hits(q[:PROBES])
     taken: list[Block] = []
@@ -86,7 +86,8 @@ def draw_obstacles(
     return tuple(taken)
 
 
-def _box(centre: list[float], size: list[float], turn: float) -> Block:
+def _box(centre: list[float], size: list[float], turn: float, ground: float) -> Block:
     x, y, z = centre
     a, b, c = size
-    return Block((a, b, c), Pose.from_xyz_rpy((x, y, max(z, c / 2)), (0.0, 0.0, float(turn))))
+    at = (x, y, max(z, ground + c / 2))
+    return Block((a, b, c), Pose.from_xyz_rpy(at, (0.0, 0.0, float(turn))))

@@ -15,6 +15,7 @@ from morphgen.cli import (
     derive,
     describe,
     fit,
+    goals,
     grammar,
     import_robot,
     list_parts,
@@ -40,6 +41,7 @@ COMMANDS = (
     derive,
     similarity,
     split,
+    goals,
     view,
 )
 

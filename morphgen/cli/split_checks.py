@@ -5,13 +5,19 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from morphgen.cli.goals import (
+    audit_with_goals,
+    bar,
+    read_split_or_built,
+    ready_goals,
+    require_room_for,
+    ship_goals,
+)
 from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
 
 if TYPE_CHECKING:
@@ -19,7 +25,7 @@ if TYPE_CHECKING:
     from morphgen.benchmark.paper import Figures
     from morphgen.benchmark.split import Split
     from morphgen.model.findings import Finding
-    from morphgen.processes import Progress
+    from morphgen.tasks.goal_making import SplitGoals
 
 LISTED = 10
 """Findings of one code, or differences, that are printed."""
@@ -38,10 +44,11 @@ def _add_audit(verbs: Subparsers) -> None:
         "audit",
         help="look for leaks between train and test",
         description="Look for leaks between train and test and for broken rules of the regime, "
-        "and name the train robot nearest to every test robot. Exit code 1 if there is an error "
-        "that the split does not accept (with --strict: or a warning).",
+        "and name the train robot nearest to every test robot. Goal sets that a built split ships "
+        "are looked at, too: for goals that both sides have, or that cannot be reached. Exit code "
+        "1 if there is an error that the split does not accept (with --strict: or a warning).",
     )
-    parser.add_argument("split", metavar="SPLIT", help="a split's file or name")
+    parser.add_argument("split", metavar="SPLIT", help="a split's file, name or built folder")
     parser.add_argument(
         "--near",
         metavar="TREE,COSINE",
@@ -49,6 +56,10 @@ def _add_audit(verbs: Subparsers) -> None:
         "(default: 0.001,0.99999)",
     )
     parser.add_argument("--strict", action="store_true", help="warnings fail, too")
+    parser.add_argument(
+        "--goals", action="store_true", help="look at goal sets also if none are shipped"
+    )
+    _add_goal_seed(parser, "seed that the goal sets must have (default: as shipped, else 0)")
     _add_common(parser)
     parser.set_defaults(run=run_audit)
 
@@ -67,6 +78,8 @@ def _add_build(verbs: Subparsers) -> None:
     )
     parser.add_argument("--light", action="store_true", help="URDF and derivation only")
     parser.add_argument("--picture", action="store_true", help="draw preview.png of every robot")
+    parser.add_argument("--goals", action="store_true", help="ship the goal set of every robot")
+    _add_goal_seed(parser, "with --goals: their seed (default: 0)")
     _add_common(parser)
     parser.set_defaults(run=run_build)
 
@@ -99,6 +112,10 @@ def _add_stats(verbs: Subparsers) -> None:
     parser.set_defaults(run=run_stats)
 
 
+def _add_goal_seed(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--goal-seed", metavar="S", type=int, help=text)
+
+
 def _add_common(parser: argparse.ArgumentParser) -> None:
     add_jobs(parser)
     add_library(parser)
@@ -108,17 +125,19 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 def run_audit(args: argparse.Namespace) -> int:
     """Audit and print."""
     from morphgen.benchmark.audit import audit
-    from morphgen.benchmark.split_file import read_split
 
     near = _near(args.near)
-    split = read_split(args.split)
-    with _bar(args) as progress:
-        done = audit(split, library_of(args), near=near, jobs=args.jobs, progress=progress)
+    split, folder = read_split_or_built(args.split)
+    library = library_of(args)
+    with bar(args) as progress:
+        done = audit(split, library, near=near, jobs=args.jobs, progress=progress)
+    done, goals = audit_with_goals(args, done, split, folder)
     passed = done.passed(strict=args.strict)
     if args.json:
-        print(json.dumps({**done.as_dict(), "passed": passed}))
+        sets = {"sets": len(goals.sets), "seed": goals.recipe.seed} if goals else None
+        print(json.dumps({**done.as_dict(), "goals": sets, "passed": passed}))
     else:
-        print(_audit_text(done, passed))
+        print(_audit_text(done, passed, goals))
     return int(not passed)
 
 
@@ -141,7 +160,7 @@ def _near(text: str | None) -> Near:
     return Near(tree, cosine)
 
 
-def _audit_text(done: Audit, passed: bool) -> str:
+def _audit_text(done: Audit, passed: bool, goals: SplitGoals | None) -> str:
     from tabulate import tabulate
 
     from morphgen.benchmark.similarity import MEASURES
@@ -160,6 +179,8 @@ def _audit_text(done: Audit, passed: bool) -> str:
     for code, findings in _by_code([each for each, _ in done.accepted]).items():
         lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
         lines += _shortened([f"  {each.where}: {each.why}" for each in findings])
+    if goals:
+        lines.append(f"{len(goals.sets)} goal sets were looked at, seed {goals.recipe.seed}")
     counts = {
         severity: sum(each.severity == severity for each in done.findings)
         for severity in ("error", "warning")
@@ -186,28 +207,32 @@ def _shortened(lines: Sequence[str]) -> list[str]:
 def run_build(args: argparse.Namespace) -> int:
     """Build and say where."""
     from morphgen.benchmark.contents import Settings
-    from morphgen.benchmark.export import build
+    from morphgen.benchmark.export import build, home_of
     from morphgen.benchmark.split_file import read_split
     from morphgen.errors import BenchmarkError
 
     if args.light and args.picture:
         raise BenchmarkError("--light writes no pictures; say --light or --picture")
+    if args.goal_seed is not None and not args.goals:
+        raise BenchmarkError("--goal-seed goes with --goals")
     settings = Settings(light=args.light, picture=args.picture)
     split = read_split(args.split)
-    with _bar(args) as progress:
+    library = library_of(args)
+    require_room_for(home_of(split, args.out), args.goals)
+    goals = ready_goals(args, split) if args.goals else []
+    with bar(args) as progress:
         report = build(
-            split,
-            args.out,
-            library_of(args),
-            jobs=args.jobs,
-            settings=settings,
-            progress=progress,
+            split, args.out, library, jobs=args.jobs, settings=settings, progress=progress
         )
+    if goals:
+        ship_goals(args, report.folder, goals)
     if args.json:
         found = {"folder": str(report.folder), "made": report.made, "kept": report.kept}
-        print(json.dumps(found))
+        print(json.dumps(found | ({"goals": len(goals)} if goals else {})))
         return 0
     print(f"{report.folder}: {report.made} robots made, {report.kept} were there")
+    if goals:
+        print(f"{len(goals)} goal sets, seed {args.goal_seed or 0}")
     print(f"test it anywhere: morphgen split verify {report.folder}")
     return 0
 
@@ -216,7 +241,7 @@ def run_verify(args: argparse.Namespace) -> int:
     """Verify and print what differs."""
     from morphgen.benchmark.verify import verify
 
-    with _bar(args) as progress:
+    with bar(args) as progress:
         found = verify(args.path, library_of(args), jobs=args.jobs, progress=progress)
     whole = not found.differences
     if args.json:
@@ -245,7 +270,7 @@ def run_stats(args: argparse.Namespace) -> int:
     rows = _same_robots([read_split(name) for name in args.splits or split_names()])
     found: list[tuple[str, list[Split], dict[str, object]]] = []
     for title, splits in rows.items():
-        with _bar(args, title) as progress:
+        with bar(args, title) as progress:
             figures = statistics(splits[0], library, jobs=args.jobs, progress=progress)
         found.append((title, splits, figures))
     if args.json:
@@ -305,18 +330,3 @@ def _beside(ours: str, theirs: Figures | None, key: str) -> str:
         return ours
     value = getattr(theirs, key)
     return f"{ours} ({'-' if value is None else f'{value:g}'})"
-
-
-@contextmanager
-def _bar(args: argparse.Namespace, title: str | None = None) -> Iterator[Progress]:
-    """A bar on stderr, gone when done."""
-    from tqdm import tqdm
-
-    hidden = args.json or None
-    with tqdm(desc=title, unit="robot", file=sys.stderr, disable=hidden, leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show

@@ -41,8 +41,8 @@ class Scene:
     block: Block | None = None
     """The one thing that can be moved."""
     obstacles: tuple[Block, ...] = ()
-    ground: bool = True
-    """A plane at z = 0; the root link does not touch it."""
+    ground: float | None = 0.0
+    """Height of a plane, metres, if there is one; the root link does not touch it."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,11 @@ class Simulation(Protocol):
     influence each other: one gives the same numbers whatever else is in the batch.
     """
 
-    scenes: Sequence[Scene]
     device: torch.device
+
+    @property
+    def scenes(self) -> Sequence[Scene]:
+        """One for every environment."""
 
     @property
     def q(self) -> torch.Tensor:

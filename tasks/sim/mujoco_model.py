@@ -176,8 +176,9 @@ def _with_own_root(robot: Robot) -> Robot:
 def _world(scene: Scene, root: str, spec: mujoco.MjSpec) -> World:
     held = spec.body(root)
     held.pos, held.quat = scene.T_world_root.position, scene.T_world_root.quaternion
-    if scene.ground:
+    if scene.ground is not None:
         plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+        plane.pos = [0.0, 0.0, scene.ground]
         plane.contype, plane.conaffinity = _BY_SCENE | _BY_BLOCK, 0
     for obstacle in scene.obstacles:
         geom = _add_box(spec.worldbody, obstacle, _OBSTACLE_PRIORITY)

@@ -11,6 +11,8 @@ from morphgen.benchmark.built import load_built
 from morphgen.benchmark.paper import PAPER
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
+from morphgen.tasks import free_space, goals
+from morphgen.tasks.split_goals import read_goals
 from splits import TEST, TRAIN, combined, member, split
 
 
@@ -221,3 +223,129 @@ def test_what_they_cannot_do_is_refused_in_a_line(run, write, tmp_path, argv, me
     assert err.startswith("morphgen: ")
     assert err.count("\n") == 1
     assert message in err
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """A cache of the test's own, but for fits."""
+    monkeypatch.setattr(goals, "user_cache_path", lambda name: tmp_path / "cache" / name)
+
+
+def reaching(**more):
+    """A sound split of robots that reach."""
+    train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
+    return combined(train=train, test=test, **more)
+
+
+def known(**more):
+    """A split that tests a body that it trains, among obstacles or not."""
+    twin = member(TRAIN[0], "twin", task="reach")
+    return replace(reaching(**more), test=(*reaching().test, twin))
+
+
+def build_with_goals(run, path, out="data", *more):
+    code, printed, err = run("split", "build", path, "--light", "--goals", "--out", out, *more)
+    assert (code, err) == (0, "")
+    return printed.splitlines()
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_a_build_ships_goals_that_verify_and_pass_the_audit(run, write, tmp_path):
+    path = write(reaching())
+    assert build_with_goals(run, path) == [
+        "data/mine/some: 4 robots made, 0 were there",
+        "4 goal sets, seed 0",
+        "test it anywhere: morphgen split verify data/mine/some",
+    ]
+    first = tree(Path("data"))
+    assert "mine/some/goals/test/planar-plane.npz" in first
+    assert read_goals("data/mine/some", "train").keys() == {m.name for m in reaching().train}
+    build_with_goals(run, path)
+    build_with_goals(run, path, "elsewhere", "--jobs", "2")
+    assert tree(Path("data")) == tree(Path("elsewhere")) == first
+    assert run("split", "verify", "data/mine/some")[0] == 0
+    code, out, err = run("split", "audit", "data/mine/some", "--strict")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-2:] == [
+        "4 goal sets were looked at, seed 0",
+        "mine/some: passed: 0 error, 0 warning, 0 accepted",
+    ]
+    data = json.loads(run("split", "audit", "data/mine/some", "--json")[1])
+    assert data["goals"] == {"sets": 4, "seed": 0}
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_the_seed_of_goals_is_said_shipped_and_audited(run, write):
+    lines = build_with_goals(run, write(reaching()), "data", "--goal-seed", "7")
+    assert lines[1] == "4 goal sets, seed 7"
+    assert {one.seed for one in read_goals("data/mine/some", "train").values()} == {7}
+    assert run("split", "audit", "data/mine/some")[0] == 0
+    code, out, _ = run("split", "audit", "data/mine/some", "--goal-seed", "0")
+    assert code == 1
+    i = out.splitlines().index("error goals-seed (4)")
+    assert out.splitlines()[i + 1].endswith("its set was made with seed 7, the split's with 0")
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_goals_are_audited_only_if_they_are_there_or_asked_for(run, write):
+    accepted = {"body-shared": "new goals", "combination-seen": "it is known"}
+    path = write(known(accepted=accepted))
+    assert run("split", "audit", path)[0] == 0
+    run("split", "build", path, "--light")
+    assert run("split", "audit", "data/mine/some")[0] == 0
+    for words in ((path, "--goals"), ("data/mine/some", "--goals")):
+        code, out, _ = run("split", "audit", *words)
+        assert code == 1
+        i = out.splitlines().index("error goals-shared (1)")
+        assert out.splitlines()[i + 1] == (
+            "  test robot twin: train robot gantry-plane has 100 of its 100 goals"
+        )
+        assert "5 goal sets were looked at, seed 0" in out
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_accepted_findings_about_goals_do_not_fail(run, write):
+    accepted = {"body-shared": "one", "combination-seen": "two", "goals-shared": "three"}
+    path = write(known(accepted=accepted))
+    code, out, _ = run("split", "audit", path, "--goals", "--strict")
+    assert code == 0
+    assert "accepted goals-shared (1): three" in out.splitlines()
+    assert run("split", "audit", path, "--strict")[0] == 0
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_a_robot_without_goals_stops_the_build_before_it_begins(run, write, monkeypatch):
+    monkeypatch.setattr(free_space, "TRIES", 1)
+    few = [member(f"arm=arm3 ee={ee}", task="reach") for ee in ("claw", "plane")]
+    path = write(replace(reaching(), train=(*reaching().train[:2], *few)))
+    code, out, err = run("split", "build", path, "--goals")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "train robot arm3-claw has no goal set: robot 'arm3-claw': only" in err
+    assert err.endswith("; nor has arm3-plane\n")
+    assert not Path("data").exists()
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_a_build_without_goals_does_not_leave_those_of_another(run, write):
+    path = write(reaching())
+    build_with_goals(run, path)
+    before = tree(Path("data"))
+    code, out, err = run("split", "build", path, "--light")
+    assert (code, out) == (2, "")
+    assert "data/mine/some was built with goals: say --goals, delete data/mine/some/goals" in err
+    assert tree(Path("data")) == before
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("build some.yaml --goal-seed 1", "--goal-seed goes with --goals"),
+        ("build some.yaml --goals --goal-seed -1", "goal seed -1: expected 0 or more"),
+        ("audit some.yaml --goals --goal-seed -1", "goal seed -1: expected 0 or more"),
+        ("audit folder", "folder is no built split: it has no build.json"),
+    ],
+)
+def test_goals_that_cannot_be_are_refused_in_a_line(refused, write, tmp_path, argv, message):
+    write(reaching())
+    (tmp_path / "folder").mkdir()
+    assert message in refused("split", *argv.split())

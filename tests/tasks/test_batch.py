@@ -6,16 +6,15 @@ import pytest
 import torch
 
 import morphgen
-from morphgen.grammar.library import default_library
+from morphgen.errors import TaskError
 from morphgen.rl.references import InverseKinematics, Random, Zero, as_actions
-from morphgen.tasks.batch import ReachBatch
-from morphgen.tasks.bodies import bodies_of
+from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import BINS, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals import goal_set
 from morphgen.tasks.kinematics import tool_poses
-from morphgen.tasks.sim.base import Scene
-from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from morphgen.tasks.make import batch_of
+from morphgen.tasks.points import NOISE
+from morphgen.tasks.settings import reach_setting
 
 CONFIG = replace(ReachConfig(), goals=20)
 WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
@@ -27,35 +26,27 @@ def robots():
 
 
 @pytest.fixture(scope="module")
-def bodies(robots):
-    return bodies_of(robots, default_library(()).folders)
-
-
-@pytest.fixture(scope="module")
-def sets(robots, tmp_path_factory):
+def settings(robots, tmp_path_factory):
     cache = tmp_path_factory.mktemp("goals")
     return {
-        obstacles: {
-            i: goal_set(robot, CONFIG, obstacles=obstacles, seed=0, cache=cache)
-            for i, robot in enumerate(robots)
-        }
+        obstacles: [
+            reach_setting(robot, CONFIG, obstacles=obstacles, seed=0, cache=cache)
+            for robot in robots
+        ]
         for obstacles in (False, True)
     }
 
 
 @pytest.fixture
-def made(robots, bodies, sets):
+def made(settings):
     """Make batches; they are closed when the test is over."""
     opened = []
 
-    def make(body=(0, 1, 2), obstacles=False, **options):
-        goals = sets[obstacles]
-        scenes = [Scene(robots[i], obstacles=goals[i].obstacles) for i in body]
-        config = options.pop("config", CONFIG)
-        simulation = MujocoSimulation(scenes)
-        batch = ReachBatch(bodies, body, goals, simulation, config=config, **options)
-        opened.append(batch)
-        return batch
+    def make(num_envs=3, robots=(0, 1, 2), obstacles=False, **options):
+        chosen = [settings[obstacles][i] for i in robots]
+        options = {"reach": CONFIG, "sim": "mujoco", **options}
+        opened.append(batch_of(chosen, num_envs, **options))
+        return opened[-1]
 
     yield make
     for batch in opened:
@@ -67,23 +58,33 @@ def run(batch, controller, steps):
     return [batch.step(controller.act(batch)) for _ in range(steps)]
 
 
-def test_observations_have_the_shapes_they_claim(made, bodies):
-    seen = made(obstacles=True).reset()
-    n, links = 3, bodies.max_links
+def test_observations_have_the_shapes_they_claim(made):
+    channels = Channels(velocity=True, previous_action=True, points=50)
+    batch = made(obstacles=True, channels=channels)
+    seen = batch.reset()
+    n, links = 3, batch.bodies.max_links
     assert {name: tuple(value.shape) for name, value in seen.items()} == {
         "tokens": (n, links, 48),
         "links": (n, links),
         "actions": (n, links),
         "goal": (n, 7),
+        "goal_mask": (n,),
+        "object": (n, 13),
+        "object_mask": (n,),
+        "line": (n, 1),
         "obstacles": (n, CONFIG.obstacles, 13),
         "obstacle_mask": (n, CONFIG.obstacles),
+        "velocity": (n, links),
+        "previous_action": (n, links),
+        "points": (n, 50, 3),
+        "point_mask": (n, 50),
     }
     assert seen["obstacle_mask"].all()
     assert all(value.isfinite().all() for value in seen.values())
 
 
 def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
-    batch = made(config=replace(CONFIG, steps=5))
+    batch = made(reach=replace(CONFIG, steps=5))
     batch.reset()
     goal = batch.goal.clone()
     controller = Random(0)
@@ -99,7 +100,7 @@ def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
 
 
 def test_the_final_observation_is_before_the_next_start(made):
-    batch = made(config=replace(CONFIG, steps=3))
+    batch = made(reach=replace(CONFIG, steps=3))
     batch.reset()
     for _ in range(3):
         goal = batch.goal.clone()
@@ -110,7 +111,7 @@ def test_the_final_observation_is_before_the_next_start(made):
 
 
 def test_a_start_is_never_the_goals_own_configuration(made):
-    batch = made(body=(0,) * 40)
+    batch = made(40, robots=(0,))
     for _ in range(3):
         batch.reset()
         assert ((batch.targets - batch.witness).abs().amax(dim=1) > 1e-3).all()
@@ -130,17 +131,17 @@ def test_doing_nothing_moves_nothing(made):
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
-    body = (0,) * 12
-    steps = run(made(body=body, kind=kind), InverseKinematics(0), CONFIG.steps)
+    steps = run(made(12, robots=(0,), kind=kind), InverseKinematics(0), CONFIG.steps)
     assert steps[-1].success.float().mean() >= 0.9
     assert steps[-1].score[steps[-1].success].unique().tolist() == [CONFIG.score_near]
-    steps = run(made(body=body, kind=kind), Random(0), CONFIG.steps)
+    steps = run(made(12, robots=(0,), kind=kind), Random(0), CONFIG.steps)
     assert steps[-1].success.float().mean() <= 0.2
 
 
-def test_inverse_kinematics_goes_around_what_is_in_the_way(made, robots):
-    spaces = [FreeSpace(Scene(robot)) for robot in robots]
-    steps = run(made(body=(1,) * 8 + (2,) * 4), InverseKinematics(0, spaces), CONFIG.steps)
+def test_inverse_kinematics_goes_around_what_is_in_the_way(made):
+    batch = made(12, robots=(1, 1, 2))
+    spaces = [FreeSpace(setting.scene) for setting in batch.settings]
+    steps = run(batch, InverseKinematics(0, spaces), CONFIG.steps)
     assert steps[-1].success.float().mean() >= 0.9
 
 
@@ -151,8 +152,8 @@ def test_the_reward_is_the_sum_of_its_terms(made):
 
 
 def test_an_environment_is_the_same_in_whichever_batch(made):
-    whole = made(body=(0, 1, 2, 0), seed=7)
-    part = made(body=(2, 0), seed=7, first=2)
+    whole = made(4, seed=7)
+    part = made(2, seed=7, first=2)
     actions = torch.rand(30, 4, whole.bodies.max_links, generator=torch.Generator().manual_seed(0))
     whole.reset()
     part.reset()
@@ -166,3 +167,48 @@ def test_shares_become_the_nearest_bins_towards_zero():
     shares = torch.tensor([[0.0, 1.0, -1.0, 0.3, -0.3, 0.01]])
     found = [BINS[i] for i in as_actions(shares, "discrete")[0].tolist()]
     assert found == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
+
+
+def test_a_batch_goes_on_from_its_state(made):
+    one, other = made(seed=3), made(seed=3)
+    one.reset()
+    other.reset()
+    other.reset()
+    state = one.state_dict()
+    assert not torch.equal(one.goal, other.goal)
+    other.load_state_dict(state)
+    one.reset()
+    other.reset()
+    assert torch.equal(one.goal, other.goal)
+    assert torch.equal(one.targets, other.targets)
+    with pytest.raises(TaskError, match="the state is of 3 environments; there are 2"):
+        made(2).load_state_dict(state)
+
+
+def test_velocities_and_actions_are_those_of_the_links(made):
+    batch = made(channels=Channels(velocity=True, previous_action=True))
+    assert batch.reset()["velocity"].abs().max() == 0
+    action = torch.ones(batch.mask.shape)
+    seen = batch.step(action).observation
+    assert torch.equal(seen["previous_action"] != 0, batch.mask)
+    assert ((seen["velocity"] != 0) <= (batch.bodies.joint_of_link[batch.body] >= 0)).all()
+    assert (seen["velocity"].abs().amax(dim=1) > 0.01).all()
+
+
+def test_points_are_on_the_obstacles(made):
+    batch = made(obstacles=True, channels=Channels(points=80))
+    seen = batch.reset()
+    for env in range(3):
+        off = torch.stack(
+            [_outside(seen["points"][env], block) for block in batch.settings[env].scene.obstacles]
+        )
+        assert off.abs().amin(dim=0).max() < 6 * NOISE
+    again = batch.reset()["points"]
+    assert not torch.equal(seen["points"], again)
+
+
+def _outside(points, block):
+    """Signed distance of points from the surface of a box along the axes, at most."""
+    T = torch.tensor(block.pose.inverse().matrix, dtype=torch.float32)
+    local = points @ T[:3, :3].T + T[:3, 3]
+    return (local.abs() - torch.tensor(block.size) / 2).amax(dim=1)

@@ -140,7 +140,7 @@ def test_links_are_where_the_kinematics_put_them(simulate, request_):
 def test_motors_follow_the_critically_damped_law(simulate, request_):
     body = robot(request_)
     free = replace(body, joints=tuple(replace(j, effort=None, velocity=None) for j in body.joints))
-    simulation = simulate(Scene(free, ground=False), contacts=Contacts(False, False))
+    simulation = simulate(Scene(free, ground=None), contacts=Contacts(False, False))
     q = np.array(body.home)
     target = np.clip(q + 0.05 * (np.arange(body.dof) % 3 - 1), *bounds(body).T)
     reset(simulation, q)
@@ -305,7 +305,7 @@ def test_what_is_held_does_not_touch_what_stands(simulate):
 
 def self_contact(simulate, body, **contacts):
     simulation = simulate(
-        Scene(body, Pose((0.0, 0.0, 2.0)), ground=False), contacts=Contacts(**contacts)
+        Scene(body, Pose((0.0, 0.0, 2.0)), ground=None), contacts=Contacts(**contacts)
     )
     q = reset(simulation, (0.0, 0.0, 0.0, 0.0))
     simulation.step(q)

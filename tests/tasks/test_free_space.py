@@ -44,7 +44,7 @@ def free(scene, *q):
 def test_links_may_touch_the_ground_and_not_go_into_it():
     lowest = -0.5 + 0.1
     assert free(Scene(aside()), 0.0, lowest - SHALLOW, lowest - DEEP) == [True, True, False]
-    assert free(Scene(aside(), ground=False), lowest - DEEP) == [True]
+    assert free(Scene(aside(), ground=None), lowest - DEEP) == [True]
 
 
 def test_the_ground_is_solid_however_deep_a_link_is():
@@ -203,3 +203,71 @@ def test_a_robot_that_is_never_free_is_named_with_what_collides(monkeypatch):
     assert "'lift': only 0 of 200 random" in text
     assert "rate 0)" in text
     assert "'ball' and 'ground' collide, in 100%" in text
+
+
+def block_at(x, z, *, yaw=0.0, pitch=0.0):
+    pose = Pose.from_xyz_rpy((x, 0.0, z), (0.0, pitch, yaw))
+    return [*pose.position, *pose.quaternion]
+
+
+def pushed(robot=None, **changes):
+    block = Block((0.2, 0.2, 0.2), mass=0.1)
+    return FreeSpace(Scene(robot or aside(), block=block, **changes))
+
+
+def test_the_block_is_an_obstacle_where_it_is_said_to_be():
+    """The ball of 0.1 m is 0.5 m beside the plate, and its centre 0.5 m above the ground."""
+    space = pushed()
+    above = 0.5 + 0.1 + 0.1
+    heights = (above + SHALLOW, above - SHALLOW, above - DEEP, 5.0)
+    blocks = [block_at(0.5, z) for z in heights]
+    assert space.free(np.zeros((4, 1)), blocks).tolist() == [True, True, False, True]
+    assert space.free(np.zeros((4, 1))).all()
+    assert space.free([[0.3], [0.0]], [block_at(0.5, above)] * 2).tolist() == [False, True]
+
+
+def test_the_block_may_be_turned_any_way():
+    diagonal = 0.1 * np.sqrt(2)
+    space = pushed()
+
+    def free(**turn):
+        return space.free([[0.0]], [block_at(0.5, 0.5 + 0.1 + diagonal - DEEP, **turn)])[0]
+
+    assert free(yaw=np.pi / 4)
+    assert not free(pitch=np.pi / 4)
+    aside_of = [block_at(0.5 - 0.1 - diagonal + DEEP, 0.5, yaw=yaw) for yaw in (0.0, np.pi / 4)]
+    assert space.free([[0.0]] * 2, aside_of).tolist() == [True, False]
+
+
+def test_the_block_may_stand_on_the_ground_but_not_in_what_stands_still():
+    blocks = [block_at(2.0, 0.1), block_at(2.0, 0.0), block_at(0.0, 0.1), block_at(1.5, 0.1)]
+    wall = Block((0.2, 0.2, 0.2), Pose((1.6, 0.0, 0.1)))
+    space = pushed(obstacles=(wall,))
+    expected = [True, True, False, False]
+    assert space.free(np.zeros((4, 1)), blocks).tolist() == expected
+    assert space.room(blocks).tolist() == expected
+
+
+def test_room_is_left_by_what_moves():
+    space = pushed()
+    in_ball, in_plate = block_at(0.5, 0.5), block_at(0.1, 0.1)
+    assert not space.free([[0.0]], [in_ball])[0]
+    assert space.room([in_ball, in_plate]).tolist() == [True, False]
+
+
+def test_the_point_of_a_tool_is_not_in_the_block():
+    fingertip = Frame("tool", "ball", Pose((0.0, 0.0, 0.3)))
+    space = pushed(replace(aside(), frames=(fingertip,)))
+    assert space.free([[0.0]] * 2, [block_at(0.5, z) for z in (0.85, 0.95)]).tolist() == [
+        False,
+        True,
+    ]
+
+
+def test_blocks_have_their_shape_and_a_scene_with_one():
+    with pytest.raises(ValueError, match=r"blocks have shape \(7,\); 1 configurations need"):
+        pushed().free([[0.0]], block_at(0.5, 0.5))
+    with pytest.raises(ValueError, match=r"a scene with a block"):
+        FreeSpace(Scene(aside())).free([[0.0]], [block_at(0.5, 0.5)])
+    with pytest.raises(ValueError, match=r"shape \(2, 7\)"):
+        pushed().free([[0.0]], [block_at(0.5, 0.5)] * 2)

@@ -12,7 +12,7 @@ import pytest
 from morphgen.benchmark.workspace import shoulder, workspace
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import BenchmarkError
-from morphgen.model.geometry import Box, Pose, Shape
+from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import bounds, frame_pose
 from morphgen.model.robot import Link
 from morphgen.tasks import free_space, obstacles
@@ -26,7 +26,7 @@ from robots import arm
 from scenes import robot
 
 CONFIG = ReachConfig(goals=12)
-LIFTED = Pose.from_xyz_rpy((0.2, -0.1, 0.4), (0.0, 0.0, 1.0))
+LIFTED = -0.4
 WORDS = (
     "arm=ur5 ee=plane",
     "arm=panda ee=panda_hand",
@@ -46,12 +46,12 @@ def body():
     return replace(arm(), ignore_pairs=ignore_pairs(arm()))
 
 
-def made(body, cache, *, obstacles=False, seed=0, config=CONFIG, at=LIFTED):
-    return goal_set(body, config, obstacles=obstacles, seed=seed, T_world_root=at, cache=cache)
+def made(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
+    return goal_set(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
 
 
-def scene_of(body, found, at=LIFTED):
-    return Scene(body, at, obstacles=found.obstacles)
+def scene_of(body, found, ground=LIFTED):
+    return Scene(body, obstacles=found.obstacles, ground=ground)
 
 
 def files(folder):
@@ -62,22 +62,21 @@ def files(folder):
 @pytest.mark.parametrize("boxes", [False, True])
 def test_every_goal_is_proven_by_its_witness(words, boxes, cache):
     body = robot(words)
-    found = made(body, cache, obstacles=boxes, at=Pose())
+    found = made(body, cache, obstacles=boxes, ground=0.0)
     assert found.q.shape == (12, body.dof)
     assert found.poses.shape == (12, 7)
     assert (found.poses[:, 3] >= 0).all()
     assert len(found.obstacles) == (3 if boxes else 0)
-    assert certify(found, body, scene_of(body, found, Pose())) == []
+    assert certify(found, body, scene_of(body, found, 0.0)) == []
     assert 12 == found.accepted <= found.tried
     assert len(np.unique(found.q, axis=0)) == 12
 
 
-def test_goals_are_in_the_world(body, cache):
-    here, there = (made(body, cache, at=at) for at in (Pose(), LIFTED))
-    expected = LIFTED.matrix @ frame_pose(body, there.q)
-    assert there.poses[:, :3] == pytest.approx(expected[:, :3, 3])
+def test_goals_are_above_the_ground_wherever_it_is(body, cache):
+    here, there = (made(body, cache, ground=ground) for ground in (0.0, LIFTED))
+    assert there.poses[:, :3] == pytest.approx(frame_pose(body, there.q)[:, :3, 3])
     assert certify(there, body, scene_of(body, there)) == []
-    assert certify(there, body, scene_of(body, there, Pose())) != []
+    assert certify(there, body, scene_of(body, there, 0.5)) != []
     assert here.key != there.key
 
 
@@ -86,36 +85,36 @@ def test_goals_are_never_inside_an_obstacle(words, cache):
     """Neither the witness's links nor the tool's point, which may be where no link is."""
     body = robot(words)
     config = replace(CONFIG, goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
-    found = made(body, cache, obstacles=True, config=config, at=Pose())
-    assert not FreeSpace(scene_of(body, found, Pose())).obstacle_hits(found.q).any()
+    found = made(body, cache, obstacles=True, config=config, ground=0.0)
+    assert not FreeSpace(scene_of(body, found, 0.0)).obstacle_hits(found.q).any()
     for box in found.obstacles:
         T = box.pose.inverse().matrix
         inside = np.abs(found.poses[:, :3] @ T[:3, :3].T + T[:3, 3]) <= np.array(box.size) / 2
         assert not inside.all(axis=1).any()
 
 
-@pytest.mark.parametrize("at", [Pose(), Pose((4.0, -3.0, 0.4))])
+@pytest.mark.parametrize("ground", [0.0, -0.4])
 @pytest.mark.parametrize("words", WORDS)
-def test_obstacles_are_in_the_workspace_and_leave_the_robot_at_home(words, at, cache):
+def test_obstacles_are_in_the_workspace_and_leave_the_robot_at_home(words, ground, cache):
     body = robot(words)
-    found = made(body, cache, obstacles=True, at=at, config=replace(CONFIG, obstacles=6))
-    space = FreeSpace(scene_of(body, found, at))
+    found = made(body, cache, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6))
+    space = FreeSpace(scene_of(body, found, ground))
     assert not space.obstacle_hits([body.home]).any()
-    reach, centre = workspace(body).reach, np.array(at.apply(shoulder(body)))
+    reach, centre = workspace(body).reach, shoulder(body)
     for box in found.obstacles:
         assert all(0.06 * reach <= edge <= 0.15 * reach for edge in box.size)
-        assert box.pose.position[2] >= box.size[2] / 2
-        assert np.linalg.norm(centre - box.pose.position) <= reach
-    q, _ = FreeSpace(Scene(body, at)).draw(300, np.random.default_rng(9))
+        assert box.pose.position[2] >= ground + box.size[2] / 2 - 1e-12
+        assert np.linalg.norm(np.subtract(centre, box.pose.position)) <= reach
+    q, _ = FreeSpace(Scene(body, ground=ground)).draw(300, np.random.default_rng(9))
     assert space.free(q).mean() > KEPT - 0.15
 
 
 def test_obstacles_that_leave_too_little_are_passed_over(body, monkeypatch):
     def left(share):
         monkeypatch.setattr(obstacles, "KEPT", share)
-        boxes = draw_obstacles(body, 8, (0.5, 0.7), np.random.default_rng(0), T_world_root=LIFTED)
-        q, _ = FreeSpace(Scene(body, LIFTED)).draw(200, np.random.default_rng(1))
-        return FreeSpace(Scene(body, LIFTED, obstacles=boxes)).free(q).mean()
+        boxes = draw_obstacles(body, 8, (0.5, 0.7), np.random.default_rng(0), ground=LIFTED)
+        q, _ = FreeSpace(Scene(body, ground=LIFTED)).draw(200, np.random.default_rng(1))
+        return FreeSpace(Scene(body, obstacles=boxes, ground=LIFTED)).free(q).mean()
 
     assert left(0.0) < 0.6
     assert left(0.7) > 0.6
@@ -150,7 +149,7 @@ def changes(body):
     return {
         "obstacles": {"obstacles": True},
         "goals": {"config": replace(CONFIG, goals=13)},
-        "place": {"at": Pose((0.0, 0.0, 0.4))},
+        "ground": {"ground": -0.2},
         "body": {"body": replace(body, home=(0.0, *body.home[1:]))},
         "pairs": {"body": replace(body, ignore_pairs=(*body.ignore_pairs, ("base", "slider")))},
         "number of obstacles": {"obstacles": True, "config": replace(CONFIG, obstacles=2)},
@@ -195,11 +194,10 @@ def test_every_run_gives_the_same_bytes(body, tmp_path):
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
         "from dataclasses import replace; from robots import arm; "
         "from morphgen.checks.self_collision import ignore_pairs; "
-        "from morphgen.model.geometry import Pose; from morphgen.tasks.config import ReachConfig; "
+        "from morphgen.tasks.config import ReachConfig; "
         "from morphgen.tasks.goals import goal_set; "
         "body = replace(arm(), ignore_pairs=ignore_pairs(arm())); "
-        "at = Pose.from_xyz_rpy((0.2, -0.1, 0.4), (0.0, 0.0, 1.0)); "
-        "goal_set(body, ReachConfig(goals=12), obstacles=True, seed=0, T_world_root=at, "
+        "goal_set(body, ReachConfig(goals=12), obstacles=True, seed=0, ground=-0.4, "
         "cache=Path(sys.argv[1]))"
     )
     tests = Path(__file__).parents[1]
@@ -218,7 +216,7 @@ def test_fewer_goals_are_the_first_of_more(body, cache):
 def test_a_failed_sample_does_not_truncate_the_set(cache):
     """Three of four configurations of this arm collide, and every set is full."""
     body = robot("arm=ur5 ee=plane")
-    found = made(body, cache, at=Pose())
+    found = made(body, cache, ground=0.0)
     assert found.tried > 2 * found.accepted
     assert len(found.q) == 12
 
@@ -226,7 +224,7 @@ def test_a_failed_sample_does_not_truncate_the_set(cache):
 def test_a_robot_without_enough_goals_is_refused_with_its_acceptance_rate(body, cache, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 20)
     with pytest.raises(BenchmarkError) as caught:
-        made(body, cache, at=Pose((0.0, 0.0, -5.0)))
+        made(body, cache, ground=5.0)
     text = str(caught.value)
     assert "robot 'arm': only 0 of 240 random configurations" in text
     assert "acceptance rate 0), 12 are needed" in text

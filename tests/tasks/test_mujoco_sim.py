@@ -98,7 +98,7 @@ def test_effort_limits_what_a_joint_lifts():
     strong = real_arm_scene().robot
     joints = tuple(replace(j, effort=5.0) if j.effort else j for j in strong.joints)
     sim = MujocoSimulation(
-        [Scene(each, ground=False) for each in (strong, replace(strong, joints=joints))],
+        [Scene(each, ground=None) for each in (strong, replace(strong, joints=joints))],
         NOTHING_TOUCHES,
     )
     targets = sim.q + torch.tensor([0.3, 0, 0, 0, 0, 0])
@@ -269,7 +269,7 @@ def test_links_touch_each_other_if_asked_and_not_ignored():
     q = np.clip(np.array([0, 1.2, 0, -3.0, 0, 0.2, 0.8, 0.0]), *bounds(body).T)
     counts = []
     for contacts in (Contacts(), Contacts(self_collision=False)):
-        sim = MujocoSimulation([Scene(body, ground=False)], contacts)
+        sim = MujocoSimulation([Scene(body, ground=None)], contacts)
         held(sim, 1)
         assert sim._data[0].ncon == 0
         sim.reset(torch.tensor([0]), torch.from_numpy(q[None]).float(), torch.zeros(1, 7))

@@ -92,7 +92,7 @@ def test_tools_go_the_same_way_in_free_space(words):
     for seed in range(3):
         targets = smooth_walk(body, seed)
         mujoco, bullet = (
-            frame_pose(body, positions(each, Scene(body, ground=False), targets, IN_FREE_SPACE))
+            frame_pose(body, positions(each, Scene(body, ground=None), targets, IN_FREE_SPACE))
             for each in SIMULATIONS
         )
         apart = np.linalg.norm(mujoco[:, :3, 3] - bullet[:, :3, 3], axis=1)

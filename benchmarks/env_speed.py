@@ -1,0 +1,200 @@
+"""Environment steps a second: raw PyBullet, morphgen, panda-gym and MuJoCo in one run.
+
+    python benchmarks/env_speed.py [--envs 128] [--seconds 4] [--rounds 3] [--json rows.json]
+
+Reach and push of a Panda with its hand and reach of a UR5 with a plate, collision shapes of fitted
+primitives; random actions; steps of 5 ms, four to an action. Rows of a task:
+
+- raw PyBullet: the same scenes under the same actions, and of that only what is spent within
+  `stepSimulation`: as if targets, states, observations and rewards cost nothing.
+- morphgen with PyBullet in one process and in two, with MuJoCo in one thread and in two:
+  observations, rewards and new episodes on.
+- morphgen with PyBullet and without self-collision, which panda-gym does not have.
+- panda-gym, its own scene and observation, joint control, its physics set to the same steps; one
+  environment in one process, and one in each of two (Gymnasium's vector environments).
+
+Every row is measured in turn, in every round, so that what else the machine does hits all; the
+figures are medians of the rounds. "of raw" is the ratio to raw PyBullet of the same task.
+
+panda-gym comes with `pip install morphgen[bench]`; without it its rows are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pybullet
+import torch
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.benchmark.split import Task
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.make import SimulatorName, make_batch
+from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
+from morphgen.tasks.speed import measure, random_actions
+
+Rate = Callable[[float], float]
+"""Environment steps a second, measured for so many seconds at least."""
+CASES: tuple[tuple[Task, str, str], ...] = (
+    ("reach", "arm=panda ee=panda_hand", "PandaReachJoints-v3"),
+    ("push", "arm=panda ee=panda_hand", "PandaPushJoints-v3"),
+    ("reach", "arm=ur5 ee=plane", ""),
+)
+"""Task, robot, and the environment of panda-gym that does the same."""
+RAW = "raw PyBullet"
+ACTIONS = 25
+"""Different ones, again and again."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A way to step the environments of a task."""
+
+    case: str
+    name: str
+    rate: Rate
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--envs", type=int, default=128)
+    parser.add_argument("--seconds", type=float, default=4.0, help="of every row in every round")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", type=Path, help="also write the rows here")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = [row for case in CASES for row in _rows(*case, args.envs)]
+    found: dict[tuple[str, str], list[float]] = {(row.case, row.name): [] for row in rows}
+    for _ in range(args.rounds):
+        for row in tqdm(rows, unit="row"):
+            found[row.case, row.name].append(row.rate(args.seconds))
+    medians = {key: statistics.median(rates) for key, rates in found.items()}
+    table = [
+        (case, name, rate, rate / medians[case, RAW]) for (case, name), rate in medians.items()
+    ]
+    if args.json:
+        text = json.dumps(
+            [dict(zip(("case", "name", "rate", "of_raw"), row, strict=True)) for row in table],
+            indent=1,
+        )
+        args.json.write_text(text + "\n", encoding="utf-8")
+    headers = ("task", "with", "env-steps/s", "of raw")
+    print(tabulate(table, headers, floatfmt=("", "", ",.0f", ".2f")))
+    if find_spec("panda_gym") is None:
+        print("panda-gym is not installed: no peer in this run (pip install 'morphgen[bench]')")
+    return 0
+
+
+def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
+    case = f"{task} {robot}"
+    ours: list[tuple[str, SimulatorName, int]] = [
+        ("morphgen, PyBullet, 1 process", "pybullet", 1),
+        ("morphgen, PyBullet, 2 processes", "pybullet", 2),
+        ("morphgen, MuJoCo, 1 thread", "mujoco", 1),
+        ("morphgen, MuJoCo, 2 threads", "mujoco", 2),
+    ]
+    rows = [Row(case, RAW, partial(_raw, task, robot, envs))]
+    for name, sim, workers in ours:
+        rows.append(Row(case, name, partial(_ours, task, robot, envs, sim, workers, Contacts())))
+    if peer:
+        alone = partial(_ours, task, robot, envs, "pybullet", 1, Contacts(self_collision=False))
+        rows.append(Row(case, "the same, 1 process, links pass through each other", alone))
+    if peer and find_spec("panda_gym") is not None:
+        for count in (1, 2):
+            name = f"panda-gym, {count} process" + ("es" if count > 1 else "")
+            rows.append(Row(case, name, partial(_peer, peer, count)))
+    return rows
+
+
+def _batch(
+    task: Task, robot: str, envs: int, sim: SimulatorName, workers: int, contacts: Contacts
+) -> TaskBatch:
+    return make_batch(task, [robot], envs, sim=sim, workers=workers, contacts=contacts)
+
+
+def _ours(
+    task: Task,
+    robot: str,
+    envs: int,
+    sim: SimulatorName,
+    workers: int,
+    contacts: Contacts,
+    seconds: float,
+) -> float:
+    with closing(_batch(task, robot, envs, sim, workers, contacts)) as batch:
+        return measure(batch, seconds).steps_per_second
+
+
+def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
+    """Of the calls of ``stepSimulation`` that the same environments make."""
+    spent, calls = 0.0, 0
+    with closing(_batch(task, robot, envs, "pybullet", 1, Contacts())) as batch:
+        batch.reset()
+        step = pybullet.stepSimulation
+
+        def timed(**client: int) -> None:
+            nonlocal spent, calls
+            start = time.perf_counter()
+            step(**client)
+            spent += time.perf_counter() - start
+            calls += 1
+
+        pybullet.stepSimulation = timed
+        try:
+            end = time.perf_counter() + seconds
+            actions = random_actions(batch, ACTIONS, seed=0)
+            while time.perf_counter() < end:
+                for action in actions:
+                    batch.step(action)
+        finally:
+            pybullet.stepSimulation = step
+    return calls / spent
+
+
+def _peer(name: str, count: int, seconds: float) -> float:
+    """Of panda-gym with our steps."""
+    import gymnasium
+
+    make = [partial(_panda, name)] * count
+    vector = gymnasium.vector.SyncVectorEnv if count == 1 else gymnasium.vector.AsyncVectorEnv
+    with closing(vector(make)) as envs:
+        envs.reset(seed=0)
+        rng = np.random.default_rng(0)
+        actions = rng.uniform(-1, 1, (ACTIONS, *envs.action_space.shape)).astype(np.float32)
+        for action in actions:
+            envs.step(action)
+        start, steps = time.perf_counter(), 0
+        while time.perf_counter() - start < seconds:
+            envs.step(actions[steps % ACTIONS])
+            steps += 1
+        return steps * count / (time.perf_counter() - start)
+
+
+def _panda(name: str) -> Any:  # noqa: ANN401 - gymnasium's environments have no types here
+    import gymnasium
+    import panda_gym
+
+    assert panda_gym is not None
+    env = gymnasium.make(name)
+    sim = env.unwrapped.sim
+    sim.n_substeps, sim.timestep = SUBSTEPS, TIMESTEP
+    sim.physics_client.setTimeStep(TIMESTEP)
+    return env
+
+
+if __name__ == "__main__":
+    sys.exit(main())

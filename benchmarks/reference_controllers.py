@@ -1,0 +1,143 @@
+"""How often reference controllers succeed, on every robot of every scenario, in both simulators.
+
+    python benchmarks/reference_controllers.py [--task reach] [--only ur5] [--envs 8] [--episodes 2]
+        [--sims pybullet,mujoco] [--obstacles] [--jobs 2] [--json rows.json]
+
+Distinct bodies of all splits that come with morphgen, each at the tasks that splits give it (a
+body at one task once), collision shapes of fitted primitives, goals and starts of seed 0. A row a
+body and task: the share of episodes that end in success, with inverse kinematics for reach or the
+scripted push, and with random actions; and how far the tool moves in an episode without any action.
+Without ``--obstacles`` there are none, whatever the splits say.
+
+The last rows are means. A simulator that is not installed is left out, and told.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import mean
+
+import torch
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.benchmark.split import SIDES, Member
+from morphgen.benchmark.split_file import read_split, split_names
+from morphgen.grammar.library import Library, default_library
+from morphgen.processes import mapped
+from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.rollouts import run_episodes
+from morphgen.rl.scripted_push import ScriptedPush
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.kinematics import tool_positions
+from morphgen.tasks.make import SIMULATORS, SimulatorName, batch_of
+from morphgen.tasks.settings import member_setting
+
+Row = dict[str, float | str]
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """What every process does to a robot."""
+
+    sims: tuple[SimulatorName, ...]
+    envs: int
+    episodes: int
+    obstacles: bool
+
+    @cached_property
+    def library(self) -> Library:
+        """Where parts are."""
+        return default_library(())
+
+    def __call__(self, member: Member) -> Row:
+        """Measure one robot at one task."""
+        torch.set_num_threads(1)
+        setting = member_setting(replace(member, obstacles=self.obstacles), self.library)
+        row: Row = {"robot": member.name, "task": member.task}
+        for sim in self.sims:
+            with closing(batch_of([setting], self.envs, sim=sim)) as batch:
+                if member.task == "reach":
+                    spaces = [FreeSpace(setting.scene)]
+                    acting = InverseKinematics(0, spaces)
+                    good = run_episodes(batch, acting, self.episodes)
+                else:
+                    good = run_episodes(batch, ScriptedPush(0), self.episodes)
+                chance = run_episodes(batch, Random(0), self.episodes)
+                row[f"{sim} reference"] = mean(episode.success for episode in good)
+                row[f"{sim} random"] = mean(episode.success for episode in chance)
+                row[f"{sim} drift mm"] = _drift(batch)
+        return row
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", choices=["reach", "push"])
+    parser.add_argument("--only", default="", help="robots whose name has this in it")
+    parser.add_argument("--envs", type=int, default=8)
+    parser.add_argument("--episodes", type=int, default=2, help="of each environment")
+    parser.add_argument("--sims", default=",".join(SIMULATORS))
+    parser.add_argument("--obstacles", action="store_true")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="also write the rows here")
+    args = parser.parse_args()
+    sims = tuple(sim for sim in SIMULATORS if sim in args.sims.split(",") and find_spec(sim))
+    members = [
+        member
+        for member in _members()
+        if args.task in (None, member.task) and args.only in member.name
+    ]
+    work = Measuring(sims, args.envs, args.episodes, args.obstacles)
+    found = mapped(work, members, args.jobs, chunk=1)
+    rows = list(tqdm(found, total=len(members), unit="robot"))
+    for task in ("reach", "push"):
+        of_task = [row for row in rows if row["task"] == task]
+        if of_task:
+            numbers = [key for key in of_task[0] if key not in ("robot", "task")]
+            means = {key: mean(float(row[key]) for row in of_task) for key in numbers}
+            rows.append({"robot": "mean", "task": task, **means})
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    print(tabulate(rows, headers="keys", floatfmt=".2f"))
+    for sim in SIMULATORS:
+        if sim not in sims:
+            print(f"{sim}: left out")
+    return 0
+
+
+def _members() -> Iterator[Member]:
+    """A member for every body at every task."""
+    seen: set[tuple[str, str]] = set()
+    for name in split_names():
+        split = read_split(name)
+        for side in SIDES:
+            for member in split.side(side):
+                if (member.body, member.task) not in seen:
+                    seen.add((member.body, member.task))
+                    yield member
+
+
+def _drift(batch: TaskBatch) -> float:
+    """How far tools move within an episode without action, at most, millimetres."""
+    batch.reset()
+    start = tool_positions(batch.bodies.chain, batch.body, batch.q)
+    acting, farthest = Zero(), 0.0
+    for _ in range(int(batch.longest.min()) - 1):
+        batch.step(acting.act(batch))
+        now = tool_positions(batch.bodies.chain, batch.body, batch.q)
+        farthest = max(farthest, float((now - start).norm(dim=1).max()))
+    return 1000 * farthest
+
+
+if __name__ == "__main__":
+    sys.exit(main())

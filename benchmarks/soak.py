@@ -1,0 +1,90 @@
+"""Random actions for minutes: nothing that is not finite, no leak, no process left behind.
+
+    python benchmarks/soak.py [SPLIT] [--minutes 10] [--envs 40] [--sim pybullet] [--workers 2]
+
+Steps the robots that a split trains on, among obstacles, whatever the split says of them. Every
+observation and reward is tested. Resident memory of this process and of its workers is told after
+a tenth of the time and at the end; the exit code is 1 if something was not finite, if memory grew
+by more than a twentieth in between, or if a worker outlived the batch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from morphgen.benchmark.split import robots
+from morphgen.benchmark.split_file import read_split
+from morphgen.fitting.dressed import as_primitives
+from morphgen.grammar.library import default_library
+from morphgen.tasks.batch import Step, TaskBatch
+from morphgen.tasks.make import SIMULATORS, make_batch
+from morphgen.tasks.speed import random_actions
+
+GROWTH = 1.05
+"""Memory at the end over that after a tenth of the time, at most."""
+
+
+def main() -> int:
+    """Step and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("split", nargs="?", default="extrapolation/arms/reach")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--envs", type=int, default=40)
+    parser.add_argument("--sim", choices=SIMULATORS, default="pybullet")
+    parser.add_argument("--workers", type=int, default=2)
+    args = parser.parse_args()
+    split, library = read_split(args.split), default_library(())
+    bodies = [as_primitives(robot, library.folders) for robot in robots(split, "train", library)]
+    tasks = [member.task for member in split.train]
+    torch.set_num_threads(1)
+    with closing(
+        make_batch(tasks, bodies, args.envs, sim=args.sim, workers=args.workers, obstacles=True)
+    ) as batch:
+        steps, early, late, lost = _run(batch, 60 * args.minutes)
+    left = [process.pid for process in multiprocessing.active_children()]
+    print(f"{steps:,} steps of {args.envs} environments in {args.minutes:g} minutes, {args.sim}")
+    print(f"memory after a tenth: {early / 2**20:,.0f} MB; at the end: {late / 2**20:,.0f} MB")
+    print(f"steps with something that is not finite: {lost}; processes left behind: {len(left)}")
+    return int(lost > 0 or late > GROWTH * early or bool(left))
+
+
+def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int]:
+    """Steps, memory after a tenth and at the end, and how many steps were not finite."""
+    actions = random_actions(batch, 1000, seed=0)
+    batch.reset()
+    steps = lost = early = 0
+    start = time.monotonic()
+    with tqdm(total=round(seconds), unit="s") as bar:
+        while (elapsed := time.monotonic() - start) < seconds:
+            if not early and elapsed > seconds / 10:
+                early = _memory()
+            step = batch.step(actions[steps % len(actions)])
+            lost += not _is_finite(step)
+            steps += 1
+            bar.update(int(elapsed) - bar.n)
+    return steps, early, _memory(), lost
+
+
+def _is_finite(step: Step) -> bool:
+    told = [step.reward, step.distance, step.score, *step.terms.values()]
+    seen = [*step.observation.values(), *step.final_observation.values()]
+    return all(bool(each.isfinite().all()) for each in (*told, *seen))
+
+
+def _memory() -> int:
+    """Resident memory of this process and its children, bytes, as Linux tells it."""
+    pids = ["self", *(str(process.pid) for process in multiprocessing.active_children())]
+    pages = [int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids]
+    return sum(pages) * 4096
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Episodes of a controller in a batch, one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from morphgen.tasks.batch import TaskBatch
+
+
+class Controller(Protocol):
+    """What acts."""
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Actions of all environments, shape (n, L)."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """How an episode went."""
+
+    env: int
+    body: int
+    """Index of the robot."""
+    success: bool
+    """At its end."""
+    distance: float
+    """From success then, metres; see ``Step``."""
+    score: float
+    """Mean of its steps' scores."""
+    steps: int
+
+
+def run_episodes(
+    batch: TaskBatch,
+    controller: Controller,
+    count: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[Episode]:
+    """The first episodes of every environment, as many of each.
+
+    Args:
+        batch: Environments; they are reset first.
+        controller: What acts.
+        count: Episodes of each environment.
+        progress: Told how many episodes are over, at the end of any.
+
+    Returns:
+        By environment, and then in their order.
+
+    Raises:
+        SimulationError: If a simulation becomes unstable.
+    """
+    batch.reset()
+    n = batch.num_envs
+    found: list[list[Episode]] = [[] for _ in range(n)]
+    bodies = batch.body.tolist()
+    total = torch.zeros(n, device=batch.device)
+    steps = torch.zeros(n, dtype=torch.int64, device=batch.device)
+    done = 0
+    while done < n * count:
+        step = batch.step(controller.act(batch))
+        total += step.score
+        steps += 1
+        over = torch.nonzero(step.terminated | step.truncated)[:, 0]
+        if not len(over):
+            continue
+        for env in over.tolist():
+            if len(found[env]) < count:
+                taken = int(steps[env])
+                found[env].append(
+                    Episode(
+                        env,
+                        bodies[env],
+                        bool(step.success[env]),
+                        float(step.distance[env]),
+                        float(total[env]) / taken,
+                        taken,
+                    )
+                )
+                done += 1
+        total[over], steps[over] = 0, 0
+        progress(done)
+    return [episode for own in found for episode in own]

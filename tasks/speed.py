@@ -1,0 +1,122 @@
+"""How fast a batch is, and where its time goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.config import BINS
+from morphgen.tasks.sim.base import SUBSTEPS
+
+WARM_UP = 20
+"""Control steps before the clock starts."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Of a batch under random actions."""
+
+    steps_per_second: float
+    """Control steps of all environments together, episodes' beginnings included."""
+    shares: dict[str, float]
+    """Of the time, by what it was spent on; they sum up to 1."""
+
+    @property
+    def substeps_per_second(self) -> float:
+        """Physics steps of all environments together."""
+        return self.steps_per_second * SUBSTEPS
+
+
+def random_actions(batch: TaskBatch, count: int, seed: int) -> list[torch.Tensor]:
+    """Actions drawn evenly from all there are."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (count, *batch.mask.shape)
+    if batch.kind == "discrete":
+        drawn = torch.randint(len(BINS), shape, generator=generator)
+    else:
+        drawn = 2 * torch.rand(shape, generator=generator) - 1
+    return list(drawn.to(batch.device).unbind(0))
+
+
+def measure(
+    batch: TaskBatch,
+    seconds: float,
+    *,
+    seed: int = 0,
+    own: Sequence[tuple[Any, str]] = (),
+    clock: Callable[[], float] = time.perf_counter,
+) -> Speed:
+    """Step a batch for some time.
+
+    Args:
+        batch: Environments; they are reset first.
+        seconds: How long, at least.
+        seed: Of the actions.
+        own: The simulator's own step, as module and name of its function; what is spent in it is
+            told apart from what is spent around it. Only if it runs in this thread alone.
+        clock: Tells the time, seconds.
+    """
+    spent: dict[str, float] = {}
+    parts: dict[str, list[tuple[Any, str]]] = {
+        "actions": [(batch, "_act")],
+        "rewards": [(batch, "_judge")],
+        "observation": [(batch, "observe")],
+        "new episodes": [(batch, "_begin")],
+        "around the simulator": [(batch.simulation, "step")],
+        "simulator": list(own),
+    }
+    actions = random_actions(batch, WARM_UP, seed)
+    batch.reset()
+    for action in actions:
+        batch.step(action)
+    steps = 0
+    with ExitStack() as stack:
+        for part, functions in parts.items():
+            for owner, name in functions:
+                stack.enter_context(_timed(owner, name, part, spent, clock))
+        start = clock()
+        while clock() - start < seconds:
+            batch.step(actions[steps % len(actions)])
+            steps += 1
+        total = clock() - start
+    shares = {part: spent.get(part, 0.0) / total for part in parts}
+    shares["around the simulator"] -= shares["simulator"]
+    shares["rest"] = 1 - sum(shares.values())
+    if not own:
+        shares["simulator"] = shares.pop("around the simulator")
+    return Speed(steps * batch.num_envs / total, shares)
+
+
+@contextmanager
+def _timed(
+    owner: Any,  # noqa: ANN401 - a module or any object
+    name: str,
+    part: str,
+    spent: dict[str, float],
+    clock: Callable[[], float],
+) -> Iterator[None]:
+    """Add up what is spent in a function while this lasts."""
+    inner = getattr(owner, name)
+    shadowed = name in vars(owner)
+
+    def timed(*args: object, **kwargs: object) -> object:
+        start = clock()
+        try:
+            return inner(*args, **kwargs)
+        finally:
+            spent[part] = spent.get(part, 0.0) + clock() - start
+
+    setattr(owner, name, timed)
+    try:
+        yield
+    finally:
+        if shadowed:
+            setattr(owner, name, inner)
+        else:
+            delattr(owner, name)

@@ -1,0 +1,176 @@
+"""``morphgen goals``: what it prints, what fails, and what it refuses."""
+
+import json
+import signal
+import time
+
+import pytest
+
+from commands import start
+from morphgen.benchmark.contents import Settings
+from morphgen.benchmark.export import build
+from morphgen.benchmark.split_file import split_text
+from morphgen.tasks import free_space, goal_making, goals, push_sets
+from splits import LIBRARY, TEST, TRAIN, member, split
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A cache of the test's own, but for fits."""
+    for module in (goals, push_sets):
+        monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / "cache" / name)
+    return tmp_path / "cache" / "morphgen"
+
+
+def some():
+    train = [member(TRAIN[0], task="reach"), member("arm=arm3 ee=claw", task="reach")]
+    return split(train, [member(TEST[0], task="reach", obstacles=True)])
+
+
+@pytest.fixture
+def path(tmp_path):
+    (tmp_path / "some.yaml").write_text(split_text(some()))
+    return "some.yaml"
+
+
+def cells(line):
+    return [cell for cell in line.split("  ") if cell]
+
+
+def test_a_row_a_robot_says_what_its_goals_are(run, path, cache):
+    code, out, err = run("goals", path)
+    assert (code, err) == (0, "")
+    head, _, *rows, last = out.splitlines()
+    assert [cell.strip() for cell in cells(head)] == [
+        "robot",
+        "side",
+        "task",
+        "goals",
+        "acceptance",
+        "obstacles",
+        "certified",
+    ]
+    assert [[cell.strip() for cell in cells(row)][:4] for row in rows] == [
+        ["gantry-plane", "train", "reach", "100"],
+        ["arm3-claw", "train", "reach", "100"],
+        ["planar-plane", "test", "reach", "100"],
+    ]
+    assert [row.split()[5] for row in rows] == ["0", "0", "3"]
+    assert last == "3 of 3 goal sets are there, seed 0"
+    assert len(list((cache / "goals").iterdir())) == 3
+
+
+def test_certificates_are_asked_for(run, path):
+    code, out, _ = run("goals", path, "--certify")
+    assert code == 0
+    assert [line.split()[-1] for line in out.splitlines()[2:-1]] == ["yes"] * 3
+
+
+def test_goals_are_json_alone(run, path):
+    code, out, err = run("goals", path, "--json", "--seed", 3, "--certify")
+    assert (code, err) == (0, "")
+    data = json.loads(out)
+    assert (data["seed"], data["passed"], data["failures"]) == (3, True, [])
+    first = data["sets"][0]
+    assert (first["robot"], first["side"], first["task"]) == ("gantry-plane", "train", "reach")
+    assert (first["goals"], first["seed"], first["certified"]) == (100, 3, True)
+    assert first["acceptance"] == first["accepted"] / first["tried"]
+    assert [one["certified"] for one in json.loads(run("goals", path, "--json")[1])["sets"]] == [
+        None
+    ] * 3
+
+
+def test_a_robot_that_fails_does_not_stop_the_others(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(free_space, "TRIES", 1)
+    fine = [member(words, task="reach") for words in (TRAIN[0], TRAIN[1])]
+    few = member("arm=arm3 ee=claw", task="reach")
+    path = tmp_path / "few.yaml"
+    path.write_text(split_text(split([fine[0], few], [fine[1]])))
+    code, out, err = run("goals", path)
+    assert (code, err) == (1, "")
+    lines = out.splitlines()
+    assert [line.split()[3] for line in lines[2:5]] == ["100", "none", "100"]
+    assert lines[5].startswith("train robot arm3-claw: robot 'arm3-claw': only ")
+    assert "(acceptance rate 0." in lines[5]
+    assert lines[6:] == ["2 of 3 goal sets are there, seed 0"]
+    data = json.loads(run("goals", path, "--json")[1])
+    assert (data["passed"], len(data["sets"])) == (False, 2)
+    assert [(one["robot"], one["side"]) for one in data["failures"]] == [("arm3-claw", "train")]
+
+
+def test_a_goal_that_is_not_proven_fails(run, path, monkeypatch):
+    lines = ["goal 3: its witness is in collision", "goal 4: its witness is in collision"]
+    monkeypatch.setattr(goal_making, "certify", lambda *_: lines)
+    assert run("goals", path)[0] == 0
+    code, out, _ = run("goals", path, "--certify")
+    assert code == 1
+    printed = out.splitlines()
+    assert [line.split()[-1] for line in printed[2:5]] == ["NO"] * 3
+    assert printed[5] == f"train robot gantry-plane: {lines[0]} (and 1 more)"
+    data = json.loads(run("goals", path, "--certify", "--json")[1])
+    assert (data["passed"], data["sets"][0]["unproven"]) == (False, lines)
+
+
+def test_one_robot_is_given_by_words_a_name_or_a_folder(run, tmp_path):
+    run("compose", "base=gantry", "ee=plane", "--no-picture", "--geometry", "primitive")
+    keys = set()
+    for words in (("base=gantry", "ee=plane"), ("gantry-plane",), ("robots/gantry-plane",)):
+        code, out, err = run("goals", *words, "--task", "reach", "--certify")
+        assert (code, err) == (0, "")
+        (row,) = out.splitlines()[2:-1]
+        assert row.split()[:3] == ["gantry-plane", "reach", "100"]
+        (one,) = json.loads(run("goals", *words, "--task", "reach", "--json")[1])["sets"]
+        keys.add(one["key"])
+        assert one["side"] is None
+    assert len(keys) == 1
+
+
+def test_one_robot_can_push_among_obstacles(run):
+    code, out, _ = run("goals", "gantry-plane", "--task", "push", "--obstacles", "--certify")
+    assert code == 0
+    assert out.splitlines()[2].split()[1:3] == ["push", "100"]
+    assert out.splitlines()[2].split()[-2:] == ["3", "yes"]
+
+
+def test_a_built_split_is_a_split(run, tmp_path):
+    folder = build(some(), tmp_path / "data", LIBRARY, settings=Settings(light=True)).folder
+    assert run("goals", folder)[1].endswith("3 of 3 goal sets are there, seed 0\n")
+
+
+def test_an_interruption_is_said_in_a_line_and_keeps_what_is_made(tmp_path):
+    many = [member(f"base=gantry ee=plane ee.size={60 + i}mm", f"robot-{i}") for i in range(40)]
+    (tmp_path / "many.yaml").write_text(split_text(split(many, some().test)))
+    process = start("goals", "many.yaml", XDG_CACHE_HOME=str(tmp_path / "cache"))
+    while not (stored := files(tmp_path / "cache")) and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert (process.returncode, out) == (130, "")
+    assert err.splitlines()[-1].endswith("morphgen: interrupted; nothing half-written is left")
+    assert "Traceback" not in err
+    assert len(stored) < 41
+    assert all(path.suffix == ".npz" for path in files(tmp_path / "cache"))
+
+
+def files(folder):
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("nowhere.yaml", "nowhere.yaml: no such file"),
+        ("extrapolation/arms/raech", "unknown split 'extrapolation/arms/raech'; did you mean"),
+        ("arm=ur5 ee=plane", "arm=ur5 ee=plane: name one split, or say --task for a robot"),
+        ("arm=ur5", "unknown split 'arm=ur5'"),
+        ("some.yaml --seed -1", "goal seed -1: expected 0 or more"),
+        ("some.yaml --jobs 0", "0 jobs: expected 1 or more"),
+        ("some.yaml --obstacles", "--obstacles goes with --task"),
+        ("arm=ur6 --task reach", "unknown arm 'ur6'; did you mean"),
+        ("nothing/there --task reach", "nothing/there"),
+        ("folder", "folder is no built split: it has no build.json"),
+    ],
+)
+def test_what_it_cannot_do_is_refused_in_a_line(refused, path, tmp_path, argv, message):
+    (tmp_path / "folder").mkdir()
+    assert message in refused("goals", *argv.split())

@@ -1,0 +1,324 @@
+"""The audit finds goals that leak, and sets that are not those of the split's robots."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morphgen.benchmark.audit import audit
+from morphgen.benchmark.split_file import read_split
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.goal_audit import CODES, audit_goals, with_goals
+from morphgen.tasks.goal_leaks import NEAR
+from morphgen.tasks.goal_making import gathered, split_goals
+from morphgen.tasks.settings import Recipe
+from splits import LIBRARY, TEST, TRAIN, member, split
+
+RECIPE = Recipe(0, ReachConfig(goals=12), PushConfig(starts=4))
+REACH = "train", "gantry-plane"
+PUSH = "train", "gantry-cylinder"
+LAST = "test", "planar-plane"
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def some(**more):
+    """Reach and push, with and without obstacles."""
+    train = [member(TRAIN[0], task="reach"), member(TRAIN[2])]
+    return split(train, [member(TEST[0], task="reach", obstacles=True)], **more)
+
+
+def made(which, cache, recipe=RECIPE):
+    return gathered(split_goals(which, LIBRARY, recipe, cache=cache), recipe)
+
+
+@pytest.fixture
+def sets(cache):
+    return made(some(), cache)
+
+
+def changed(sets, at, fields=None, **changes):
+    """The sets with one of them changed."""
+    one = replace(sets.sets[at], **changes)
+    one = replace(one, goals=replace(one.goals, **(fields or {})))
+    return replace(sets, sets={**sets.sets, at: one})
+
+
+def found(which, sets):
+    return [(each.code, each.where) for each in audit_goals(which, sets, LIBRARY)]
+
+
+def whys(which, sets):
+    return [each.why for each in audit_goals(which, sets, LIBRARY)]
+
+
+def moved(array, row, column, by):
+    array = array.copy()
+    array[row, column] += by
+    return array
+
+
+def test_sound_sets_have_no_findings(sets):
+    assert found(some(), sets) == []
+
+
+def test_a_shipped_split_has_no_findings(cache):
+    which = read_split("extrapolation/primitives/reach")
+    assert found(which, made(which, cache)) == []
+
+
+def test_a_cache_that_ignores_the_seed_is_found(sets, cache):
+    """The set of another seed under the key of this one is proven, and not the one."""
+    other = made(some(), cache, replace(RECIPE, seed=1))
+    for at in (REACH, PUSH):
+        wrong = replace(other.sets[at].goals, key=sets.sets[at].goals.key, seed=0)
+        told = audit_goals(some(), changed(sets, at, goals=wrong), LIBRARY)
+        assert [each.code for each in told] == ["goals-changed"]
+        assert told[0].why == "its goals are not those that seed 0 gives"
+
+
+def test_sets_of_another_seed_are_found(cache):
+    other = made(some(), cache, replace(RECIPE, seed=1))
+    told = audit_goals(some(), replace(other, recipe=RECIPE), LIBRARY)
+    assert [each.code for each in told] == ["goals-seed"] * 3
+    assert told[0].why == "its set was made with seed 1, the split's with 0"
+    assert found(some(), other) == []
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        replace(RECIPE, reach=ReachConfig(goals=10), push=PushConfig(starts=3)),
+        replace(
+            RECIPE,
+            reach=ReachConfig(goals=12, obstacles=2),
+            push=PushConfig(starts=4, block_size=(0.1, 0.12)),
+        ),
+    ],
+)
+def test_sets_with_other_constants_are_found(sets, cache, recipe):
+    other = made(some(), cache, recipe)
+    wrong = [at for at, one in other.sets.items() if one.goals.key != sets.sets[at].goals.key]
+    told = audit_goals(some(), replace(other, recipe=RECIPE), LIBRARY)
+    assert [each.code for each in told] == ["goals-config"] * len(wrong)
+    assert len(wrong) >= 2
+
+
+def test_a_set_without_the_obstacles_of_its_member_is_found(cache):
+    bare = replace(some().test[0], obstacles=False)
+    other = made(replace(some(), test=(bare,)), cache)
+    (why,) = whys(some(), other)
+    assert why == "its set is for reach, not reach with obstacles"
+
+
+def test_a_set_of_another_body_is_found(sets):
+    body = "0" * 32
+    told = audit_goals(some(), changed(sets, REACH, {"key": "1" * 64}, body=body), LIBRARY)
+    assert [(each.code, each.where) for each in told] == [
+        ("goals-body", "train robot gantry-plane")
+    ]
+    assert told[0].why.startswith(f"its set is of body {body}, not of ")
+
+
+def test_sets_that_were_swapped_are_found(cache):
+    which = split([member(TRAIN[0], task="reach"), member(TRAIN[1], task="reach")], [TEST[0]])
+    sets = made(which, cache)
+    a, b = (("train", name) for name in ("gantry-plane", "planar-cube"))
+    goals = {a: sets.sets[b].goals, b: sets.sets[a].goals}
+    swapped = {at: replace(one, goals=goals.get(at, one.goals)) for at, one in sets.sets.items()}
+    told = audit_goals(which, replace(sets, sets=swapped), LIBRARY)
+    bodies = [each for each in told if each.code == "goals-body"]
+    assert [each.why for each in bodies] == [
+        "its set is that of train robot planar-cube",
+        "its set is that of train robot gantry-plane",
+    ]
+    assert {each.code for each in told} == {"goals-body", "goals-unproven", "goals-missing"}
+
+
+def test_goals_out_of_reach_are_found(sets):
+    goals = sets.sets[REACH].goals
+    told = audit_goals(
+        some(), changed(sets, REACH, {"poses": moved(goals.poses, [3, 5], 0, 0.01)}), LIBRARY
+    )
+    assert [each.code for each in told] == ["goals-changed", "goals-unproven"]
+    assert told[1].why.startswith("goal 3: the tool of its witness is 0.01 m away")
+    assert told[1].why.endswith("(and 1 more)")
+
+
+def test_goals_in_collision_are_found(sets):
+    box = sets.sets[LAST].goals.obstacles[0]
+    at = tuple(sets.sets[LAST].goals.poses[0, :3].tolist())
+    inside = (replace(box, pose=replace(box.pose, position=at)),)
+    told = audit_goals(some(), changed(sets, LAST, {"obstacles": inside}), LIBRARY)
+    assert [each.code for each in told] == ["goals-changed", "goals-unproven"]
+    assert told[1].why.startswith("goal 0: its witness is in collision")
+
+
+@pytest.mark.parametrize(
+    ("field", "column", "by", "why"),
+    [
+        ("q", 0, 9.0, "start 2: start: joint "),
+        ("behind", 2, 9.0, "start 2: proof behind: joint "),
+        ("blocks", 2, 0.05, "start 2: the block is 0.05 m above the ground"),
+        ("blocks", 1, 1.0, "start 2: the block is across the line already"),
+        ("blocks", 0, 0.05, "start 2: the tool of its proof is not behind the block"),
+        ("across", 0, 0.05, "start 2: the tool of its proof is not on the line"),
+        ("q", 0, np.nan, "not all numbers are finite"),
+    ],
+)
+def test_pushes_that_cannot_be_proven_are_found(sets, field, column, by, why):
+    array = getattr(sets.sets[PUSH].goals, field)
+    wrong = changed(sets, PUSH, {field: moved(array, 2, column, by)})
+    told = [each for each in audit_goals(some(), wrong, LIBRARY) if each.code == "goals-unproven"]
+    assert [each.where for each in told] == ["train robot gantry-cylinder"]
+    assert told[0].why.startswith(why)
+
+
+def test_a_block_in_an_obstacle_is_found(cache):
+    which = split([member(TRAIN[0], obstacles=True)], [member(TRAIN[2])])
+    sets = made(which, cache)
+    goals = sets.sets[REACH].goals
+    box = goals.obstacles[0]
+    at = tuple(goals.blocks[1, :3].tolist())
+    inside = (replace(box, pose=replace(box.pose, position=at)), *goals.obstacles[1:])
+    told = audit_goals(which, changed(sets, REACH, {"obstacles": inside}), LIBRARY)
+    (unproven,) = [each.why for each in told if each.code == "goals-unproven"]
+    assert unproven.startswith("start 1: the block is in an obstacle or the base")
+
+
+def test_a_member_without_a_set_and_a_set_without_a_member_are_found(sets):
+    other = {**sets.sets, ("test", "stranger"): sets.sets[LAST]}
+    del other[REACH]
+    assert found(some(), replace(sets, sets=other)) == [
+        ("goals-missing", "train robot gantry-plane"),
+        ("goals-unknown", "test robot stranger"),
+    ]
+
+
+def test_a_robot_that_has_no_goals_is_told_why(sets):
+    broken = replace(some().train[0], derivation="base=planar[top: ee=cubw]")
+    which = replace(some(), train=(broken, some().train[1]))
+    told = audit_goals(which, sets, LIBRARY)
+    assert [each.code for each in told] == ["goals-missing"]
+    assert "unknown part 'cubw'" in told[0].why
+
+
+def twins(task, obstacles=False):
+    """The same body on both sides under two names, beside another."""
+    train = [member(TRAIN[2], task=task), member(TRAIN[0], task=task)]
+    return split(train, [member(TRAIN[0], "twin", task=task, obstacles=obstacles)])
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_the_same_body_on_both_sides_shares_its_goals(cache, task):
+    count = 12 if task == "reach" else 4
+    told = audit_goals(twins(task), made(twins(task), cache), LIBRARY)
+    assert [(each.code, each.severity, each.where) for each in told] == [
+        ("goals-shared", "error", "test robot twin")
+    ]
+    assert told[0].why == f"train robot gantry-plane has {count} of its {count} goals"
+
+
+def test_the_same_body_at_another_task_shares_nothing(cache):
+    train = [member(TRAIN[0], task="reach")]
+    which = split(train, [member(TRAIN[0], "twin")])
+    assert found(which, made(which, cache)) == []
+    assert found(twins("reach", True), made(twins("reach", True), cache)) == []
+
+
+def test_one_goal_of_the_same_body_is_a_leak_if_it_is_near(cache):
+    which = twins("reach", obstacles=True)
+    sets = made(which, cache)
+    goal = sets.sets[REACH].goals.poses[7]
+    poses = sets.sets["test", "twin"].goals.poses.copy()
+
+    def told(by, turned=0.0):
+        poses[2] = goal
+        poses[2, 0] += by
+        half = turned / 2
+        w, x, y, z = goal[3:]
+        spin = np.array([np.cos(half), np.sin(half), 0, 0])
+        poses[2, 3:] = [
+            w * spin[0] - x * spin[1],
+            x * spin[0] + w * spin[1],
+            y * spin[0] + z * spin[1],
+            z * spin[0] - y * spin[1],
+        ]
+        wrong = changed(sets, ("test", "twin"), {"poses": poses})
+        return [why for why in whys(which, wrong) if why.startswith("train robot")]
+
+    expected = ["train robot gantry-plane has 1 of its 12 goals"]
+    assert told(0.9 * NEAR, np.radians(0.9)) == expected
+    assert told(1.1 * NEAR) == told(0.0, np.radians(1.1)) == []
+
+
+def test_a_goal_that_other_bodies_share_is_no_leak_but_most_of_a_set_is(cache):
+    which = split([member(TRAIN[0], task="reach")], [member(TRAIN[2], "other", task="reach")])
+    sets = made(which, cache)
+    theirs = sets.sets[REACH].goals
+
+    def shared(n, field):
+        array = getattr(sets.sets["test", "other"].goals, field).copy()
+        array[:n] = getattr(theirs, field)[:n]
+        wrong = changed(sets, ("test", "other"), {field: array})
+        return [why for why in whys(which, wrong) if why.startswith("train robot")]
+
+    assert shared(6, "poses") == shared(6, "q") == []
+    assert shared(7, "poses") == ["train robot gantry-plane has 7 of its 12 goals"]
+    assert shared(7, "q") == ["train robot gantry-plane has 7 of its 12 configurations"]
+
+
+def test_the_worst_of_several_is_named(cache):
+    train = [member(TRAIN[0], name, task="reach") for name in ("a", "b")]
+    which = split(train, [member(TRAIN[0], "twin", task="reach")])
+    assert whys(which, made(which, cache)) == ["train robot a (and 1 more) has 12 of its 12 goals"]
+
+
+@pytest.mark.parametrize(("at", "fields"), [(REACH, ["poses", "q"]), (PUSH, ["blocks", "q"])])
+def test_goals_that_a_set_has_twice_are_a_warning(sets, at, fields):
+    goals = sets.sets[at].goals
+    arrays = {name: getattr(goals, name).copy() for name in fields}
+    for array in arrays.values():
+        array[[1, 2]] = array[0]
+    told = audit_goals(some(), changed(sets, at, arrays), LIBRARY)
+    (twice,) = [each for each in told if each.code == "goals-repeated"]
+    assert (twice.severity, twice.where) == ("warning", f"train robot {at[1]}")
+    assert twice.why == "goals 0 and 1 of its set are the same (and 2 more pairs)"
+
+
+def test_a_block_at_the_same_place_is_another_start_with_another_configuration(sets):
+    blocks = sets.sets[PUSH].goals.blocks.copy()
+    blocks[1] = blocks[0]
+    told = found(some(), changed(sets, PUSH, {"blocks": blocks}))
+    assert ("goals-repeated", "train robot gantry-cylinder") not in told
+    assert ("goals-changed", "train robot gantry-cylinder") in told
+
+
+def test_what_a_split_accepts_does_not_fail(cache):
+    reasons = {"body-shared": "new goals of a known body", "goals-shared": "on purpose"}
+    which = replace(twins("reach"), accepted=reasons, regime="interpolation")
+    done = audit(which, LIBRARY)
+    findings = audit_goals(which, made(which, cache), LIBRARY)
+    joined = with_goals(done, which, findings)
+    assert {each.code: why for each, why in joined.accepted} == reasons
+    assert "goals-shared" not in {each.code for each in joined.findings}
+    strict = replace(which, accepted={"body-shared": "a reason"})
+    assert not with_goals(audit(strict, LIBRARY), strict, findings).passed()
+
+
+def test_an_accepted_finding_about_goals_is_unused_only_if_somebody_looked(sets):
+    which = replace(some(), accepted={"goals-shared": "on purpose"}, regime="interpolation")
+    done = audit(which, LIBRARY)
+    unused = "accepted goals-shared"
+    assert unused not in {each.where for each in with_goals(done, which, None).findings}
+    assert unused in {each.where for each in with_goals(done, which, ()).findings}
+
+
+def test_every_code_has_a_fix(sets):
+    broken = replace(sets, sets={})
+    told = audit_goals(some(), broken, LIBRARY)
+    assert {each.code for each in told} == {"goals-missing"} <= CODES
+    assert all(each.fix for each in told)

@@ -1,0 +1,44 @@
+"""What ``measure`` says of where time goes, with a clock that ticks when it is read."""
+
+from contextlib import closing
+from dataclasses import replace
+from itertools import count
+
+import pytest
+
+import morphgen
+from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.make import make_batch, own_step
+from morphgen.tasks.speed import measure
+
+CONFIG = replace(ReachConfig(), goals=4, steps=10)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return morphgen.compose("arm=arm3 ee=claw")
+
+
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+def test_shares_sum_up_and_the_simulators_own_step_is_told_apart(robot, sim, tmp_path):
+    ticks = count()
+    with closing(make_batch("reach", [robot], 3, sim=sim, reach=CONFIG, cache=tmp_path)) as batch:
+        found = measure(batch, 2000, own=[own_step(sim)], clock=lambda: float(next(ticks)))
+        assert "step" not in vars(batch.simulation)
+        assert "observe" not in vars(batch)
+    assert sum(found.shares.values()) == pytest.approx(1)
+    for part in ("simulator", "around the simulator", "observation", "rewards", "new episodes"):
+        assert found.shares[part] > 0, part
+    # A step reads the clock twice in every part, and for each environment in the simulator.
+    assert found.shares["simulator"] == pytest.approx(3 * found.shares["actions"], rel=0.05)
+    assert found.substeps_per_second == 4 * found.steps_per_second > 0
+
+
+def test_without_it_all_within_the_simulation_is_one(robot, tmp_path):
+    ticks = count()
+    with closing(
+        make_batch("reach", [robot], 2, sim="mujoco", reach=CONFIG, cache=tmp_path)
+    ) as batch:
+        found = measure(batch, 500, clock=lambda: float(next(ticks)))
+    assert "around the simulator" not in found.shares
+    assert found.shares["simulator"] == pytest.approx(found.shares["actions"], rel=0.05)

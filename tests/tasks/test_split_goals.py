@@ -1,0 +1,311 @@
+"""Goal sets of splits: made once, shipped with a built split, and read back as they were."""
+
+import io
+import json
+import pickle
+import re
+import zipfile
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from commands import tree
+from morphgen.benchmark.built import load_built
+from morphgen.benchmark.contents import Settings
+from morphgen.benchmark.export import build
+from morphgen.benchmark.verify import verify
+from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.tasks import free_space, goal_making, goals, settings, split_goals
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.goal_making import gathered, robot_goals
+from morphgen.tasks.goal_making import split_goals as make
+from morphgen.tasks.goal_npz import arrays_of, goals_from_npz, goals_npz
+from morphgen.tasks.settings import Recipe
+from morphgen.tasks.split_goals import read_goals, read_split_goals, write_goals
+from scenes import robot
+from splits import LIBRARY, TEST, TRAIN, member, split
+
+RECIPE = Recipe(0, ReachConfig(goals=12), PushConfig(starts=4))
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return tmp_path / "cache"
+
+
+def reaching(train=TRAIN, test=TEST, **more):
+    """A split of robots that reach, the last with obstacles."""
+    sides = [[member(words, task="reach") for words in side] for side in (train, test)]
+    sides[1][-1] = replace(sides[1][-1], obstacles=True)
+    return split(*sides, **more)
+
+
+def mixed():
+    """Robots that reach and push; a name is on both sides."""
+    train = [member(TRAIN[0], task="reach"), member(TRAIN[2], obstacles=True)]
+    return split(train, [member(TRAIN[0])])
+
+
+def made(which, cache, recipe=RECIPE, **options):
+    return make(which, LIBRARY, recipe, cache=cache, **options)
+
+
+def same(a, b):
+    ours, theirs = arrays_of(a), arrays_of(b)
+    return ours.keys() == theirs.keys() and all((ours[k] == theirs[k]).all() for k in ours)
+
+
+def forbidden(*_, **__):
+    raise AssertionError("it was made again")
+
+
+def test_single_and_multi_embodiment_have_the_same_goals(tmp_path):
+    """A set hangs on its robot, not on the split, the side or the robots beside it."""
+    one = member(TRAIN[1], "alone", task="reach")
+    single = made(split([one], [one]), tmp_path / "single")
+    multi = made(reaching(train=TRAIN[::-1]), tmp_path / "multi")
+    (among,) = [each for each in multi if each.robot == "planar-cube"]
+    assert among.goals.key == single[0].goals.key == single[1].goals.key
+    assert (among.goals.q == single[0].goals.q).all()
+    assert (among.goals.poses == single[1].goals.poses).all()
+
+
+def test_goals_follow_the_seed_that_the_cache_must_not_ignore(cache):
+    first, second = (made(reaching(), cache, replace(RECIPE, seed=seed)) for seed in (0, 1))
+    for a, b in zip(first, second, strict=True):
+        assert (a.goals.seed, b.goals.seed) == (0, 1)
+        assert not np.isin(a.goals.q, b.goals.q).any()
+    assert settings.BENCHMARK.seed == settings.SEED == 0
+
+
+def test_every_member_has_its_own_set_train_first(cache):
+    found = made(mixed(), cache, certified=True)
+    assert [(one.side, one.robot, one.task) for one in found] == [
+        ("train", "gantry-plane", "reach"),
+        ("train", "gantry-cylinder", "push"),
+        ("test", "gantry-plane", "push"),
+    ]
+    assert [len(one.goals.q) for one in found] == [12, 4, 4]
+    assert [len(one.goals.obstacles) for one in found] == [0, 3, 0]
+    assert [one.unproven for one in found] == [(), (), ()]
+    assert [0 < one.acceptance <= 1 for one in found] == [True] * 3
+    assert [one.unproven for one in made(mixed(), cache)] == [None] * 3
+
+
+def test_a_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
+    monkeypatch.setattr(free_space, "TRIES", 1)
+    words = ("arm=arm3 ee=claw", TRAIN[1], TRAIN[0])
+    few, part, fine = (member(each, task="reach") for each in words)
+    part = replace(part, derivation="base=planar[top: ee=cubw]")
+    found = made(split([few, part], [fine]), cache)
+    assert [one.goals is None for one in found] == [True, True, False]
+    assert [one.acceptance for one in found] == [None, None, 1.0]
+    few, part, fine = (one.why for one in found)
+    assert re.search(r"only \d of 12 random configurations .* \(acceptance rate 0\.\d+\)", few)
+    assert "unknown part 'cubw'" in part
+    assert fine == ""
+
+
+def test_a_set_that_cannot_be_certified_says_so(cache, monkeypatch):
+    monkeypatch.setattr(goal_making, "certify", lambda *_: ["goal 3: its witness is in collision"])
+    found = made(reaching(), cache, certified=True)
+    assert {one.unproven for one in found} == {("goal 3: its witness is in collision",)}
+
+
+def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
+    def interrupt(done, total):
+        assert total == 4
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        made(reaching(), cache, progress=interrupt)
+    assert len(list(cache.iterdir())) == 2
+    found = made(reaching(), cache)
+    monkeypatch.setattr(goals, "FreeSpace", forbidden)
+    assert all(same(a.goals, b.goals) for a, b in zip(found, made(reaching(), cache), strict=True))
+
+
+def test_processes_make_the_same_sets(tmp_path):
+    sizes = [f"base=gantry ee=cube ee.size={size}mm" for size in range(60, 68)]
+    which = split(
+        [member(words, f"cube-{i}", task="reach") for i, words in enumerate(sizes)],
+        [member(TEST[0], task="reach")],
+    )
+    here, there = (made(which, tmp_path / str(jobs), jobs=jobs, certified=True) for jobs in (1, 2))
+    assert [one.robot for one in here] == [one.robot for one in there]
+    assert all(same(a.goals, b.goals) for a, b in zip(here, there, strict=True))
+    assert all(one.unproven == () for one in there)
+
+
+def test_one_robot_has_the_set_that_it_has_in_a_split(cache):
+    body = robot("base=gantry ee=plane")
+    alone = robot_goals(body, "reach", RECIPE, obstacles=False, cache=cache)
+    among = made(reaching(), cache)[0]
+    assert (alone.side, alone.robot) == (None, body.name)
+    assert alone.goals.key == among.goals.key
+    wrong = robot_goals(replace(body, frames=()), "push", RECIPE, obstacles=False, cache=cache)
+    assert "no frame 'tool'" in wrong.why
+
+
+@pytest.fixture
+def home(tmp_path):
+    return built(tmp_path / "here", mixed())
+
+
+def built(folder, which):
+    return build(which, folder, LIBRARY, settings=Settings(light=True)).folder
+
+
+def test_what_ships_is_read_back_as_it_was(home, cache):
+    found = made(mixed(), cache)
+    assert write_goals(home, found, RECIPE) == home / "goals"
+    read = read_split_goals(home)
+    assert read.recipe == RECIPE
+    assert read.sets.keys() == gathered(found, RECIPE).sets.keys()
+    for one in found:
+        again = read.sets[one.side, one.robot]
+        assert same(again.goals, one.goals)
+        assert again.goals.obstacles == one.goals.obstacles
+        assert (again.body, again.task, again.obstacles) == (one.body, one.task, one.obstacles)
+    assert read_goals(home, "train")["gantry-cylinder"].block == found[1].goals.block
+    assert read_goals(home, "test").keys() == {"gantry-plane"}
+    assert type(read_goals(home, "train")["gantry-plane"]) is goals.GoalSet
+    for one in found:
+        for each in fields(one.goals):
+            was, is_ = (getattr(x, each.name) for x in (one.goals, read.of(one.side, one.robot)))
+            assert type(was) is type(is_), each.name
+
+
+def test_two_builds_are_equal_byte_for_byte(home, tmp_path):
+    other = built(tmp_path / "there", mixed())
+    for i, folder in enumerate((home, other)):
+        write_goals(folder, made(mixed(), tmp_path / f"cache{i}"), RECIPE)
+    assert tree(home) == tree(other)
+    write_goals(home, made(mixed(), tmp_path / "cache0"), RECIPE)
+    assert tree(home) == tree(other)
+    assert sorted(path.name for path in (home / "goals").iterdir()) == [
+        "README.md",
+        "index.json",
+        "test",
+        "train",
+    ]
+
+
+def test_a_file_carries_no_time(cache):
+    content = goals_npz(made(reaching(), cache)[0].goals)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_the_index_says_what_the_sets_are(home, cache):
+    found = made(mixed(), cache)
+    write_goals(home, found, RECIPE)
+    index = json.loads((home / "goals" / "index.json").read_text())
+    assert (index["format"], index["seed"], index["reach"]["goals"]) == (1, 0, 12)
+    for record, one in zip(index["sets"], found, strict=True):
+        assert (record["robot"], record["side"], record["body"]) == (one.robot, one.side, one.body)
+        assert (record["key"], record["seed"]) == (one.goals.key, one.goals.seed)
+        assert record["acceptance"] == record["accepted"] / record["tried"] == one.acceptance
+        assert (home / "goals" / record["file"]).is_file()
+
+
+def test_the_sums_of_a_build_are_those_of_its_goals_too(home, cache):
+    write_goals(home, made(mixed(), cache), RECIPE)
+    assert verify(home, LIBRARY).differences == ()
+    path = home / "goals" / "train" / "gantry-cylinder.npz"
+    path.write_bytes(path.read_bytes()[:-1])
+    ((where, why),) = [(each.where, each.why) for each in verify(home, LIBRARY).differences]
+    assert where == "goals/train/gantry-cylinder.npz"
+    assert "is not what SHA256SUMS was written for" in why
+
+
+def test_an_interruption_leaves_a_build_that_is_not_finished(home, cache, monkeypatch):
+    found = made(mixed(), cache)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(split_goals, "sums_text", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            write_goals(home, found, RECIPE)
+    with pytest.raises(BenchmarkError, match="is not finished"):
+        load_built(home)
+    (home / ".goals.old").mkdir()
+    build(mixed(), home.parents[1], LIBRARY, settings=Settings(light=True))
+    write_goals(home, found, RECIPE)
+    assert verify(home, LIBRARY).differences == ()
+    assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_member_without_a_set_is_refused_and_nothing_is_written(home, cache):
+    found = made(mixed(), cache)
+    before = tree(home)
+    without = [replace(one, goals=None, why="too few") for one in found[:2]] + found[2:]
+    with pytest.raises(BenchmarkError) as caught:
+        write_goals(home, without, RECIPE)
+    text = "train robot gantry-plane has no goal set: too few; nor has gantry-cylinder"
+    assert str(caught.value) == text
+    assert tree(home) == before
+
+
+def test_only_a_finished_build_takes_goals(tmp_path, cache):
+    found = made(mixed(), cache)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(MorphgenError, match="SHA256SUMS: no such file"):
+        write_goals(tmp_path / "other", found, RECIPE)
+    assert tree(tmp_path / "other") == {}
+
+
+def test_a_build_without_goals_says_how_to_get_them(home):
+    with pytest.raises(BenchmarkError, match=r"index\.json: no such file; morphgen split build --"):
+        read_goals(home, "train")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"format": 1', '"format": 2', "format 2; this version reads 1"),
+        ('"format": 1,', "", "no index of goal sets: KeyError"),
+        ('"goals": 12,', '"golas": 12,', "no index of goal sets: TypeError"),
+        ('"sets": [', '"sets": [3,', "no index of goal sets: TypeError"),
+        ("{", "{{", "no index of goal sets: JSONDecodeError"),
+        ('"task": "push"', '"task": "reach"', "gantry-cylinder.npz: no goal set for reach: 'poses"),
+        ("train/gantry-cylinder", "train/gantry-cylinde", "gantry-cylinde.npz: no such file"),
+        (
+            "train/gantry-cylinder",
+            "test/gantry-plane",
+            "is not the file that index.json was written",
+        ),
+    ],
+)
+def test_a_broken_index_is_named(home, cache, old, new, message):
+    write_goals(home, made(mixed(), cache), RECIPE)
+    path = home / "goals" / "index.json"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(BenchmarkError) as caught:
+        read_goals(home, "train")
+    assert message in str(caught.value)
+    assert str(home / "goals") in str(caught.value)
+
+
+def test_a_broken_file_is_named(cache, tmp_path):
+    whole = made(reaching(), cache)[0].goals
+    content = goals_npz(whole)
+    path = tmp_path / "some.npz"
+    for broken in (b"", content[:100], content[:-200]):
+        with pytest.raises(BenchmarkError, match=r"some\.npz: no goal set for reach"):
+            goals_from_npz(broken, "reach", path)
+    for wrong in (replace(whole, poses=whole.poses[1:]), replace(whole, q=whole.q[0])):
+        with pytest.raises(BenchmarkError, match=r"some\.npz: configurations and poses are of"):
+            goals_from_npz(goals_npz(wrong), "reach", path)
+
+
+def test_sets_travel_between_processes(cache):
+    one = made(mixed(), cache)[1]
+    assert one.goals is not None
+    assert same(pickle.loads(pickle.dumps(one)).goals, one.goals)
