@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +62,10 @@ class Step:
     """See ``Verdict``, shape (n,)."""
     terms: Terms
     """What the reward is the sum of."""
+    q: torch.Tensor
+    """Joint positions after the action, whatever followed, shape (n, J)."""
+    block_pose: torch.Tensor
+    """Poses of the blocks likewise, shape (n, 7)."""
 
 
 class TaskBatch:
@@ -116,8 +120,8 @@ class TaskBatch:
             bodies.action_mask(fingers=True)[self.body],
             bodies.action_mask(fingers=False)[self.body],
         )
-        streams = [np.random.SeedSequence(seed, spawn_key=(first + i,)) for i in range(n)]
-        self._random = [np.random.default_rng(stream) for stream in streams]
+        self._numbers = range(first, first + n)
+        self._random = _streams(seed, self._numbers)
         self._reach = Reach(self.settings, self.body, reach, joints)
         self._push = Push(self.settings, self.body, push, joints)
         self._tasks: list[tuple[Reach | Push, torch.Tensor]] = [
@@ -171,9 +175,21 @@ class TaskBatch:
         """Where the block must cross now, y of its centre, shape (n,), metres; zeros for reach."""
         return self._push.line
 
-    def reset(self) -> Observation:
-        """Begin an episode everywhere."""
+    def reset(self, seed: int | None = None, *, spread: bool = False) -> Observation:
+        """Begin an episode everywhere.
+
+        Args:
+            seed: Of all episodes from now on; by default they go on.
+            spread: Whether these first episodes are as if some of their time had passed, another
+                share in each environment: learners want episodes that do not end all at once.
+        """
+        if seed is not None:
+            self._random = _streams(seed, self._numbers)
         self._begin(torch.arange(self.num_envs, device=self.device))
+        if spread:
+            passed = [stream.random() for stream in self._random]
+            shares = torch.tensor(passed, device=self.device)
+            self.elapsed = (shares * self.longest).long()
         return self.observe()
 
     def step(self, actions: torch.Tensor) -> Step:
@@ -192,6 +208,7 @@ class TaskBatch:
         verdict = self._judge()
         truncated = (self.elapsed >= self.longest) & ~verdict.terminated
         final = self.observe()
+        q, block_pose = self.q.clone(), self.simulation.block_pose.clone()
         over = torch.nonzero(truncated | verdict.terminated)[:, 0]
         if len(over):
             self._begin(over)
@@ -205,6 +222,8 @@ class TaskBatch:
             distance=verdict.distance,
             score=verdict.score,
             terms=verdict.terms,
+            q=q,
+            block_pose=block_pose,
         )
 
     def observe(self) -> Observation:
@@ -296,6 +315,12 @@ class TaskBatch:
         """Values of the simulation's joints, padded to those of ``bodies``."""
         more = self.bodies.max_joints - self._joints
         return torch.nn.functional.pad(values, (0, more)) if more else values
+
+
+def _streams(seed: int, numbers: Iterable[int]) -> list[np.random.Generator]:
+    """What each environment draws from: by its number, whatever else is in the batch."""
+    own = (np.random.SeedSequence(seed, spawn_key=(number,)) for number in numbers)
+    return [np.random.default_rng(sequence) for sequence in own]
 
 
 def _obstacles(settings: Sequence[Setting], device: torch.device) -> Observation:

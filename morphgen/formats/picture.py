@@ -153,7 +153,7 @@ def _render_mujoco(
     camera.distance, camera.azimuth, camera.elevation = view.distance, 90 + _YAW, _PITCH
     options = mujoco.MjvOption()
     options.geomgroup[3] = 0
-    context = _gl_context(*size)
+    context = gl_context(*size)
     try:
         context.make_current()
         scene = mujoco.MjvScene(model, maxgeom=10_000)
@@ -173,8 +173,12 @@ def _render_mujoco(
     return Image.fromarray(pixels[::-1])
 
 
-def _gl_context(width: int, height: int) -> GlContext:
-    """An offscreen OpenGL context of MuJoCo's, by EGL or OSMesa."""
+def gl_context(width: int, height: int) -> GlContext:
+    """An offscreen OpenGL context of MuJoCo's, by EGL or OSMesa.
+
+    Raises:
+        MissingDependencyError: If neither is installed.
+    """
     reasons = []
     for backend in ("egl", "osmesa"):
         try:
@@ -184,6 +188,6 @@ def _gl_context(width: int, height: int) -> GlContext:
         else:
             return context
     raise MissingDependencyError(
-        "no picture can be drawn: PyBullet is not installed (pip install pybullet; it has wheels "
-        "up to Python 3.11) and MuJoCo finds no offscreen OpenGL: " + "; ".join(reasons)
+        "nothing can be drawn: there is no offscreen OpenGL (on Debian and Ubuntu: apt-get install "
+        "libegl1 libgl1-mesa-dri): " + "; ".join(reasons)
     )

@@ -185,6 +185,20 @@ def test_a_batch_goes_on_from_its_state(made):
         made(2).load_state_dict(state)
 
 
+def test_first_episodes_may_be_spread_over_time(made):
+    batch = made(60, robots=(0,), seed=1)
+    batch.reset(spread=True)
+    passed = batch.elapsed.clone()
+    assert passed.unique().numel() > 40
+    assert 0 <= passed.min() < 60 < 240 < passed.max() < CONFIG.steps
+    batch.reset(seed=1, spread=True)
+    assert torch.equal(batch.elapsed, passed)
+    over = torch.zeros(60, dtype=torch.bool)
+    for _ in range(CONFIG.steps - int(passed.max())):
+        over |= batch.step(Zero().act(batch)).truncated
+    assert torch.equal(over, passed == passed.max())
+
+
 def test_velocities_and_actions_are_those_of_the_links(made):
     batch = made(channels=Channels(velocity=True, previous_action=True))
     assert batch.reset()["velocity"].abs().max() == 0

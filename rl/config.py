@@ -1,0 +1,142 @@
+"""Constants of agents and of PPO, each with its source; "paper" is AnyBody, arXiv 2505.14986."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from morphgen.errors import TaskError, nearest
+
+AgentName = Literal["se", "me-mlp", "me-tf"]
+AGENTS: tuple[AgentName, ...] = get_args(AgentName)
+"""``se`` is for one robot, and sees no morphology; ``me-...`` are for many."""
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Networks of actor and critic: two of the same kind, which share nothing.
+
+    The paper gives no sizes; unless said otherwise these are those of its released code.
+    """
+
+    agent: AgentName = "me-tf"
+    discrete: bool = True
+    """Bins or numbers as actions (paper: bins for reach, numbers for push)."""
+    mask_morphology: bool = False
+    """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
+    mlp_features: int = 16
+    """Of a token in the MLP."""
+    mlp_width: int = 192
+    mlp_layers: int = 3
+    features: int = 64
+    """Of a token in the transformer."""
+    layers: int = 4
+    heads: int = 4
+    feedforward: int = 512
+    decoder: int = 64
+    """Width of the MLP from a link's features to its action, and to the value (ours)."""
+
+    def __post_init__(self) -> None:
+        """Check.
+
+        Raises:
+            TaskError: If the agent is unknown, or a size is none.
+        """
+        if self.agent not in AGENTS:
+            raise TaskError(f"agent {self.agent!r}{nearest(self.agent, AGENTS)}")
+        for name in ("mlp_features", "mlp_width", "features", "heads", "feedforward", "decoder"):
+            _at_least(name, getattr(self, name), 1)
+        if self.features % self.heads:
+            raise TaskError(f"features {self.features}: expected a multiple of heads {self.heads}")
+
+    @property
+    def kind(self) -> Literal["continuous", "discrete"]:
+        """Of the actions."""
+        return "discrete" if self.discrete else "continuous"
+
+    @property
+    def blind(self) -> bool:
+        """Whether the agent sees no morphology."""
+        return self.mask_morphology or self.agent == "se"
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation (Schulman et al. 2017), and what the paper adds to it."""
+
+    transitions: int = 2_000_000
+    """Steps of all environments together; rounded up to whole updates (paper: 1.28e9)."""
+    steps: int = 128
+    """Of every environment between updates (paper)."""
+    epochs: int = 4
+    """Passes over these (paper)."""
+    minibatches: int = 16
+    """Of an epoch (paper)."""
+    clip: float = 0.2
+    """Of the ratio of probabilities (paper)."""
+    gamma: float = 0.99
+    """Discount (paper)."""
+    lam: float = 0.95
+    """Of generalised advantage estimation (Schulman et al. 2017)."""
+    learning_rate: float = 3e-4
+    """Of the first update; falls in a line to zero after the last (Schulman et al. 2017)."""
+    adam_epsilon: float = 1e-5
+    """Huang et al. 2022, "The 37 implementation details of PPO"."""
+    gradient_clip: float = 1.0
+    """Largest norm of the actor's gradient, and of the critic's (ours)."""
+    entropy: float = 0.002
+    """Weight of the entropy, which is the sum of that of the joints (ours)."""
+    symlog: bool = True
+    """The critic predicts the symlog of returns (paper, after DreamerV3)."""
+    slow_critic: bool = True
+    """Returns to learn come from a moving average of the critic (paper)."""
+    slow_decay: float = 0.98
+    """Of that average, a gradient step (DreamerV3; the paper gives none)."""
+    task_reweighting: bool = False
+    """Robots count with weights drawn anew every gradient step (paper: "random")."""
+    curriculum: bool = True
+    """Move the line of push; nothing else has one (paper)."""
+    bf16: bool = False
+    """Networks in bfloat16, by autocast."""
+    compile: bool = False
+    """Networks by ``torch.compile``."""
+
+    def __post_init__(self) -> None:
+        """Check.
+
+        Raises:
+            TaskError: If a number is out of its range.
+        """
+        for name in ("transitions", "steps", "epochs", "minibatches"):
+            _at_least(name, getattr(self, name), 1)
+        for name in ("clip", "learning_rate", "adam_epsilon", "gradient_clip"):
+            if not getattr(self, name) > 0:
+                raise TaskError(f"{name} {getattr(self, name):g}: expected more than 0")
+        for name in ("gamma", "lam", "slow_decay"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise TaskError(f"{name} {getattr(self, name):g}: expected 0 to 1")
+        if not self.entropy >= 0:
+            raise TaskError(f"entropy {self.entropy:g}: expected 0 or more")
+
+    def updates(self, num_envs: int) -> int:
+        """How many updates the transitions are."""
+        return -(-self.transitions // (self.steps * num_envs))
+
+    def minibatch(self, num_envs: int) -> int:
+        """Transitions of a minibatch.
+
+        Raises:
+            TaskError: If the minibatches would not be of one size.
+        """
+        size, rest = divmod(self.steps * num_envs, self.minibatches)
+        if rest or not size:
+            raise TaskError(
+                f"{self.steps} steps of {num_envs} environments cannot be split into "
+                f"{self.minibatches} equal minibatches"
+            )
+        return size
+
+
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise TaskError(f"{name} {value}: expected {least} or more")

@@ -1,0 +1,372 @@
+"""Proximal policy optimisation over a batch of bodies: the whole algorithm, top to bottom."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from morphgen.errors import TaskError
+from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.gae import gae, next_values
+from morphgen.rl.policies import layout_from, layout_of, make_networks, require_layout
+from morphgen.rl.report import Numbers, Report, explained_variance, outcome
+from morphgen.rl.symlog import symexp, symlog
+from morphgen.tasks.batch import Observation, TaskBatch
+
+TOLD = ("reward", "score", "success", "terminated", "truncated")
+"""What of every step is kept besides observations and actions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """T steps of n environments, on the learner's device."""
+
+    observation: Observation
+    """What was acted upon, tensors (T, n, ...)."""
+    last: Observation
+    """What came after, tensors (n, ...)."""
+    final: Observation
+    """Where time ended an episode, its last; tensors (k, ...), in the order of ``nonzero``."""
+    actions: torch.Tensor
+    """Shape (T, n, L)."""
+    log_prob: torch.Tensor
+    rewards: torch.Tensor
+    terminated: torch.Tensor
+    truncated: torch.Tensor
+    """These four of shape (T, n)."""
+
+
+class Learner:
+    """A policy in training. Once made, ``iterate`` until ``done``."""
+
+    def __init__(
+        self,
+        batch: TaskBatch,
+        policy: PolicyConfig,
+        config: PPOConfig,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Set up; the batch begins its episodes.
+
+        Args:
+            batch: Environments; their actions are of the policy's kind.
+            policy: The networks.
+            config: The algorithm.
+            seed: Of weights, actions, minibatches and weights of robots.
+            device: Where networks and rollouts are; the batch may be elsewhere.
+
+        Raises:
+            TaskError: If the batch takes other actions, or cannot be split into minibatches.
+        """
+        if batch.kind != policy.kind:
+            raise TaskError(f"the policy's actions are {policy.kind}, the batch's {batch.kind}")
+        self.batch, self.policy, self.config = batch, policy, config
+        self.device = torch.device(device)
+        self.update, self.updates = 0, config.updates(batch.num_envs)
+        self._size = config.minibatch(batch.num_envs)
+        self._body = batch.body.to(self.device)
+        self._bodies = int(batch.body.max()) + 1
+        self._observation: Observation | None = None
+        self._buffer: Observation = {}
+        self._begin()
+        self.layout = layout_of(self._now())
+        weights, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
+        actor, critic = make_networks(policy, self.layout, weights)
+        self.actor, self.critic = actor.to(self.device), critic.to(self.device)
+        self.slow = copy.deepcopy(self.critic).requires_grad_(False)
+        self.optimiser = torch.optim.Adam(
+            [*self.actor.parameters(), *self.critic.parameters()], eps=config.adam_epsilon
+        )
+        self._generators = {
+            name: torch.Generator(self.device).manual_seed(stream)
+            for name, stream in zip(("actions", "minibatches", "weights"), streams, strict=True)
+        }
+        self._act, self._value = self._callable(self.actor), self._callable(self.critic)
+        self._slow_value = self._callable(self.slow)
+
+    @property
+    def done(self) -> bool:
+        """Whether all updates have been made."""
+        return self.update >= self.updates
+
+    def iterate(self) -> Report:
+        """Collect a rollout and learn from it.
+
+        Raises:
+            TaskError: If a number is no longer finite.
+            SimulationError: If a simulation became unstable.
+        """
+        began = time.perf_counter()
+        self._begin()
+        rollout, seen = self._collect()
+        collected = time.perf_counter()
+        learned = self._learn(rollout)
+        self.update += 1
+        lost = [name for name, value in learned.items() if not math.isfinite(value)]
+        if lost:
+            raise TaskError(f"update {self.update}: {', '.join(lost)} is not finite any more")
+        ended = time.perf_counter()
+        made = self.config.steps * self.batch.num_envs
+        return Report(
+            update=self.update,
+            transitions=self.update * made,
+            collect_seconds=collected - began,
+            learn_seconds=ended - collected,
+            steps_per_second=made / (ended - began),
+            **seen,
+            **learned,
+        )
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything to go on from here; ``torch.load`` reads it with ``weights_only``.
+
+        All episodes begin anew after this, here as after ``resume``: the state of a simulator is in
+        no checkpoint. So a run that is taken up again equals one that went on if both make their
+        checkpoints after the same updates.
+        """
+        self._observation = None
+        learned = {name: net.state_dict() for name, net in self._networks().items()}
+        return {
+            **copy.deepcopy({**learned, "optimiser": self.optimiser.state_dict()}),
+            "generators": {name: each.get_state() for name, each in self._generators.items()},
+            "batch": self.batch.state_dict(),
+            "update": self.update,
+            "updates": self.updates,
+            "device": self.device.type,
+            "layout": asdict(self.layout),
+            "policy": asdict(self.policy),
+            "config": asdict(self.config),
+        }
+
+    def resume(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on where another learner of the same batch, configuration and device stopped.
+
+        Raises:
+            TaskError: If these are not the same; nothing is changed then.
+        """
+        self._require_policy(checkpoint)
+        here = {**asdict(self.config), "updates": self.updates, "device": self.device.type}
+        _require_same(
+            {**checkpoint["config"], **{k: checkpoint[k] for k in ("updates", "device")}}, here
+        )
+        self.batch.load_state_dict(checkpoint["batch"])
+        for name, network in self._networks().items():
+            network.load_state_dict(checkpoint[name])
+        self.optimiser.load_state_dict(checkpoint["optimiser"])
+        for name, generator in self._generators.items():
+            generator.set_state(checkpoint["generators"][name].cpu())
+        self.update = checkpoint["update"]
+        self._observation = None
+
+    def adopt(self, checkpoint: Mapping[str, Any]) -> None:
+        """Begin with the networks of a checkpoint, and nothing else of it: to fine-tune.
+
+        Raises:
+            TaskError: If they are other networks, or for other observations.
+        """
+        self._require_policy(checkpoint)
+        for name, network in self._networks().items():
+            network.load_state_dict(checkpoint[name])
+
+    def _networks(self) -> dict[str, nn.Module]:
+        return {"actor": self.actor, "critic": self.critic, "slow": self.slow}
+
+    def _require_policy(self, checkpoint: Mapping[str, Any]) -> None:
+        require_layout(layout_from(checkpoint["layout"]), self.layout, "the checkpoint")
+        _require_same(checkpoint["policy"], asdict(self.policy))
+
+    def _callable(self, network: nn.Module) -> Callable[[Observation], torch.Tensor]:
+        compiled = (
+            torch.compile(network, fullgraph=True, dynamic=False)
+            if self.config.compile
+            else network
+        )
+
+        def call(observation: Observation) -> torch.Tensor:
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bf16):
+                found: torch.Tensor = compiled(observation)
+            return found
+
+        return call
+
+    def _begin(self) -> None:
+        """Move the curriculum, and begin episodes if none are under way."""
+        if self.config.curriculum:
+            self.batch.advance(self.update / self.updates)
+        if self._observation is None:
+            self._observation = self.batch.reset()
+        elif self.config.curriculum:
+            self._observation = self.batch.observe()
+
+    def _now(self) -> Observation:
+        assert self._observation is not None
+        return {name: each.to(self.device) for name, each in self._observation.items()}
+
+    @torch.no_grad()
+    def _collect(self) -> tuple[Rollout, Numbers]:
+        """Act for ``steps`` control steps; returns them, and what the report says of them."""
+        now = self._now()
+        if not self._buffer:
+            self._buffer = {
+                name: each.new_empty(self.config.steps, *each.shape) for name, each in now.items()
+            }
+        acted, told, terms, finals = [], [], [], []
+        for t in range(self.config.steps):
+            for name, rows in self._buffer.items():
+                rows[t].copy_(now[name])
+            seen = {name: rows[t] for name, rows in self._buffer.items()}
+            head = self.actor.head(self._act(seen), seen["actions"])
+            actions = head.sample(self._generators["actions"])
+            step = self.batch.step(actions.to(self.batch.device))
+            acted.append((actions, head.log_prob(actions)))
+            told.append([getattr(step, name) for name in TOLD])
+            terms.append({name: each.mean() for name, each in step.terms.items()})
+            finals.append({k: v[step.truncated] for k, v in step.final_observation.items()})
+            self._observation = step.observation
+            now = self._now()
+        tallied = dict(zip(TOLD, map(torch.stack, zip(*told, strict=True)), strict=True))
+        means = {k: float(torch.stack([each[k] for each in terms]).mean()) for k in terms[0]}
+        actions, log_prob = (torch.stack(each) for each in zip(*acted, strict=True))
+        rollout = Rollout(
+            observation=self._buffer,
+            last={name: each.clone() for name, each in now.items()},
+            final={k: torch.cat([each[k] for each in finals]).to(self.device) for k in now},
+            actions=actions,
+            log_prob=log_prob,
+            rewards=tallied["reward"].to(self.device),
+            terminated=tallied["terminated"].to(self.device),
+            truncated=tallied["truncated"].to(self.device),
+        )
+        return rollout, {**outcome(tallied, self.batch.body, self._bodies), "terms": means}
+
+    @torch.no_grad()
+    def _targets(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Values, advantages and returns, each (T, n)."""
+        flat = {name: each.flatten(0, 1) for name, each in rollout.observation.items()}
+        values = self._values(flat).reshape(rollout.rewards.shape)
+        ahead = next_values(
+            values, self._values(rollout.last), rollout.truncated, self._values(rollout.final)
+        )
+        advantages = gae(
+            rollout.rewards,
+            values,
+            ahead,
+            rollout.terminated,
+            rollout.truncated,
+            gamma=self.config.gamma,
+            lam=self.config.lam,
+        )
+        return values, advantages, advantages + values
+
+    def _values(self, observation: Observation) -> torch.Tensor:
+        """Expected returns by the critic whose word counts, in chunks of one shape, (n,)."""
+        value = self._slow_value if self.config.slow_critic else self._value
+        count, found = len(observation["goal"]), []
+        for start in range(0, count, self._size):
+            rows = torch.arange(start, start + self._size, device=self.device)
+            rows = rows.clamp(max=count - 1)
+            found.append(value({name: each[rows] for name, each in observation.items()}))
+        every = torch.cat([torch.zeros(0, device=self.device), *found])[:count]
+        return symexp(every) if self.config.symlog else every
+
+    def _learn(self, rollout: Rollout) -> Numbers:
+        """Improve the policy and the critic; returns what the report says of it."""
+        rate = learning_rate(self.config, self.update, self.updates)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        values, advantages, returns = self._targets(rollout)
+        normal = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        seen = {name: each.flatten(0, 1) for name, each in rollout.observation.items()}
+        data = {
+            "actions": rollout.actions.flatten(0, 1),
+            "log_prob": rollout.log_prob.flatten(),
+            "advantage": normal.flatten(),
+            "goal": (symlog(returns) if self.config.symlog else returns).flatten(),
+            "body": self._body.repeat(self.config.steps),
+        }
+        found = []
+        for _ in range(self.config.epochs):
+            order = torch.randperm(
+                len(data["body"]), generator=self._generators["minibatches"], device=self.device
+            )
+            for rows in order.reshape(-1, self._size):
+                here = {name: each[rows] for name, each in seen.items()}
+                found.append(self._descend(here, {k: v[rows] for k, v in data.items()}))
+        names = found[0].keys()
+        means = {name: float(torch.stack([each[name] for each in found]).mean()) for name in names}
+        explained = float(explained_variance(values, returns))
+        return {**means, "explained_variance": explained, "learning_rate": rate}
+
+    def _descend(self, seen: Observation, data: Observation) -> dict[str, torch.Tensor]:
+        """One gradient step on a minibatch; actor and critic are clipped apart."""
+        head = self.actor.head(self._act(seen), seen["actions"])
+        log_ratio = head.log_prob(data["actions"]) - data["log_prob"]
+        policy = policy_loss(log_ratio, data["advantage"], self.config.clip)
+        entropy = head.entropy()
+        value = 0.5 * (self._value(seen) - data["goal"]).square()
+        weight = self._weights()[data["body"]]
+        loss = (weight * (policy - self.config.entropy * entropy + value)).mean()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        clip = self.config.gradient_clip
+        actor = nn.utils.clip_grad_norm_(self.actor.parameters(), clip)
+        critic = nn.utils.clip_grad_norm_(self.critic.parameters(), clip)
+        self.optimiser.step()
+        follow(self.slow, self.critic, self.config.slow_decay)
+        with torch.no_grad():
+            ratio = log_ratio.exp()
+            return {
+                "policy_loss": policy.mean(),
+                "value_loss": value.mean(),
+                "entropy": entropy.mean(),
+                "kl": (ratio - 1 - log_ratio).mean(),
+                "clip_fraction": ((ratio - 1).abs() > self.config.clip).float().mean(),
+                "actor_gradient": actor,
+                "critic_gradient": critic,
+            }
+
+    def _weights(self) -> torch.Tensor:
+        """How much each robot's transitions count, (R,), mean 1.
+
+        With reweighting they are drawn anew: a softmax of normal numbers (Lin et al. 2022,
+        "Reasonable effectiveness of random weighting").
+        """
+        if not self.config.task_reweighting:
+            return torch.ones(self._bodies, device=self.device)
+        drawn = torch.empty(self._bodies, device=self.device)
+        drawn.normal_(generator=self._generators["weights"])
+        return self._bodies * torch.softmax(drawn, dim=0)
+
+
+def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float) -> torch.Tensor:
+    """The clipped objective (Schulman et al. 2017, equation 7), negative; all shapes (m,)."""
+    ratio = log_ratio.exp()
+    return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+
+
+def learning_rate(config: PPOConfig, update: int, updates: int) -> float:
+    """That of an update, counted from 0, of so many: a line that ends at zero after the last."""
+    return config.learning_rate * (1 - update / updates)
+
+
+@torch.no_grad()
+def follow(slow: nn.Module, fast: nn.Module, decay: float) -> None:
+    """Move the weights of one network towards another's: ``decay`` of its own remain."""
+    for own, other in zip(slow.parameters(), fast.parameters(), strict=True):
+        own.lerp_(other, 1 - decay)
+
+
+def _require_same(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+    wrong = [f"{k} {theirs.get(k)}, here {ours[k]}" for k in ours if theirs.get(k) != ours[k]]
+    if wrong:
+        raise TaskError(f"the checkpoint is of another run: {'; '.join(wrong)}")

@@ -1,0 +1,227 @@
+"""Pictures of environments, drawn without display or GPU, and films of them."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from morphgen.errors import FormatError
+from morphgen.formats.picture import gl_context
+from morphgen.model.kinematics import movable_positions
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.settings import Setting
+from morphgen.tasks.stage import stage_model
+
+Frame = NDArray[np.uint8]
+
+SIZE = (640, 480)
+"""Width and height of a frame, pixels."""
+SUFFIXES = (".mp4", ".gif")
+"""What a film's file may end in."""
+
+_FOV = 35.0
+_AZIMUTH, _ELEVATION = 220.0, -25.0
+"""Degrees, as MuJoCo has them: from ahead and the left, where a block comes from behind a tool."""
+_MARGIN = 0.92
+_SHADOW_SIZE = 2048
+"""Of the map that says where it is dark, pixels. Shadows say how high a tool is. Without a GPU they
+take half of the time; smoothed edges would take as long again, and are hardly seen in a film."""
+_AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
+"""Pose of what is not to be seen."""
+
+
+class Stage:
+    """A setting in front of a camera that does not move.
+
+    MuJoCo's OpenGL draws it, by EGL or OSMesa, whichever simulator moves it. PyBullet's software
+    renderer needs no library of the system, but it draws nothing that one can see through.
+    The camera shows the robot at home and at starts of its episodes, its goals, obstacles, and the
+    block from its starts to the line.
+    """
+
+    def __init__(self, setting: Setting, size: tuple[int, int] = SIZE) -> None:
+        """Prepare.
+
+        Args:
+            setting: The robot, which stands at the origin, and what is around it.
+            size: Width and height of frames, pixels.
+
+        Raises:
+            MeshError: If a mesh cannot be read.
+            MissingDependencyError: If there is no offscreen OpenGL.
+        """
+        self.size, self._setting = size, setting
+        self._stage = stage_model(setting)
+        model = self._stage.model
+        model.vis.global_.fovy = _FOV
+        model.vis.global_.offwidth, model.vis.global_.offheight = size
+        model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_SIZE, 0
+        low, high = self._stage.points.min(axis=0), self._stage.points.max(axis=0)
+        model.stat.center[:], model.stat.extent = (low + high) / 2, 1.5 * (high - low).max()
+        model.vis.map.shadowclip = 2.0
+        light = model.vis.headlight
+        light.ambient[:], light.diffuse[:], light.specular[:] = 0.35, 0.35, 0.1
+        self._data = mujoco.MjData(model)
+        self._camera = _camera(self._stage.points, size[0] / size[1])
+        self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 100)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._context = gl_context(*size)
+        self._context.make_current()
+        self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+        self._closed = False
+
+    def frame(
+        self,
+        q: ArrayLike,
+        *,
+        block: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        line: float | None = None,
+    ) -> Frame:
+        """Draw a moment.
+
+        Args:
+            q: Positions of the robot's independent joints, shape (dof,), rad or m.
+            block: Pose of the block in the world, (x, y, z, qw, qx, qy, qz).
+            goal: Wanted pose of the tool: a ball of the size of success, and axes.
+            line: y that the block must cross, metres.
+
+        Returns:
+            Shape (height, width, 3).
+
+        Raises:
+            ValueError: If the stage is closed, or ``q`` has another shape.
+        """
+        if self._closed:
+            raise ValueError("this stage is closed")
+        model, data = self._stage.model, self._data
+        data.qpos[self._stage.q_at] = movable_positions(self._setting.robot, q)
+        ground = self._setting.scene.ground or 0.0
+        at_line = None if line is None else (0.0, line, ground, 1.0, 0.0, 0.0, 0.0)
+        for name, pose in (("block", block), ("goal", goal), ("line", at_line)):
+            where = np.asarray(_AWAY if pose is None else pose)
+            mark = self._stage.marks[name]
+            data.mocap_pos[mark], data.mocap_quat[mark] = where[:3], where[3:]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        options = mujoco.MjvOption()
+        mujoco.mjv_updateScene(model, data, options, None, self._camera, everything, self._scene)
+        return self._drawn()
+
+    def close(self) -> None:
+        """Free the OpenGL context; a second time does nothing."""
+        if not self._closed:
+            self._closed = True
+            self._context.make_current()
+            self._gpu.free()
+            self._context.free()
+
+    def _drawn(self) -> Frame:
+        width, height = self.size
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._context.make_current()
+        mujoco.mjr_render(rectangle, self._scene, self._gpu)
+        mujoco.mjr_readPixels(pixels, None, rectangle, self._gpu)
+        return np.ascontiguousarray(pixels[::-1])
+
+
+def moment(batch: TaskBatch, env: int = 0) -> dict[str, Any]:
+    """How an environment of a batch is now: the arguments of ``Stage.frame``."""
+    setting = batch.settings[int(batch.body[env])]
+    now: dict[str, Any] = {"q": _copied(batch.q[env, : setting.robot.dof])}
+    if setting.task == "reach":
+        return now | {"goal": _copied(batch.goal[env])}
+    block = _copied(batch.simulation.block_pose[env])
+    return now | {"block": block, "line": float(batch.line[env])}
+
+
+def _copied(values: torch.Tensor) -> NDArray[np.float32]:
+    return np.array(values.cpu().numpy(), dtype=np.float32)
+
+
+def require_film(path: Path) -> None:
+    """Require that a film can be written there, before anything is drawn.
+
+    Raises:
+        FormatError: If the suffix is of no film, or there is no such folder.
+    """
+    if path.suffix not in SUFFIXES:
+        raise FormatError(f"{path}: a film ends in {' or '.join(SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise FormatError(f"cannot write {path}: there is no folder {path.parent}")
+
+
+def write_film(frames: Iterable[Frame], path: Path, fps: float) -> None:
+    """Write frames as they come: H.264 in ``.mp4``, or an endless ``.gif``.
+
+    Nothing is there until all is written. The same frames give the same bytes.
+
+    Args:
+        frames: At least one, shape (height, width, 3) each, even numbers for ``.mp4``.
+        path: Where to.
+        fps: Frames a second.
+
+    Raises:
+        FormatError: If it cannot be written there.
+    """
+    require_film(path)
+    try:
+        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+            partial = Path(folder) / path.name
+            writer: Any = imageio.get_writer(partial, **_writing(path.suffix, fps))
+            with writer:
+                for frame in frames:
+                    writer.append_data(frame)
+            partial.replace(path)
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _writing(suffix: str, fps: float) -> dict[str, Any]:
+    if suffix == ".gif":
+        return {"mode": "I", "duration": 1000 / fps, "loop": 0}
+    return {
+        "format": "FFMPEG",
+        "mode": "I",
+        "fps": fps,
+        "codec": "libx264",
+        "quality": 8,
+        "macro_block_size": 2,
+        "output_params": ["-fflags", "+bitexact", "-flags:v", "+bitexact"],
+    }
+
+
+def _camera(points: NDArray[np.float64], aspect: float) -> mujoco.MjvCamera:
+    """The nearest view from its direction that holds all points, shape (n, 3).
+
+    Seen from a place c on an axis v across the view, at distance d before the origin, a point is in
+    view if ``|v - c| <= t (a + d)``: a is how far ahead it is, t half the view's width at 1 m. So
+    ``d >= p - c / t`` and ``d >= n + c / t`` for the largest p = v / t - a and n = -v / t - a.
+    """
+    turn = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True).as_matrix()
+    across, ahead, up = (points @ turn).T
+    half = _MARGIN * math.tan(math.radians(_FOV / 2))
+    centres, distances = [], []
+    for v, t in ((across, half * aspect), (up, half)):
+        p, n = (v / t - ahead).max(), (-v / t - ahead).max()
+        centres.append(t * (p - n) / 2)
+        distances.append((p + n) / 2)
+    middle = (ahead.min() + ahead.max()) / 2
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = turn @ (centres[0], middle, centres[1])
+    camera.distance = max(distances) + middle
+    camera.azimuth, camera.elevation = _AZIMUTH, _ELEVATION
+    return camera

@@ -1,0 +1,240 @@
+"""One robot at a task as a plain Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.benchmark.split import Task
+from morphgen.errors import TaskError, nearest
+from morphgen.model.robot import Robot
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.batch import Channels, Observation, Step
+from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
+from morphgen.tasks.film import SIZE, Frame, Stage, moment
+from morphgen.tasks.make import BatchOptions, SimulatorName, make_batch
+from morphgen.tasks.sim.base import Contacts
+from morphgen.tasks.spaces import NumpyObservation, action_space, arrays, observation_space
+
+RENDER_MODES = ("rgb_array",)
+_OF_OTHERS = {"reach": {"object", "line"}, "push": {"goal"}}
+
+
+class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
+    """A robot at a task; see ``ReachEnv`` and ``PushEnv``.
+
+    Observations are those of ``TaskBatch`` without what only a batch of several bodies needs: no
+    padding, no masks, and nothing of the other task. Tokens are (links, 48).
+
+    An action is a number for each joint that the task moves, in the order of their links: for reach
+    the joints on the way to the tool, for push fingers too. ``action_joints`` has their names,
+    ``action_links`` their links, the rows of the tokens. Continuous actions are shares of a joint's
+    largest step, in [-1, 1]; discrete ones are indices of ``morphgen.tasks.config.BINS``.
+
+    ``info`` has ``success``, ``distance``, ``score`` and ``terms`` (see ``Step``), and whether
+    links touch each other, ``self_collision``. Episodes end by themselves: no time limit is needed.
+
+    ``reset(seed=s)`` begins the episodes that environment 0 of ``make_batch(..., seed=s)`` has.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": list(RENDER_MODES),
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+    task: Task
+
+    def __init__(
+        self,
+        robot: str | Path | Robot = "ur5-plane",
+        *,
+        sim: SimulatorName = "pybullet",
+        obstacles: bool = False,
+        kind: ActionKind = "continuous",
+        channels: Channels | None = None,
+        contacts: Contacts | None = None,
+        config: ReachConfig | PushConfig | None = None,
+        goal_seed: int = 0,
+        cache: Path | None = None,
+        library: Iterable[Path] = (),
+        render_mode: str | None = None,
+        size: tuple[int, int] = SIZE,
+    ) -> None:
+        """Set up.
+
+        Args:
+            robot: A robot, or what ``robot_of`` knows: ``ur5-plane``, words of ``morphgen
+                compose``, a bundle's folder or a URDF, with fitted primitives as collision shapes.
+            sim: ``pybullet`` or ``mujoco``.
+            obstacles: Whether there are any.
+            kind: Actions are ``continuous`` or ``discrete``.
+            channels: What is observed besides.
+            contacts: What may touch what; by default everything.
+            config: Constants of the task.
+            goal_seed: Of goals, starts and obstacles.
+            cache: Folder of these; by default the user's.
+            library: Folders of your own parts.
+            render_mode: ``rgb_array`` or None.
+            size: Width and height of what is rendered, pixels.
+
+        Raises:
+            TaskError: If an argument is none of the choices.
+            MorphgenError: As ``make_batch``.
+        """
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            hint = nearest(render_mode, RENDER_MODES)
+            raise TaskError(f"unknown render mode {render_mode!r}{hint}")
+        self._contacts = contacts or Contacts()
+        options: BatchOptions = {
+            "sim": sim,
+            "kind": kind,
+            "channels": channels,
+            "contacts": self._contacts,
+            **_constants(self.task, config),
+        }
+        self.render_mode, self._size = render_mode, size
+        self._stage: Stage | None = None
+        self.batch = make_batch(
+            self.task,
+            [robot],
+            1,
+            obstacles=obstacles,
+            goal_seed=goal_seed,
+            cache=cache,
+            library=library,
+            **options,
+        )
+        self.setting = self.batch.settings[0]
+        own = self.setting.robot
+        self.action_links: tuple[int, ...] = tuple(torch.nonzero(self.batch.mask[0])[:, 0].tolist())
+        self.action_joints = tuple(own.joints[link - 1].name for link in self.action_links)
+        self._running = self._closed = False
+        self._last: dict[str, Any] | None = None
+        seen = self._seen(self.batch.observe())
+        self.observation_space = cast(
+            gym.Space[NumpyObservation], observation_space({k: v[None] for k, v in seen.items()})
+        )
+        self.action_space = action_space(kind, len(self.action_links))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NumpyObservation, dict[str, Any]]:
+        """Begin an episode; without a seed the next one, and the very first at random."""
+        self._require_open()
+        first = self._np_random is None
+        super().reset(seed=seed)
+        if seed is None and first:
+            seed = int(self.np_random.integers(2**63))
+        fresh = self._last is not None and seed is None
+        seen = self.batch.observe() if fresh else self.batch.reset(seed)
+        self._running, self._last = True, None
+        return self._seen(seen), {"self_collision": self._contacts.self_collision}
+
+    def step(
+        self, action: NDArray[Any]
+    ) -> tuple[NumpyObservation, float, bool, bool, dict[str, Any]]:
+        """Act for one control step.
+
+        Raises:
+            TaskError: If the action is none, or no episode is running.
+            SimulationError: If the simulation became unstable.
+        """
+        self._require_open()
+        if not self._running:
+            raise TaskError("no episode is running; call reset()")
+        actions = self._padded(action)
+        now = moment(self.batch)
+        step = self.batch.step(actions)
+        terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
+        if terminated or truncated:
+            self._running = False
+            self._last = _moved(now, step)
+        seen = self._seen(step.final_observation)
+        return seen, float(step.reward[0]), terminated, truncated, self._info(step)
+
+    def render(self) -> Frame | None:
+        """The environment as it is, (height, width, 3), if ``render_mode`` is ``rgb_array``."""
+        self._require_open()
+        if self.render_mode is None:
+            gym.logger.warn(
+                'nothing is rendered: make the environment with render_mode="rgb_array"'
+            )
+            return None
+        if self._stage is None:
+            self._stage = Stage(self.setting, self._size)
+        return self._stage.frame(**(self._last or moment(self.batch)))
+
+    def close(self) -> None:
+        """Free everything; a second time does nothing."""
+        self._closed = True
+        self.batch.close()
+        if self._stage is not None:
+            self._stage.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise TaskError("this environment is closed")
+
+    def _padded(self, action: NDArray[Any]) -> torch.Tensor:
+        """An action for every link, shape (1, L)."""
+        given = np.asarray(action)
+        expected = (len(self.action_links),)
+        if given.shape != expected:
+            joints = ", ".join(self.action_joints)
+            raise TaskError(f"the action has shape {given.shape}; expected {expected}: {joints}")
+        actions = torch.zeros(self.batch.mask.shape, dtype=torch.from_numpy(given).dtype)
+        actions[0, list(self.action_links)] = torch.from_numpy(given)
+        return actions
+
+    def _seen(self, observation: Observation) -> NumpyObservation:
+        """What is seen of a batch of one."""
+        links = slice(len(self.setting.robot.links))
+        rows: dict[str, Any] = {"tokens": links, "velocity": links}
+        rows["previous_action"] = list(self.action_links)
+        return {
+            name: np.array(values[0][rows.get(name, slice(None))])
+            for name, values in arrays(observation).items()
+            if values.dtype == np.float32 and name not in _OF_OTHERS[self.task]
+        }
+
+    def _info(self, step: Step) -> dict[str, Any]:
+        return {
+            "success": bool(step.success[0]),
+            "distance": float(step.distance[0]),
+            "score": float(step.score[0]),
+            "terms": {name: float(term[0]) for name, term in step.terms.items()},
+            "self_collision": self._contacts.self_collision,
+        }
+
+
+class ReachEnv(TaskEnv):
+    """Bring the tool to a goal, and keep it there for 6 s; ``morphgen/Reach-v0``."""
+
+    task = "reach"
+
+
+class PushEnv(TaskEnv):
+    """Push a block across a line within 6 s; ``morphgen/Push-v0``."""
+
+    task = "push"
+
+
+def _constants(task: Task, config: ReachConfig | PushConfig | None) -> BatchOptions:
+    if config is None:
+        return {}
+    if task == "reach" and isinstance(config, ReachConfig):
+        return {"reach": config}
+    if task == "push" and isinstance(config, PushConfig):
+        return {"push": config}
+    raise TaskError(f"{type(config).__name__} is not the config of {task}")
+
+
+def _moved(before: dict[str, Any], step: Step) -> dict[str, Any]:
+    """A ``film.moment`` after a step, whatever episode has begun since."""
+    now = before | {"q": step.q[0, : len(before["q"])].cpu().numpy()}
+    return now | ({"block": step.block_pose[0].cpu().numpy()} if "block" in before else {})

@@ -1,0 +1,111 @@
+"""A batch of bodies as a vectorised environment of stable-baselines3, which must be installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from morphgen.errors import TaskError
+from morphgen.tasks.spaces import NumpyObservation
+from morphgen.tasks.vector import TaskVector
+
+Indices = int | Iterable[int] | None
+
+
+class SB3Vector(VecEnv):
+    """Steps a ``TaskVector``, which it owns.
+
+    ``infos`` are lists of dicts. Where an episode ended they have ``terminal_observation``,
+    ``TimeLimit.truncated`` (time ran out, so that the value of what was seen last counts) and
+    ``is_success``; always ``distance`` and ``score``.
+    """
+
+    def __init__(self, vector: TaskVector) -> None:
+        """Wrap environments, whose episodes begin anew at ``reset``."""
+        self.vector = vector
+        self._actions: NDArray[Any] = np.zeros(0)
+        super().__init__(
+            vector.num_envs, vector.single_observation_space, vector.single_action_space
+        )
+
+    def reset(self) -> dict[str, NDArray[Any]]:
+        """Begin an episode everywhere, with the seed if one was given."""
+        seen, _ = self.vector.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        return seen
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep actions for ``step_wait``."""
+        self._actions = actions
+
+    def step_wait(
+        self,
+    ) -> tuple[NumpyObservation, NDArray[Any], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Act for one control step."""
+        seen, reward, terminated, truncated, facts = self.vector.step(self._actions)
+        over = terminated | truncated
+        infos: list[dict[str, Any]] = [
+            {"distance": distance, "score": score}
+            for distance, score in zip(
+                facts["distance"].tolist(), facts["score"].tolist(), strict=True
+            )
+        ]
+        for env in np.flatnonzero(over):
+            infos[env]["terminal_observation"] = facts["final_obs"][env]
+            infos[env]["TimeLimit.truncated"] = bool(truncated[env])
+            infos[env]["is_success"] = bool(facts["success"][env])
+        return seen, reward, over, infos
+
+    def close(self) -> None:
+        """Free the environments."""
+        self.vector.close()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """An attribute of the ``TaskVector``, which all environments share."""
+        value = getattr(self.vector, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:  # noqa: ANN401
+        """Set an attribute of the ``TaskVector``.
+
+        Raises:
+            TaskError: If only some environments are to have it.
+        """
+        self._require_all(attr_name, indices)
+        setattr(self.vector, attr_name, value)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,  # noqa: ANN401
+        indices: Indices = None,
+        **method_kwargs: Any,  # noqa: ANN401
+    ) -> list[Any]:
+        """Call a method of the ``TaskVector`` once, for all environments.
+
+        Raises:
+            TaskError: If it is to be called for some environments only.
+        """
+        self._require_all(method_name, indices)
+        result = getattr(self.vector, method_name)(*method_args, **method_kwargs)
+        return [result] * self.num_envs
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+    ) -> list[bool]:
+        """No environment is."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """None: a batch is not rendered."""
+        return [None] * self.num_envs
+
+    def _require_all(self, name: str, indices: Indices) -> None:
+        if list(self._get_indices(indices)) != list(range(self.num_envs)):
+            raise TaskError(f"{name}: environments of a batch have their attributes in common")

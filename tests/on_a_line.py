@@ -1,0 +1,98 @@
+"""The smallest batch to learn from: a point on a line, with the observations of real bodies."""
+
+import numpy as np
+import torch
+
+from morphgen.tasks.batch import Step
+from morphgen.tasks.config import BINS
+
+LINKS = 4
+STRIDE = 0.25
+NEAR = 0.15
+
+
+class OnALine:
+    """Even environments reach: time ends their episodes. Odd ones push: their body goes the other
+    way, another link moves it, the goal is the line, and being there ends the episode.
+    """
+
+    def __init__(self, num_envs, *, kind="discrete", seed=0, horizon=12):
+        self.num_envs, self.kind, self.horizon = num_envs, kind, horizon
+        self.device = torch.device("cpu")
+        self.body = torch.arange(num_envs) % 2
+        self.pushes = self.body == 1
+        self.mask = torch.zeros(num_envs, LINKS, dtype=torch.bool)
+        self.mask[torch.arange(num_envs), 1 + self.body] = True
+        self.elapsed = torch.zeros(num_envs, dtype=torch.int64)
+        self.q, self.goal = torch.zeros(num_envs), torch.zeros(num_envs)
+        self.progress = []
+        self._random = np.random.default_rng(seed)
+
+    def reset(self):
+        self._begin(torch.ones(self.num_envs, dtype=torch.bool))
+        return self.observe()
+
+    def step(self, actions):
+        shares = torch.tensor(BINS)[actions] if self.kind == "discrete" else actions.clamp(-1, 1)
+        way = torch.where(self.pushes, -1.0, 1.0)
+        self.q = self.q + STRIDE * way * (shares * self.mask).sum(dim=1)
+        self.elapsed += 1
+        distance = (self.q - self.goal).abs()
+        near = distance < NEAR
+        terminated = near & self.pushes
+        truncated = (self.elapsed >= self.horizon) & ~terminated
+        final, q = self.observe(), self.q
+        self._begin(terminated | truncated)
+        terms = {"distance": -distance, "near": near.float()}
+        return Step(
+            observation=self.observe(),
+            reward=terms["distance"] + terms["near"],
+            terminated=terminated,
+            truncated=truncated,
+            final_observation=final,
+            success=near,
+            distance=distance,
+            score=-distance,
+            terms=terms,
+            q=q[:, None],
+            block_pose=torch.zeros(self.num_envs, 7),
+        )
+
+    def observe(self):
+        n = self.num_envs
+        tokens = torch.zeros(n, LINKS, 48)
+        rows = torch.arange(n)
+        tokens[rows, 1 + self.body, 20] = torch.where(self.pushes, -1.0, 1.0)
+        tokens[rows, 1 + self.body, 32] = self.q
+        links = torch.zeros(n, LINKS, dtype=torch.bool)
+        links[:, :3] = True
+        goal, thing = torch.zeros(n, 7), torch.zeros(n, 13)
+        goal[:, 0] = torch.where(self.pushes, 0.0, self.goal)
+        thing[:, 1] = torch.where(self.pushes, self.q, 0.0)
+        return {
+            "tokens": tokens,
+            "links": links,
+            "actions": self.mask,
+            "goal": goal,
+            "goal_mask": ~self.pushes,
+            "object": thing,
+            "object_mask": self.pushes,
+            "line": torch.where(self.pushes, self.goal, 0.0)[:, None],
+            "obstacles": torch.zeros(n, 0, 13),
+            "obstacle_mask": torch.zeros(n, 0, dtype=torch.bool),
+        }
+
+    def advance(self, progress):
+        self.progress.append(progress)
+
+    def state_dict(self):
+        return {"random": self._random.bit_generator.state}
+
+    def load_state_dict(self, state):
+        self._random.bit_generator.state = state["random"]
+
+    def _begin(self, envs):
+        drawn = torch.from_numpy(self._random.uniform(-1, 1, (2, int(envs.sum())))).float()
+        self.q, self.goal = self.q.clone(), self.goal.clone()
+        self.q[envs], self.goal[envs] = drawn
+        self.elapsed[envs] = 0

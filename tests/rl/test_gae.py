@@ -1,0 +1,100 @@
+"""Advantages, worked out by hand, and the logarithm of returns."""
+
+import torch
+
+from morphgen.rl.gae import gae, next_values
+from morphgen.rl.symlog import symexp, symlog
+
+GAMMA, LAM = 0.9, 0.5
+
+
+def column(*numbers):
+    return torch.tensor(numbers)[:, None]
+
+
+def advantages(terminated, truncated, ahead=(20.0, 30.0, 40.0)):
+    found = gae(
+        column(1.0, 2.0, 3.0),
+        column(10.0, 20.0, 30.0),
+        column(*ahead),
+        column(*terminated),
+        column(*truncated),
+        gamma=GAMMA,
+        lam=LAM,
+    )
+    return found[:, 0]
+
+
+NEVER = (False, False, False)
+MIDDLE = (False, True, False)
+
+
+def test_an_episode_that_goes_on():
+    # delta: 1 + 18 - 10 = 9; 2 + 27 - 20 = 9; 3 + 36 - 30 = 9. Each passes on 0.45 of the next.
+    wanted = torch.tensor([9 + 0.45 * (9 + 0.45 * 9), 9 + 0.45 * 9, 9.0])
+    torch.testing.assert_close(advantages(NEVER, NEVER), wanted)
+
+
+def test_after_a_termination_nothing_follows():
+    # The middle delta loses its 27, and nothing of the last step passes on to it.
+    wanted = torch.tensor([9 + 0.45 * (2 - 20), 2.0 - 20, 9.0])
+    torch.testing.assert_close(advantages(MIDDLE, NEVER), wanted)
+
+
+def test_after_a_truncation_the_last_observation_counts_and_the_sum_stops():
+    # 50 is the value of the episode's last observation: 2 + 45 - 20 = 27.
+    wanted = torch.tensor([9 + 0.45 * 27, 27.0, 9.0])
+    torch.testing.assert_close(advantages(NEVER, MIDDLE, (20.0, 50.0, 40.0)), wanted)
+
+
+def test_a_step_that_ends_both_ways_has_terminated():
+    both = advantages(MIDDLE, MIDDLE, (20.0, 50.0, 40.0))
+    torch.testing.assert_close(both, advantages(MIDDLE, NEVER))
+
+
+def test_environments_do_not_mix():
+    rewards = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    values, ahead = rewards.flip(0), rewards.roll(1, 0)
+    over = torch.zeros(5, 3, dtype=torch.bool)
+    over[2, 1] = True
+    none = torch.zeros_like(over)
+    whole = gae(rewards, values, ahead, over, none, gamma=GAMMA, lam=LAM)
+    for i in range(3):
+        one = (each[:, i : i + 1] for each in (rewards, values, ahead, over, none))
+        torch.testing.assert_close(whole[:, i : i + 1], gae(*one, gamma=GAMMA, lam=LAM))
+
+
+def test_with_lambda_1_returns_are_discounted_sums():
+    rewards = torch.tensor([[1.0], [2.0], [4.0]])
+    values = torch.tensor([[5.0], [6.0], [7.0]])
+    ahead = torch.tensor([[6.0], [7.0], [8.0]])
+    none = torch.zeros(3, 1, dtype=torch.bool)
+    found = values + gae(rewards, values, ahead, none, none, gamma=GAMMA, lam=1.0)
+    assert torch.allclose(found[0, 0], torch.tensor(1 + 0.9 * 2 + 0.81 * 4 + 0.729 * 8))
+
+
+def test_next_values_are_those_of_the_observations_before_new_episodes():
+    values = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    cut = torch.tensor([[False, True], [False, False], [True, True]])
+    found = next_values(values, torch.tensor([7.0, 8.0]), cut, torch.tensor([20.0, 50.0, 60.0]))
+    assert found.tolist() == [[3.0, 20.0], [5.0, 6.0], [50.0, 60.0]]
+    assert values.tolist() == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
+
+
+def test_symexp_is_the_inverse_of_symlog():
+    x = torch.tensor([-5e4, -3.0, -1e-6, 0.0, 1e-6, 0.5, 7.0, 1e5])
+    torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-5, atol=0)
+
+
+def test_symlog_is_odd_near_the_identity_and_logarithmic():
+    torch.testing.assert_close(symlog(torch.tensor(torch.e - 1)), torch.tensor(1.0))
+    x = torch.linspace(0, 9, 10)
+    assert symlog(-x).equal(-symlog(x))
+    small = torch.tensor([1e-4])
+    torch.testing.assert_close(symlog(small), small, rtol=1e-3, atol=0)
+
+
+def test_symlog_has_slope_one_at_zero_on_both_sides():
+    x = torch.tensor([-1e-9, 1e-9], requires_grad=True)
+    symlog(x).sum().backward()
+    torch.testing.assert_close(x.grad, torch.ones(2))

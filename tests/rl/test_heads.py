@@ -1,0 +1,127 @@
+"""Only movable links have a say in what is drawn, how likely it is, and how open."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import Categorical, Independent, Normal
+
+from morphgen.rl.heads import (
+    HIGH,
+    LOW,
+    REST,
+    START,
+    MaskedGaussian,
+    MaskedMultiDiscrete,
+    bounded_log_std,
+)
+from morphgen.tasks.config import BINS
+
+MASK = torch.tensor([[False, True, True, False], [True, False, True, True], [False] * 4])
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def gaussian(mask=MASK):
+    mean = torch.randn(3, 4, generator=seeded())
+    return MaskedGaussian(mean, torch.tensor([-1.0, -0.5, 0.0, 0.3]), mask)
+
+
+def discrete(mask=MASK):
+    return MaskedMultiDiscrete(2 * torch.randn(3, 4, len(BINS), generator=seeded()), mask)
+
+
+def test_gaussian_is_torchs_over_the_movable_links():
+    head = gaussian()
+    actions = head.sample(seeded(1))
+    for row, mask in enumerate(MASK[:2]):
+        theirs = Independent(Normal(head.mean[row, mask], head.log_std[mask].exp()), 1)
+        assert head.log_prob(actions)[row] == pytest.approx(theirs.log_prob(actions[row, mask]))
+        assert head.entropy()[row] == pytest.approx(theirs.entropy())
+
+
+def test_multi_discrete_is_torchs_over_the_movable_links():
+    head = discrete()
+    actions = head.sample(seeded(1))
+    for row, mask in enumerate(MASK[:2]):
+        theirs = Independent(Categorical(logits=head.logits[row, mask]), 1)
+        assert head.log_prob(actions)[row] == pytest.approx(theirs.log_prob(actions[row, mask]))
+        assert head.entropy()[row] == pytest.approx(theirs.entropy())
+
+
+@pytest.mark.parametrize("head", [gaussian(), discrete()], ids=["gaussian", "discrete"])
+def test_what_cannot_move_says_nothing(head):
+    assert head.log_prob(head.sample(seeded()))[2] == 0
+    assert head.entropy()[2] == 0
+
+
+def test_gaussian_draws_with_its_mean_and_deviation():
+    mask = torch.ones(40_000, 2, dtype=torch.bool)
+    mean = torch.tensor([0.2, -0.4])
+    head = MaskedGaussian(mean.expand(40_000, 2), torch.tensor([-1.0, 0]), mask)
+    drawn = head.sample(seeded())
+    torch.testing.assert_close(drawn.mean(dim=0), mean, atol=0.02, rtol=0)
+    wanted = torch.tensor([math.exp(-1), 1.0])
+    torch.testing.assert_close(drawn.std(dim=0), wanted, atol=0.02, rtol=0)
+
+
+def test_multi_discrete_draws_with_its_probabilities():
+    logits = torch.linspace(-2, 1, len(BINS))
+    mask = torch.ones(60_000, 1, dtype=torch.bool)
+    drawn = MaskedMultiDiscrete(logits.expand(60_000, 1, len(BINS)), mask).sample(seeded())
+    shares = torch.bincount(drawn[:, 0], minlength=len(BINS)) / len(drawn)
+    torch.testing.assert_close(shares, logits.softmax(dim=0), atol=0.01, rtol=0)
+
+
+def test_modes_are_the_mean_and_the_likeliest_bin():
+    head = gaussian()
+    assert head.mode()[MASK].equal(head.mean[MASK])
+    bins = discrete()
+    assert bins.mode()[MASK].equal(bins.logits.argmax(dim=-1)[MASK])
+
+
+def test_links_that_do_not_move_rest():
+    assert BINS[REST] == 0
+    for actions in (discrete().sample(seeded()), discrete().mode()):
+        assert set(actions[~MASK].tolist()) == {REST}
+    for actions in (gaussian().sample(seeded()), gaussian().mode()):
+        assert set(actions[~MASK].tolist()) == {0.0}
+
+
+def test_a_generator_is_all_that_chance_depends_on():
+    for head in (gaussian(), discrete()):
+        assert head.sample(seeded(3)).equal(head.sample(seeded(3)))
+        assert not head.sample(seeded(3)).equal(head.sample(seeded(4)))
+
+
+@pytest.mark.parametrize("garbage", [1e30, math.inf, math.nan])
+def test_garbage_behind_the_mask_changes_no_gradient(garbage):
+    def gradients(fill):
+        mean = torch.randn(3, 4, generator=seeded()).masked_fill(~MASK, fill).requires_grad_()
+        logits = torch.randn(3, 4, len(BINS), generator=seeded())
+        logits = logits.masked_fill(~MASK[..., None], fill).requires_grad_()
+        normal = MaskedGaussian(mean, torch.zeros(4), MASK)
+        bins = MaskedMultiDiscrete(logits, MASK)
+        chosen = torch.full((3, 4), 2)
+        far = torch.ones(3, 4).masked_fill(~MASK, fill)
+        total = normal.log_prob(far) + bins.log_prob(chosen) + bins.entropy()
+        total.sum().backward()
+        assert not mean.grad[~MASK].any()
+        assert not logits.grad[~MASK].any()
+        return total, mean.grad, logits.grad
+
+    for dirty, clean in zip(gradients(garbage), gradients(0.0), strict=True):
+        assert dirty.equal(clean)
+        assert clean.isfinite().all()
+
+
+def test_log_std_starts_where_it_should_learns_and_stays_in_bounds():
+    raw = torch.zeros(1, requires_grad=True)
+    found = bounded_log_std(raw)
+    assert found.item() == pytest.approx(START, abs=1e-6)
+    found.backward()
+    assert raw.grad.item() > 0.1
+    far = bounded_log_std(torch.tensor([-20.0, 20.0]))
+    torch.testing.assert_close(far, torch.tensor([LOW, HIGH]), atol=1e-4, rtol=0)

@@ -1,0 +1,357 @@
+"""What is not there has no influence on actions, values and gradients; what is there has."""
+
+import math
+
+import pytest
+import torch
+
+from morphgen.benchmark.token_layout import POSITION
+from morphgen.errors import TaskError
+from morphgen.rl.config import AGENTS, PolicyConfig, PPOConfig
+from morphgen.rl.policies import layout_of, make_networks, require_layout
+
+N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
+COUNT = torch.tensor([6, 4, 1, 3])
+MASKS = {
+    "tokens": "links",
+    "velocity": "links",
+    "previous_action": "links",
+    "goal": "goal_mask",
+    "object": "object_mask",
+    "line": "object_mask",
+    "obstacles": "obstacle_mask",
+    "points": "point_mask",
+}
+"""What hides rows of what."""
+
+
+def observed(seed=0, *, extras=True):
+    """A mixed batch: rows 0 and 1 reach, 2 and 3 push; 3 has no obstacle, and 2 no point."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    links = torch.arange(LINKS) < COUNT[:, None]
+    actions = links & (torch.arange(LINKS) > 0)
+    actions[2, 0] = True
+    pushes = torch.tensor([False, False, True, True])
+    found = {
+        "tokens": normal(N, LINKS, 48),
+        "links": links,
+        "actions": actions,
+        "goal": normal(N, 7),
+        "goal_mask": ~pushes,
+        "object": normal(N, 13),
+        "object_mask": pushes,
+        "line": normal(N, 1),
+        "obstacles": normal(N, OBSTACLES, 13),
+        "obstacle_mask": torch.tensor([[1, 0, 1], [1, 1, 1], [0, 1, 0], [0, 0, 0]]).bool(),
+    }
+    if extras:
+        found["velocity"], found["previous_action"] = normal(N, LINKS), normal(N, LINKS)
+        found["points"] = normal(N, POINTS, 3)
+        found["point_mask"] = torch.tensor([True, True, False, True])[:, None].repeat(1, POINTS)
+        found["point_mask"][0, 5:] = False
+    return found
+
+
+def mask_of(seen, name):
+    """Where numbers of an entry are there, of the entry's shape."""
+    mask = seen[MASKS[name]]
+    return mask.reshape(mask.shape + (1,) * (seen[name].dim() - mask.dim())).expand_as(seen[name])
+
+
+def filled(seen, value):
+    """The same observation with something else where nothing is."""
+    values = {k: seen[k].masked_fill(~mask_of(seen, k), value) for k in MASKS if k in seen}
+    return {**seen, **values}
+
+
+def networks(agent="me-tf", seen=None, *, discrete=True, mask_morphology=False, lively=True):
+    """An actor and a critic; ``lively`` ones are as if they had learned."""
+    config = PolicyConfig(agent=agent, discrete=discrete, mask_morphology=mask_morphology)
+    actor, critic = make_networks(config, layout_of(seen or observed()), seed=0)
+    if lively:
+        generator = torch.Generator().manual_seed(1)
+        for each in (*actor.parameters(), *critic.parameters()):
+            each.data += 0.1 * torch.randn(each.shape, generator=generator)
+    return actor, critic
+
+
+def outputs(actor, critic, seen):
+    """Actions, their probability, and values."""
+    head = actor.distribution(seen)
+    return head.mode(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
+
+
+agents = pytest.mark.parametrize("agent", AGENTS)
+kinds = pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
+
+
+@agents
+@kinds
+@pytest.mark.parametrize("garbage", [-7.5, 1e30, -3e38, math.inf, math.nan])
+def test_garbage_in_the_padding_changes_nothing(agent, discrete, garbage):
+    seen = observed()
+    pair = networks(agent, seen, discrete=discrete)
+    clean, dirty = outputs(*pair, filled(seen, 0.0)), outputs(*pair, filled(seen, garbage))
+    for one, other in zip(clean, dirty, strict=True):
+        assert one.isfinite().all()
+        assert one.equal(other)
+
+
+@agents
+@kinds
+@pytest.mark.parametrize("garbage", [1e30, math.nan])
+def test_garbage_in_the_padding_changes_no_gradient_of_a_weight(agent, discrete, garbage):
+    seen = observed()
+
+    def gradients(fill):
+        actor, critic = networks(agent, seen, discrete=discrete)
+        _, log_prob, value = outputs(actor, critic, filled(seen, fill))
+        (log_prob.sum() + value.square().sum()).backward()
+        return [each.grad for each in (*actor.parameters(), *critic.parameters())]
+
+    for clean, dirty in zip(gradients(0.0), gradients(garbage), strict=True):
+        assert clean.isfinite().all()
+        assert clean.equal(dirty)
+
+
+@agents
+@kinds
+def test_gradients_are_zero_in_the_padding_and_only_there(agent, discrete):
+    seen = observed()
+    for name in MASKS:
+        seen[name].requires_grad_()
+    _, log_prob, value = outputs(*networks(agent, seen, discrete=discrete), seen)
+    (log_prob + value).sum().backward()
+    for name in MASKS:
+        assert not seen[name].grad[~mask_of(seen, name)].any(), name
+        if name not in ("tokens", "points"):
+            assert seen[name].grad[mask_of(seen, name)].all(), name
+    of_links = seen["tokens"].grad.abs().sum(dim=-1)
+    assert of_links[seen["links"]].all()
+    assert seen["points"].grad[0].any()
+
+
+@agents
+def test_permuting_padding_changes_nothing(agent):
+    seen = observed()
+    pair = networks(agent, seen)
+    turned = filled(seen, 3.0)
+    turned["tokens"] = turned["tokens"].clone()
+    turned["tokens"][1, 4:] = torch.randn(2, 48, generator=torch.Generator().manual_seed(5))
+    swapped = {**turned, "tokens": turned["tokens"].clone()}
+    swapped["tokens"][1, [4, 5]] = turned["tokens"][1, [5, 4]]
+    for one, other in zip(outputs(*pair, turned), outputs(*pair, swapped), strict=True):
+        assert one.equal(other)
+
+
+def test_the_transformer_does_not_care_how_much_padding_there_is():
+    seen = observed()
+    pair = networks("me-tf", seen)
+    more = torch.full((N, 5, 13), 9.0)
+    wider = {
+        **seen,
+        "obstacles": torch.cat([seen["obstacles"], more], dim=1),
+        "obstacle_mask": torch.cat([seen["obstacle_mask"], more[..., 0] < 0], dim=1),
+    }
+    for one, other in zip(outputs(*pair, seen), outputs(*pair, wider), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+def test_the_transformer_learns_nothing_of_the_index_of_a_link_that_is_not_there():
+    seen = {name: each[1:2] for name, each in observed().items()}
+    actor, critic = networks("me-tf", seen)
+    _, log_prob, value = outputs(actor, critic, seen)
+    (log_prob + value).sum().backward()
+    for network in (actor.network, critic.network):
+        assert network.index.grad[:4].any(dim=1).all()
+        assert not network.index.grad[4:].any()
+
+
+def test_the_transformer_does_not_care_for_the_order_of_obstacles():
+    seen = observed()
+    pair = networks("me-tf", seen)
+    order = torch.tensor([2, 0, 1])
+    other = {k: v[:, order] if k.startswith("obstacle") else v for k, v in seen.items()}
+    for one, two in zip(outputs(*pair, seen), outputs(*pair, other), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
+
+
+@agents
+def test_points_that_are_not_there_do_not_count(agent):
+    seen = {name: each[:1] for name, each in observed().items()}
+    pair = networks(agent, seen)
+    fewer = {k: v[:, :5] if k.startswith("point") else v for k, v in seen.items()}
+    assert seen["point_mask"].sum() == fewer["point_mask"].sum() == 5
+    for one, two in zip(outputs(*pair, seen), outputs(*pair, fewer), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
+
+
+@agents
+def test_what_is_not_there_is_zeros(agent):
+    seen = observed()
+    vectors, mask = networks(agent, seen)[0].network.entities(seen)
+    assert mask.sum(dim=1).tolist() == [6 + 1 + 2 + 1, 4 + 1 + 3 + 1, 1 + 2 + 1, 3 + 2 + 1]
+    assert not vectors[~mask].any()
+    assert vectors[mask].any(dim=1).all()
+
+
+@agents
+def test_order_of_points_means_nothing(agent):
+    seen = observed()
+    pair = networks(agent, seen)
+    other = {k: v.flip(1) if k.startswith("point") else v for k, v in seen.items()}
+    for one, two in zip(outputs(*pair, seen), outputs(*pair, other), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
+
+
+@agents
+def test_environments_do_not_mix(agent):
+    seen = observed()
+    actor, critic = networks(agent, seen)
+    for i in range(N):
+        alone = {name: each[i : i + 1] for name, each in seen.items()}
+        torch.testing.assert_close(critic(alone), critic(seen)[i : i + 1], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(actor(alone), actor(seen)[i : i + 1], rtol=1e-4, atol=1e-5)
+
+
+@agents
+def test_numbers_of_links_that_no_action_moves_are_zero(agent):
+    seen = observed()
+    actor, _ = networks(agent, seen)
+    numbers = actor(seen)
+    assert not numbers[~seen["actions"]].any()
+    assert numbers[seen["actions"]].all()
+
+
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+def test_morphology_is_hidden_if_asked_for(agent):
+    seen, other = observed(), observed(1)
+    positions = seen["tokens"].clone()
+    positions[..., POSITION.columns] = other["tokens"][..., POSITION.columns]
+    bodies = other["tokens"].clone()
+    bodies[..., POSITION.columns] = seen["tokens"][..., POSITION.columns]
+    for masked in (True, False):
+        _, critic = networks(agent, seen, mask_morphology=masked)
+        assert critic(seen).equal(critic({**seen, "tokens": bodies})) == masked
+        assert not critic(seen).isclose(critic({**seen, "tokens": positions})).any()
+
+
+def test_se_sees_no_morphology_and_is_the_mlp_otherwise():
+    seen = observed()
+    _, se = networks("se", seen)
+    _, mlp = networks("me-mlp", seen, mask_morphology=True)
+    assert se(seen).equal(mlp(seen))
+    assert not se(seen).isclose(networks("me-mlp", seen)[1](seen)).any()
+
+
+@agents
+@pytest.mark.parametrize("name", ["tokens", "goal", "object", "line", "obstacles", "points"])
+def test_all_that_is_there_counts(agent, name):
+    seen = observed()
+    actor, critic = networks(agent, seen)
+    other = {**seen, name: observed(1)[name]}
+    moved = (critic(seen) != critic(other)) & (actor(seen) != actor(other)).any(dim=2).any(dim=1)
+    there = mask_of(seen, name).reshape(N, -1).any(dim=1)
+    assert moved.equal(there)
+
+
+def test_sizes_are_those_of_the_paper():
+    actor, _ = networks("me-tf")
+    net = actor.network
+    assert net.index.shape == (LINKS, 64)
+    assert len(net.blocks) == 4
+    assert [block.heads for block in net.blocks] == [4] * 4
+    assert net.blocks[0].feedforward[1].weight.shape == (512, 64)
+    mlp = networks("me-mlp")[0].network
+    assert mlp.entities.project["links"].weight.shape[0] == 16
+    assert [layer[1].weight.shape for layer in mlp.layers] == [(192, 192)] * 3
+
+
+@agents
+def test_all_actions_begin_alike_and_values_near_zero(agent):
+    seen = observed()
+    actor, critic = networks(agent, seen, lively=False)
+    spread = actor(seen).softmax(dim=-1)[seen["actions"]]
+    assert (spread - 1 / 11).abs().max() < 0.01
+    assert critic(seen).abs().max() < 0.1
+    calm, _ = networks(agent, seen, discrete=False, lively=False)
+    assert calm.distribution(seen).mode().abs().max() < 0.1
+
+
+def test_weights_follow_from_the_seed_and_leave_torchs_own_stream_alone():
+    config, layout = PolicyConfig(), layout_of(observed())
+    before = torch.random.get_rng_state()
+    first, again, other = (make_networks(config, layout, seed)[0] for seed in (3, 3, 4))
+    assert torch.random.get_rng_state().equal(before)
+    pairs = [first.state_dict(), again.state_dict(), other.state_dict()]
+    assert all(pairs[0][name].equal(pairs[1][name]) for name in pairs[0])
+    assert not pairs[0]["network.index"].equal(pairs[2]["network.index"])
+
+
+@agents
+def test_an_observation_without_obstacles_and_extras_will_do(agent):
+    seen = observed(extras=False)
+    seen["obstacles"], seen["obstacle_mask"] = torch.zeros(N, 0, 13), torch.zeros(N, 0).bool()
+    for found in outputs(*networks(agent, seen), seen):
+        assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+def test_networks_compile_whole_and_are_the_same(agent):
+    seen = observed()
+    actor, critic = networks(agent, seen)
+    for network in (actor, critic):
+        compiled = torch.compile(network, backend="aot_eager", fullgraph=True, dynamic=False)
+        torch.testing.assert_close(compiled(seen), network(seen), rtol=1e-4, atol=1e-5)
+    torch.compiler.reset()
+
+
+@agents
+@pytest.mark.parametrize("garbage", [1e30, math.nan])
+def test_bfloat16_is_close_and_masks_hold_there_too(agent, garbage):
+    seen = observed()
+    actor, critic = networks(agent, seen)
+    with torch.autocast("cpu", torch.bfloat16):
+        numbers, value = actor(seen), critic(seen)
+        dirty = filled(seen, garbage)
+        assert numbers.equal(actor(dirty))
+        assert value.equal(critic(dirty))
+    assert numbers.dtype == value.dtype == torch.float32
+    exact = actor(seen)
+    assert (numbers - exact).abs().max() < 0.05 * exact.abs().max()
+    assert 0 < (value - critic(seen)).abs().max() < 0.05 * critic(seen).abs().max()
+
+
+def test_weights_for_other_observations_are_refused_with_the_difference():
+    here = layout_of(observed())
+    words = r"a\.pt is for other .*: obstacles 0, here 3; points 0, here 8; channels \(\), here"
+    with pytest.raises(TaskError, match=words):
+        require_layout(layout_of(without_obstacles()), here, "a.pt")
+    require_layout(here, layout_of(observed(5)), "a.pt")
+
+
+def without_obstacles():
+    return {**observed(extras=False), "obstacles": torch.zeros(N, 0, 13)}
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: PolicyConfig(agent="me-tff"), "agent 'me-tff'; did you mean 'me-tf'"),
+        (lambda: PolicyConfig(features=30), "features 30: expected a multiple of heads 4"),
+        (lambda: PolicyConfig(mlp_width=0), "mlp_width 0: expected 1 or more"),
+        (lambda: PPOConfig(steps=0), "steps 0: expected 1 or more"),
+        (lambda: PPOConfig(clip=0.0), "clip 0: expected more than 0"),
+        (lambda: PPOConfig(learning_rate=math.nan), "learning_rate nan: expected more than 0"),
+        (lambda: PPOConfig(gamma=1.5), "gamma 1.5: expected 0 to 1"),
+        (lambda: PPOConfig(entropy=-1.0), "entropy -1: expected 0 or more"),
+        (lambda: PPOConfig(steps=10).minibatch(3), "10 steps of 3 .* 16 equal minibatches"),
+    ],
+)
+def test_impossible_configurations_are_refused(make, words):
+    with pytest.raises(TaskError, match=words):
+        make()

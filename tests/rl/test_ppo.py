@@ -1,0 +1,441 @@
+"""PPO, part by part against known answers, and as a whole against a task that it must solve."""
+
+import copy
+import io
+import math
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from morphgen.errors import TaskError
+from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.ppo import Learner, follow, learning_rate, policy_loss
+from morphgen.rl.report import explained_variance
+from morphgen.rl.symlog import symlog
+from on_a_line import OnALine
+
+SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4)
+"""Four updates of eight environments."""
+
+
+def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, **changes):
+    batch = batch or OnALine(8, kind="discrete" if discrete else "continuous")
+    policy = PolicyConfig(agent=agent, discrete=discrete)
+    return Learner(batch, policy, replace(SMALL, **changes), seed=seed)
+
+
+def weights(made):
+    networks = {"actor": made.actor, "critic": made.critic, "slow": made.slow}
+    return {
+        f"{name}.{key}": each.clone()
+        for name, network in networks.items()
+        for key, each in network.state_dict().items()
+    }
+
+
+def equal(a, b):
+    return all(a[name].equal(b[name]) for name in a)
+
+
+def untimed(report):
+    """A report without what depends on the machine; repr, as nan is no equal of nan."""
+    timed = ("collect_seconds", "learn_seconds", "steps_per_second")
+    return repr({name: value for name, value in asdict(report).items() if name not in timed})
+
+
+def stored(checkpoint):
+    """What is left of a checkpoint after a file."""
+    file = io.BytesIO()
+    torch.save(checkpoint, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def test_policy_loss_by_hand():
+    ratio = torch.tensor([1.5, 1.5, 0.5, 0.5, 1.1])
+    advantage = torch.tensor([1.0, -1.0, 1.0, -1.0, 2.0])
+    found = policy_loss(ratio.log(), advantage, 0.2)
+    torch.testing.assert_close(found, torch.tensor([-1.2, 1.5, -0.5, 0.8, -2.2]))
+
+
+def test_policy_loss_has_a_slope_only_where_it_is_not_clipped():
+    log_ratio = torch.tensor([1.5, 1.5, 0.5, 0.5]).log().requires_grad_()
+    policy_loss(log_ratio, torch.tensor([1.0, -1.0, 1.0, -1.0]), 0.2).sum().backward()
+    torch.testing.assert_close(log_ratio.grad, torch.tensor([0.0, 1.5, -0.5, 0.0]))
+
+
+def test_the_learning_rate_falls_over_the_updates_that_happen():
+    made = learner()
+    rates = []
+    while not made.done:
+        rates.append(made.iterate().learning_rate)
+    assert made.updates == 4
+    assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
+    assert learning_rate(SMALL, 4, 4) == 0
+
+
+def test_transitions_are_rounded_up_to_whole_updates():
+    assert PPOConfig(transitions=1025, steps=128).updates(4) == 3
+    assert PPOConfig(transitions=1024, steps=128).updates(4) == 2
+
+
+def test_explained_variance_by_hand():
+    returns = torch.tensor([[1.0, 2.0], [3.0, 6.0]])
+    assert explained_variance(returns, returns) == 1
+    assert explained_variance(torch.full((2, 2), 7.0), returns) == 0
+    assert explained_variance(0.5 * returns, returns) == pytest.approx(0.75)
+    assert explained_variance(-returns, returns) == pytest.approx(-3)
+    assert explained_variance(returns, torch.ones(2, 2)) == 0
+
+
+def test_a_moving_average_by_hand():
+    slow, fast = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
+    slow.weight.data.fill_(1.0)
+    fast.weight.data.fill_(3.0)
+    follow(slow, fast, 0.75)
+    follow(slow, fast, 0.75)
+    assert slow.weight.item() == pytest.approx(0.75**2 * 1 + (1 - 0.75**2) * 3)
+    assert fast.weight.item() == 3
+
+
+def test_the_slow_critic_follows_every_gradient_step():
+    made = learner(epochs=1, minibatches=1)
+    before = weights(made)
+    made.iterate()
+    after = weights(made)
+    moved = [name[7:] for name in after if name.startswith("critic.")]
+    assert moved
+    for name in moved:
+        fast = after[f"critic.{name}"]
+        wanted = 0.98 * before[f"slow.{name}"] + 0.02 * fast
+        torch.testing.assert_close(after[f"slow.{name}"], wanted)
+    assert not equal({k: v for k, v in before.items() if k.startswith("slow")}, after)
+
+
+class Answers(torch.nn.Module):
+    """A critic that knows its answers: ten times the place on the line."""
+
+    def forward(self, seen):
+        return 10 * seen["tokens"][..., 32].sum(dim=1)
+
+
+@pytest.mark.parametrize("slow", [True, False])
+@pytest.mark.parametrize("logarithmic", [True, False])
+def test_targets_by_hand(slow, logarithmic):
+    # With lambda 0 a return is the reward and the discounted value of what the action led to.
+    batch = OnALine(4, horizon=3)
+    made = learner(batch, slow_critic=slow, symlog=logarithmic, lam=0.0, minibatches=4)
+    wrong = lambda seen: torch.full_like(seen["line"][:, 0], 99.0)  # noqa: E731
+    right = lambda seen: symlog(Answers()(seen)) if logarithmic else Answers()(seen)  # noqa: E731
+    made._slow_value, made._value = (right, wrong) if slow else (wrong, right)
+    steps = []
+    step = batch.step
+    batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
+    rollout, _ = made._collect()
+    values, advantages, returns = made._targets(rollout)
+    after = torch.stack([Answers()(each.final_observation) for each in steps])
+    rewards = torch.stack([each.reward for each in steps])
+    terminated = torch.stack([each.terminated for each in steps])
+    truncated = torch.stack([each.truncated for each in steps])
+    assert terminated.any()
+    assert truncated.any()
+    torch.testing.assert_close(returns, rewards + 0.99 * after * ~terminated, rtol=1e-4, atol=1e-4)
+    at = Answers()({"tokens": rollout.observation["tokens"].flatten(0, 1)}).reshape(8, 4)
+    torch.testing.assert_close(values, at, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(advantages, returns - values)
+
+
+@pytest.mark.parametrize("logarithmic", [True, False], ids=["symlog", "plain"])
+def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
+    options = {"epochs": 80, "minibatches": 1, "learning_rate": 3e-3, "gradient_clip": 10.0}
+    made = learner(symlog=logarithmic, **options)
+    rollout, _ = made._collect()
+    _, _, returns = made._targets(rollout)
+    made._learn(rollout)
+    with torch.no_grad():
+        values = made.critic({k: v.flatten(0, 1) for k, v in rollout.observation.items()})
+    wanted = (symlog(returns) if logarithmic else returns).flatten()
+    other = (returns if logarithmic else symlog(returns)).flatten()
+    assert (values - wanted).square().mean() < 0.2 * wanted.var()
+    assert (values - other).square().mean() > 0.2 * other.var()
+
+
+def test_minibatches_hold_every_transition_once_an_epoch():
+    made = learner(epochs=3)
+    seen = []
+    descend = made._descend
+    made._descend = lambda obs, data: seen.append(data) or descend(obs, data)
+    made.iterate()
+    assert len(seen) == 3 * 4
+    for epoch in range(3):
+        part = [each["log_prob"] for each in seen[4 * epoch : 4 * epoch + 4]]
+        assert [len(each) for each in part] == [16] * 4
+        goals = torch.cat([each["advantage"] for each in seen[4 * epoch : 4 * epoch + 4]])
+        assert goals.mean().item() == pytest.approx(0, abs=1e-5)
+        assert goals.std().item() == pytest.approx(1, abs=1e-4)
+        bodies = torch.cat([each["body"] for each in seen[4 * epoch : 4 * epoch + 4]])
+        assert torch.bincount(bodies).tolist() == [32, 32]
+    first = torch.cat([each["advantage"] for each in seen[:4]])
+    second = torch.cat([each["advantage"] for each in seen[4:8]])
+    assert not first.equal(second)
+    assert first.sort().values.equal(second.sort().values)
+
+
+def test_a_transition_keeps_its_observation_action_and_body_through_shuffling():
+    made = learner()
+    pairs = []
+    descend = made._descend
+    made._descend = lambda seen, data: pairs.append((seen, data)) or descend(seen, data)
+    made.iterate()
+    for seen, data in pairs[:1]:
+        assert seen["object_mask"].equal(data["body"] == 1)
+        head = learner().actor.distribution(seen)
+        torch.testing.assert_close(head.log_prob(data["actions"]), data["log_prob"])
+
+
+def test_before_the_first_step_no_ratio_is_clipped_and_kl_is_zero():
+    report = learner(epochs=1, minibatches=1).iterate()
+    assert report.kl == pytest.approx(0, abs=1e-6)
+    assert report.clip_fraction == 0
+    assert report.policy_loss == pytest.approx(0, abs=1e-5)
+    assert report.entropy == pytest.approx(math.log(11), rel=1e-3)
+    far = learner(epochs=20, minibatches=1, learning_rate=0.03).iterate()
+    assert far.kl > 0.01
+    assert 0 < far.clip_fraction < 1
+
+
+def test_gradients_of_actor_and_critic_are_clipped_apart():
+    made = learner(gradient_clip=1e-3, epochs=1, minibatches=1)
+    report = made.iterate()
+    for network, norm in ((made.actor, "actor_gradient"), (made.critic, "critic_gradient")):
+        left = torch.stack([each.grad.norm() for each in network.parameters()]).norm()
+        assert getattr(report, norm) > 1e-3
+        assert left.item() == pytest.approx(1e-3, rel=1e-2)
+
+
+def test_a_report_says_what_happened():
+    batch = OnALine(8, horizon=4)
+    steps = []
+    step = batch.step
+    batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
+    report = learner(batch).iterate()
+    over = torch.stack([each.terminated | each.truncated for each in steps])
+    scores = torch.stack([each.score for each in steps])
+    success = torch.stack([each.success for each in steps])[over].float()
+    assert report.update == 1
+    assert report.transitions == 64
+    assert report.episodes == over.sum()
+    assert report.success == pytest.approx(success.mean().item())
+    assert report.score == pytest.approx(scores.mean().item())
+    by_robot = [scores[:, ::2].mean().item(), scores[:, 1::2].mean().item()]
+    assert report.scores == pytest.approx(by_robot)
+    assert sum(report.terms.values()) == pytest.approx(report.reward, rel=1e-5)
+    assert report.steps_per_second == pytest.approx(
+        64 / (report.collect_seconds + report.learn_seconds)
+    )
+
+
+def test_entropy_grows_if_it_is_all_that_counts():
+    made = learner(discrete=False, entropy=10.0, learning_rate=1e-2)
+    reports = []
+    while not made.done:
+        reports.append(made.iterate())
+    assert reports[-1].entropy > reports[0].entropy + 0.05
+
+
+def test_robots_count_alike_or_with_random_weights_of_mean_one():
+    assert learner()._weights().tolist() == [1, 1]
+    made = learner(task_reweighting=True)
+    drawn = torch.stack([made._weights() for _ in range(4000)])
+    assert (drawn > 0).all()
+    torch.testing.assert_close(drawn.mean(dim=1), torch.ones(4000))
+    torch.testing.assert_close(drawn.mean(dim=0), torch.ones(2), atol=0.05, rtol=0)
+    # Half the difference of two normal numbers through tanh: log-odds of variance 2.
+    odds = (drawn[:, 0] / drawn[:, 1]).log()
+    assert odds.var().item() == pytest.approx(2, rel=0.1)
+
+
+def test_a_robot_without_weight_is_not_learned_from():
+    def steps(weight, **kept):
+        made = learner(epochs=1, minibatches=1, entropy=0.01)
+        made._weights = lambda: torch.tensor(weight)
+        learn = made._learn
+
+        def other(rollout):
+            return learn(replace(rollout, **{k: v(rollout) for k, v in kept.items()}))
+
+        made._learn = other
+        made.iterate()
+        return weights(made)
+
+    # What pushers are said to have been likely to do does not matter if they weigh nothing.
+    def twisted(rollout):
+        log_prob = rollout.log_prob.clone()
+        log_prob[:, 1::2] -= 0.1
+        return log_prob
+
+    assert equal(steps([2.0, 0.0]), steps([2.0, 0.0], log_prob=twisted))
+    assert not equal(steps([1.0, 1.0]), steps([1.0, 1.0], log_prob=twisted))
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_the_curriculum_goes_with_the_updates(moves):
+    batch = OnALine(8)
+    made = learner(batch, curriculum=moves)
+    while not made.done:
+        made.iterate()
+    assert batch.progress == ([0.0, 0.0, 0.25, 0.5, 0.75] if moves else [])
+
+
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+@pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
+def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
+    options = {"agent": agent, "discrete": discrete, "task_reweighting": True}
+    went_on = learner(**options)
+    went_on.iterate(), went_on.iterate()
+    checkpoint = stored(went_on.checkpoint())
+    reports = [went_on.iterate(), went_on.iterate()]
+
+    kind = "discrete" if discrete else "continuous"
+    again = learner(OnALine(8, kind=kind, seed=99), seed=77, **options)
+    again.iterate()
+    again.resume(checkpoint)
+    assert not again.done
+    same = [again.iterate(), again.iterate()]
+    assert again.done
+    assert equal(weights(went_on), weights(again))
+    for one, other in zip(reports, same, strict=True):
+        assert untimed(one) == untimed(other)
+    assert went_on.batch.state_dict() == again.batch.state_dict()
+
+
+@pytest.mark.parametrize("part", ["optimiser", "generators", "batch", "slow", "update"])
+def test_a_run_that_forgets_a_part_does_not_equal_one_that_went_on(part):
+    went_on = learner(task_reweighting=True)
+    went_on.iterate(), went_on.iterate()
+    checkpoint = stored(went_on.checkpoint())
+    went_on.iterate()
+    again = learner(OnALine(8, seed=99), seed=77, task_reweighting=True)
+    again.iterate()
+    again.resume({**checkpoint, part: again.checkpoint()[part]})
+    again.iterate()
+    assert not equal(weights(went_on), weights(again))
+
+
+def test_a_checkpoint_does_not_change_with_the_learner():
+    made = learner()
+    made.iterate()
+    checkpoint = made.checkpoint()
+    before = copy.deepcopy(checkpoint)
+    made.iterate()
+    again = learner()
+    again.resume(checkpoint)
+    assert all(checkpoint["actor"][k].equal(before["actor"][k]) for k in before["actor"])
+    steps = [each["step"] for each in checkpoint["optimiser"]["state"].values()]
+    assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
+
+
+def test_the_same_seed_gives_the_same_run():
+    runs = [learner(seed=seed) for seed in (1, 1, 2)]
+    for each in runs:
+        each.iterate()
+    assert equal(weights(runs[0]), weights(runs[1]))
+    assert not equal(weights(runs[0]), weights(runs[2]))
+
+
+def test_checkpoints_of_other_runs_are_refused_and_nothing_is_changed():
+    made = learner()
+    before = weights(made)
+    with pytest.raises(TaskError, match=r"another run: gamma 0\.9, here 0\.99$"):
+        made.resume(learner(gamma=0.9).checkpoint())
+    with pytest.raises(TaskError, match="another run: agent me-tf, here me-mlp"):
+        made.resume(learner(agent="me-tf").checkpoint())
+    wider = learner().checkpoint()
+    wider["layout"]["links"] = 30
+    for take in (made.resume, made.adopt):
+        with pytest.raises(TaskError, match="the checkpoint is for other observations: links 30, "):
+            take(wider)
+    assert equal(before, weights(made))
+
+
+def test_fine_tuning_begins_with_the_networks_and_nothing_else():
+    pre = learner()
+    pre.iterate()
+    fine = learner(OnALine(16), gamma=0.9)
+    fine.adopt(stored(pre.checkpoint()))
+    assert equal(weights(pre), weights(fine))
+    assert fine.update == 0
+    assert not fine.optimiser.state
+    fine.iterate()
+    assert not equal(weights(pre), weights(fine))
+
+
+def test_a_batch_of_other_actions_is_refused():
+    with pytest.raises(TaskError, match="actions are discrete, the batch's continuous"):
+        learner(OnALine(8, kind="continuous"))
+
+
+def test_numbers_that_are_lost_stop_the_run():
+    batch = OnALine(8)
+    made = learner(batch)
+    step = batch.step
+    batch.step = lambda actions: replace(step(actions), reward=torch.full((8,), math.nan))
+    with pytest.raises(TaskError, match=r"update 1: .*value_loss.* is not finite any more"):
+        made.iterate()
+
+
+def test_bfloat16_gives_nearly_the_same_update():
+    plain = learner(agent="me-tf", epochs=1, minibatches=1).iterate()
+    short = learner(agent="me-tf", epochs=1, minibatches=1, bf16=True).iterate()
+    assert short.value_loss == pytest.approx(plain.value_loss, rel=0.05)
+    assert short.value_loss != plain.value_loss
+    assert short.entropy == pytest.approx(plain.entropy, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+def test_compilation_gives_nearly_the_same_update(agent):
+    plain = learner(agent=agent, epochs=1).iterate()
+    compiled = learner(agent=agent, epochs=1, compile=True).iterate()
+    torch.compiler.reset()
+    assert compiled.value_loss == pytest.approx(plain.value_loss, rel=1e-3)
+    assert compiled.actor_gradient == pytest.approx(plain.actor_gradient, rel=1e-2)
+
+
+def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
+    """Reports of a run on 32 points that learns fast."""
+    batch = OnALine(32, kind="discrete" if discrete else "continuous")
+    config = PPOConfig(
+        transitions=updates * 32 * 24,
+        steps=24,
+        minibatches=4,
+        learning_rate=1e-3,
+        gamma=0.9,
+        **changes,
+    )
+    made = Learner(batch, PolicyConfig(agent=agent, discrete=discrete), config)
+    reports = []
+    while not made.done:
+        reports.append(made.iterate())
+    return reports
+
+
+@pytest.mark.parametrize(
+    ("discrete", "options"),
+    [(True, {}), (False, {"symlog": False, "slow_critic": False, "task_reweighting": True})],
+    ids=["discrete", "continuous"],
+)
+def test_it_learns_two_bodies_and_two_tasks_at_once(discrete, options):
+    reports = trained(discrete=discrete, **options)
+    assert reports[0].success < 0.4
+    assert reports[-1].success > 0.85
+    assert min(reports[-1].scores) > max(reports[0].scores) + 0.2
+    assert reports[-1].explained_variance > 0.5
+
+
+@pytest.mark.slow
+def test_the_transformer_learns_them_too():
+    reports = trained(agent="me-tf", updates=24)
+    assert reports[0].success < 0.4
+    assert reports[-1].success > 0.9

@@ -1,0 +1,230 @@
+"""Pictures show what there is, from a camera that has all of it in view, and films are whole."""
+
+from dataclasses import replace
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from morphgen.errors import FormatError
+from morphgen.model.geometry import Pose
+from morphgen.tasks import film
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.film import Stage, moment, require_film, write_film
+from morphgen.tasks.make import make_batch
+from morphgen.tasks.robots import robot_of
+from morphgen.tasks.settings import Setting, push_setting, reach_setting
+from morphgen.tasks.sim.base import Block, Scene
+from robots import arm
+
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("goals")
+
+
+@pytest.fixture(scope="module")
+def reach(cache):
+    config = ReachConfig(goals=10)
+    return reach_setting(robot_of("arm3-stick"), config, obstacles=True, seed=0, cache=cache)
+
+
+@pytest.fixture(scope="module")
+def push(cache):
+    config = PushConfig(starts=10)
+    return push_setting(robot_of("prims"), config, obstacles=False, seed=0, cache=cache)
+
+
+@pytest.fixture
+def on():
+    """Put settings on a stage, which is closed at the end of the test."""
+    stages = []
+
+    def of(setting, size=SIZE):
+        stages.append(Stage(setting, size))
+        return stages[-1]
+
+    yield of
+    for stage in stages:
+        stage.close()
+
+
+def changed(a, b):
+    """Pixels that differ, shape (height, width)."""
+    return np.abs(a.astype(int) - b).max(axis=2) > 8
+
+
+def test_a_frame_is_of_its_size_and_its_bytes_are_always_the_same(on, reach):
+    stage = on(reach)
+    frame = stage.frame(reach.goals.q[0], goal=reach.goals.poses[1])
+    assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
+    stage.frame(reach.goals.q[5])
+    again = [stage.frame(reach.goals.q[0], goal=reach.goals.poses[1])]
+    again.append(on(reach).frame(reach.goals.q[0], goal=reach.goals.poses[1]))
+    assert all(np.array_equal(frame, each) for each in again)
+
+
+def test_the_robot_is_where_its_joints_are(on, reach):
+    stage = on(reach)
+    a, b = (stage.frame(q) for q in reach.goals.q[:2])
+    assert 50 < changed(a, b).sum() < a.size / 6
+
+
+def test_the_goal_is_green_and_only_where_it_is_asked_for(on, reach):
+    stage = on(reach)
+    without = stage.frame(reach.goals.q[0])
+    shown = [stage.frame(reach.goals.q[0], goal=pose) for pose in reach.goals.poses[1:3]]
+    spots = [changed(without, frame) for frame in shown]
+    assert all(8 < spot.sum() < 600 for spot in spots)
+    assert not (spots[0] & spots[1]).all()
+    red, green, blue = shown[0][spots[0]].mean(axis=0)
+    assert green > max(red, blue)
+
+
+def test_the_block_is_drawn_where_it_is_and_the_line_on_the_ground(on, push):
+    stage = on(push)
+    start, line = push.pushes.blocks[0], push.pushes.line
+    here = stage.frame(push.pushes.q[0], block=start, line=line)
+    aside = start.copy()
+    aside[1] = line
+    there = stage.frame(push.pushes.q[0], block=aside, line=line)
+    assert changed(here, there).sum() > 30
+    no_line = stage.frame(push.pushes.q[0], block=start)
+    strip = changed(here, no_line)
+    assert 20 < strip.sum() < 1500
+    assert here[strip].mean(axis=0).argmax() == 1
+
+
+def test_obstacles_are_drawn(on, reach):
+    bare = replace(reach, scene=replace(reach.scene, obstacles=()))
+    q = reach.goals.q[0]
+    points = on(reach)._stage.points
+    stage = on(bare)
+    stage._camera = film._camera(points, SIZE[0] / SIZE[1])
+    assert changed(on(reach).frame(q), stage.frame(q)).sum() > 50
+
+
+@pytest.mark.parametrize("name", ["reach", "push"])
+def test_all_that_matters_is_in_view_and_fills_it(name, request):
+    """Points are projected here anew, by the position and axes of the camera."""
+    setting = request.getfixturevalue(name)
+    points = film.stage_model(setting).points
+    camera = film._camera(points, 4 / 3)
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    forward = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    seen = points - (camera.lookat - camera.distance * forward)
+    depth = seen @ forward
+    half = np.tan(np.radians(film._FOV / 2))
+    vertical = seen @ up / depth / half
+    across = seen @ right / depth / (half * 4 / 3)
+    assert depth.min() > 0
+    most = max(np.abs(vertical).max(), np.abs(across).max())
+    assert most == pytest.approx(film._MARGIN, abs=1e-6)
+
+
+def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(on):
+    robot = arm()
+    bare = replace(robot, links=tuple(replace(link, visuals=()) for link in robot.links))
+    still = Setting(bare, "reach", Scene(bare, ground=None))
+    a, b = (on(still).frame(q) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
+    assert changed(a, b).sum() > 50
+
+
+def test_a_scene_without_anything_else_can_be_drawn(on):
+    block = Block((0.2, 0.2, 0.2), Pose((0.5, 0.0, 0.1)), 0.1)
+    stage = on(Setting(arm(), "push", Scene(arm(), block=block)))
+    with_block = stage.frame(arm().home, block=(0.5, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0))
+    assert changed(with_block, stage.frame(arm().home)).sum() > 50
+
+
+def test_two_stages_do_not_disturb_each_other(on, reach, push):
+    one, other = on(reach), on(push, (100, 80))
+    first = one.frame(reach.goals.q[0])
+    small = other.frame(push.pushes.q[0])
+    assert small.shape == (80, 100, 3)
+    other.close()
+    assert np.array_equal(one.frame(reach.goals.q[0]), first)
+
+
+def test_a_closed_stage_says_so(on, reach):
+    stage = on(reach)
+    stage.close()
+    stage.close()
+    with pytest.raises(ValueError, match="closed"):
+        stage.frame(reach.goals.q[0])
+
+
+def test_a_moment_is_an_environment_of_a_batch(cache):
+    batch = make_batch(
+        ["reach", "push"],
+        ["arm3-stick", "prims"],
+        2,
+        sim="mujoco",
+        reach=ReachConfig(goals=10),
+        push=PushConfig(starts=10),
+        cache=cache,
+    )
+    batch.reset()
+    reaching, pushing = moment(batch, 0), moment(batch, 1)
+    assert set(reaching) == {"q", "goal"}
+    assert set(pushing) == {"q", "block", "line"}
+    for env, now in enumerate((reaching, pushing)):
+        assert len(now["q"]) == batch.settings[env].robot.dof
+        assert np.array_equal(now["q"], batch.q[env, : len(now["q"])].numpy())
+    assert pushing["line"] == pytest.approx(batch.settings[1].pushes.line)
+    batch.close()
+
+
+FRAMES = [np.full((48, 64, 3), value, dtype=np.uint8) for value in range(0, 250, 25)]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_has_its_frames_its_speed_and_the_same_bytes(tmp_path, suffix):
+    for name in ("a", "b"):
+        write_film(iter(FRAMES), tmp_path / f"{name}{suffix}", fps=25)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"a{suffix}", f"b{suffix}"]
+    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+    with imageio.get_reader(tmp_path / f"a{suffix}") as reader:
+        frames = [np.asarray(frame)[..., :3] for frame in reader]
+        facts = reader.get_meta_data()
+    assert len(frames) == len(FRAMES)
+    assert frames[0].shape == FRAMES[0].shape
+    for found, written in zip(frames, FRAMES, strict=True):
+        assert abs(found.mean() - written.mean()) < 4
+    assert facts.get("fps", 1000 / facts.get("duration", 1)) == 25
+
+
+def test_a_film_is_there_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"old")
+
+    def broken():
+        yield FRAMES[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_film(broken(), path, fps=25)
+    assert [each.name for each in tmp_path.iterdir()] == ["film.mp4"]
+    assert path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("film.avi", "a film ends in .mp4 or .gif"),
+        ("film", "a film ends in .mp4 or .gif"),
+        ("no/film.mp4", "there is no folder"),
+    ],
+)
+def test_where_no_film_can_be_written_is_said_at_once(tmp_path, name, says):
+    with pytest.raises(FormatError, match=says):
+        require_film(tmp_path / name)
+    with pytest.raises(FormatError, match=says):
+        write_film(FRAMES, tmp_path / name, fps=25)
+    assert list(tmp_path.iterdir()) == []

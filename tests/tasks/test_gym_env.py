@@ -1,0 +1,284 @@
+"""One robot in plain Gymnasium: spaces, seeds, ends, pictures, and both checkers."""
+
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FlattenObservation
+from stable_baselines3.common.env_checker import check_env as check_for_sb3
+
+from morphgen.errors import CompositionError, TaskError
+from morphgen.tasks import make_batch, registration
+from morphgen.tasks.batch import Channels
+from morphgen.tasks.config import BINS, PushConfig, ReachConfig
+from morphgen.tasks.gym_env import PushEnv, ReachEnv
+from morphgen.tasks.sim.base import Contacts
+
+STEPS = 8
+REACH, PUSH = ReachConfig(steps=STEPS, goals=5), PushConfig(steps=STEPS, starts=5)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("goals")
+
+
+@pytest.fixture
+def make(cache):
+    """Make environments, which are closed at the end of the test."""
+    registration.register()
+    made = []
+
+    def of(name, robot="arm3-stick", **options):
+        config = REACH if name == registration.REACH else PUSH
+        given = {"config": config, "sim": "mujoco", "cache": cache} | options
+        made.append(gym.make(name, robot=robot, **given))
+        return made[-1]
+
+    yield of
+    for env in made:
+        env.unwrapped.close()
+
+
+def run(env, steps):
+    """Observations and rewards of random actions, episode after episode."""
+    env.action_space.seed(0)
+    rows = []
+    for _ in range(steps):
+        seen, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        rows.append(np.concatenate([*(v.ravel() for v in seen.values()), [reward]]))
+        if terminated or truncated:
+            seen, _ = env.reset()
+            rows.append(np.concatenate([*(v.ravel() for v in seen.values()), [0]]))
+    return np.concatenate([row.ravel() for row in rows])
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        (registration.REACH, {"sim": "pybullet"}),
+        (registration.REACH, {"kind": "discrete", "obstacles": True}),
+        (registration.PUSH, {"robot": "prims"}),
+        (
+            registration.PUSH,
+            {"robot": "prims", "channels": Channels(velocity=True, previous_action=True, points=9)},
+        ),
+    ],
+)
+def test_both_checkers_pass(make, name, options):
+    """All that they have to say is that tokens are no vector; flattened they say nothing."""
+    env = make(name, render_mode="rgb_array", size=(64, 48), **options)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+        check_for_sb3(env.unwrapped)
+    assert all("unconventional shape" in str(each.message) for each in caught)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_for_sb3(FlattenObservation(env))
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        "import gymnasium, morphgen",
+        "import morphgen, gymnasium",
+        "import morphgen.tasks, gymnasium, morphgen",
+    ],
+)
+def test_the_ids_are_known_in_whichever_order_of_imports(order):
+    code = (
+        f"{order}; from morphgen.tasks.registration import register; register(); register()\n"
+        "assert gymnasium.spec('morphgen/Reach-v0').entry_point\n"
+        "assert gymnasium.spec('morphgen/Push-v0').entry_point\n"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_registering_loads_nothing_and_waits_for_gymnasium():
+    code = (
+        "import sys; from morphgen.tasks.registration import register; register()\n"
+        "assert not {'gymnasium', 'numpy', 'torch'} & set(sys.modules), 'loaded'\n"
+        "finders = len(sys.meta_path)\n"
+        "import gymnasium, inspect\n"
+        "assert len(sys.meta_path) == finders - 1\n"
+        "assert 'morphgen/Reach-v0' in gymnasium.registry\n"
+        "assert 'import' in inspect.getsource(gymnasium)\n"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_reach_observes_what_one_robot_needs(make):
+    env = make(registration.REACH)
+    links = len(env.unwrapped.setting.robot.links)
+    shapes = {name: space.shape for name, space in env.observation_space.items()}
+    assert shapes == {"tokens": (links, 48), "goal": (7,)}
+    assert env.action_space.shape == (len(env.unwrapped.action_joints),)
+
+
+def test_push_observes_block_line_and_obstacles(make):
+    channels = Channels(velocity=True, previous_action=True, points=12)
+    env = make(registration.PUSH, "prims", obstacles=True, channels=channels, kind="discrete")
+    links, joints = len(env.unwrapped.setting.robot.links), len(env.unwrapped.action_joints)
+    assert {name: space.shape for name, space in env.observation_space.items()} == {
+        "tokens": (links, 48),
+        "object": (13,),
+        "line": (1,),
+        "obstacles": (PUSH.obstacles, 13),
+        "velocity": (links,),
+        "previous_action": (joints,),
+        "points": (12, 3),
+    }
+    assert env.action_space.nvec.tolist() == [len(BINS)] * joints
+
+
+def test_an_action_moves_its_own_joint(make):
+    env = make(registration.REACH, channels=Channels(previous_action=True)).unwrapped
+    for k, name in enumerate(env.action_joints):
+        env.reset(seed=0)
+        before = env.batch.targets.clone()
+        action = np.zeros(len(env.action_joints), dtype=np.float32)
+        action[k] = 0.5 if before[0, k] < env.batch.bodies.home[0, k] else -0.5
+        seen, *_ = env.step(action)
+        moved = torch.nonzero(env.batch.targets[0] != before[0])[:, 0].tolist()
+        robot = env.setting.robot
+        assert [robot.joints[robot.independent[j]].name for j in moved] == [name]
+        assert seen["previous_action"].tolist() == action.tolist()
+
+
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+def test_a_seed_gives_its_episodes(make, sim):
+    env, other = make(registration.REACH, sim=sim), make(registration.REACH, sim=sim)
+    env.reset(seed=5)
+    first = run(env, 3 * STEPS)
+    env.reset(seed=6)
+    assert not np.array_equal(run(env, 3 * STEPS), first)
+    env.reset(seed=5)
+    assert np.array_equal(run(env, 3 * STEPS), first)
+    other.reset(seed=5)
+    assert np.array_equal(run(other, 3 * STEPS), first)
+
+
+def test_without_a_seed_episodes_go_on_and_begin_anywhere(make):
+    env = make(registration.REACH)
+    goals = [tuple(env.reset(seed=1)[0]["goal"])]
+    goals += [tuple(env.reset()[0]["goal"]) for _ in range(7)]
+    assert len(set(goals)) > 1
+    again = [tuple(env.reset(seed=1)[0]["goal"])]
+    assert again + [tuple(env.reset()[0]["goal"]) for _ in range(7)] == goals
+    starts = {tuple(make(registration.REACH).reset()[0]["tokens"].ravel()) for _ in range(6)}
+    assert len(starts) > 1
+
+
+def test_the_episodes_are_those_of_a_batch(make, cache):
+    env = make(registration.REACH)
+    batch = make_batch("reach", ["arm3-stick"], 1, sim="mujoco", seed=7, reach=REACH, cache=cache)
+    seen, _ = env.reset(seed=7)
+    expected = batch.reset()
+    for k in range(2 * STEPS):
+        assert np.array_equal(seen["goal"], expected["goal"][0].numpy())
+        links = len(seen["tokens"])
+        assert np.array_equal(seen["tokens"], expected["tokens"][0, :links].numpy())
+        action = np.full(env.action_space.shape, 0.1 * (-1) ** k, dtype=np.float32)
+        seen, reward, _, over, info = env.step(action)
+        actions = torch.zeros(1, batch.bodies.max_links)
+        actions[:, list(env.unwrapped.action_links)] = torch.from_numpy(action)
+        step = batch.step(actions)
+        expected = step.observation
+        assert (reward, info["distance"]) == (float(step.reward[0]), float(step.distance[0]))
+        if over:
+            seen, _ = env.reset()
+    batch.close()
+
+
+def test_an_episode_ends_by_itself_and_is_seen_to_its_end(make):
+    env = make(registration.PUSH, "prims", channels=Channels(velocity=True)).unwrapped
+    env.reset(seed=0)
+    for k in range(STEPS):
+        seen, _, terminated, truncated, info = env.step(np.ones(5, dtype=np.float32))
+        assert (terminated, truncated) == (False, k == STEPS - 1)
+    assert np.abs(seen["velocity"]).max() > 0
+    assert set(info) == {"success", "distance", "score", "terms", "self_collision"}
+    assert info["terms"]["distance"] == pytest.approx(-info["distance"])
+    with pytest.raises(TaskError, match="no episode is running; call reset"):
+        env.step(np.ones(5, dtype=np.float32))
+
+
+def test_info_says_how_contacts_are_set(make):
+    env = make(registration.REACH, contacts=Contacts(self_collision=False))
+    assert env.reset(seed=0)[1] == {"self_collision": False}
+    assert env.step(env.action_space.sample())[4]["self_collision"] is False
+
+
+@pytest.mark.parametrize(
+    ("name", "robot"), [(registration.REACH, "arm3-stick"), (registration.PUSH, "prims")]
+)
+def test_the_last_moment_of_an_episode_can_be_seen(make, name, robot):
+    """The batch has begun the next one by then, elsewhere."""
+    env = make(name, robot, render_mode="rgb_array", size=(160, 120)).unwrapped
+    env.reset(seed=3)
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    frames = [env.render()]
+    for _ in range(STEPS):
+        env.step(action)
+        frames.append(env.render())
+    still = np.abs(frames[-1].astype(int) - frames[-2]).mean()
+    env.reset()
+    moved = np.abs(env.render().astype(int) - frames[-1]).mean()
+    assert still < moved / 5
+
+
+def test_without_a_render_mode_nothing_is_drawn(make):
+    env = make(registration.REACH)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.unwrapped.render() is None
+
+
+def test_a_closed_environment_says_so(make):
+    env = make(registration.REACH, render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    env.render()
+    env.close()
+    env.close()
+    for use in (env.reset, env.render, lambda: env.step(np.zeros(5, dtype=np.float32))):
+        with pytest.raises(TaskError, match="this environment is closed"):
+            use()
+
+
+@pytest.mark.parametrize(
+    ("action", "says"),
+    [
+        (np.zeros(23, dtype=np.float32), r"shape \(23,\); expected \(5,\): arm_base, arm_shoulder"),
+        (np.float32(0), r"shape \(\); expected \(5,\)"),
+        (np.full(5, np.nan, dtype=np.float32), "not finite"),
+    ],
+)
+def test_an_action_that_is_none_is_refused(make, action, says):
+    env = make(registration.REACH).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(TaskError, match=says):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("made", "options", "error", "says"),
+    [
+        (ReachEnv, {"robot": "ur5-plain"}, CompositionError, "did you mean 'plane'"),
+        (ReachEnv, {"sim": "bullet"}, TaskError, "did you mean 'pybullet'"),
+        (ReachEnv, {"kind": "discreet"}, TaskError, "did you mean 'discrete'"),
+        (ReachEnv, {"render_mode": "rgb"}, TaskError, "did you mean 'rgb_array'"),
+        (ReachEnv, {"config": PUSH}, TaskError, "PushConfig is not the config of reach"),
+        (PushEnv, {"config": REACH}, TaskError, "ReachConfig is not the config of push"),
+    ],
+)
+def test_wrong_options_are_refused(made, options, error, says, cache):
+    config = REACH if made is ReachEnv else PUSH
+    given = {"robot": "arm3-stick", "config": config, "cache": cache} | options
+    with pytest.raises(error, match=says):
+        made(**given)

@@ -1,0 +1,80 @@
+"""A robot goes by many names, and a wrong one is told what was meant."""
+
+from pathlib import Path
+
+import pytest
+
+import morphgen
+from morphgen.benchmark.split import robot_hash
+from morphgen.errors import CompositionError, FormatError, PartError
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.model.geometry import Mesh
+from morphgen.tasks.robots import robot_of
+from robots import arm
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("gantry-cube", "base=gantry ee=cube"),
+        ("arm3-stick", "arm=arm3 ee=stick"),
+        ("pedestal-arm3-stick", "base=pedestal arm=arm3 ee=stick"),
+        ("z1", "arm=z1"),
+        ("prims", "prims"),
+        ("chain beads=4", "chain beads=4"),
+        ("arm=arm3 ee=stick ee.length=0.3", "arm=arm3 ee=stick ee.length=0.3"),
+    ],
+)
+def test_names_are_words_of_compose(given, words):
+    expected = morphgen.compose(words, geometry="primitive")
+    assert robot_of(given).name == expected.name
+    assert robot_hash(robot_of(given)) == robot_hash(expected)
+
+
+def test_a_robot_is_itself():
+    robot = arm()
+    assert robot_of(robot) is robot
+
+
+def test_collision_shapes_are_primitives_unless_meshes_are_asked_for():
+    def has_meshes(robot):
+        shapes = (shape for link in robot.links for shape in link.collisions)
+        return any(isinstance(shape.geometry, Mesh) for shape in shapes)
+
+    assert not has_meshes(robot_of("ur5-plane"))
+    assert has_meshes(robot_of("ur5-plane", geometry="mesh"))
+
+
+def test_files_are_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = morphgen.write(arm(), "bundles", picture=False)
+    Path("own.urdf").write_text(urdf_text(arm(), str))
+    for given in (folder, str(folder), "bundles/arm", "own.urdf", Path("own.urdf")):
+        assert robot_of(given).dof == arm().dof
+
+
+def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("prims").mkdir()
+    assert robot_of("prims").name == "prims"
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "says"),
+    [
+        ("ur5-plain", CompositionError, "'plain' is no part; did you mean 'plane'?"),
+        ("prismz", CompositionError, "did you mean 'prims'?"),
+        ("chian beads=4", CompositionError, "did you mean 'chain'?"),
+        ("bead", CompositionError, "'bead' is a segment, which only a grammar can place"),
+        ("ur5-ur10", CompositionError, "arm is given twice: ur5 and ur10"),
+        ("arm=ur5 ee=plain", PartError, "did you mean 'plane'?"),
+        ("robots/missing", FormatError, "robots/missing: no such file"),
+        ("missing.urdf", FormatError, "missing.urdf: no such file"),
+        (Path("missing"), FormatError, "missing: no such file"),
+        (" ", CompositionError, "no robot is named"),
+    ],
+)
+def test_a_wrong_name_says_what_is_near(given, error, says):
+    with pytest.raises(error) as caught:
+        robot_of(given)
+    assert says in str(caught.value)

@@ -1,0 +1,219 @@
+"""A batch for loops of Gymnasium's vector environments and for stable-baselines3."""
+
+import sys
+import warnings
+from contextlib import closing
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
+
+from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.tasks import make_batch, registration
+from morphgen.tasks.config import BINS, PushConfig, ReachConfig
+from morphgen.tasks.vector import TaskVector, sb3_vector
+
+ROBOTS, TASKS = ["arm3-stick", "prims"], ["reach", "push"]
+REACH, PUSH = ReachConfig(steps=12, goals=5), PushConfig(steps=9, starts=5)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("goals")
+
+
+@pytest.fixture
+def batch_of(cache):
+    """Make batches of two bodies at two tasks, one of them with obstacles."""
+    made = []
+
+    def of(num_envs=4, **options):
+        given = {"sim": "mujoco", "reach": REACH, "push": PUSH, "cache": cache} | options
+        made.append(make_batch(TASKS, ROBOTS, num_envs, obstacles=[True, False], **given))
+        return made[-1]
+
+    yield of
+    for batch in made:
+        batch.close()
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_spaces_hold_what_is_seen_and_done(batch_of, kind):
+    batch = batch_of(kind=kind)
+    envs = TaskVector(batch)
+    links = batch.bodies.max_links
+    if kind == "discrete":
+        assert envs.single_action_space.nvec.tolist() == [len(BINS)] * links
+    else:
+        assert envs.single_action_space.shape == (links,)
+    seen, infos = envs.reset(seed=0)
+    assert infos == {}
+    for _ in range(15):
+        assert seen in envs.observation_space
+        assert {name: v.shape for name, v in seen.items()} == {
+            name: (4, *space.shape) for name, space in envs.single_observation_space.items()
+        }
+        seen, *_ = envs.step(envs.action_space.sample())
+
+
+def test_what_is_empty_is_not_observed(cache):
+    batch = make_batch("reach", ROBOTS[:1], 2, sim="mujoco", reach=REACH, cache=cache)
+    with closing(TaskVector(batch)) as envs:
+        assert "obstacles" in batch.observe()
+        assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
+
+
+def test_steps_are_those_of_the_batch(batch_of):
+    batch, envs = batch_of(seed=3), TaskVector(batch_of(seed=99))
+    expected, (seen, _) = batch.reset(), envs.reset(seed=3)
+    rng = np.random.default_rng(0)
+    for _ in range(2 * REACH.steps):
+        for name, values in seen.items():
+            wide = expected[name].reshape(values.shape).numpy()
+            assert np.array_equal(values, wide), name
+        actions = rng.uniform(-1, 1, (4, batch.bodies.max_links)).astype(np.float32)
+        step = batch.step(torch.from_numpy(actions))
+        seen, reward, terminated, truncated, infos = envs.step(actions)
+        expected = step.observation
+        assert np.array_equal(reward, step.reward.numpy())
+        assert np.array_equal(terminated, step.terminated.numpy())
+        assert np.array_equal(truncated, step.truncated.numpy())
+        assert np.array_equal(infos["distance"], step.distance.numpy())
+        for name, term in step.terms.items():
+            assert np.array_equal(infos["terms"][name], term.numpy())
+
+
+def test_where_an_episode_ends_the_next_begins_and_the_last_is_told(batch_of):
+    envs = TaskVector(batch_of())
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    envs.reset(seed=0)
+    actions = np.full(envs.action_space.shape, 0.3, dtype=np.float32)
+    for k in range(1, REACH.steps + 1):
+        seen, _, terminated, truncated, infos = envs.step(actions)
+        over = np.array([k == REACH.steps, k == PUSH.steps] * 2)
+        assert not terminated.any()
+        assert np.array_equal(truncated, over)
+        assert np.array_equal(infos["_success"], ~over)
+        assert ("final_obs" in infos) == over.any()
+        if not over.any():
+            continue
+        assert np.array_equal(infos["_final_obs"], over)
+        assert np.array_equal(infos["final_info"]["_score"], over)
+        assert np.array_equal(infos["final_info"]["terms"]["_distance"], over)
+        for env, final in enumerate(infos["final_obs"]):
+            assert (final is not None) == over[env]
+            if over[env]:
+                assert final in envs.single_observation_space
+                assert not np.array_equal(final["tokens"], seen["tokens"][env])
+
+
+def test_nothing_that_is_returned_changes_later(batch_of):
+    envs = TaskVector(batch_of())
+    kept = []
+    seen, _ = envs.reset(seed=0)
+    for _ in range(REACH.steps + 1):
+        kept.append((seen, {name: values.copy() for name, values in seen.items()}))
+        seen, *_ = envs.step(envs.action_space.sample())
+    for later, then in kept:
+        assert all(np.array_equal(later[name], then[name]) for name in then)
+    first, second = (envs.step(envs.action_space.sample())[0] for _ in range(2))
+    assert not any(np.shares_memory(first[name], second[name]) for name in first)
+
+
+def test_a_loop_as_of_cleanrl_runs(batch_of):
+    """Statistics of episodes, values of final observations, everything in preallocated rows."""
+    envs = RecordEpisodeStatistics(TaskVector(batch_of()))
+    envs.reset(seed=1)
+    rewards, dones = np.zeros((50, 4)), np.zeros((50, 4), dtype=bool)
+    returns, bootstrapped = [], 0
+    envs.action_space.seed(0)
+    for t in range(50):
+        _, rewards[t], terminated, truncated, infos = envs.step(envs.action_space.sample())
+        dones[t] = terminated | truncated
+        if "final_info" in infos:
+            returns += infos["episode"]["r"][infos["_episode"]].tolist()
+            rows = [infos["final_obs"][env]["tokens"] for env in np.flatnonzero(truncated)]
+            bootstrapped += len(torch.as_tensor(np.array(rows)))
+    assert bootstrapped == dones.sum() == len(returns) == 2 * (50 // 12) + 2 * (50 // 9)
+    ends = np.flatnonzero(dones[:, 0])
+    assert returns[2] == pytest.approx(rewards[: ends[0] + 1, 0].sum(), rel=1e-5)
+    envs.close()
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_ppo_of_stable_baselines3_learns(batch_of, kind):
+    envs = VecMonitor(sb3_vector(batch_of(kind=kind)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = PPO("MultiInputPolicy", envs, n_steps=24, batch_size=48, n_epochs=1, seed=0)
+        before = torch.cat([each.detach().flatten() for each in model.policy.parameters()])
+        model.learn(2 * 24 * 4)
+    after = torch.cat([each.detach().flatten() for each in model.policy.parameters()])
+    assert not torch.equal(before, after)
+    assert torch.isfinite(after).all()
+    assert model.num_timesteps == 2 * 24 * 4
+    assert {episode["l"] for episode in model.ep_info_buffer} == {REACH.steps, PUSH.steps}
+    assert len(model.ep_success_buffer) == len(model.ep_info_buffer)
+
+
+def test_stable_baselines3_is_told_how_episodes_ended(batch_of):
+    envs = sb3_vector(batch_of())
+    envs.seed(3)
+    first = envs.reset()["goal"]
+    assert np.array_equal(first, TaskVector(batch_of(seed=3)).reset()[0]["goal"])
+    for _ in range(PUSH.steps):
+        seen, _, dones, infos = envs.step(np.zeros((4, 23), dtype=np.float32))
+    assert dones.tolist() == [False, True] * 2
+    for env, info in enumerate(infos):
+        assert {"distance", "score"} <= set(info)
+        assert ("terminal_observation" in info) == dones[env]
+        if dones[env]:
+            assert info["TimeLimit.truncated"] is True
+            assert info["is_success"] is False
+            assert set(info["terminal_observation"]) == set(seen)
+
+
+def test_stable_baselines3_asks_for_attributes(batch_of):
+    envs = sb3_vector(batch_of())
+    assert envs.get_attr("num_envs", [0, 2]) == [4, 4]
+    assert envs.env_is_wrapped(gym.Wrapper) == [False] * 4
+    envs.set_attr("label", "x")
+    assert envs.get_attr("label") == ["x"] * 4
+    seen, _ = envs.env_method("reset", seed=1)[0]
+    assert seen in envs.vector.observation_space
+    with pytest.raises(TaskError, match="in common"):
+        envs.set_attr("label", "y", indices=0)
+
+
+def test_without_stable_baselines3_the_error_says_what_to_install(batch_of, monkeypatch):
+    monkeypatch.delitem(sys.modules, "morphgen.tasks.sb3", raising=False)
+    for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:
+        monkeypatch.delitem(sys.modules, name)
+
+    class Missing:
+        def find_spec(self, name, path=None, target=None):
+            if name == "stable_baselines3":
+                raise ModuleNotFoundError(name, name=name)
+
+    monkeypatch.setattr(sys, "meta_path", [Missing(), *sys.meta_path])
+    with pytest.raises(MissingDependencyError, match="pip install stable-baselines3"):
+        sb3_vector(batch_of())
+
+
+def test_gymnasium_makes_vectors_of_several_robots(cache):
+    registration.register()
+    options = {"robots": ["prims", "arm3-stick"], "sim": "mujoco", "push": PUSH, "cache": cache}
+    envs = gym.make_vec(registration.PUSH, num_envs=3, **options)
+    assert [each.robot.name for each in envs.batch.settings] == ["prims", "arm3-stick"]
+    assert envs.reset(seed=0)[0] in envs.observation_space
+    envs.close()
+    envs.close()
+    with pytest.raises(TaskError, match="these environments are closed"):
+        envs.step(envs.action_space.sample())
+    with pytest.raises(TaskError, match="these environments are closed"):
+        envs.reset()
