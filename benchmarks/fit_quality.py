@@ -1,9 +1,18 @@
 """How well primitives stand for links, beside trimesh's tightest bound and scikit-robot.
 
-    python benchmarks/fit_quality.py [--only ur5,panda] [--jobs 2] [--json rows.json]
+    python benchmarks/fit_quality.py [--only ur5,panda] [--solid link,as-read] [--jobs 2]
+                                     [--json rows.json]
 
 Every link of every real arm, the same solid and the same measure for all, that of
-`morphgen.fitting.quality`. A row an arm, means over its links (links with the same meshes
+`morphgen.fitting.quality`. A table for each solid:
+
+- ``link``: what `morphgen.fitting.solid` takes for the inside of the link.
+- ``as-read``: a mesh's own triangles if trimesh finds them closed just as it reads the file, and
+  the convex hull of any other mesh. COLLADA files, whose vertices are split at sharp edges, are
+  never closed so, and their links (all of the Jaco's) become fuller than they are.
+- ``hull``: the convex hull of each mesh, which is what simulators collide with.
+
+A row an arm, means over its links (links with the same meshes
 are fitted once):
 
 - IoU of one primitive: trimesh's tightest of oriented box, cylinder and sphere (what AnyBody uses),
@@ -22,14 +31,14 @@ import json
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import trimesh
@@ -39,11 +48,13 @@ from tqdm import tqdm
 from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, fit_solid
 from morphgen.fitting.quality import Array, quality
-from morphgen.fitting.solid import Solid, solid_of
+from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
 from morphgen.fitting.stored import shapes_key
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.inertia import solid_mesh
+from morphgen.model.mesh import is_flat, load_mesh
 
 T = TypeVar("T")
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
@@ -81,34 +92,45 @@ def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="arms, separated by commas")
+    parser.add_argument("--solid", default="link", help=f"of {', '.join(SOLIDS)}; by commas")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write a row a link here")
     args = parser.parse_args()
+    solids = args.solid.split(",")
+    if unknown := set(solids) - set(SOLIDS):
+        parser.error(f"no solid {', '.join(sorted(unknown))}; valid: {', '.join(SOLIDS)}")
     peer = find_spec("skrobot") is not None
-    tasks = _tasks({name for name in args.only.split(",") if name})
-    found: dict[str, list[dict[str, float]]] = defaultdict(list)
-    lines = []
+    tasks = link_tasks({name for name in args.only.split(",") if name})
     unique = {shapes_key(task.shapes): task for task in tasks}
-    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-        measured = pool.map(partial(_measure, peer=peer), unique.values())
-        row_of = dict(zip(unique, tqdm(measured, total=len(unique), unit="link"), strict=True))
-    for task in tasks:
-        row = row_of[shapes_key(task.shapes)]
-        found[task.arm].append(row)
-        lines.append({"arm": task.arm, "link": task.link, **row})
+    lines = []
+    for name in solids:
+        with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
+            measured = pool.map(partial(_measure, solid_name=name, peer=peer), unique.values())
+            row_of = dict(zip(unique, tqdm(measured, total=len(unique), unit="link"), strict=True))
+        found: dict[str, list[dict[str, float]]] = defaultdict(list)
+        for task in tasks:
+            row = row_of[shapes_key(task.shapes)]
+            found[task.arm].append(row)
+            lines.append({"solid": name, "arm": task.arm, "link": task.link, **row})
+        print(f"\nsolid: {name}")
+        _print(found, peer)
     if args.json:
         args.json.write_text(json.dumps(lines, indent=1) + "\n", encoding="utf-8")
-    columns = [name for name in COLUMNS if peer or "skrobot" not in name]
-    rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
-    table = [*rows, *_means("mean of all arms", rows)]
-    table += _means(f"mean of {', '.join(FOUR)}", [row for row in rows if row[0] in FOUR])
-    print(tabulate(table, ["arm", *columns], floatfmt=".3f"))
     if not peer:
         print("scikit-robot is not installed: no peer in this run (pip install 'morphgen[bench]')")
     return 0
 
 
-def _tasks(only: set[str]) -> list[Task]:
+def _print(found: Mapping[str, Sequence[dict[str, float]]], peer: bool) -> None:
+    columns = [name for name in COLUMNS if peer or "skrobot" not in name]
+    rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
+    table = [*rows, *_means("mean of all arms", rows)]
+    table += _means(f"mean of {', '.join(FOUR)}", [row for row in rows if row[0] in FOUR])
+    print(tabulate(table, ["arm", *columns], floatfmt=".3f"))
+
+
+def link_tasks(only: set[str]) -> list[Task]:
+    """The links with shapes of the real arms, of all of them if none is named."""
     return [
         Task(manifest.name, link.name, link_shapes(link))
         for manifest in default_library().manifests("arm")
@@ -119,8 +141,43 @@ def _tasks(only: set[str]) -> list[Task]:
     ]
 
 
-def _measure(task: Task, *, peer: bool) -> dict[str, float]:
-    solid = solid_of(task.shapes)
+def _hull(shapes: Sequence[Shape]) -> Solid:
+    return _joined([trimesh.convex.convex_hull(mesh) for mesh, _ in _meshes(shapes)])
+
+
+def _as_read(shapes: Sequence[Shape]) -> Solid:
+    found = []
+    for mesh, is_closed in _meshes(shapes):
+        solid = solid_of_mesh(mesh) if is_closed else None
+        found.append(solid.mesh if solid else trimesh.convex.convex_hull(mesh))
+    return _joined(found)
+
+
+def _meshes(shapes: Sequence[Shape]) -> Iterator[tuple[trimesh.Trimesh, bool]]:
+    """In the link frame, and whether each is closed as its file is read; none that are flat."""
+    for shape in shapes:
+        geometry, is_closed = shape.geometry, True
+        if isinstance(geometry, Mesh):
+            is_closed = bool(trimesh.load_mesh(geometry.path).is_watertight)
+        mesh = (load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)).copy()
+        mesh.apply_transform(shape.T_link_shape.matrix)
+        if not is_flat(np.asarray(mesh.vertices)):
+            yield mesh, is_closed
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> Solid:
+    return Solid(cast(trimesh.Trimesh, trimesh.util.concatenate(meshes)), "watertight")
+
+
+SOLIDS: dict[str, Callable[[Sequence[Shape]], Solid]] = {
+    "link": solid_of,
+    "as-read": _as_read,
+    "hull": _hull,
+}
+
+
+def _measure(task: Task, *, solid_name: str, peer: bool) -> dict[str, float]:
+    solid = SOLIDS[solid_name](task.shapes)
     row = {"iou trimesh": quality(solid, [_tightest(solid)]).iou}
     if peer:
         shape, seconds = _timed(lambda: _scikit_robot(solid))
