@@ -1,0 +1,138 @@
+"""Faults of AnyBody's released code that concern tasks, each with the test that we do not have it.
+
+Others are tested where they would be: goal sets in ``test_goals`` and ``test_split_goals``, the
+slow critic, the deviation of actions and the learning rate in ``tests/rl``.
+"""
+
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+import torch
+
+import morphgen
+from morphgen.model.dynamics import actuation
+from morphgen.rl.references import Random
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.make import batch_of
+from morphgen.tasks.settings import push_setting, reach_setting
+
+SIMS = ("pybullet", "mujoco")
+FEW = replace(ReachConfig(), goals=12, steps=40)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("goals")
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
+
+
+@pytest.mark.parametrize("sim", SIMS)
+def test_joints_are_reset_within_their_limits_and_stay_there(robot, sim, cache):
+    """Their reset at joint limits was computed and discarded."""
+    setting = reach_setting(robot, FEW, obstacles=False, seed=0, cache=cache)
+    with closing(batch_of([setting], 4, sim=sim, reach=FEW)) as batch:
+        batch.reset()
+        low, high = batch.bodies.lower, batch.bodies.upper
+        outwards = torch.ones(batch.mask.shape)
+        for k in range(2 * FEW.steps):
+            assert (batch.targets >= low).all()
+            assert (batch.targets <= high).all()
+            step = batch.step(outwards)
+            assert (step.q >= low - 0.02).all()
+            assert (step.q <= high + 0.02).all(), k
+            if step.truncated.any():
+                starts = torch.from_numpy(setting.goals.q).float()
+                apart = (batch.q[:, None] - starts).abs().amax(dim=2).amin(dim=1)
+                assert apart.max() < 1e-6
+
+
+@pytest.mark.parametrize("sim", SIMS)
+def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
+    """Theirs were computed for each robot and never used.
+
+    Ten times the inertia has ten times the stiffness, so that the body moves as before.
+    """
+    heavy = robot.with_links(
+        [
+            replace(
+                link,
+                inertial=replace(
+                    link.inertial,
+                    mass=10 * link.inertial.mass,
+                    inertia=tuple(10 * value for value in link.inertial.inertia),
+                ),
+            )
+            if link.inertial is not None
+            else link
+            for link in robot.links
+        ]
+    )
+    strong = [replace(joint, effort=None if joint.effort is None else 100 * joint.effort)
+              for joint in heavy.joints]  # fmt: skip
+    heavy = replace(heavy, joints=tuple(strong))
+    light_stiffness, heavy_stiffness = (
+        [each.stiffness for each in actuation(body)] for body in (robot, heavy)
+    )
+    assert heavy_stiffness == pytest.approx([10 * value for value in light_stiffness], rel=0.05)
+    ends = []
+    for body in (robot, heavy):
+        setting = reach_setting(body, FEW, obstacles=False, seed=0, cache=cache)
+        with closing(batch_of([setting], 1, sim=sim, reach=FEW)) as batch:
+            batch.reset()
+            start = torch.tensor(body.home)[None].float()
+            batch.simulation.reset(torch.tensor([0]), start, torch.zeros(1, 7))
+            for _ in range(15):
+                batch.simulation.step(start + 0.1)
+            ends.append(batch.simulation.q.clone())
+    assert (ends[0] - ends[1]).abs().max() < 0.01
+    assert (ends[0] - torch.tensor(robot.home)).abs().min() > 0.05
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_obstacles_of_an_episode_never_hold_its_goal_or_start(robot, task, cache):
+    """Their goals could lie inside the obstacle that was there at the time."""
+    make = {"reach": reach_setting, "push": push_setting}[task]
+    config = FEW if task == "reach" else replace(PushConfig(), starts=6, steps=40)
+    setting = make(robot, config, obstacles=True, seed=0, cache=cache)
+    space = FreeSpace(setting.scene)
+    with closing(batch_of([setting], 6, sim="mujoco", reach=FEW)) as batch:
+        for seed in range(3):
+            batch.reset(seed)
+            blocks = batch.simulation.block_pose.numpy() if task == "push" else None
+            assert space.free(batch.q.numpy(), blocks).all()
+            if task == "reach":
+                assert space.free(batch.witness.numpy()).all()
+
+
+def test_one_goal_holds_for_the_whole_episode(robot, cache):
+    """Theirs was drawn again inside the episode."""
+    setting = reach_setting(robot, FEW, obstacles=False, seed=0, cache=cache)
+    with closing(batch_of([setting], 3, sim="mujoco", reach=FEW)) as batch:
+        batch.reset()
+        goal, acting = batch.goal.clone(), Random(0)
+        for _ in range(FEW.steps - 1):
+            batch.step(acting.act(batch))
+            assert torch.equal(batch.goal, goal)
+        batch.step(acting.act(batch))
+        assert not torch.equal(batch.goal, goal)
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_episodes_follow_their_seed(robot, task, cache):
+    """Generators of theirs had none."""
+    make = {"reach": reach_setting, "push": push_setting}[task]
+    config = FEW if task == "reach" else replace(PushConfig(), starts=6)
+    setting = make(robot, config, obstacles=False, seed=0, cache=cache)
+    seen = []
+    for seed in (5, 5, 6):
+        with closing(batch_of([setting], 4, sim="mujoco", seed=seed)) as batch:
+            batch.reset()
+            seen.append(torch.cat([batch.q, batch.goal, batch.simulation.block_pose], dim=1))
+    assert torch.equal(seen[0], seen[1])
+    assert not torch.equal(seen[0], seen[2])
