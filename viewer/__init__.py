@@ -1,1 +1,1 @@
-"""The page on which robots are looked at."""
+"""Pages in a browser on which robots are looked at, composed and compared."""

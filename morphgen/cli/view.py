@@ -1,39 +1,58 @@
-"""``morphgen view``: a robot in the browser."""
+"""``morphgen view``: robots in the browser."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import sys
 
-from morphgen.cli.options import Subparsers
+from morphgen.cli.options import Subparsers, add_library
+
+LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "view",
-        help="show a bundle in the browser, with a slider a joint",
-        description="Show a bundle in the browser, with a slider a joint, until interrupted.",
+        help="look at robots in the browser: browse, compose, compare",
+        description="Look at robots in the browser, until interrupted. Without a target: the "
+        "library, the splits and the robots of this folder.",
+        epilog="examples: morphgen view; morphgen view robots/arm3; "
+        "morphgen view extrapolation/arms/reach; morphgen view arm=ur5 ee=plane; "
+        "morphgen view some.urdf",
     )
-    parser.add_argument("bundle", type=Path, help="a bundle's folder")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="TARGET",
+        help="a folder of robots, a bundle, a URDF or xacro, a split's name or file, a grammar, or "
+        "words as for morphgen compose",
+    )
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to bind (default: this machine)"
     )
     parser.add_argument("--port", type=int, default=8080)
+    add_library(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted."""
     from morphgen.errors import MorphgenError
-    from morphgen.viewer.page import serve
+    from morphgen.viewer.app import serve
 
     if not 0 < args.port < 65536:
         raise MorphgenError(f"--port {args.port}: expected 1 to 65535")
-    server = serve(args.bundle, args.host, args.port)
-    print(f"http://{args.host}:{server.get_port()}  (stop with Ctrl-C)", flush=True)
+    viewer = serve(args.words, args.host, args.port, args.library)
+    if args.host not in LOCAL:
+        print(
+            f"morphgen: warning: --host {args.host}: whoever can reach this machine can use this "
+            "page, see the robots of this folder and write into it; there is no password",
+            file=sys.stderr,
+        )
+    print(f"http://{args.host}:{viewer.port}  (stop with Ctrl-C)", flush=True)
     try:
-        server.sleep_forever()
+        viewer.server.sleep_forever()
     except KeyboardInterrupt:
-        server.stop()
+        viewer.stop()
     return 0

@@ -1,0 +1,56 @@
+"""Draw reach and push of three bodies: docs/images/tasks/{reach,push}.png, a row a body.
+
+    python docs/task_pictures.py [--seed 1]
+
+Five moments of an episode of inverse kinematics, or of the scripted push, in PyBullet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from morphgen.benchmark.split import TASKS, Task
+from morphgen.rl.play import controller, play
+from morphgen.tasks.gym_env import PushEnv, ReachEnv
+
+ROBOTS = ("ur5-plane", "prims", "chain beads=3")
+MOMENTS = 5
+SIZE = (320, 240)
+
+
+def main() -> int:
+    """Play and draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "images" / "tasks", help="folder"
+    )
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    for task in TASKS:
+        rows = [_row(task, robot, args.seed) for robot in ROBOTS]
+        path = args.out / f"{task}.png"
+        Image.fromarray(np.concatenate(rows)).save(path)
+        print(path)
+    return 0
+
+
+def _row(task: Task, robot: str, seed: int) -> np.ndarray:
+    made, policy = {"reach": (ReachEnv, "ik"), "push": (PushEnv, "scripted")}[task]
+    with closing(made(robot, render_mode="rgb_array", size=SIZE)) as env:
+        acting = controller(policy, env, seed)
+        frames = list(play(env, acting, 1, seed, lambda episode: print(robot, episode)))
+    # A reach is over long before its time is.
+    last = len(frames) // 4 if task == "reach" else len(frames)
+    chosen = np.linspace(0, last - 1, MOMENTS).round().astype(int)
+    return np.concatenate([frames[i] for i in chosen], axis=1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

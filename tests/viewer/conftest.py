@@ -1,0 +1,132 @@
+"""A viewer on small robots, and a browser without a screen to look at it."""
+
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from morphgen.formats.bundle import write_bundle
+from morphgen.grammar.library import default_library
+from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
+from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
+from morphgen.viewer.app import serve
+from robots import arm
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+NO_WARNING = """
+new MutationObserver(() => {
+  for (const note of document.querySelectorAll(".mantine-Notification-root"))
+    if (note.textContent.includes("Software WebGL")) note.remove();
+}).observe(document, {childList: true, subtree: true});
+"""
+"""viser's notice that there is no GPU would lie over the page."""
+WAIT = 120_000
+"""How long a page may take on a busy machine, milliseconds."""
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """A browser; every test opens pages of its own."""
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
+    )
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip("there is no chromium (apt-get install chromium)")
+    sandbox = () if os.geteuid() else ("--no-sandbox",)
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=path, args=[*SOFTWARE_GL, *sandbox])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """A folder with a set of robots, and one of bundles of which one is broken."""
+    root = tmp_path_factory.mktemp("here")
+    library = default_library()
+    grammar = load_grammar(find_grammar("prims", library.folders), library.folders)
+    plan = SetPlan(
+        root / "robots" / "prims", "prims", grammar_text(grammar), 0, (), True, False, ()
+    )
+    make_set(plan, 30, make_serially)
+    write_bundle(arm(), root / "robots" / "some-arm", picture=False)
+    broken = write_bundle(arm(), root / "robots" / "broken", picture=False)
+    text = (broken / "robot.urdf").read_text()
+    (broken / "robot.urdf").write_text(text.replace('<child link="lower"', '<child link="lost"'))
+    return root
+
+
+@pytest.fixture
+def viewer(folder, monkeypatch, tmp_path):
+    """Start viewers in the folder; they are stopped after the test."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    started = []
+
+    def start(*words, **options):
+        started.append(serve(words, port=0, **options))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.stop()
+
+
+@pytest.fixture
+def see(chromium, viewer, request):
+    """Open the page of a query, of a new viewer unless one is given."""
+    with _pages(chromium) as open_page:
+
+        def see_query(query="", *, on=None, width=1400, height=900):
+            on = on or viewer()
+            return open_page(f"http://127.0.0.1:{on.port}/{query}", width, height)
+
+        yield see_query
+
+
+@contextmanager
+def _pages(browser):
+    contexts = []
+
+    def open_page(url, width, height):
+        context = browser.new_context(viewport={"width": width, "height": height})
+        context.set_default_timeout(WAIT)
+        contexts.append(context)
+        context.add_init_script(NO_WARNING)
+        page = context.new_page()
+        page.failures = []
+        page.on("pageerror", lambda error: page.failures.append(str(error)))
+        page.goto(url)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture
+def control():
+    """Find viser's controls in a page by their labels."""
+
+    def labelled(page, label):
+        return page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]//input")
+
+    return SimpleNamespace(input=labelled)
+
+
+@pytest.fixture
+def picture(request):
+    """Write a screenshot for a person to look at, if ``MORPHGEN_SCREENSHOTS`` names a folder."""
+    folder = os.environ.get("MORPHGEN_SCREENSHOTS")
+
+    def write(page, name=None):
+        if folder:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            page.screenshot(path=Path(folder) / f"{name or request.node.name}.png")
+
+    return write

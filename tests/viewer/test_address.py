@@ -1,0 +1,44 @@
+"""Addresses are read as they are written."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from morphgen.viewer.address import PAGES, Address, AddressError, parse_address
+
+KEYS = st.from_regex(r"[a-z][a-z_ ]{0,8}", fullmatch=True)
+TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
+
+
+@given(
+    st.sampled_from(PAGES),
+    st.lists(TEXTS, min_size=1, max_size=4),
+    st.dictionaries(KEYS.filter(lambda key: key not in PAGES), TEXTS.filter(bool)),
+)
+def test_what_is_written_is_read(page, of, state):
+    address = Address(page, tuple(of), state)
+    assert parse_address(address.query) == address
+
+
+def test_a_place_stays_readable():
+    address = Address("robot", ("words:arm=ur5 ee=plane",), {"q": "0.1,-2"})
+    assert address.query == "?robot=words:arm=ur5%20ee=plane&q=0.1,-2"
+
+
+def test_no_query_is_the_first_page():
+    assert parse_address("") is None
+    assert parse_address("?") is None
+
+
+@pytest.mark.parametrize(
+    ("query", "why"),
+    [("?robbot=a", "did you mean 'robot'"), ("?robot=a&split=b", "two pages: robot and split")],
+)
+def test_what_leads_nowhere_is_refused(query, why):
+    with pytest.raises(AddressError, match=why):
+        parse_address(query)
+
+
+def test_state_at_its_default_is_left_out():
+    address = Address("gallery", ("robots",), {"n": "2", "sort": "name"})
+    assert address.with_state(n="", sort="-mass").query == "?gallery=robots&sort=-mass"

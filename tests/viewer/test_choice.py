@@ -1,0 +1,122 @@
+"""The compose panel says in words what its controls show."""
+
+import pytest
+
+from morphgen.errors import MorphgenError
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_words
+from morphgen.viewer.choice import (
+    NOTHING,
+    controls_of,
+    first_parts,
+    options,
+    parse_choice,
+    slots_of,
+    with_part,
+    with_value,
+)
+
+LIBRARY = default_library()
+WORDS = "base=pedestal left.arm=ur5 left.ee=plane right.ee=stick left.ee.size=0.1 base.height=0.7"
+
+
+def test_words_come_back():
+    choice = parse_choice(WORDS.split(), LIBRARY)
+    again = parse_choice(choice.words.split(), LIBRARY)
+    assert again == choice
+    assert parse_words(choice.words.split(), LIBRARY) == parse_words(WORDS.split(), LIBRARY)
+
+
+@pytest.mark.parametrize("bad", ["arm", "arm=ur5 ee.size=1", "arm=ur5 arm.size=1", "arm=ur6"])
+def test_bad_words_are_refused(bad):
+    with pytest.raises(MorphgenError):
+        parse_choice(bad.split(), LIBRARY)
+
+
+@pytest.mark.parametrize(
+    ("words", "slots"),
+    [
+        ("ee=stick", "arm ee left.arm left.ee right.arm right.ee"),
+        ("arm=ur5", "arm ee left.arm right.arm"),
+        ("arm=ur5 left.arm=ur5", "arm ee left.arm left.ee right.arm"),
+        ("arm=yumi", "arm left.ee right.ee left.arm right.arm"),
+        ("base=gantry arm=ur5", "arm ee"),
+    ],
+)
+def test_parts_offer_slots_and_each_can_be_filled(words, slots):
+    choice = parse_choice(words.split(), LIBRARY)
+    assert slots_of(choice, LIBRARY) == slots.split()
+    for slot in slots.split():
+        part = "ur5" if slot.endswith("arm") else "stick"
+        filled = with_part(choice, slot, part, LIBRARY)
+        assert filled.parts[slot] == part
+        parse_words(filled.words.split(), LIBRARY)
+
+
+def test_options_begin_with_nothing():
+    assert options("left.arm", LIBRARY)[0] == NOTHING
+    assert "none" not in options("ee", LIBRARY)
+
+
+def test_every_parameter_has_a_control_with_its_range():
+    manifest = LIBRARY.manifest("arm3")
+    controls = {control.key: control for control in controls_of("arm", manifest)}
+    assert controls.keys() == {"arm.length", "arm.radius", "arm.wrist", "arm.mount_yaw"}
+    length = controls["arm.length"]
+    assert (length.low, length.high, length.default, length.label) == (0.1, 0.5, 0.3, "length (m)")
+    assert controls["arm.wrist"].step == 1.0
+    assert "arm.mount_yaw" not in {c.key for c in controls_of("base", LIBRARY.manifest("pedestal"))}
+
+
+TEMPLATES = [
+    manifest
+    for kind in ("base", "arm", "ee")
+    for manifest in LIBRARY.manifests(kind)
+    if manifest.is_template and manifest.name != "none"
+]
+
+
+@pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
+def test_every_part_takes_both_ends_of_every_control(manifest):
+    name = manifest.name
+    slot = manifest.kind
+    words = f"{slot}={name}" + (" ee=stick" if slot == "base" else "")
+    choice = parse_choice(words.split(), LIBRARY)
+    for control in controls_of(slot, manifest):
+        for value in (control.low, control.high):
+            text = with_value(choice, control, value).words
+            parse_words(text.split(), LIBRARY)
+
+
+def test_another_part_takes_its_parameters_with_it():
+    choice = parse_choice(WORDS.split(), LIBRARY)
+    other = with_part(choice, "left.ee", "stick", LIBRARY)
+    assert "left.ee.size" not in other.values
+    assert other.values == {"base.height": 0.7}
+    assert "left.arm" not in with_part(choice, "left.arm", NOTHING, LIBRARY).parts
+
+
+def test_another_base_keeps_the_limbs_that_it_has_ports_for():
+    choice = parse_choice(["base=pedestal", "arm=ur5", "left.arm=ur5", "left.ee=stick"], LIBRARY)
+    gantry = with_part(choice, "base", "gantry", LIBRARY)
+    assert gantry.words == "base=gantry arm=ur5"
+    planar = with_part(choice, "base", "planar", LIBRARY)
+    assert planar.parts == {**choice.parts, "base": "planar"}
+
+
+def test_a_default_is_not_said():
+    choice = parse_choice(["arm=arm3", "arm.length=0.2"], LIBRARY)
+    control = next(c for c in controls_of("arm", LIBRARY.manifest("arm3")) if c.key == "arm.length")
+    assert with_value(choice, control, control.default).words == "base=fixed arm=arm3"
+    assert with_value(choice, control, 0.4).words == "base=fixed arm=arm3 arm.length=0.4"
+
+
+def test_a_derivation_grows_part_by_part():
+    derivation, name = parse_words(WORDS.split(), LIBRARY)
+    whole = list(derivation.walk())
+    for n in range(1, len(whole) + 1):
+        partial = first_parts(derivation, n)
+        assert [node.label for node in partial.walk()] == [node.label for node in whole[:n]]
+        assert compose(partial, LIBRARY, name).links
+    assert first_parts(derivation, 99) == derivation

@@ -1,0 +1,118 @@
+"""Robots are compared joint by joint, token by token and shape by shape."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_words
+from morphgen.model.kinematics import bounds
+from morphgen.viewer.compare_page import (
+    fit_qualities,
+    fit_table,
+    heat,
+    likeness,
+    likeness_table,
+    parse_places,
+)
+from morphgen.viewer.drawings import heatmap_svg, map_svg
+from morphgen.viewer.joint_roles import all_roles, roles, scaled, with_roles
+from morphgen.viewer.token_figure import differences, tokens_png
+from robots import arm
+
+LIBRARY = default_library()
+
+
+def robot_of(words):
+    derivation, name = parse_words(words.split(), LIBRARY)
+    return compose(derivation, LIBRARY, name)
+
+
+def test_roles_are_places_on_the_way_to_the_tool():
+    assert roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
+    panda = robot_of("arm=panda ee=panda_hand")
+    assert roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
+    assert all_roles([arm(), panda]) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
+
+
+def test_a_role_moves_every_robot_by_the_same_share():
+    for robot in (arm(), robot_of("arm=panda ee=panda_hand")):
+        home = np.array(robot.home)
+        assert with_roles(robot, home, {}) == pytest.approx(home)
+        moved = with_roles(robot, home, {"joint 2": -1.0, "finger 1": 1.0, "joint 99": 1.0})
+        rows = {role: i for i, role in enumerate(roles(robot))}
+        low, high = bounds(robot).T
+        assert moved[rows["joint 2"]] == pytest.approx(low[rows["joint 2"]])
+        assert moved[rows["finger 1"]] == pytest.approx(high[rows["finger 1"]])
+        values = dict(zip(roles(robot), scaled(robot, home), strict=True))
+        assert with_roles(robot, home, values) == pytest.approx(home)
+
+
+def test_differences_are_those_from_the_first():
+    a = np.zeros((2, 48))
+    b = np.zeros((3, 48))
+    b[1, 5] = 0.1
+    same, other = differences([a, b])
+    assert not same.any()
+    assert other[1].nonzero()[0].tolist() == [5]
+    assert other[2].all()
+
+
+def test_the_picture_of_tokens_is_the_same_every_time():
+    tables = [np.linspace(-1, 1, 96).reshape(2, 48), np.zeros((3, 48))]
+    links = [["a", "b"], ["a", "$x$", "c"]]
+    first = tokens_png(["one", "two_$y"], links, tables)
+    assert first == tokens_png(["one", "two_$y"], links, tables)
+    width, height = Image.open(io.BytesIO(first)).size
+    assert width > 800
+    assert height > 200
+
+
+def test_robots_are_like_themselves():
+    robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
+    found = likeness(robots, LIBRARY.folders)
+    assert found.values["cosine"].diagonal() == pytest.approx([1, 1])
+    assert found.values["tree"].diagonal() == pytest.approx([0, 0])
+    assert found.values["tree"][0, 1] > 0
+    table = likeness_table(["<a>", "b"], found)
+    assert "&lt;a&gt; and b" in table
+
+
+def test_fits_have_their_quality():
+    robot = robot_of("arm=ur5 ee=plane")
+    found = fit_qualities(robot, LIBRARY.folders)
+    assert found["ee_plate"][0] == 1.0
+    assert 0.5 < found["arm_forearm_link"][0] < 1.0
+    table = fit_table(robot, found)
+    assert f"{found['arm_forearm_link'][0]:.2f}" in table
+    assert "not fitted yet" in fit_table(robot, {})
+
+
+def test_heat_goes_from_red_over_yellow_to_green():
+    assert heat(0.2) == heat(0.5) == (224, 49, 49)
+    assert heat(0.75) == (250, 200, 30)
+    assert heat(1.0) == (47, 158, 68)
+
+
+def test_places_are_read_a_line_each():
+    assert parse_places(" a \n\nwords:arm=ur5 ee=plane\n") == ("a", "words:arm=ur5 ee=plane")
+
+
+def test_drawings_lead_to_robots_and_escape_names():
+    names, sides = ["<a>", "b"], ["train", "test"]
+    text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), names, sides, ["x y", "z"])
+    assert 'href="?robot=x%20y"' in text
+    assert "&lt;a&gt;" in text
+    assert "<a>" not in text.replace("<a href", "")
+    heatmap = heatmap_svg(np.array([[1.0, 0.3], [0.3, 1.0]]), names, sides, larger=True)
+    assert heatmap.count("<rect") == 4
+    assert "b and &lt;a&gt;: 0.300" in heatmap
+
+
+def test_points_in_one_place_are_drawn():
+    text = map_svg(np.zeros((3, 2)), list("abc"), ["train"] * 3, list("abc"))
+    assert text.count("<circle") == 3
+    assert "nan" not in text

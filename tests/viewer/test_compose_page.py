@@ -1,0 +1,71 @@
+"""Robots are composed in a browser."""
+
+import re
+
+import pytest
+
+from morphgen.formats.bundle import read_bundle
+
+pytestmark = pytest.mark.slow
+
+
+def choose(page, label, option, nth=0):
+    field = page.get_by_text(label, exact=True).nth(nth)
+    field.locator("xpath=ancestor::*[.//input][1]//input").first.click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def test_parts_are_chosen_and_turned_into_words(see, picture):
+    page = see("?compose=arm=arm3 ee=plane")
+    page.get_by_text(re.compile("5 DoF|6 DoF")).first.wait_for()
+    slider = page.get_by_text("length (m)", exact=True)
+    slider.locator("xpath=ancestor::*[.//input][1]//input").last.fill("0.45")
+    page.wait_for_url(re.compile(r"arm\.length=0\.45"))
+    page.get_by_role("tab", name="Get").click()
+    page.get_by_text("morphgen compose base=fixed arm=arm3 ee=plane arm.length=0.45").wait_for()
+    picture(page)
+    assert page.failures == []
+
+
+def test_what_does_not_fit_says_why_and_the_robot_stays(see):
+    page = see("?compose=base=gantry ee=stick")
+    page.get_by_text("DoF").first.wait_for()
+    choose(page, "ee", "(none)", nth=1)
+    page.get_by_text(re.compile("nothing to compose")).wait_for()
+    assert page.get_by_text("gantry-stick").is_visible()
+
+
+def test_a_robot_is_written(see, folder):
+    page = see("?compose=base=planar ee=cube")
+    page.get_by_text("DoF").first.wait_for()
+    page.get_by_role("tab", name="Get").click()
+    name = page.get_by_text("name", exact=True)
+    name.locator("xpath=ancestor::*[.//input][1]//input").fill("by-hand")
+    page.get_by_role("button", name="Write to robots/").click()
+    page.get_by_text("Written", exact=True).wait_for()
+    assert read_bundle(folder / "robots" / "by-hand").name == "planar-cube"
+    assert (folder / "robots" / "by-hand" / "preview.png").is_file()
+
+
+def test_a_grammar_is_edited_drawn_and_stepped_through(see, picture):
+    page = see("?compose=planar_arm")
+    page.get_by_text("Derivation").first.wait_for()
+    page.get_by_role("button", name="next").click()
+    page.wait_for_url(re.compile(r"seed=0&number=1"))
+    page.get_by_text("planar_arm-000001").wait_for()
+    picture(page)
+    text = page.locator("textarea").first
+    whole = text.input_value()
+    text.fill(whole.replace("->", "-> nosuchpart |", 1))
+    page.get_by_text(re.compile(r"planar_arm:\d+:\d+")).first.wait_for()
+    text.fill(whole)
+    page.get_by_text(re.compile(r"planar_arm:\d+:\d+")).first.wait_for(state="detached")
+    steps = page.get_by_text("parts shown", exact=True)
+    steps.locator("xpath=ancestor::*[.//input][1]//input").last.fill("1")
+    page.locator("pre .dim").first.wait_for()
+    assert page.failures == []
+
+
+def test_a_drawn_robot_has_an_address(see):
+    page = see("?compose=chain&seed=3&number=2")
+    page.get_by_text("chain-000002").wait_for()

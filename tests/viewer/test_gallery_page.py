@@ -1,0 +1,100 @@
+"""Galleries in a browser."""
+
+import re
+
+import pytest
+
+from morphgen.benchmark.split_file import read_split
+
+
+def names(page):
+    return page.locator(".card .name").all_inner_texts()
+
+
+def wait_for_names(page, wanted):
+    for name in wanted:
+        page.locator(".card .name", has_text=name).wait_for()
+
+
+def test_a_set_is_shown_and_a_click_opens_a_robot(see):
+    page = see("?gallery=robots/prims")
+    page.locator(".card").first.wait_for()
+    assert names(page) == [f"prims-{i:06d}" for i in range(24)]
+    assert page.get_by_text("30 robots · page 1 of 2").is_visible()
+    href = page.locator(".card").nth(3).get_attribute("href")
+    assert href == "?robot=robots/prims/prims-000003"
+    assert page.failures == []
+
+
+@pytest.mark.slow
+def test_rows_are_searched_and_the_address_says_so(see, control):
+    page = see("?gallery=robots/prims")
+    page.locator(".card").first.wait_for()
+    control.input(page, "Search").fill("00000")
+    page.get_by_text("10 of 30 robots").wait_for()
+    assert names(page) == [f"prims-{i:06d}" for i in range(10)]
+    page.wait_for_url(re.compile(r"search=00000"))
+    page.reload()
+    page.get_by_text("10 of 30 robots").wait_for()
+
+
+@pytest.mark.slow
+def test_pages_are_turned(see):
+    page = see("?gallery=robots/prims&sort=-name")
+    page.locator(".card").first.wait_for()
+    assert names(page)[0] == "prims-000029"
+    page.get_by_role("button", name="next").click()
+    page.get_by_text("page 2 of 2").wait_for()
+    assert names(page) == [f"prims-{i:06d}" for i in range(5, -1, -1)]
+    page.wait_for_url(re.compile(r"sort=-name&n=2"))
+
+
+@pytest.mark.slow
+def test_thumbnails_are_drawn_by_workers_and_a_broken_robot_says_so(see):
+    page = see("?gallery=robots")
+    page.locator(".card").first.wait_for()
+    page.wait_for_selector(".card:has-text('some-arm') img")
+    page.wait_for_selector(".card:has-text('broken') .tag.error")
+    title = page.locator(".card", has_text="broken").first.get_attribute("title")
+    assert "no link 'lost'" in title or "lost" in title
+
+
+@pytest.mark.slow
+def test_the_library_leads_to_all(see):
+    page = see()
+    page.locator(".card").first.wait_for()
+    for text in ("robots/prims", "extrapolation/arms/reach", "planar_arm", "compose a robot"):
+        assert page.get_by_role("link", name=text, exact=True).is_visible()
+    page.get_by_role("link", name="robots/prims", exact=True).click()
+    page.get_by_text("30 robots · page 1 of 2").wait_for()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("?gallery=nowhere", "no such file"),
+        ("?gallery=../..", "outside of the folders"),
+        ("?galery=robots", "did you mean 'gallery'"),
+        ("?split=extrapolation/arm/reach", "no such file"),
+    ],
+)
+def test_an_address_that_leads_nowhere_says_why(see, query, message):
+    page = see(query)
+    page.get_by_text(re.compile(re.escape(message))).first.wait_for()
+    page.get_by_role("link", name="Library").click()
+    page.get_by_text("Categories").wait_for()
+
+
+@pytest.mark.slow
+def test_a_split_is_made_of_what_passes_the_filter(see, control, folder):
+    page = see("?gallery=robots/prims&search=00000")
+    page.get_by_text("10 of 30 robots").wait_for()
+    page.get_by_text("New split").click()
+    for label, value in (("split name", "from/gallery"), ("to train on", "3"), ("to test on", "2")):
+        control.input(page, label).last.fill(value)
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("morphgen split audit splits/from/gallery.yaml").wait_for()
+    split = read_split(folder / "splits" / "from" / "gallery.yaml")
+    assert [member.name for member in split.train] == [f"prims-{i:06d}" for i in range(3)]
+    assert [member.name for member in split.test] == ["prims-000010", "prims-000011"]

@@ -1,0 +1,243 @@
+"""The page of a robot in a browser."""
+
+import io
+import re
+import zipfile
+
+import pytest
+from PIL import Image
+
+from morphgen.checks import check
+from morphgen.checks.self_collision import SelfCollision
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.model.kinematics import frame_pose
+from morphgen.viewer.places import read_place
+from morphgen.viewer.robot_state import joints_text
+from morphgen.viewer.robot_view import RED
+from robots import arm
+
+ARM = "?robot=robots/some-arm"
+
+
+def slider_number(page, label):
+    """The number field of a slider."""
+    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
+    return row.locator("input").last
+
+
+def wait_for_page(page):
+    page.get_by_text("no self-collision").or_(
+        page.get_by_text("collision", exact=True)
+    ).first.wait_for()
+
+
+def show_tab(page, name):
+    page.get_by_role("tab", name=name).click()
+
+
+def node(viewer, name):
+    """A node of the only browser's scene, as the server holds it."""
+    (session,) = viewer.sessions.values()
+    return session.client.scene._handle_from_node_name[name]
+
+
+@pytest.mark.slow
+def test_a_slider_moves_the_robot_and_the_address(see, viewer, folder):
+    on = viewer()
+    page = see(ARM, on=on)
+    wait_for_page(page)
+    robot = read_bundle(folder / "robots" / "some-arm")
+    tool = robot.link_index[robot.frame("tool").link]
+    before = node(on, f"/robot/{tool}").position.copy()
+    slider_number(page, "shoulder").fill("1.2")
+    page.wait_for_url(re.compile(r"q=1\.2,0\.5,0\.01,0\.02"))
+    after = node(on, f"/robot/{tool}").position
+    assert abs(after - before).max() > 0.1
+    q = [1.2, *robot.home[1:]]
+    expected = (frame_pose(robot, q) @ robot.frame("tool").T_link_frame.inverse().matrix)[:3, 3]
+    assert after == pytest.approx(expected, abs=1e-6)
+    assert page.failures == []
+
+
+@pytest.mark.slow
+def test_an_address_brings_a_configuration_and_layers_back(see, viewer, picture):
+    on = viewer()
+    page = see(f"{ARM}&q=0.3,-0.4,0.02,0.01&show=collision,frames,joint axes,inertia", on=on)
+    wait_for_page(page)
+    assert slider_number(page, "elbow").input_value() == "-0.4"
+    assert node(on, "/robot/1/collision0").visible
+    assert not node(on, "/robot/1/visual0").visible
+    assert node(on, "/robot/2").show_axes
+    assert node(on, "/robot/1/axis").visible
+    assert node(on, "/robot/1/inertia").visible
+    show_tab(page, "Show")
+    page.get_by_text("centres of mass").wait_for()
+    picture(page)
+    assert page.failures == []
+
+
+@pytest.mark.slow
+def test_collisions_are_red_while_they_last(see, viewer):
+    on = viewer()
+    q = [0.0, -1.0, 2.6, 2.5, 0.0, 0.0]
+    page = see(f"?robot=words:arm=ur5 ee=plane&q={joints_text(q)}&show=visual,ignored pairs", on=on)
+    page.get_by_text("collision", exact=True).wait_for()
+    robot = read_place("words:arm=ur5 ee=plane", on.places)
+    (pairs,) = SelfCollision(robot).penetrations([q])
+    assert len(pairs) > 0
+    links = [robot.link_index[name] for pair in pairs for name in pair]
+    for link in links:
+        assert tuple(node(on, f"/robot/{link}/visual0").color) == RED
+    assert node(on, "/robot/ignored").visible
+    page.get_by_role("button", name="home").click()
+    page.get_by_text("no self-collision").wait_for()
+    for link in links:
+        assert tuple(node(on, f"/robot/{link}/visual0").color) != RED
+    page.get_by_role("button", name="random free").click()
+    page.wait_for_url(re.compile(r"[?&]q="))
+    page.get_by_text("no self-collision").wait_for()
+
+
+@pytest.mark.slow
+def test_workspace_trail_and_gizmo(see, viewer, picture):
+    on = viewer()
+    page = see(f"{ARM}&show=visual,workspace,trail,drag the tool", on=on)
+    wait_for_page(page)
+    slider_number(page, "shoulder").fill("-0.5")
+    page.wait_for_url(re.compile(r"q=-0\.5"))
+    slider_number(page, "shoulder").fill("0.5")
+    page.wait_for_url(re.compile(r"q=0\.5"))
+    (session,) = on.sessions.values()
+    names = session.client.scene._handle_from_node_name
+    page.wait_for_timeout(1000)
+    assert {"/robot/workspace", "/robot/trail", "/gizmo"} <= names.keys()
+    robot = read_place("robots/some-arm", on.places)
+    pose = frame_pose(robot, [0.5, *robot.home[1:]])
+    assert names["/gizmo"].position == pytest.approx(pose[:3, 3], abs=1e-6)
+    picture(page)
+
+
+@pytest.mark.slow
+def test_links_and_findings_are_told(see, viewer):
+    on = viewer()
+    place = "words:arm=panda ee=panda_hand"
+    page = see(f"?robot={place}", on=on)
+    wait_for_page(page)
+    show_tab(page, "Links")
+    page.get_by_role("cell", name="ee_panda_rightfinger").wait_for()
+    show_tab(page, "Check")
+    codes = {finding.code for finding in check(read_place(place, on.places))}
+    assert len(codes) > 0
+    for code in codes:
+        page.get_by_text(code, exact=True).first.wait_for()
+
+
+@pytest.mark.slow
+def test_a_bundle_is_taken_away_whole(see, folder):
+    page = see(ARM)
+    wait_for_page(page)
+    show_tab(page, "Get")
+    with page.expect_download() as found:
+        page.get_by_role("button", name="Bundle (.zip)").click()
+    with zipfile.ZipFile(found.value.path()) as archive:
+        names = set(archive.namelist())
+    assert {"arm/robot.urdf", "arm/robot.xml", "arm/card.json"} <= names
+    with page.expect_download() as found:
+        page.get_by_role("button", name="Screenshot").click()
+    picture = Image.open(io.BytesIO(found.value.path().read_bytes()))
+    assert picture.size[0] > 300
+    assert len(picture.convert("RGB").getcolors(10**6)) > 20
+
+
+@pytest.mark.slow
+def test_a_broken_robot_shows_its_findings(see, picture):
+    page = see("?robot=robots/broken")
+    page.locator(".tag.error").first.wait_for()
+    assert page.get_by_text(re.compile("lost")).first.is_visible()
+    page.get_by_role("link", name="Library").wait_for()
+    picture(page)
+
+
+@pytest.mark.slow
+def test_a_changed_file_is_seen_after_a_reload(see, viewer, folder, tmp_path):
+    bundle = write_bundle(arm(), folder / "robots" / "changing", picture=False)
+    page = see("?robot=robots/changing")
+    wait_for_page(page)
+    assert page.get_by_text("6 links").is_visible()
+    (bundle / "robot.urdf").write_text("<robot name='x'><link/></robot>")
+    page.reload()
+    page.locator(".tag.error").first.wait_for()
+
+
+@pytest.mark.slow
+def test_two_browsers_do_not_disturb_each_other(see, viewer):
+    on = viewer()
+    first = see(ARM, on=on)
+    wait_for_page(first)
+    second = see("?robot=robots/prims/prims-000001", on=on)
+    second.get_by_text("prims-000001").first.wait_for()
+    third = see(ARM, on=on)
+    wait_for_page(third)
+    slider_number(first, "shoulder").fill("1.5")
+    first.wait_for_url(re.compile(r"q=1\.5"))
+    assert slider_number(third, "shoulder").input_value() == "0.4"
+    assert "prims-000001" in second.url
+    second.close()
+    slider_number(third, "shoulder").fill("-1.5")
+    third.wait_for_url(re.compile(r"q=-1\.5"))
+    assert slider_number(first, "shoulder").input_value() == "1.5"
+
+
+@pytest.mark.slow
+def test_a_browser_that_goes_while_its_page_is_made_harms_nobody(see, viewer, capfd):
+    on = viewer()
+    for _ in range(3):
+        page = see("?robot=words:arm=panda ee=panda_hand&show=visual,workspace,primitives", on=on)
+        page.wait_for_timeout(700)
+        page.close()
+    page = see(ARM, on=on)
+    wait_for_page(page)
+    assert len(on.sessions) <= 4
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("some.urdf", b"this is no URDF", "some.urdf:1:1"),
+        (
+            "some.urdf",
+            b'<robot name="r"><link name="a"><visual><geometry>'
+            b'<mesh filename="../../secret.stl"/></geometry></visual></link></robot>',
+            "leads out of its folder",
+        ),
+        ("large.urdf", b" " * (101 * 2**20), "at most 100 MB"),
+    ],
+    ids=["no-urdf", "climbs-out", "large"],
+)
+def test_a_bad_upload_says_why(see, tmp_path, name, content, message):
+    page = see("?library=")
+    button = page.get_by_role("button", name="Look at a URDF")
+    button.wait_for()
+    (tmp_path / name).write_bytes(content)
+    with page.expect_file_chooser() as chooser:
+        button.click()
+    chooser.value.set_files(tmp_path / name)
+    page.get_by_text(re.compile(re.escape(message))).first.wait_for()
+
+
+@pytest.mark.slow
+def test_an_upload_is_shown(see, tmp_path):
+    page = see("?library=")
+    button = page.get_by_role("button", name="Look at a URDF")
+    button.wait_for()
+    (tmp_path / "some.urdf").write_text(
+        '<robot name="sent"><link name="a"><visual><geometry><box size="1 1 1"/></geometry>'
+        "</visual></link></robot>"
+    )
+    with page.expect_file_chooser() as chooser:
+        button.click()
+    chooser.value.set_files(tmp_path / "some.urdf")
+    page.wait_for_url(re.compile(r"robot=upload:"))
+    page.get_by_text("sent").first.wait_for()

@@ -1,0 +1,84 @@
+"""A split in a browser."""
+
+import re
+
+import pytest
+
+from morphgen.benchmark.split_file import read_split
+from morphgen.errors import BenchmarkError
+from morphgen.grammar.library import default_library
+from morphgen.viewer.entries import Entry
+from morphgen.viewer.folder_page import sides_of
+from morphgen.viewer.new_split import member_of, save_split
+from morphgen.viewer.places import Places
+
+SPLIT = "extrapolation/primitives/reach"
+
+
+@pytest.mark.slow
+def test_both_sides_the_map_and_the_audit(see, picture):
+    page = see(f"?split={SPLIT}")
+    page.get_by_text("train (10)").wait_for()
+    page.get_by_text("test (2)").wait_for()
+    page.wait_for_selector(".card:has-text('chain-000001') img")
+    picture(page, "split")
+    page.get_by_role("tab", name="Statistics").click()
+    page.get_by_text("Cosine of test to train").wait_for()
+    page.get_by_role("tab", name="Audit").click()
+    page.get_by_text("Nearest train robots").wait_for()
+    page.get_by_role("tab", name="Map").click()
+    point = page.locator("svg a", has=page.locator("title", has_text="chain-000001"))
+    point.first.wait_for()
+    assert page.locator("svg rect").count() == 144
+    picture(page, "split-map")
+    point.first.locator("circle").click()
+    page.wait_for_url(re.compile(r"robot=split:.*chain-000001"))
+    page.get_by_text("chain-000001").first.wait_for()
+    assert page.failures == []
+
+
+@pytest.mark.slow
+def test_a_new_split_is_saved_of_what_is_shown(see, folder):
+    page = see(f"?split={SPLIT}&search=0000")
+    page.get_by_text("train (10)").wait_for()
+    search = page.get_by_text("Search", exact=True)
+    search.locator("xpath=ancestor::*[.//input][1]//input").fill("000001")
+    page.get_by_text(re.compile("of 12 robots")).wait_for()
+    page.get_by_text("New split of what is shown").click()
+    name = page.get_by_text("split name", exact=True)
+    name.locator("xpath=ancestor::*[.//input][1]//input").fill("mine/ones")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("morphgen split audit splits/mine/ones.yaml").wait_for()
+    split = read_split(folder / "splits" / "mine" / "ones.yaml")
+    assert {member.name[-6:] for member in (*split.train, *split.test)} == {"000001"}
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text(re.compile("exists; choose another name")).first.wait_for()
+
+
+def test_robots_of_a_set_become_members(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    places = Places(default_library().folders, (folder.resolve(),), folder / "none")
+    members = [
+        member_of(f"robots/prims/prims-{i:06d}", "prims", "push", False, places) for i in range(4)
+    ]
+    path = save_split("mine/prims", "interpolation", members[:3], members[3:], places)
+    split = read_split(path)
+    assert split.train == tuple(members[:3])
+    assert {member.task for member in split.train} == {"push"}
+
+
+def test_sides_are_inside_and_outside_of_the_filter():
+    rows = [Entry(name, name) for name in "abcdef"]
+    train, test = sides_of(rows, rows[2:5], 2, 3)
+    assert [row.name for row in train] == ["c", "d"]
+    assert [row.name for row in test] == ["a", "b", "f"]
+    with pytest.raises(BenchmarkError, match="3 robots pass the filter and 3 do not: too few"):
+        sides_of(rows, rows[2:5], 4, 1)
+
+
+def test_sides_must_not_be_empty_and_names_must_be_names(folder):
+    places = Places((), (folder.resolve(),), folder / "none")
+    with pytest.raises(BenchmarkError, match="0 train and 0 test"):
+        save_split("mine", "interpolation", [], [], places)
+    with pytest.raises(BenchmarkError, match="use letters"):
+        save_split("../mine", "interpolation", [], [], places)

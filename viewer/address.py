@@ -1,0 +1,70 @@
+"""Addresses of pages: the query of a URL, such as ``?gallery=robots/arm3&sort=reach``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+from urllib.parse import parse_qsl, quote, urlencode
+
+from morphgen.errors import MorphgenError, nearest
+
+Page = Literal["library", "gallery", "robot", "compose", "compare", "split"]
+PAGES: tuple[Page, ...] = get_args(Page)
+
+
+class AddressError(MorphgenError):
+    """An address that leads to no page."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """A page, what it shows, and how."""
+
+    page: Page
+    of: tuple[str, ...] = ("",)
+    """What is shown: a folder, a robot, a split's name, words; several to compare."""
+    state: Mapping[str, str] = field(default_factory=dict)
+    """Sort order, filter, joint positions ...; what is at its default is left out."""
+
+    @property
+    def subject(self) -> str:
+        """The first thing that is shown."""
+        return self.of[0]
+
+    @property
+    def query(self) -> str:
+        """The text after the host, from the question mark on."""
+        pairs = [*((self.page, of) for of in self.of), *self.state.items()]
+        return "?" + urlencode(pairs, quote_via=quote, safe="/=:,@+")
+
+    def with_state(self, **changes: str) -> Address:
+        """The same page with other state; an empty value removes a key."""
+        state = {key: value for key, value in {**self.state, **changes}.items() if value}
+        return replace(self, state=state)
+
+
+def parse_address(query: str) -> Address | None:
+    """Read the query of a URL.
+
+    Args:
+        query: With or without its question mark.
+
+    Returns:
+        None if the query is empty: the page that the viewer was started for.
+
+    Raises:
+        AddressError: If it names no page, or two different ones.
+    """
+    pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
+    if not pairs:
+        return None
+    named = {key for key, _ in pairs}
+    pages = [page for page in PAGES if page in named]
+    if not pages:
+        raise AddressError(f"address {query!r} names no page{nearest(pairs[0][0], PAGES)}")
+    if len(pages) > 1:
+        raise AddressError(f"address {query!r} names two pages: {' and '.join(pages)}")
+    of = tuple(value for key, value in pairs if key == pages[0])
+    state = {key: value for key, value in pairs if key not in PAGES}
+    return Address(pages[0], of, state)

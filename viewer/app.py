@@ -1,0 +1,161 @@
+"""The viewer: a server of pages, a session for every browser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shutil
+import socket
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+
+import viser
+
+from morphgen.errors import MorphgenError
+from morphgen.formats.urdf import UnsoundError
+from morphgen.grammar.library import default_library
+from morphgen.viewer import (
+    browser,
+    compare_page,
+    compose_page,
+    folder_page,
+    library_page,
+    markup,
+    robot_page,
+    split_page,
+)
+from morphgen.viewer.address import Address, Page, parse_address
+from morphgen.viewer.places import Places, target_address
+from morphgen.viewer.portraits import start_workers
+from morphgen.viewer.session import Session, close, post
+
+WORKERS = 2
+"""Processes that draw thumbnails and compare robots."""
+
+SHOW: Mapping[Page, Callable[[Session], None]] = {
+    "library": library_page.show,
+    "gallery": folder_page.show,
+    "robot": robot_page.show,
+    "compose": compose_page.show,
+    "compare": compare_page.show,
+    "split": split_page.show,
+}
+"""How each page is built."""
+
+
+@dataclass(eq=False)
+class Viewer:
+    """A running viewer."""
+
+    server: viser.ViserServer
+    start: Address
+    """The page that is shown to those who name none."""
+    places: Places
+    pool: ProcessPoolExecutor
+    sessions: dict[int, Session] = field(default_factory=dict)
+    shared: dict[str, object] = field(default_factory=dict)
+    """What took long to find."""
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self.server.get_port()
+
+    def stop(self) -> None:
+        """End all sessions, the server and its workers."""
+        for session in list(self.sessions.values()):
+            close(session)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+        self.pool.shutdown(wait=False, cancel_futures=True)
+        shutil.rmtree(self.places.uploads, ignore_errors=True)
+
+
+def serve(
+    words: Sequence[str] = (),
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    library: Sequence[Path] = (),
+) -> Viewer:
+    """Start a viewer.
+
+    Args:
+        words: What its first page shows: nothing for the library; a folder, a file or a split's
+            name; or words of ``morphgen compose``.
+        host: Address to bind.
+        port: Port; if it is taken, the next free one.
+        library: Folders of the user's own parts.
+
+    Raises:
+        MorphgenError: If there is no such thing, or the address is none of this machine's.
+    """
+    places = Places(default_library(library).folders, _roots(words), Path("/nowhere"))
+    places.library.names()  # a folder that is missing, or a part that is broken, is told now
+    start = target_address(words, places)
+    try:
+        with socket.socket() as probe:
+            probe.bind((host, 0))
+    except OSError as error:
+        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
+    uploads = Path(tempfile.mkdtemp(prefix="morphgen-uploads-")).resolve()
+    places = Places(places.folders, places.roots, uploads)
+    with contextlib.redirect_stdout(io.StringIO()):  # its banner names the port before we do
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    # What a browser misses that has just gone is no news.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+    viewer = Viewer(server, start, places, start_workers(WORKERS))
+
+    async def connect(client: viser.ClientHandle) -> None:
+        session = Session(client, places, viewer.pool, start, viewer.shared)
+        viewer.sessions[client.client_id] = session
+        post(session, lambda: open_page(session))
+
+    async def disconnect(client: viser.ClientHandle) -> None:
+        session = viewer.sessions.pop(client.client_id, None)
+        if session is not None:
+            close(session)
+
+    server.on_client_disconnect(disconnect)
+    server.on_client_connect(connect)
+    return viewer
+
+
+def open_page(session: Session) -> None:
+    """Build the page that a browser's URL names."""
+    client = session.client
+    client.gui.configure_theme(show_logo=False, show_share_button=False)
+    try:
+        session.address = parse_address(browser.read_query(client)) or session.address
+        SHOW[session.address.page](session)
+    except UnsoundError as error:
+        _show_fault(session, str(error.origin), markup.findings_table(error.findings))
+    except MorphgenError as error:
+        _show_fault(session, "There is nothing to see here", escape(str(error)))
+    except (RuntimeError, TimeoutError):
+        if not session.closed.is_set():
+            raise
+
+
+def _show_fault(session: Session, title: str, text: str) -> None:
+    """A page that says why there is no other."""
+    gui = session.client.gui
+    gui.reset()
+    session.client.scene.reset()
+    gui.set_panel_label("morphgen")
+    gui.main_panel.dock_left()
+    gui.main_panel.set_width(760)
+    gui.add_html(markup.STYLE + markup.crumbs((session.address.page, None)))
+    gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{text}"))
+
+
+def _roots(words: Sequence[str]) -> tuple[Path, ...]:
+    """Where robots may be read from: here, and what the user named."""
+    here = Path.cwd().resolve()
+    named = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
+    beside = [path.parent if path.is_file() else path for path in named]
+    return tuple(dict.fromkeys((here, *beside)))

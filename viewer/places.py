@@ -1,0 +1,259 @@
+"""Where robots come from: folders, files, words of ``morphgen compose``, splits and uploads.
+
+A robot's place is a text that fits into an address:
+
+    robots/ur5-plane                               a bundle's folder, or a URDF or xacro
+    words:arm=ur5 ee=plane                         as for ``morphgen compose``
+    derivation:body=cubes(size=0.1)                parts and parameters
+    split:extrapolation/arms/reach@test/widowx     a member of a split
+    upload:3f2a/some.urdf                          what a user sent, while the viewer runs
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+
+from morphgen.benchmark.built import SPLIT
+from morphgen.benchmark.split import SIDES, Member, Side, Split, member_robot
+from morphgen.benchmark.split_file import find_split, read_split_file, split_names
+from morphgen.errors import MorphgenError, nearest
+from morphgen.formats.bundle import CARD, MJCF, URDF, read_robot, split_colours
+from morphgen.formats.resolve import file_stamp
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.library import Library
+from morphgen.grammar.model import grammar_names
+from morphgen.grammar.request import default_name, parse_words
+from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
+from morphgen.model.robot import Robot
+from morphgen.viewer.address import Address
+
+WORDS, DERIVED, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
+SPLIT_SUFFIX = ".yaml"
+ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml")
+
+
+class PlaceError(MorphgenError):
+    """There is nothing to see at a place."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """What may be looked at; plain data that a worker gets, too."""
+
+    folders: tuple[Path, ...]
+    """Of the library."""
+    roots: tuple[Path, ...]
+    """Folders and files that addresses may name, absolute; nothing outside of them is read."""
+    uploads: Path
+    """Where uploads are kept."""
+
+    @cached_property
+    def library(self) -> Library:
+        """Where parts are."""
+        return Library(self.folders)
+
+    def path(self, text: str) -> Path:
+        """The file or folder of a place that is a path.
+
+        Raises:
+            PlaceError: If it does not exist, or is outside of ``roots``.
+        """
+        base, name = self.roots[0], text
+        if text.startswith(UPLOAD):
+            base, name = self.uploads, text.removeprefix(UPLOAD)
+        path = base / name
+        allowed = (*self.roots, self.uploads)
+        if not any(path.resolve().is_relative_to(root) for root in allowed):
+            raise PlaceError(
+                f"{text}: is outside of the folders that this viewer was started for: "
+                + ", ".join(map(str, self.roots))
+            )
+        if not path.exists():
+            raise PlaceError(f"{text}: no such file or folder")
+        return path
+
+
+def target_address(words: Sequence[str], places: Places) -> Address:
+    """The page that ``morphgen view`` opens for its words.
+
+    Args:
+        words: None of them for the library; a folder, file or split's name; or words to compose.
+        places: What may be looked at.
+
+    Raises:
+        MorphgenError: If there is no such thing.
+    """
+    if not words:
+        return Address("library")
+    if len(words) == 1 and "=" not in words[0]:
+        return _single_address(words[0], places)
+    parse_words(words, places.library)
+    return Address("robot", (WORDS + " ".join(words),))
+
+
+def _single_address(word: str, places: Places) -> Address:
+    if Path(word).exists():
+        path = places.path(word)
+        if path.is_file():
+            return Address("split" if path.suffix == SPLIT_SUFFIX else "robot", (word,))
+        if (path / SPLIT).is_file():
+            return Address("split", (word,))
+        return Address("robot" if is_robot(path) else "gallery", (word,))
+    if word in split_names():
+        return Address("split", (word,))
+    if word in grammar_names() or word.endswith(".grammar"):
+        return Address("compose", (word,))
+    valid = (*split_names(), *grammar_names())
+    raise PlaceError(
+        f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}"
+    )
+
+
+def is_robot(folder: Path) -> bool:
+    """Whether a folder is a robot's: a bundle, or one of a light set."""
+    return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
+
+
+def is_set(folder: Path) -> bool:
+    """Whether a folder is a set that ``morphgen sample`` made."""
+    return (folder / INDEX).is_file() or (folder / SETTINGS).is_file()
+
+
+def read_place(place: str, places: Places) -> Robot:
+    """The robot at a place.
+
+    Raises:
+        UnsoundError: If its structure is broken; the findings say how.
+        MorphgenError: If there is none, or it cannot be read or composed.
+    """
+    if place.startswith(MEMBER):
+        return member_robot(member_at(place, places), places.library)
+    if derivation := derivation_at(place, places):
+        return compose(derivation, places.library, _name(place, derivation, places))
+    return read_robot(places.path(place))
+
+
+def as_in_library(robot: Robot, library: Library) -> Robot:
+    """The robot with the meshes of the library's parts, to which fits are stored.
+
+    A bundle has copies of them. A robot whose derivation does not give the same text of URDF, but
+    for the meshes' names, stays as it is.
+    """
+    text = robot.provenance.get("derivation")
+    if not text:
+        return robot
+    try:
+        made = compose(parse_derivation(str(text)), library, robot.name)
+    except MorphgenError:
+        return robot  # its parts are not here, so no fits of them are
+    return made if _nameless(made) == _nameless(robot) else robot
+
+
+def _nameless(robot: Robot) -> str:
+    return urdf_text(split_colours(robot), lambda mesh: "")
+
+
+def name_of(place: str) -> str:
+    """What to call a robot before it is read."""
+    for prefix in (WORDS, DERIVED):
+        if place.startswith(prefix):
+            return place.removeprefix(prefix)
+    return place.rstrip("/").rpartition("/")[2]
+
+
+def derivation_at(place: str, places: Places) -> Derivation | None:
+    """How the robot at a place is derived; None if it is read from a URDF.
+
+    Raises:
+        MorphgenError: If there is no such place, or its derivation is none.
+    """
+    if place.startswith(WORDS):
+        return parse_words(place.removeprefix(WORDS).split(), places.library)[0]
+    if place.startswith(DERIVED):
+        return parse_derivation(place.removeprefix(DERIVED))
+    if place.startswith(MEMBER):
+        return parse_derivation(member_at(place, places).derivation)
+    light = places.path(place) / DERIVATION
+    if light.is_file() and not (places.path(place) / CARD).is_file():
+        return parse_derivation(light.read_text(encoding="utf-8"), str(light))
+    return None
+
+
+def _name(place: str, derivation: Derivation, places: Places) -> str:
+    if place.startswith(WORDS):
+        return parse_words(place.removeprefix(WORDS).split(), places.library)[1]
+    if place.startswith(DERIVED):
+        return default_name(derivation, places.library)
+    return places.path(place).resolve().name
+
+
+def split_at(text: str, places: Places) -> Split:
+    """A split by its name, file or built folder.
+
+    Raises:
+        MorphgenError: If there is none, or it cannot be read.
+    """
+    if text in split_names():
+        return read_split_file(find_split(text)).split
+    path = places.path(text)
+    return read_split_file(path / SPLIT if path.is_dir() else path).split
+
+
+def member_place(split: str, side: Side, member: Member) -> str:
+    """The place of a member of a split."""
+    return f"{MEMBER}{split}@{side}/{member.name}"
+
+
+def member_at(place: str, places: Places) -> Member:
+    """The member of a split at a place.
+
+    Raises:
+        PlaceError: If there is none.
+    """
+    name, at, member = place.removeprefix(MEMBER).rpartition("@")
+    text, _, robot = member.partition("/")
+    side = next((each for each in SIDES if each == text), None)
+    if not at or side is None:
+        raise PlaceError(f"{place}: expected split:NAME@train/ROBOT or split:NAME@test/ROBOT")
+    members = {each.name: each for each in split_at(name, places).side(side)}
+    if robot not in members:
+        raise PlaceError(
+            f"{place}: split {name} has no {side} robot {robot!r}" + nearest(robot, members)
+        )
+    return members[robot]
+
+
+def content_key(place: str, places: Places) -> str:
+    """A hash that changes when the robot at a place may: its files, its parts, morphgen.
+
+    Raises:
+        MorphgenError: If there is no such place.
+    """
+    lines = [version("morphgen")]
+    if derivation := derivation_at(place, places):
+        lines.append(str(derivation))
+        lines += _stamps(_part_files(derivation, places.library))
+    else:
+        path = places.path(place)
+        files = (path / URDF, path / MJCF, path / CARD) if path.is_dir() else (path,)
+        lines += [str(path.resolve()), *_stamps(files)]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:32]
+
+
+def _part_files(derivation: Derivation, library: Library) -> Iterable[Path]:
+    for part in {node.part for node in derivation.walk()}:
+        manifest = library.manifest(part)
+        yield manifest.path
+        if isinstance(manifest.source, Path):
+            yield manifest.source
+
+
+def _stamps(files: Iterable[Path]) -> list[str]:
+    return [f"{path} {file_stamp(path)}" for path in sorted(set(files))]

@@ -1,0 +1,132 @@
+"""Thumbnails of robots, and the facts that a gallery shows of them; made by worker processes."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import signal
+import tempfile
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from threading import Thread
+
+from PIL import Image
+from platformdirs import user_cache_path
+
+from morphgen.benchmark.survey import facts_of
+from morphgen.checks import check
+from morphgen.errors import MorphgenError
+from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
+from morphgen.formats.files import write_atomic
+from morphgen.formats.picture import render
+from morphgen.viewer.places import Places, content_key, is_robot, read_place
+
+SIZE = (240, 180)
+_QUALITY = 82
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Portrait:
+    """A robot at a glance."""
+
+    thumbnail: str
+    """A JPEG as a ``data:`` URL; empty if none can be drawn."""
+    facts: dict[str, object]
+    """For ``entries.with_facts``."""
+    error: str = ""
+    """Why there is no robot; empty if there is."""
+
+
+def start_workers(n: int) -> ProcessPoolExecutor:
+    """Processes that make portraits; shut them down when done."""
+    return ProcessPoolExecutor(n, get_context("spawn"), _prepare)
+
+
+def ask(pool: ProcessPoolExecutor, place: str, places: Places) -> Future[Portrait]:
+    """Have a portrait made."""
+    return pool.submit(portrait, place, places)
+
+
+def portrait(place: str, places: Places) -> Portrait:
+    """The portrait of the robot at a place, from the cache or made and kept there."""
+    try:
+        kept = user_cache_path("morphgen") / f"viewer-{_FORMAT}"
+        path = kept / f"{content_key(place, places)}.json"
+        if path.is_file():
+            data = json.loads(path.read_text(encoding="utf-8"))
+            facts = {**data["facts"], "findings": tuple(data["facts"]["findings"])}
+            return Portrait(data["thumbnail"], facts)
+        made = _made(place, places)
+    except (MorphgenError, OSError) as error:
+        return Portrait("", {"findings": ("broken",)}, str(error))
+    with suppress(OSError):  # where nothing can be kept it is drawn again next time
+        kept.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
+    return made
+
+
+def thumbnail_of_picture(path: Path) -> str:
+    """A picture file as a small JPEG in a ``data:`` URL; empty if it is none."""
+    try:
+        with Image.open(path) as picture:
+            return _data_url(picture)
+    except OSError:
+        return ""
+
+
+def _made(place: str, places: Places) -> Portrait:
+    robot = read_place(place, places)
+    loud = sorted({finding.code for finding in check(robot) if finding.severity != "info"})
+    known = facts_of(robot)
+    has_tool = any(frame.name == "tool" for frame in robot.frames)
+    facts: dict[str, object] = {
+        "dof": known.dof,
+        "links": known.links,
+        "reach": known.reach if has_tool and known.dof else None,
+        "mass": known.mass,
+        "findings": tuple(loud),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        bundle = write_bundle(robot, Path(folder) / "robot", picture=False)
+        picture = render(robot, bundle / URDF, bundle / MJCF, size=(2 * SIZE[0], 2 * SIZE[1]))
+    if ":" not in place and is_robot(places.path(place)):
+        _keep_picture(robot_folder=places.path(place), picture=picture)
+    return Portrait(_data_url(picture), facts)
+
+
+def _keep_picture(robot_folder: Path, picture: Image.Image) -> None:
+    """Leave the picture in a bundle that has none, where that can be written."""
+    path = robot_folder / PICTURE
+    if path.exists():
+        return
+    content = io.BytesIO()
+    picture.save(content, "PNG")
+    with suppress(OSError):  # where others own the folder, the user's cache has the thumbnail
+        write_atomic(path, content.getvalue())
+
+
+def _data_url(picture: Image.Image) -> str:
+    content = io.BytesIO()
+    small = picture.convert("RGB")
+    small.thumbnail(SIZE)
+    small.save(content, "JPEG", quality=_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+def _prepare() -> None:
+    """Ctrl-C is for the parent; without it a worker ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
