@@ -174,7 +174,7 @@ def _peer(name: str, count: int, seconds: float) -> float:
     with closing(vector(make)) as envs:
         envs.reset(seed=0)
         rng = np.random.default_rng(0)
-        actions = rng.uniform(-1, 1, (ACTIONS, *envs.action_space.shape)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (ACTIONS, *(envs.action_space.shape or ()))).astype(np.float32)
         for action in actions:
             envs.step(action)
         start, steps = time.perf_counter(), 0
@@ -190,7 +190,7 @@ def _panda(name: str) -> Any:  # noqa: ANN401 - gymnasium's environments have no
 
     assert panda_gym is not None
     env = gymnasium.make(name)
-    sim = env.unwrapped.sim
+    sim = env.get_wrapper_attr("sim")
     sim.n_substeps, sim.timestep = SUBSTEPS, TIMESTEP
     sim.physics_client.setTimeStep(TIMESTEP)
     return env

@@ -204,7 +204,7 @@ class Learner:
         if self.config.curriculum:
             self.batch.advance(self.update / self.updates)
         if self._observation is None:
-            self._observation = self.batch.reset()
+            self._observation = self.batch.reset(spread=True)
         elif self.config.curriculum:
             self._observation = self.batch.observe()
 

@@ -33,9 +33,15 @@ class Task(Protocol):
     body: torch.Tensor
     mask: torch.Tensor
     targets: torch.Tensor
-    goal: torch.Tensor
     elapsed: torch.Tensor
-    kind: str
+
+    @property
+    def goal(self) -> torch.Tensor:
+        """Wanted poses of the tools, shape (n, 7)."""
+
+    @property
+    def kind(self) -> str:
+        """Of the actions."""
 
 
 class Zero:

@@ -28,7 +28,8 @@ class OnALine:
         self.progress = []
         self._random = np.random.default_rng(seed)
 
-    def reset(self):
+    def reset(self, *, spread=False):
+        self.spread = spread
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         return self.observe()
 

@@ -1,0 +1,156 @@
+"""``morphgen eval``: how well a policy, or a reference controller, does on each robot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli.options import Subparsers, add_json, add_library
+from morphgen.cli.train import count
+
+if TYPE_CHECKING:
+    from morphgen.benchmark.split import Side
+    from morphgen.rl.evaluation import Exam, Score
+    from morphgen.rl.sources import Source
+    from morphgen.rl.trained import Mode
+
+REFERENCES = ("random", "zero", "ik", "scripted")
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "eval",
+        help="score a trained policy, or a reference controller, robot by robot",
+        description="Run episodes of every robot and print scores with 95%% bootstrap intervals "
+        "over episodes. The score of reach is above that of random actions; that of push is the "
+        "success rate.",
+        epilog="examples: morphgen eval runs/interpolation/arm3/reach/me-tf/seed0 --on test; "
+        "morphgen eval ik --split interpolation/arm3/reach",
+    )
+    parser.add_argument(
+        "checkpoint", help=f"a checkpoint or a run's folder; or one of {', '.join(REFERENCES)}"
+    )
+    parser.add_argument(
+        "--split",
+        dest="words",
+        nargs="+",
+        metavar="SPLIT",
+        default=[],
+        help="of a reference, or instead of a checkpoint's own: as for morphgen train",
+    )
+    parser.add_argument("--on", choices=["train", "test"], help="side of the split (default: both)")
+    parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
+    parser.add_argument("--mode", choices=["deterministic", "stochastic"], help="default: both")
+    amount = parser.add_mutually_exclusive_group()
+    amount.add_argument("--episodes", type=int, help="of each robot, at least")
+    amount.add_argument(
+        "--steps",
+        type=count,
+        default=10_000,
+        help="of each robot: as many episodes as have so many steps if time ends them "
+        "(default: 10,000)",
+    )
+    parser.add_argument("--sim", choices=["pybullet", "mujoco"], help="default: the training's")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--goal-seed", type=int, default=0, help="with --split: of all goals")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="a table: .csv, .json or .md")
+    add_library(parser)
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate and print."""
+    from morphgen.rl.evaluation import as_data
+    from morphgen.rl.score_tables import require_table, score_table, summary, write_scores
+
+    if args.out is not None:
+        require_table(args.out)
+    found = _references(args) if args.checkpoint in REFERENCES else _policies(args)
+    if args.out is not None:
+        write_scores(args.out, found)
+    if args.json:
+        print(json.dumps({mode: as_data(scores) for mode, scores in found.items()}))
+        return 0
+    print(score_table(found))
+    print(summary(found))
+    return 0
+
+
+def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
+    from morphgen.errors import TaskError
+    from morphgen.rl.evaluation import Exam, evaluate_reference
+
+    if not args.words:
+        raise TaskError(f"{args.checkpoint}: say on which robots, with --split")
+    sources = _sources(args)
+    exam = Exam(_episodes(args), args.sim or "pybullet", args.seed, args.workers)
+    found = (evaluate_reference(args.checkpoint, source, exam) for source in sources)
+    return {args.checkpoint: [score for scores in found for score in scores]}
+
+
+def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
+    from morphgen.rl.trained import MODES
+
+    modes: tuple[Mode, ...] = (args.mode,) if args.mode else MODES
+    return {mode: _policy(args, mode) for mode in modes}
+
+
+def _policy(args: argparse.Namespace, mode: Mode) -> list[Score]:
+    from morphgen.rl.evaluation import evaluate_checkpoints, evaluate_run
+    from morphgen.rl.runs import read_checkpoint
+    from morphgen.rl.training import checkpoints, require_device
+
+    require_device(args.device)
+    path = Path(args.checkpoint)
+    files = list(checkpoints(path))
+    config, _ = read_checkpoint(files[0])
+    exam = _exam(args, config)
+    if args.words:
+        sources = _sources(args)
+        found = [
+            evaluate_checkpoints(files, one, exam, mode, device=args.device) for one in sources
+        ]
+    else:
+        sides: tuple[Side, ...] = ("train", "test") if config.source.split else ("train",)
+        wanted = sides if args.on is None else (args.on,)
+        found = [evaluate_run(path, side, exam, mode, device=args.device) for side in wanted]
+    return [score for scores in found for score in scores]
+
+
+def _exam(args: argparse.Namespace, config: object) -> Exam:
+    from dataclasses import replace
+
+    from morphgen.rl.evaluation import exam_of
+    from morphgen.rl.runs import RunConfig
+
+    assert isinstance(config, RunConfig)
+    exam = exam_of(config, _episodes(args), seed=args.seed, workers=args.workers)
+    return replace(exam, sim=args.sim) if args.sim else exam
+
+
+def _episodes(args: argparse.Namespace) -> int:
+    from morphgen.rl.evaluation import episodes_for
+    from morphgen.tasks.config import ReachConfig
+
+    if args.episodes is not None:
+        return int(args.episodes)
+    return episodes_for(args.steps, ReachConfig().steps)
+
+
+def _sources(args: argparse.Namespace) -> list[Source]:
+    from morphgen.cli.train import source_of
+    from morphgen.rl.sources import other_side
+
+    args.on, wanted = "train", args.on
+    source = source_of(args.words, args)
+    args.on = wanted
+    if not source.split:
+        return [source]
+    sides: tuple[Side, ...] = ("train", "test") if wanted is None else (wanted,)
+    return [other_side(source, side) for side in sides]

@@ -1,0 +1,112 @@
+"""``morphgen finetune``: go on learning with a trained policy, on other robots."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli.options import Subparsers, add_library
+from morphgen.cli.train import count, trained
+
+if TYPE_CHECKING:
+    from morphgen.rl.runs import RunConfig
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "finetune",
+        help="train a policy further, on the test robots of its split",
+        description="Begin a run with the networks of a checkpoint. Agent and algorithm are the "
+        "checkpoint's unless said otherwise; optimiser and schedule begin anew.",
+        epilog="example: morphgen finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test "
+        "--steps 30000",
+    )
+    parser.add_argument("checkpoint", type=Path, help="a checkpoint or a run's folder")
+    parser.add_argument(
+        "--split",
+        dest="words",
+        nargs="+",
+        metavar="SPLIT",
+        default=[],
+        help="other robots than those of the checkpoint's split: as for morphgen train",
+    )
+    parser.add_argument(
+        "--on", choices=["train", "test"], default="test", help="side of the split (default: test)"
+    )
+    parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
+    parser.add_argument(
+        "--steps",
+        type=count,
+        default=30_000,
+        help="transitions, of all environments together (default: 30,000)",
+    )
+    parser.add_argument("--envs", type=int, default=16, help="default: 16")
+    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument("--sim", choices=["pybullet", "mujoco"], help="default: the training's")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
+    )
+    parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
+    parser.add_argument("--goal-seed", type=int, default=0, help="with --split: of all goals")
+    parser.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="another constant of PPO, such as learning_rate=1e-4; may be repeated",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="default: finetuned/SIDE-seedN in the run's folder"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on with the run that is there")
+    parser.add_argument("--no-tensorboard", action="store_true", help="write no events")
+    parser.add_argument("--wandb", action="store_true", help="send to Weights & Biases, too")
+    add_library(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train and say where it is."""
+    from morphgen.errors import TaskError
+    from morphgen.rl.runs import CHECKPOINT
+    from morphgen.rl.training import checkpoints
+
+    files = list(checkpoints(args.checkpoint))
+    if len(files) > 1:
+        raise TaskError(
+            f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"
+        )
+    folder = args.out or files[0].parent / "finetuned" / f"{args.on}-seed{args.seed}"
+    for part in trained(folder, _config(files[0], args), args):
+        print(part.folder / CHECKPOINT)
+    return 0
+
+
+def _config(file: Path, args: argparse.Namespace) -> RunConfig:
+    from dataclasses import fields, replace
+
+    from morphgen.cli.train import source_of
+    from morphgen.errors import TaskError
+    from morphgen.rl.config import PPOConfig
+    from morphgen.rl.runs import read_checkpoint
+    from morphgen.rl.sources import other_side
+    from morphgen.rl.variants import constants
+
+    began, _ = read_checkpoint(file)
+    source = source_of(args.words, args) if args.words else other_side(began.source, args.on)
+    changes = constants(args.set)
+    fixed = set(changes) - {field.name for field in fields(PPOConfig)}
+    if fixed:
+        raise TaskError(f"--set {min(fixed)}: the networks are those of the checkpoint")
+    return replace(
+        began,
+        source=source,
+        ppo=replace(began.ppo, **changes, transitions=args.steps),
+        seed=args.seed,
+        sim=args.sim or began.sim,
+        envs=args.envs,
+        device=args.device,
+        begin=str(file.resolve()),
+    )

@@ -1,0 +1,298 @@
+"""``morphgen train``: teach an agent the robots of a split, or one robot."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from morphgen.cli.options import Subparsers, add_library
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+    from morphgen.rl.report import Report
+    from morphgen.rl.runs import RunConfig
+    from morphgen.rl.sources import Source
+    from morphgen.rl.training import Part, Show, Way
+    from morphgen.rl.variants import Variant
+
+SWITCHES = {
+    "symlog": "the critic predicts the symlog of returns (default: on)",
+    "slow-critic": "returns to learn come from a moving average of the critic (default: on)",
+    "discrete": "bins as actions (default: on if all robots reach)",
+    "task-reweighting": "robots count with random weights (default: off)",
+    "curriculum": "the line of push moves (default: on)",
+    "mask-morphology": "hide the robot's body from the agent (default: off)",
+}
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the command."""
+    parser = commands.add_parser(
+        "train",
+        help="train an agent on the robots of a split, or on one",
+        description="Train a policy by PPO into a run's folder. Interrupted or killed, it goes on "
+        "where it was with --resume, to the same weights.",
+        epilog="examples: morphgen train interpolation/arm3/reach --agent me-tf --sim mujoco; "
+        "morphgen train arm=ur5 ee=stick task=reach --agent se",
+    )
+    parser.add_argument(
+        "words",
+        nargs="+",
+        metavar="SPLIT",
+        help="a split's name, file or built folder; or words of compose, parts such as ur5-plane, "
+        "a bundle's folder or a URDF, and task=reach or task=push",
+    )
+    parser.add_argument("--agent", default="me-tf", help="se, me-mlp or me-tf (default: me-tf)")
+    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument(
+        "--on",
+        choices=["train", "test"],
+        default="train",
+        help="side of the split (default: train)",
+    )
+    parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/SPLIT/AGENT/seedN")
+    parser.add_argument("--resume", action="store_true", help="go on with the run that is there")
+    for name, text in SWITCHES.items():
+        parser.add_argument(
+            f"--{name}", action=argparse.BooleanOptionalAction, default=None, help=text
+        )
+    add_training(parser, steps=2e6, envs=128)
+    add_library(parser)
+    parser.set_defaults(run=run)
+
+
+def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:
+    """Options of everything that trains."""
+    parser.add_argument(
+        "--steps",
+        type=count,
+        default=int(steps),
+        help=f"transitions, of all environments together (default: {steps:g})",
+    )
+    parser.add_argument(
+        "--envs",
+        type=int,
+        default=envs,
+        help=f"environments, which the robots share (default: {envs})",
+    )
+    parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
+    )
+    parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
+    parser.add_argument("--goal-seed", type=int, default=0, help="of all goals (default: 0)")
+    parser.add_argument(
+        "--whole",
+        action="store_true",
+        help="se on a split: all steps and environments for each robot, not shares of them",
+    )
+    parser.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="another constant, such as learning_rate=1e-4 or minibatches=8; may be repeated",
+    )
+    parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
+    parser.add_argument("--compile", action="store_true", help="networks by torch.compile")
+    parser.add_argument("--no-tensorboard", action="store_true", help="write no events")
+    parser.add_argument("--wandb", action="store_true", help="send to Weights & Biases, too")
+
+
+def count(text: str) -> int:
+    """A whole number, also as 2e6."""
+    value = float(text)
+    if not (math.isfinite(value) and value.is_integer()):
+        raise ValueError(text)
+    return int(value)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train and say where it is."""
+    from morphgen.rl.runs import CHECKPOINT
+
+    source = source_of(args.words, args)
+    variant = variant_of(args)
+    config = config_of(source, variant, args)
+    folder = args.out or Path("runs") / place(source) / str(variant) / f"seed{args.seed}"
+    parts = trained(folder, config, args)
+    for part in parts:
+        print(part.folder / CHECKPOINT)
+    return 0
+
+
+def trained(folder: Path, config: RunConfig, args: argparse.Namespace) -> list[Part]:
+    """Train a run to its end, with a bar."""
+    from morphgen.rl.training import train
+
+    with shown() as show:
+        return train(folder, config, resume=args.resume, way=way_of(args), show=show)
+
+
+def source_of(words: list[str], args: argparse.Namespace) -> Source:
+    """The robots that words mean.
+
+    Raises:
+        TaskError: If a robot has no task, or the seed of the goals is none.
+        MorphgenError: If there is no such split.
+    """
+    from morphgen.cli.goals import read_split_or_built
+    from morphgen.errors import BenchmarkError, TaskError
+    from morphgen.rl.sources import robot_source, split_source
+
+    if args.goal_seed < 0:
+        raise TaskError(f"--goal-seed {args.goal_seed}: expected 0 or more")
+    common = {"goal_seed": args.goal_seed, "library": tuple(args.library)}
+    given = [word for word in words if word.startswith("task=")]
+    robot = [word for word in words if not word.startswith("task=")]
+    if given:
+        task = given[-1].partition("=")[2]
+        if len(given) > 1 or task not in ("reach", "push") or not robot:
+            raise TaskError(f"{' '.join(words)}: name a robot and one task=reach or task=push")
+        return robot_source(" ".join(robot), task, obstacles=args.obstacles, **common)  # type: ignore[arg-type]
+    if len(words) > 1 or "=" in words[0]:
+        raise TaskError(f"{' '.join(words)}: a robot needs its task, task=reach or task=push")
+    if args.obstacles:
+        raise TaskError("--obstacles is for one robot; a split says which robots have any")
+    try:
+        split, _ = read_split_or_built(words[0])
+    except BenchmarkError as error:
+        raise BenchmarkError(f"{error}; a robot needs task=reach or task=push") from error
+    return split_source(split, side=args.on, **common)
+
+
+def variant_of(args: argparse.Namespace) -> Variant:
+    """The agent with the switches that were given.
+
+    Raises:
+        TaskError: If it is unknown.
+    """
+    from dataclasses import replace
+
+    from morphgen.rl.variants import parse_variant
+
+    given = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
+    variant = parse_variant(args.agent)
+    switches = {name: on for name, on in given.items() if on is not None}
+    return replace(variant, switches={**variant.switches, **switches})
+
+
+def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> RunConfig:
+    """What is asked for.
+
+    Raises:
+        TaskError: If a number is out of its range.
+    """
+    from morphgen.rl.runs import RunConfig
+    from morphgen.rl.sources import tasks_of
+    from morphgen.rl.variants import constants, settle
+
+    changes = {**constants(args.set), "bf16": args.bf16, "compile": args.compile}
+    policy, ppo = settle(variant, tasks_of(source), changes, args.steps)
+    return RunConfig(
+        source,
+        policy,
+        ppo,
+        seed=args.seed,
+        sim=args.sim,
+        envs=args.envs,
+        device=args.device,
+        whole=args.whole,
+    )
+
+
+def way_of(args: argparse.Namespace) -> Way:
+    """How runs are done."""
+    from morphgen.rl.training import Way
+
+    return Way(args.workers, not args.no_tensorboard, args.wandb)
+
+
+def place(source: Source) -> str:
+    """A folder's name for robots."""
+    import re
+
+    name = source.name if source.split else f"{source.name}-{source.task}"
+    if source.obstacles:
+        name += "-obstacles"
+    if source.side != "train":
+        name += f"-{source.side}"
+    return re.sub(r"[^\w./-]+", "-", name).strip("/.")
+
+
+@contextmanager
+def shown() -> Iterator[Shower]:
+    """Bars on stderr while there is one to look at, else some lines."""
+    shower = Shower()
+    try:
+        yield shower
+    except KeyboardInterrupt:
+        shower.close()
+        print("morphgen: the run goes on from its last checkpoint with --resume", file=sys.stderr)
+        raise
+    finally:
+        shower.close()
+
+
+class Shower:
+    """Shows how a run goes."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm[NoReturn] | None = None
+
+    def __call__(self, part: Part) -> Show:
+        """Begin with a part."""
+        self.close()
+        name = part.config.source.only or part.config.source.name
+        if not sys.stderr.isatty():
+            return lambda report, updates: _print(name, report, updates)
+        from tqdm import tqdm
+
+        total = part.config.updates * part.config.ppo.steps * part.config.envs
+        self._bar = tqdm(
+            total=total,
+            desc=name,
+            unit="step",
+            unit_scale=True,
+            file=sys.stderr,
+            dynamic_ncols=True,
+        )
+        return self._show
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def _show(self, report: Report, updates: int) -> None:
+        assert self._bar is not None
+        if self._bar.n == 0:
+            self._bar.initial = report.transitions - report.transitions // report.update
+            self._bar.n = self._bar.initial
+        self._bar.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
+        self._bar.update(report.transitions - self._bar.n)
+
+
+def _print(name: str, report: Report, updates: int) -> None:
+    if report.update % max(updates // 20, 1) and report.update < updates:
+        return
+    left = (updates - report.update) * report.transitions / report.update / report.steps_per_second
+    print(
+        f"{name}: update {report.update} of {updates}, {report.transitions:,} steps, "
+        f"score {report.score:.2f}, success {_success(report)}, "
+        f"{report.steps_per_second:,.0f} steps/s, {left / 60:.1f} min left",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def _success(report: Report) -> str:
+    return f"{report.success:.0%}" if report.episodes else "unknown"

@@ -1,0 +1,315 @@
+"""How well a policy or a reference controller does, robot by robot, beside chance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.benchmark.split import Side, Task
+from morphgen.errors import TaskError, nearest
+from morphgen.model.kinematics import reach
+from morphgen.rl.intervals import mean_interval
+from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.rollouts import Controller, Episode, run_episodes
+from morphgen.rl.runs import RunConfig, read_checkpoint
+from morphgen.rl.scripted_push import ScriptedPush
+from morphgen.rl.sources import Source, other_side, settings_of
+from morphgen.rl.trained import Mode, Policy
+from morphgen.rl.training import checkpoints
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.make import SimulatorName, batch_of
+from morphgen.tasks.settings import Recipe, Setting
+
+REFERENCES: dict[str, tuple[Task, ...]] = {
+    "random": ("reach", "push"),
+    "zero": ("reach", "push"),
+    "ik": ("reach",),
+    "scripted": ("push",),
+}
+"""Controllers that learn nothing, and the tasks that they are for."""
+STEPS = 10_000
+"""Control steps of an evaluation, a robot (paper)."""
+AT_ONCE = 34
+"""Environments of a robot at most: with these, 10,000 steps are one episode in each."""
+SALT = 0x5C0_4E5
+"""So that an evaluation's episodes are not those of the training with the same seed."""
+
+Acting = Callable[[TaskBatch], Controller]
+"""What acts in a batch."""
+
+
+@dataclass(frozen=True)
+class Exam:
+    """How an evaluation is done."""
+
+    episodes: int = 34
+    """Of each robot at least; all episodes of a robot count, from their starts to their ends."""
+    sim: SimulatorName = "pybullet"
+    seed: int = 0
+    workers: int = 1
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    push: PushConfig = field(default_factory=PushConfig)
+
+    def __post_init__(self) -> None:
+        """Check.
+
+        Raises:
+            TaskError: If there is no episode, or the seed is none.
+        """
+        if self.episodes < 1 or self.seed < 0:
+            raise TaskError(
+                f"{self.episodes} episodes, seed {self.seed}: at least one episode, and no "
+                "negative seed"
+            )
+
+
+@dataclass(frozen=True)
+class Score:
+    """A robot's part of an evaluation."""
+
+    robot: str
+    side: Side
+    task: Task
+    episodes: int
+    steps: int
+    score: float
+    """Reach: ``raw`` above chance. Push: the success rate (paper)."""
+    low: float
+    high: float
+    """Of the score: 95% bootstrap interval over episodes; nan if there is one episode."""
+    raw: float
+    """Reach: mean of ``anybody_score`` over all steps. Push: the success rate."""
+    random: float
+    """The same of the random controller."""
+    success: float
+    """Share of the episodes that end in success."""
+    random_success: float
+    distance: float
+    """From success at the end, metres, mean."""
+    relative_distance: float
+    """Reach: the same over the robot's reach; nan for push."""
+
+
+def episodes_for(steps: int, longest: int) -> int:
+    """How many episodes of full length have so many steps.
+
+    Raises:
+        TaskError: If there are none.
+    """
+    if steps < 1:
+        raise TaskError(f"--steps {steps}: expected 1 or more")
+    return -(-steps // longest)
+
+
+def evaluate_run(
+    path: Path, side: Side, exam: Exam, mode: Mode, *, device: str = "cpu"
+) -> list[Score]:
+    """Evaluate what was trained on the robots of a side of its split, or on its one robot.
+
+    Policies of single robots, of ``se``, are each evaluated on their own robot, and all of them on
+    every robot of another side, where their episodes count alike.
+
+    Args:
+        path: A checkpoint, or a run's folder.
+        side: Of the split.
+        exam: How.
+        mode: Whether policies do what is likeliest, or draw.
+        device: Where the networks are.
+
+    Raises:
+        TaskError: If there is no checkpoint, or no such side.
+    """
+    files = list(checkpoints(path))
+    sources = [read_checkpoint(file)[0].source for file in files]
+    if all(source.only for source in sources) and sources[0].side == side:
+        pairs = zip(files, sources, strict=True)
+        own = (evaluate_checkpoints([file], one, exam, mode, device=device) for file, one in pairs)
+        return [score for scores in own for score in scores]
+    return evaluate_checkpoints(files, other_side(sources[0], side), exam, mode, device=device)
+
+
+def evaluate_checkpoints(
+    paths: Sequence[Path], source: Source, exam: Exam, mode: Mode, *, device: str = "cpu"
+) -> list[Score]:
+    """Evaluate trained policies, the episodes of all together.
+
+    Raises:
+        TaskError: If one is no checkpoint, or for other observations.
+        MorphgenError: If a robot or simulator cannot be made.
+    """
+    acting, kinds = [], set()
+    for path in paths:
+        run, learner = read_checkpoint(path)
+        acting.append(_policy(learner, mode, exam.seed, device))
+        kinds.add(run.policy.kind)
+    (kind,) = kinds
+    return evaluate(acting, source, exam, kind=kind)
+
+
+def _policy(learner: dict[str, Any], mode: Mode, seed: int, device: str) -> Acting:
+    return lambda batch: Policy(learner, mode, seed, device)
+
+
+def evaluate_reference(name: str, source: Source, exam: Exam) -> list[Score]:
+    """Evaluate a controller that learns nothing; see ``REFERENCES``.
+
+    Its actions are continuous. Robots at a task that it is not for are left out.
+
+    Raises:
+        TaskError: If it is unknown, or for none of the robots' tasks.
+    """
+    if name not in REFERENCES:
+        raise TaskError(f"unknown reference {name!r}{nearest(name, REFERENCES)}")
+
+    def acting(batch: TaskBatch) -> Controller:
+        if name == "ik":
+            spaces = [FreeSpace(setting.scene) for setting in batch.settings]
+            return InverseKinematics(exam.seed, spaces)
+        if name == "scripted":
+            return ScriptedPush(exam.seed)
+        return Random(exam.seed) if name == "random" else Zero()
+
+    return evaluate([acting], source, exam, kind="continuous", tasks=REFERENCES[name])
+
+
+def evaluate(
+    acting: Sequence[Acting],
+    source: Source,
+    exam: Exam,
+    *,
+    kind: ActionKind,
+    tasks: Sequence[Task] = ("reach", "push"),
+) -> list[Score]:
+    """Scores of the robots of a source, in order; the random controller has the same episodes.
+
+    Args:
+        acting: What acts: each in episodes of its own, which all count.
+        source: The robots.
+        exam: How.
+        kind: Of their actions.
+        tasks: Robots at other tasks are left out.
+
+    Raises:
+        TaskError: If no robot is left.
+        MorphgenError: If a robot or simulator cannot be made.
+    """
+    recipe = Recipe(reach=exam.reach, push=exam.push)
+    settings = [each for each in settings_of(source, recipe) if each.task in tasks]
+    if not settings:
+        raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
+    folders = tuple(map(Path, source.library))
+    played: list[list[Episode]] = [[] for _ in settings]
+    for one in acting:
+        for all_own, own in zip(played, _played(one, settings, exam, kind, folders), strict=True):
+            all_own.extend(own)
+    chance = _chance(source, exam, tuple(tasks), settings, folders)
+    return [
+        _score(setting, source.side, own, other)
+        for setting, own, other in zip(settings, played, chance, strict=True)
+    ]
+
+
+_known: dict[object, list[list[Episode]]] = {}
+
+
+def _chance(
+    source: Source,
+    exam: Exam,
+    tasks: tuple[Task, ...],
+    settings: Sequence[Setting],
+    folders: tuple[Path, ...],
+) -> list[list[Episode]]:
+    """Episodes of the random controller; played once in a process."""
+    key = (source, replace(exam, workers=1), tasks)
+    if key not in _known:
+        _known[key] = _played(
+            lambda batch: Random(exam.seed), settings, exam, "continuous", folders
+        )
+    return _known[key]
+
+
+def _played(
+    acting: Acting,
+    settings: Sequence[Setting],
+    exam: Exam,
+    kind: ActionKind,
+    folders: tuple[Path, ...],
+) -> list[list[Episode]]:
+    """Episodes by robot."""
+    rounds = -(-exam.episodes // AT_ONCE)
+    each = -(-exam.episodes // rounds)
+    batch = batch_of(
+        settings,
+        each * len(settings),
+        sim=exam.sim,
+        seed=int(np.random.SeedSequence([SALT, exam.seed]).generate_state(1)[0]),
+        kind=kind,
+        workers=exam.workers,
+        reach=exam.reach,
+        push=exam.push,
+        library=folders,
+    )
+    try:
+        found: list[list[Episode]] = [[] for _ in settings]
+        for episode in run_episodes(batch, acting(batch), rounds):
+            found[episode.body].append(episode)
+    finally:
+        batch.close()
+    return found
+
+
+def _score(
+    setting: Setting, side: Side, own: Sequence[Episode], chance: Sequence[Episode]
+) -> Score:
+    raw, random = _raw(setting, own), _raw(setting, chance)
+    reaches = setting.task == "reach"
+    above = raw - np.resize(random, len(raw)) if reaches else raw
+    interval = mean_interval(above)
+    distance = float(np.mean([episode.distance for episode in own]))
+    return Score(
+        robot=setting.robot.name,
+        side=side,
+        task=setting.task,
+        episodes=len(own),
+        steps=sum(episode.steps for episode in own),
+        score=interval.value,
+        low=interval.low,
+        high=interval.high,
+        raw=float(raw.mean()),
+        random=float(random.mean()),
+        success=float(np.mean([episode.success for episode in own])),
+        random_success=float(np.mean([episode.success for episode in chance])),
+        distance=distance,
+        relative_distance=distance / reach(setting.robot) if reaches else math.nan,
+    )
+
+
+def _raw(setting: Setting, episodes: Sequence[Episode]) -> NDArray[np.float64]:
+    """A number an episode, whose mean is the raw score; episodes of reach are equally long.
+
+    Episodes of reach have the same goals and starts in the same order, whatever acts.
+    """
+    reaches = setting.task == "reach"
+    return np.array([each.score if reaches else float(each.success) for each in episodes])
+
+
+def exam_of(config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1) -> Exam:
+    """An evaluation in the simulator and with the tasks of a run."""
+    return Exam(episodes, config.sim, seed, workers, config.reach, config.push)
+
+
+def as_data(scores: Sequence[Score]) -> list[dict[str, Any]]:
+    """Scores for JSON; nothing instead of what is no number."""
+    return [
+        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(each).items()}
+        for each in scores
+    ]

@@ -1,0 +1,158 @@
+"""Watch a controller at work: episodes of one robot, with their results and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from morphgen.benchmark.split import Task
+from morphgen.errors import TaskError, nearest
+from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.scripted_push import ScriptedPush
+from morphgen.rl.trained import Policy
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.film import Frame
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.gym_env import TaskEnv
+
+POLICIES = ("zero", "random", "ik", "scripted")
+STRIDE = 2
+"""Control steps between two pictures."""
+FPS = 1 / (STRIDE * CONTROL_PERIOD)
+"""Pictures a second, so that films run as fast as what they show: 25."""
+_ONLY_FOR: dict[str, Task] = {"ik": "reach", "scripted": "push"}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """How an episode went."""
+
+    success: bool
+    """At its end."""
+    distance: float
+    """From success then, metres; see ``Step``."""
+    score: float
+    """Reach: the mean of ``anybody_score`` over its steps; push: 1 for success, else 0."""
+    seconds: float
+    """How long it was, simulated."""
+
+
+class Controller(Protocol):
+    """What acts."""
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Actions of all environments, shape (n, L)."""
+
+
+def require_policy(name: str, task: Task) -> None:
+    """Require that there is such a controller for a task.
+
+    Raises:
+        TaskError: If there is none, or it is for the other task.
+    """
+    if _is_file(name):
+        return
+    valid = [policy for policy in POLICIES if _ONLY_FOR.get(policy, task) == task]
+    if name in POLICIES and name not in valid:
+        raise TaskError(
+            f"policy {name!r} is for {_ONLY_FOR[name]}, not for {task}; valid: {', '.join(valid)}"
+        )
+    if name not in POLICIES:
+        raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
+
+
+def kind_of(name: str) -> ActionKind | None:
+    """What actions a policy has, if it has but one kind: that of a checkpoint.
+
+    Raises:
+        TaskError: If what is there is no checkpoint.
+    """
+    return read_checkpoint(Path(name))[0].policy.kind if _is_file(name) else None
+
+
+def controller(name: str, env: TaskEnv, seed: int) -> Controller:
+    """A controller by its name.
+
+    Args:
+        name: ``zero``, ``random``, ``ik`` (for reach) or ``scripted`` (for push); or the path of a
+            checkpoint or of a run's folder, whose policy does what is likeliest.
+        env: What it is to act in.
+        seed: Of what it draws.
+
+    Raises:
+        TaskError: As ``require_policy``; or if what is there is no checkpoint, or one for other
+            observations or actions.
+        BenchmarkError: If the robot has hardly a free configuration.
+    """
+    require_policy(name, env.task)
+    if _is_file(name):
+        run, learner = read_checkpoint(Path(name))
+        if run.policy.kind != env.batch.kind:
+            raise TaskError(f"{name}: its actions are {run.policy.kind}, not {env.batch.kind}")
+        policy = Policy(learner, "deterministic", seed)
+        policy.require(env.batch.observe())
+        return policy
+    if name == "ik":
+        return InverseKinematics(seed, [FreeSpace(env.setting.scene)])
+    if name == "scripted":
+        return ScriptedPush(seed)
+    return Random(seed) if name == "random" else Zero()
+
+
+def play(
+    env: TaskEnv,
+    acting: Controller,
+    episodes: int,
+    seed: int,
+    report: Callable[[Episode], None],
+) -> Iterator[Frame]:
+    """Run episodes, and show them if the environment is rendered.
+
+    Args:
+        env: The environment, not wrapped.
+        acting: The controller.
+        episodes: How many.
+        seed: Of the episodes.
+        report: Called at the end of each.
+
+    Yields:
+        Pictures, ``FPS`` a second of simulated time, with the first and last moment of an episode.
+
+    Raises:
+        SimulationError: If the simulation becomes unstable.
+    """
+    links = list(env.action_links)
+    for number in range(episodes):
+        env.reset(seed=seed if number == 0 else None)
+        yield from _shown(env)
+        scores: list[float] = []
+        over = False
+        while not over:
+            action = acting.act(env.batch)[0, links].cpu().numpy()
+            _, _, terminated, truncated, info = env.step(action)
+            scores.append(info["score"])
+            over = terminated or truncated
+            if over or len(scores) % STRIDE == 0:
+                yield from _shown(env)
+        score = float(np.mean(scores)) if env.task == "reach" else scores[-1]
+        seconds = len(scores) * CONTROL_PERIOD
+        report(Episode(info["success"], info["distance"], score, seconds))
+
+
+def _is_file(policy: str) -> bool:
+    return policy not in POLICIES and Path(policy).exists()
+
+
+def _shown(env: TaskEnv) -> Iterator[Frame]:
+    if env.render_mode is not None:
+        frame = env.render()
+        assert frame is not None
+        yield frame

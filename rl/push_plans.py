@@ -1,0 +1,211 @@
+"""Plans of a push: a configuration behind the block, a free way there, and how to go on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.model.dynamics import actuation
+from morphgen.rl.cartesian import OneTool
+from morphgen.rl.free_ways import FreeWays
+from morphgen.rl.push_contacts import Poised, poised, touches
+from morphgen.tasks.bodies import Bodies
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.inverse_kinematics import bring_tool, tool_jacobian
+from morphgen.tasks.push_proofs import free_within
+from morphgen.tasks.settings import Setting
+from morphgen.tasks.sim.base import GRAVITY
+
+Array = NDArray[np.float64]
+
+SPEED = 0.006
+"""Largest way of the tool in a control step while it pushes, metres: 0.3 m/s."""
+
+_BEHIND = (0.1, 0.4, 0.8, 1.3)
+"""Distances of the tool behind the block's hindmost point that are tried, in its edges."""
+_NEAREST = 24
+"""Configurations from which each of them is tried."""
+_LOW, _HIGH = 0.2, 0.7
+"""Heights of the tool that are aimed at, in edges."""
+_KEPT = 14
+"""Configurations behind the block to which simple ways are looked for."""
+_POINTS = 12
+"""Of a push, at which it is tried out."""
+_REACHED = 0.02
+"""Distance from a point that counts as there, in edges."""
+_TOLERANCE = (0.3, 0.4)
+"""How much nearer the block has to touch, and how much farther be free, further on; in edges."""
+_LIFT = 1.4
+"""How far above its place the tool comes down, in edges."""
+_PARTING = 0.15, 8
+"""Way of the tool in a step away from the block, in edges, and how many steps there may be."""
+_AWAY = ((0.0, -1.0, 0.0), (0.0, -0.7, 0.7), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+_UNFINISHED, _NARROW, _ROOF = 400.0, 120.0, 150.0
+"""Control steps that it is worth to get all the way, on a broad front, and not from above."""
+_SOFT = 3000.0
+"""Control steps that a metre is worth by which the tool gives way to the block's friction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How to push."""
+
+    way: tuple[Array, ...]
+    """Configurations to go through, each (dof,); at the last the tool is behind the block."""
+    rotation: torch.Tensor
+    """How the tool is turned there, shape (3, 3)."""
+    height: float
+    """Of the tool there, metres."""
+    aside: float
+    """x of the tool less x of the block, so that it pushes the middle, metres."""
+    gap: float
+    """How far the tool goes until it touches, metres."""
+
+
+class PushPlanner:
+    """Plans for one robot and its block."""
+
+    def __init__(
+        self, setting: Setting, bodies: Bodies, index: int, rng: np.random.Generator
+    ) -> None:
+        """Collect free configurations that are low and where the block is pushed.
+
+        Args:
+            setting: A push.
+            bodies: Robots.
+            index: Which of them the setting is of.
+            rng: Where configurations come from.
+
+        Raises:
+            ValueError: If the setting is no push.
+        """
+        pushes, robot = setting.pushes, setting.robot
+        if pushes is None:
+            raise ValueError(f"{robot.name} does not push")
+        self._robot, self._tool = robot, OneTool(bodies, index)
+        self._edge, self._line, self._ground = pushes.block.size[0], pushes.line, pushes.ground
+        self._friction = pushes.block.friction * pushes.block.mass * GRAVITY
+        self._stiffness = np.array([gain.stiffness for gain in actuation(robot)])
+        self._others = ~bodies.moves_tool[index, : robot.dof].cpu().numpy()
+        self._space = FreeSpace(setting.scene)
+        step = bodies.step[index, : robot.dof].double().cpu().numpy()
+        self._ways = FreeWays(self._space, step, rng)
+        edge, first, last = self._edge, pushes.blocks.min(axis=0), pushes.blocks.max(axis=0)
+        low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
+        high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
+        self._bank, self._tools = free_within(self._space, low, high, rng)
+
+    def plan(self, q: Array, block: Array, attempt: int = 0) -> Plan | None:
+        """Look for a way to push.
+
+        Args:
+            q: Where the joints are, shape (dof,).
+            block: Pose of the block, shape (7,).
+            attempt: How many plans were made before; each goes by way of other configurations.
+
+        Returns:
+            The plan that takes the least time, or gets farthest; None if there is none.
+        """
+        found = poised(self._space, self._behind(q, block), block, self._edge)
+        position, rotation = self._tool.poses(found.q)
+        aside = position[:, 0] - block[0] - found.middle
+        share = self._tried_out(found, position, rotation, aside, block)
+        cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width) + _ROOF * found.roof
+        cost += found.gap / SPEED + _SOFT * self._given_way(found.q)
+        best = np.argsort(cost + self._ways.steps(q, found.q), kind="stable")
+        best = best[share[best] > 0]
+        first = best[:_KEPT]
+        start = self._parted(q, block)
+        vias = self._lifted(found.q[first], position[first], rotation[first])
+        way = self._ways.find(start, found.q[first], vias, cost[first], block, attempt)
+        if way is None:
+            way = self._ways.find_round_about(start, found.q[best], block, attempt)
+        if way is None:
+            return None
+        i = best[way.end]
+        return Plan(
+            way=way.points if start is q else (start, *way.points),
+            rotation=torch.from_numpy(rotation[i]).float(),
+            height=float(position[i, 2]),
+            aside=float(aside[i]),
+            gap=float(found.gap[i]),
+        )
+
+    def _behind(self, q: Array, block: Array) -> Array:
+        """Free configurations with the tool behind the block, shape (n, dof)."""
+        edge = self._edge
+        yaw = 2 * np.arctan2(block[6], block[3])
+        hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
+        goals, starts = [], []
+        for distance in _BEHIND:
+            place = np.array([block[0], hindmost - distance * edge])
+            apart = np.linalg.norm(self._tools[:, :2] - place, axis=1)
+            near = np.argsort(apart, kind="stable")[:_NEAREST]
+            height = np.clip(self._tools[near, 2] - self._ground, _LOW * edge, _HIGH * edge)
+            goals.append(np.column_stack([np.tile(place, (len(near), 1)), self._ground + height]))
+            starts.append(self._bank[near])
+        start, goal = np.concatenate(starts), np.concatenate(goals)
+        start[::2, self._others] = q[self._others]
+        start[1::2, self._others] = np.array(self._robot.home)[self._others]
+        found, error = bring_tool(self._robot, start, goal)
+        there = (np.abs(error[:, :2]) < _REACHED * edge).all(axis=1)
+        found = found[there & (np.abs(error[:, 2]) < edge / 2)]
+        return found[self._space.free(found, np.tile(block, (len(found), 1)))]
+
+    def _given_way(self, q: Array) -> Array:
+        """How far tools give way along y where the block's friction pushes back, (n,), metres."""
+        _, J = tool_jacobian(self._robot, q)
+        return np.asarray(self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1))
+
+    def _tried_out(
+        self, found: Poised, position: Array, rotation: Array, aside: Array, block: Array
+    ) -> Array:
+        """Which share of the push configurations get through, shape (n,).
+
+        The tool is taken along its way as it will be; where the block then is, it is to be near,
+        and not in the way.
+        """
+        edge, q = self._edge, found.q
+        through = found.gap + self._line - block[1] + 0.1 * edge
+        good, share = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
+        for i in range(1, _POINTS + 1):
+            ahead = through * i / _POINTS
+            goal = position.copy()
+            goal[:, 0] = block[0] + aside
+            goal[:, 1] += ahead
+            q = self._tool.brought(q, goal, rotation, 4)
+            off = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
+            good &= (off < _REACHED * edge + 0.002) & self._space.free(q)
+            moved = np.maximum(ahead - found.gap, 0)[:, None]
+            shifts = moved + np.array([-_TOLERANCE[0], _TOLERANCE[1]]) * edge
+            near, far = touches(self._space, q, block, np.zeros(1), shifts).T
+            good &= (near & ~far) | (ahead < found.gap)
+            share[good] = i / _POINTS
+        begun = share * through > found.gap + 0.1 * edge
+        return np.where(begun, share, 0.0)
+
+    def _lifted(self, ends: Array, position: Array, rotation: Array) -> Array:
+        """Configurations with the tool above, or as high as it gets, shape (n, dof)."""
+        goal, q = position.copy(), ends
+        for _ in range(5):
+            goal[:, 2] += _LIFT * self._edge / 5
+            q = self._tool.brought(q, goal, rotation, 3)
+        return q
+
+    def _parted(self, q: Array, block: Array) -> Array:
+        """The configuration itself if it is free of the block, or one near it that is."""
+        if self._space.free(q[None], block[None])[0]:
+            return q
+        position, rotation = self._tool.poses(q[None])
+        stride, steps = _PARTING
+        for direction in _AWAY:
+            goal, found = position.copy(), q[None]
+            for _ in range(steps):
+                goal += stride * self._edge * np.array(direction)
+                found = self._tool.brought(found, goal, rotation, 3)
+                if self._space.free(found, block[None])[0]:
+                    return np.asarray(found[0])
+        return q

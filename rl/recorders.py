@@ -1,0 +1,166 @@
+"""What is measured on the way of a run: lines of JSON, events of TensorBoard, Weights & Biases."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+from morphgen.errors import MissingDependencyError
+from morphgen.formats.files import write_atomic
+from morphgen.rl.report import Report
+from morphgen.rl.runs import RunConfig
+
+METRICS, EVENTS = "metrics.jsonl", "events"
+
+
+class Recorder(Protocol):
+    """Keeps reports."""
+
+    def record(self, report: Report) -> None:
+        """Keep one."""
+
+    def close(self) -> None:
+        """Finish."""
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Reports of a run, an update each, oldest first; none if it has none yet.
+
+    A last line that a killed run left unfinished does not count.
+    """
+    path = folder / METRICS
+    if not path.is_file():
+        return []
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
+    return [json.loads(line) for line in lines]
+
+
+class Metrics:
+    """``metrics.jsonl``: a line a report, nothing instead of what is not finite."""
+
+    def __init__(self, folder: Path, update: int) -> None:
+        """Go on after an update; what was kept of later ones is forgotten."""
+        kept = [each for each in read_metrics(folder) if each["update"] <= update]
+        path = folder / METRICS
+        write_atomic(path, "".join(json.dumps(each) + "\n" for each in kept))
+        self._file = path.open("a", encoding="utf-8")
+
+    def record(self, report: Report) -> None:
+        """Write a line."""
+        self._file.write(json.dumps(_finite(asdict(report))) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class TensorBoard:
+    """Events that ``tensorboard --logdir`` shows."""
+
+    def __init__(self, folder: Path, update: int) -> None:
+        """Go on after an update.
+
+        Raises:
+            MissingDependencyError: If tensorboard is not installed.
+        """
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise MissingDependencyError(
+                "TensorBoard is not installed: pip install tensorboard, or say --no-tensorboard"
+            ) from error
+        self._writer = SummaryWriter(str(folder / EVENTS), purge_step=update + 1)
+
+    def record(self, report: Report) -> None:
+        """Write scalars, by update."""
+        for name, value in scalars(report):
+            self._writer.add_scalar(name, value, report.update)
+
+    def close(self) -> None:
+        """Write what is not written yet."""
+        self._writer.close()
+
+
+class WeightsAndBiases:
+    """A run of Weights & Biases."""
+
+    def __init__(self, folder: Path, config: RunConfig) -> None:
+        """Begin, or go on with the run of this folder.
+
+        Raises:
+            MissingDependencyError: If wandb is not installed.
+        """
+        self._run = require_wandb().init(
+            project="morphgen",
+            name=str(folder),
+            id=folder.resolve().as_posix().strip("/").replace("/", "-")[-64:],
+            resume="allow",
+            dir=folder,
+            config=asdict(config),
+        )
+
+    def record(self, report: Report) -> None:
+        """Send scalars, by update."""
+        self._run.log(dict(scalars(report)), step=report.update)
+
+    def close(self) -> None:
+        """Finish."""
+        self._run.finish()
+
+
+def require_wandb() -> ModuleType:
+    """Weights & Biases.
+
+    Raises:
+        MissingDependencyError: If wandb is not installed.
+    """
+    try:
+        return import_module("wandb")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--wandb needs the package wandb: pip install wandb"
+        ) from error
+
+
+@contextmanager
+def recording(
+    folder: Path, config: RunConfig, update: int, *, tensorboard: bool, wandb: bool
+) -> Iterator[list[Recorder]]:
+    """The recorders of a run that goes on after an update."""
+    with ExitStack() as stack:
+        kept: list[Recorder] = [Metrics(folder, update)]
+        stack.callback(kept[0].close)
+        if tensorboard:
+            kept.append(TensorBoard(folder, update))
+            stack.callback(kept[-1].close)
+        if wandb:
+            kept.append(WeightsAndBiases(folder, config))
+            stack.callback(kept[-1].close)
+        yield kept
+
+
+def scalars(report: Report) -> Iterator[tuple[str, float]]:
+    """Names and values of a report that are numbers; those of robots and terms by ``/``."""
+    for name, value in asdict(report).items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name}/{key}", float(each)) for key, each in value.items())
+        elif isinstance(value, tuple):
+            yield from ((f"{name}/{i}", float(each)) for i, each in enumerate(value))
+        elif math.isfinite(value):
+            yield name, float(value)
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, tuple):
+        return [_finite(each) for each in value]
+    return value if not isinstance(value, float) or math.isfinite(value) else None

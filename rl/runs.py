@@ -1,0 +1,200 @@
+"""A run's folder: what was asked for, and how far it got."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from morphgen.errors import FormatError, TaskError
+from morphgen.formats.files import LOCK, partial_of, write_atomic
+from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.sources import Source
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.make import SimulatorName
+
+CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
+FORMAT = 1
+"""Of config and checkpoint."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """All that a run's weights follow from, but the machine."""
+
+    source: Source
+    policy: PolicyConfig
+    ppo: PPOConfig
+    seed: int = 0
+    """Of weights, actions, minibatches and episodes."""
+    sim: SimulatorName = "pybullet"
+    envs: int = 128
+    device: str = "cpu"
+    """Of networks and rollouts."""
+    begin: str = ""
+    """A checkpoint whose networks it begins with."""
+    whole: bool = False
+    """Whether ``se`` has all environments and transitions for each robot of a split (paper); else
+    the robots share them, as those of an agent of many robots do."""
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    push: PushConfig = field(default_factory=PushConfig)
+
+    @property
+    def updates(self) -> int:
+        """How many there will be."""
+        return self.ppo.updates(self.envs)
+
+
+def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
+    """Make a run's folder, or make sure that the one that is there is of this run.
+
+    Raises:
+        TaskError: As ``require_open``.
+        FormatError: If it cannot be written.
+    """
+    require_open(folder, config, resume=resume)
+    path = folder / CONFIG
+    if path.is_file():
+        return
+    data = {"format": FORMAT, "morphgen": version("morphgen"), **asdict(config)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, json.dumps(data, indent=2) + "\n")
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+
+
+def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
+    """Require that a run can be in a folder, before anything is written.
+
+    Raises:
+        TaskError: If it is there and is not to be resumed, or is of another run or none.
+    """
+    path = folder / CONFIG
+    if path.is_file():
+        if not resume:
+            raise TaskError(f"{folder} has a run: say --resume to go on, or another --out")
+        _require_same(folder, read_config(folder), config)
+    elif folder.is_dir():
+        own = (LOCK, partial_of(path).name)
+        if any(each.name not in own for each in folder.iterdir()):
+            raise TaskError(f"{folder} is there and is no run's folder: name another with --out")
+    elif folder.exists():
+        raise TaskError(f"{folder} is a file: name a folder with --out")
+
+
+def read_config(folder: Path) -> RunConfig:
+    """What a run was asked for.
+
+    Raises:
+        TaskError: If the folder is no run's.
+    """
+    path = folder / CONFIG
+    try:
+        return config_from(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise TaskError(f"{folder} is no run's folder: it has no {CONFIG}") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TaskError(f"{path} is not the config of a run: {error}") from error
+
+
+def config_from(data: Mapping[str, Any]) -> RunConfig:
+    """A config from what JSON keeps of it.
+
+    Raises:
+        KeyError: If something is missing.
+        TypeError: If something is unknown.
+        TaskError: If something is out of its range.
+    """
+    own = {key: value for key, value in data.items() if key not in ("format", "morphgen")}
+    source = {**own.pop("source")}
+    source["library"] = tuple(source["library"])
+    tasks = {name: _tuples(own.pop(name)) for name in ("reach", "push")}
+    return RunConfig(
+        Source(**source),
+        PolicyConfig(**own.pop("policy")),
+        PPOConfig(**own.pop("ppo")),
+        reach=ReachConfig(**tasks["reach"]),
+        push=PushConfig(**tasks["push"]),
+        **own,
+    )
+
+
+def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:
+    """Put a checkpoint in the place of the last one.
+
+    Raises:
+        FormatError: If it cannot be written.
+    """
+    content = io.BytesIO()
+    torch.save({"format": FORMAT, "run": asdict(config), "learner": dict(learner)}, content)
+    path = folder / CHECKPOINT
+    try:
+        write_atomic(path, content.getvalue())
+    except OSError as error:
+        raise FormatError(f"cannot write {path}: {error.strerror}") from error
+
+
+def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
+    """The run of a checkpoint, and what its learner was then.
+
+    Args:
+        path: The file, or the run's folder. Nothing in it is executed.
+
+    Raises:
+        TaskError: If there is none, or it is none of a run.
+    """
+    file = path / CHECKPOINT if path.is_dir() else path
+    if not file.is_file():
+        raise TaskError(f"{file}: no such checkpoint")
+    try:
+        data = torch.load(file, map_location="cpu", weights_only=True)
+        return config_from(data["run"]), data["learner"]
+    except (
+        pickle.UnpicklingError,
+        RuntimeError,
+        EOFError,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        AttributeError,
+    ) as error:
+        raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
+
+
+def _tuples(data: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: tuple(v) if isinstance(v, list) else v for key, v in data.items()}
+
+
+def _require_same(folder: Path, stored: RunConfig, asked: RunConfig) -> None:
+    theirs, ours = _flat(asdict(stored)), _flat(asdict(asked))
+    wrong = [
+        f"{name} {_short(theirs[name])}, not {_short(ours[name])}"
+        for name in ours
+        if theirs[name] != ours[name]
+    ]
+    if wrong:
+        raise TaskError(f"{folder} has another run: {'; '.join(wrong)}")
+
+
+def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in data.items():
+        if isinstance(value, dict):
+            flat.update({f"{name}.{key}": each for key, each in value.items()})
+        else:
+            flat[name] = value
+    return flat
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) < 60 and "\n" not in text else f"of {len(text)} letters"

@@ -1,0 +1,96 @@
+"""Scores of one policy as a table, for eyes and for files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+from tabulate import tabulate
+
+from morphgen.errors import TaskError, nearest
+from morphgen.formats.files import save
+from morphgen.rl.evaluation import Score, as_data
+
+SIDES = {"train": "MT", "test": "ZS"}
+"""What the paper calls the mean score of a side: multi-task and zero-shot."""
+HEADERS = ("robot", "side", "task", "mode", "score", "95%", "success", "raw", "random", "distance")
+SUFFIXES = (".csv", ".json", ".md")
+
+Scores = Mapping[str, Sequence[Score]]
+"""By mode, or by the name of a reference."""
+
+
+def score_table(found: Scores, style: str = "simple") -> str:
+    """A line a robot and mode; ``style`` is one of tabulate's."""
+    rows = [_row(mode, each) for mode, scores in found.items() for each in scores]
+    return tabulate(rows, HEADERS, tablefmt=style, disable_numparse=True)
+
+
+def summary(found: Scores) -> str:
+    """Mean scores of each side and task, a line a mode."""
+    lines = []
+    for mode, scores in found.items():
+        groups = dict.fromkeys((each.side, each.task) for each in scores)
+        means = []
+        for side, task in groups:
+            own = [each for each in scores if (each.side, each.task) == (side, task)]
+            score = np.mean([each.score for each in own])
+            success = np.mean([each.success for each in own])
+            means.append(f"{SIDES[side]} {task} {score:.2f}, success {success:.0%}")
+        lines.append(f"{mode}: " + "; ".join(means))
+    return "\n".join(lines)
+
+
+def require_table(path: Path) -> None:
+    """Require that a table can be written as what its name says.
+
+    Raises:
+        TaskError: If not.
+    """
+    if path.suffix not in SUFFIXES:
+        raise TaskError(f"{path}: a table's name ends in{nearest(path.suffix, SUFFIXES)}")
+
+
+def write_scores(path: Path, found: Scores) -> None:
+    """Write CSV, JSON or Markdown, as the name says.
+
+    Raises:
+        TaskError: If the name says none of these.
+        FormatError: If it cannot be written.
+    """
+    require_table(path)
+    data = {mode: as_data(scores) for mode, scores in found.items()}
+    if path.suffix == ".json":
+        save(path, json.dumps(data, indent=2) + "\n")
+    elif path.suffix == ".md":
+        save(path, score_table(found, "github") + "\n")
+    else:
+        text = io.StringIO()
+        names = ["mode", *(field.name for field in fields(Score))]
+        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer.writeheader()
+        for mode, rows in data.items():
+            writer.writerows({"mode": mode, **row} for row in rows)
+        save(path, text.getvalue())
+
+
+def _row(mode: str, score: Score) -> tuple[str, ...]:
+    interval = "" if math.isnan(score.low) else f"{score.low:.2f} to {score.high:.2f}"
+    return (
+        score.robot,
+        score.side,
+        score.task,
+        mode,
+        f"{score.score:.2f}",
+        interval,
+        f"{score.success:.0%}",
+        f"{score.raw:.2f}",
+        f"{score.random:.2f}",
+        f"{score.distance:.3f} m",
+    )

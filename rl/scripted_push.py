@@ -1,0 +1,251 @@
+"""A push that is not learned: plan a way behind the block, then go straight on and steer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from morphgen.rl.cartesian import towards
+from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
+from morphgen.tasks.bodies import Bodies
+from morphgen.tasks.config import BINS
+from morphgen.tasks.kinematics import tool_positions
+from morphgen.tasks.settings import Setting
+from morphgen.tasks.sim.base import Simulation
+
+PLANS = 5
+"""Plans of an episode at most."""
+GAIN = 0.2
+"""Share of the distance aside of tool and block that is made good in a control step."""
+LEAD, MORE_LEAD, MOST_LEAD = 0.05, 0.004, 0.3
+"""How far the commanded tool may be ahead of the tool at first, how much farther with every control
+step in which the block does not move, and at most, metres: a slender body gives way by as much."""
+MOVES = 0.03
+"""Speed of a block that moves, m/s."""
+ARRIVED = 0.02
+"""Distance of joints from their targets that counts as there, rad or m."""
+SETTLE = 15
+"""Control steps in which joints may get there."""
+PATIENCE = 40
+"""Control steps in which the block has to get on before a new plan is made."""
+PROGRESS = 0.06
+"""How far that is at least, in edges of the block."""
+LOST = 0.7
+"""Distance aside of tool and block from which it is lost, in edges of the block."""
+UNDERWAY = 10
+"""Control steps of a push before which it is not."""
+
+_FINEST = min(share for share in BINS if share > 0)
+_LEGS = 24
+
+
+class Task(Protocol):
+    """What the controller needs of a batch of environments; see ``TaskBatch``."""
+
+    bodies: Bodies
+    settings: tuple[Setting, ...]
+    simulation: Simulation
+    body: torch.Tensor
+    mask: torch.Tensor
+    targets: torch.Tensor
+    elapsed: torch.Tensor
+    pushes: torch.Tensor
+
+    @property
+    def kind(self) -> str:
+        """Of the actions."""
+
+    @property
+    def q(self) -> torch.Tensor:
+        """Positions of the independent joints, shape (n, J)."""
+
+
+class ScriptedPush:
+    """Gets behind the block, pushes it along y, and plans again where that fails.
+
+    The plan (``PushPlanner``) is made of collision tests and kinematics alone; the push is closed
+    loop: the tool goes along y, its height and rotation held, and follows the block aside.
+    Environments that do not push stand still.
+    """
+
+    def __init__(self, seed: int) -> None:
+        """Prepare.
+
+        Args:
+            seed: Of the configurations that are tried. Plans depend on nothing else but the robot,
+                its push set, and where robot and block are.
+        """
+        self._seed = seed
+        self._settings: Sequence[Setting] = ()
+        self._planners: dict[int, PushPlanner] = {}
+        self._state: _State | None = None
+
+    def act(self, task: Task) -> torch.Tensor:
+        """A step along the way behind the block, or of the push; shape (n, L)."""
+        if self._settings is not task.settings:
+            self._settings, self._planners, self._state = task.settings, {}, None
+        state = self._state
+        if state is None or state.way.shape[::2] != task.targets.shape:
+            state = self._state = _no_state(task)
+        block = task.simulation.block_pose
+        tool = tool_positions(task.bodies.chain, task.body, task.q)
+        new = task.pushes & (task.elapsed == 0)
+        state.plans[new] = 0
+        failed = _watched(state, task, block, tool) | (task.pushes & ~state.active)
+        for env in torch.nonzero(new | (failed & (state.plans < PLANS)))[:, 0].tolist():
+            self._plan(state, task, env, block[env])
+        rows = torch.arange(len(state.leg), device=state.leg.device)
+        wanted = torch.where(
+            state.pushing[:, None],
+            _pushed(state, task, block, tool),
+            state.way[rows, state.leg],
+        )
+        return _actions(task, torch.where(state.active[:, None], wanted, task.targets))
+
+    def _plan(self, state: _State, task: Task, env: int, block: torch.Tensor) -> None:
+        index = int(task.body[env])
+        if index not in self._planners:
+            rng = np.random.default_rng([self._seed, index])
+            self._planners[index] = PushPlanner(task.settings[index], task.bodies, index, rng)
+        q = task.targets[env, : task.settings[index].robot.dof].double().cpu().numpy()
+        attempt = int(state.plans[env])
+        plan = self._planners[index].plan(q, block.double().cpu().numpy(), attempt)
+        state.plans[env] += 1
+        state.active[env] = plan is not None
+        state.pushing[env] = False
+        if plan is not None:
+            state.take(env, plan, float(block[1]))
+
+
+@dataclass(eq=False)
+class _State:
+    """How far environments are with their plans; a row each."""
+
+    plans: torch.Tensor
+    """Plans made in the episode."""
+    active: torch.Tensor
+    """Whether there is one."""
+    pushing: torch.Tensor
+    """Whether the tool is behind the block already."""
+    way: torch.Tensor
+    leg: torch.Tensor
+    last: torch.Tensor
+    settled: torch.Tensor
+    """Control steps since the targets got to the end of the way."""
+    still: torch.Tensor
+    """Control steps of the push since the block got on."""
+    stuck: torch.Tensor
+    """Control steps since the arm could go on."""
+    best: torch.Tensor
+    """How far the block had got then, y."""
+    lead: torch.Tensor
+    """How far the commanded tool may be ahead now, metres."""
+    rotation: torch.Tensor
+    height: torch.Tensor
+    aside: torch.Tensor
+    gap: torch.Tensor
+    edge: torch.Tensor
+    """Of the block, metres."""
+
+    def take(self, env: int, plan: Plan, y: float) -> None:
+        """Begin a plan, the block being at y."""
+        way = plan.way[:_LEGS]
+        for i, q in enumerate(way):
+            self.way[env, i, : len(q)] = torch.from_numpy(q)
+        self.leg[env], self.last[env] = 0, len(way) - 1
+        self.rotation[env] = plan.rotation
+        self.height[env], self.aside[env], self.gap[env] = plan.height, plan.aside, plan.gap
+        self.best[env], self.lead[env] = y, LEAD
+        self.settled[env], self.still[env], self.stuck[env] = 0, 0, 0
+
+
+def _no_state(task: Task) -> _State:
+    """No plans."""
+    n, joints = task.targets.shape
+    device = task.targets.device
+    sets = [task.settings[i].pushes for i in task.body.tolist()]
+    edges = [1.0 if each is None else each.block.size[0] for each in sets]
+
+    def count() -> torch.Tensor:
+        return torch.zeros(n, dtype=torch.int64, device=device)
+
+    def flag() -> torch.Tensor:
+        return torch.zeros(n, dtype=torch.bool, device=device)
+
+    def zero(*shape: int) -> torch.Tensor:
+        return torch.zeros(n, *shape, device=device)
+
+    return _State(
+        plans=count(),
+        active=flag(),
+        pushing=flag(),
+        way=zero(_LEGS, joints),
+        leg=count(),
+        last=count(),
+        settled=count(),
+        still=count(),
+        stuck=count(),
+        best=zero(),
+        lead=zero(),
+        rotation=zero(3, 3),
+        height=zero(),
+        aside=zero(),
+        gap=zero(),
+        edge=torch.tensor(edges, device=device),
+    )
+
+
+def _watched(state: _State, task: Task, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
+    """Go from leg to leg, from the way to the push; whether the push fails, shape (n,), bool."""
+    rows = torch.arange(len(state.leg), device=state.leg.device)
+    step = task.bodies.step[task.body].clamp(min=1e-9)
+    left = ((state.way[rows, state.leg] - task.targets) / step).abs().amax(dim=1)
+    done = state.active & ~state.pushing & (left < 1.01 * _FINEST)
+    final = done & (state.leg == state.last)
+    state.leg = torch.where(done & ~final, state.leg + 1, state.leg)
+    state.settled = torch.where(final, state.settled + 1, state.settled)
+    arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
+    state.pushing = state.pushing | (final & (arrived | (state.settled > SETTLE)))
+    ahead = block[:, 1] > state.best + PROGRESS * state.edge
+    state.best = torch.where(ahead, block[:, 1], state.best)
+    state.still = torch.where(ahead | ~state.pushing, 0, state.still + 1)
+    off = (tool[:, 0] - block[:, 0] - state.aside).abs()
+    lost = (off > LOST * state.edge) & (state.still > UNDERWAY)
+    slow = state.still > PATIENCE + state.gap / SPEED
+    return state.active & state.pushing & (slow | lost | (state.stuck > UNDERWAY))
+
+
+def _pushed(state: _State, task: Task, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
+    """Targets whose tools are a bit farther on, and aside where the blocks are."""
+    goal = tool_positions(task.bodies.chain, task.body, task.targets)
+    lead = goal[:, 1] - tool[:, 1]
+    stands = task.simulation.block_velocity[:, 1] < MOVES
+    more = state.pushing & stands & (lead > state.lead - SPEED)
+    state.lead = torch.where(more, state.lead + MORE_LEAD, state.lead).clamp(max=MOST_LEAD)
+    aside = GAIN * (block[:, 0] + state.aside - tool[:, 0])
+    on = torch.where(lead < state.lead, SPEED, 0.0)
+    goal += torch.stack([aside.clamp(-SPEED, SPEED), on, torch.zeros_like(on)], dim=1)
+    goal[:, 2] = state.height
+    wanted = towards(task.bodies, task.body, task.targets, goal, state.rotation)
+    missed = goal[:, 1] - tool_positions(task.bodies.chain, task.body, wanted)[:, 1]
+    stands = state.pushing & (on > 0) & (missed > 0.8 * SPEED)
+    state.stuck = torch.where(stands, state.stuck + 1, 0)
+    return wanted
+
+
+def _actions(task: Task, wanted: torch.Tensor) -> torch.Tensor:
+    """Actions towards targets (n, J), all joints in proportion or nearly so; shape (n, L)."""
+    step = task.bodies.step[task.body]
+    ahead = wanted - task.targets
+    shares = torch.where(step > 0, ahead / step.clamp(min=1e-9), torch.zeros_like(ahead))
+    shares = shares / shares.abs().amax(dim=1, keepdim=True).clamp(min=1)
+    joint = task.bodies.joint_of_link[task.body]
+    actions = torch.gather(shares, 1, joint.clamp(min=0)) * (joint >= 0)
+    if task.kind == "continuous":
+        return actions
+    bins = torch.tensor(BINS, device=actions.device)
+    return (actions[..., None] - bins).abs().argmin(dim=-1)

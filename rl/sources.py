@@ -1,0 +1,128 @@
+"""What agents are trained and tested on: the robots of a split, or one robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+from morphgen.benchmark.split import Member, Side, Split, Task
+from morphgen.benchmark.split_file import split_text
+from morphgen.benchmark.split_reader import parse_split
+from morphgen.errors import BenchmarkError, TaskError, nearest
+from morphgen.grammar.library import default_library
+from morphgen.tasks.robots import robot_of
+from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
+
+
+@dataclass(frozen=True)
+class Source:
+    """Robots at tasks, told in text alone, so that a run's folder says all of them."""
+
+    name: str
+    """Of the split, or words of the robot."""
+    split: str = ""
+    """Text of the split's file; empty for one robot."""
+    task: Task | None = None
+    """Of the one robot; a split says it of each."""
+    obstacles: bool = False
+    """Of the one robot."""
+    side: Side = "train"
+    """Of the split."""
+    only: str | None = None
+    """The one member that is meant, if it is not all of the side."""
+    goal_seed: int = 0
+    """Of goals, starts and obstacles."""
+    library: tuple[str, ...] = ()
+    """Folders of own parts."""
+
+
+def split_source(
+    split: Split, *, goal_seed: int = 0, library: tuple[Path, ...] = (), side: Side = "train"
+) -> Source:
+    """The robots of a side of a split."""
+    folders = tuple(str(folder.resolve()) for folder in library)
+    return Source(split.name, split_text(split), side=side, goal_seed=goal_seed, library=folders)
+
+
+def robot_source(
+    robot: str,
+    task: Task,
+    *,
+    obstacles: bool = False,
+    goal_seed: int = 0,
+    library: tuple[Path, ...] = (),
+) -> Source:
+    """One robot, which is whatever ``morphgen.tasks.robots.robot_of`` knows."""
+    folders = tuple(str(folder.resolve()) for folder in library)
+    return Source(robot, task=task, obstacles=obstacles, goal_seed=goal_seed, library=folders)
+
+
+def members(source: Source) -> tuple[Member, ...]:
+    """The split's members that are meant; none for one robot.
+
+    Raises:
+        BenchmarkError: If the split has no such member, or its text is malformed.
+    """
+    if not source.split:
+        return ()
+    side = parse_split(source.split, Path(source.name)).split.side(source.side)
+    if source.only is None:
+        return side
+    names = [member.name for member in side]
+    if source.only not in names:
+        raise BenchmarkError(
+            f"split {source.name!r} has no {source.side} robot {source.only!r}"
+            f"{nearest(source.only, names)}"
+        )
+    return tuple(member for member in side if member.name == source.only)
+
+
+def tasks_of(source: Source) -> tuple[Task, ...]:
+    """The tasks of its robots, without repetition."""
+    if source.task is not None:
+        return (source.task,)
+    return tuple(dict.fromkeys(member.task for member in members(source)))
+
+
+def apart(source: Source) -> Iterator[Source]:
+    """A source for each robot of a split's side."""
+    for member in members(source):
+        yield replace(source, only=member.name)
+
+
+def other_side(source: Source, side: Side) -> Source:
+    """The same split's whole side.
+
+    Raises:
+        TaskError: If it is one robot, which has no other side.
+    """
+    if source.split:
+        return replace(source, side=side, only=None)
+    if side == "test":
+        raise TaskError(f"{source.name!r} is one robot, no split: there is nothing to test on")
+    return source
+
+
+def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
+    """The robots at their tasks; they are made once in a process.
+
+    Args:
+        source: Which.
+        recipe: Constants of the tasks; the seed is the source's.
+
+    Raises:
+        MorphgenError: If a robot cannot be made, is not the split's, or cannot do its task.
+    """
+    recipe = replace(recipe, seed=source.goal_seed)
+    if source.split:
+        return [_of_member(member, source.library, recipe) for member in members(source)]
+    assert source.task is not None
+    robot = robot_of(source.name, library=map(Path, source.library))
+    return [setting_of(robot, source.task, recipe, obstacles=source.obstacles)]
+
+
+@lru_cache(maxsize=64)
+def _of_member(member: Member, library: tuple[str, ...], recipe: Recipe) -> Setting:
+    return member_setting(member, default_library(tuple(map(Path, library))), recipe)

@@ -1,0 +1,278 @@
+"""A study: agents times seeds times splits, a run's folder each, and reference controllers."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from morphgen.benchmark.split import Side
+from morphgen.errors import FormatError, MissingDependencyError, MorphgenError, TaskError
+from morphgen.formats.files import LOCK, write_atomic
+from morphgen.rl.evaluation import (
+    REFERENCES,
+    Exam,
+    Score,
+    as_data,
+    evaluate_reference,
+    evaluate_run,
+)
+from morphgen.rl.runs import RunConfig, require_open
+from morphgen.rl.sources import Source, other_side, tasks_of
+from morphgen.rl.trained import MODES
+from morphgen.rl.training import Part, Show, Way, train
+
+SCORES = "scores.json"
+POLL = 2.0
+"""Seconds between two looks at cells that another process works on."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One agent, seed and split, or a reference controller; done when its scores are there."""
+
+    folder: Path
+    split: str
+    agent: str
+    seed: int | None
+    """None for a reference."""
+    source: Source
+    exam: Exam
+    config: RunConfig | None = None
+    """None for a reference."""
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """On which it is evaluated: the test side alone, if it is trained there."""
+        return ("test",) if self.source.side == "test" else ("train", "test")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a cell."""
+
+    cell: Cell
+    why: str = ""
+    """Why it failed; empty if it did not."""
+
+
+Work = Callable[[Sequence[Cell], Way], Iterator[Outcome]]
+"""Does cells, and tells as each is done."""
+
+
+def reference_cells(folder: Path, source: Source, exam: Exam) -> list[Cell]:
+    """The reference controllers for the tasks of a split."""
+    tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
+    return [
+        Cell(folder / source.name / name, source.name, name, None, source, _plain(exam))
+        for name, own in REFERENCES.items()
+        if tasks & set(own)
+    ]
+
+
+def agent_cell(folder: Path, agent: str, config: RunConfig, exam: Exam) -> Cell:
+    """The cell of a run."""
+    source = config.source
+    place = folder / source.name / agent / f"seed{config.seed}"
+    return Cell(place, source.name, agent, config.seed, source, _plain(exam), config)
+
+
+def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
+    """Scores by mode, or by the reference's name; None if the cell is not done.
+
+    Raises:
+        TaskError: If they are of another evaluation.
+        FormatError: If they are malformed.
+    """
+    path = cell.folder / SCORES
+    if not path.is_file():
+        return None
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        found = {mode: [_score(each) for each in own] for mode, own in data["scores"].items()}
+        exam = data["exam"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"{path}: not the scores of a cell: {error}") from error
+    if exam != json.loads(json.dumps(asdict(cell.exam))):
+        raise TaskError(f"{path}: of another evaluation; delete it, or name another --out")
+    return found
+
+
+def require_cells(cells: Sequence[Cell]) -> None:
+    """Require that what is there of cells is of these, before anything is done.
+
+    Raises:
+        TaskError: If a cell's folder has another run or evaluation.
+        FormatError: If scores are malformed.
+    """
+    for cell in cells:
+        if cell.config is not None:
+            require_open(cell.folder, cell.config, resume=True)
+        read_scores(cell)
+
+
+def do(cell: Cell, way: Way, show: Callable[[Part], Show] | None = None) -> None:
+    """Train and evaluate what is not there yet. Nobody else may work on the cell.
+
+    Raises:
+        MorphgenError: As ``train`` and ``evaluate``.
+    """
+    if read_scores(cell) is not None:
+        return
+    exam = replace(cell.exam, workers=way.workers)
+    if cell.config is None:
+        found = {cell.agent: _reference(cell, exam)}
+    else:
+        train(cell.folder, cell.config, resume=True, way=way, show=show, hold=_held)
+        found = {
+            mode: [
+                score
+                for side in cell.sides
+                for score in evaluate_run(cell.folder, side, exam, mode, device=cell.config.device)
+            ]
+            for mode in MODES
+        }
+    data = {
+        "exam": asdict(cell.exam),
+        "scores": {mode: as_data(scores) for mode, scores in found.items()},
+    }
+    write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
+
+
+def work_here(
+    cells: Sequence[Cell], way: Way, show: Callable[[Part], Show] | None = None
+) -> Iterator[Outcome]:
+    """Do cells one after another.
+
+    Other processes may do the same: each cell is done by one, and those that others work on are
+    waited for at the end.
+    """
+    waiting = deque(cells)
+    passed = 0
+    while waiting:
+        cell = waiting.popleft()
+        outcome = _alone(cell, way, show)
+        if outcome is not None:
+            passed = 0
+            yield outcome
+            continue
+        waiting.append(cell)
+        passed += 1
+        if passed >= len(waiting):
+            time.sleep(POLL)
+            passed = 0
+
+
+def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
+    """Do cells on the Ray cluster at an address, a task each; without one, on a local Ray.
+
+    Its machines have morphgen installed and share the study's folder.
+
+    Args:
+        address: Of the cluster.
+        gpus: Of a cell; a share if below 1.
+
+    Raises:
+        MissingDependencyError: If ray is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--ray needs the package ray: pip install 'morphgen[ray]'"
+        ) from error
+
+    def work(cells: Sequence[Cell], way: Way) -> Iterator[Outcome]:
+        own = not ray.is_initialized()
+        _connect(ray, address)
+        try:
+            remote = ray.remote(num_cpus=way.workers, num_gpus=gpus, max_retries=0)(_on_ray)
+            running = {
+                remote.remote(replace(cell, folder=cell.folder.resolve()), way): cell
+                for cell in cells
+            }
+            while running:
+                (done, *_), _ = ray.wait(list(running))
+                cell = running.pop(done)
+                try:
+                    yield Outcome(cell, ray.get(done))
+                except ray.exceptions.RayTaskError as error:
+                    raise error.cause if error.cause is not None else error from None
+                except ray.exceptions.RayError as error:
+                    yield Outcome(cell, f"its Ray worker died: {type(error).__name__}")
+        finally:
+            if own:
+                ray.shutdown()
+
+    return work
+
+
+def _on_ray(cell: Cell, way: Way) -> str:
+    (outcome,) = work_here([cell], way)
+    return outcome.why
+
+
+def _connect(ray: ModuleType, address: str | None) -> None:
+    host, _, port = (address or "").rpartition(":")
+    try:
+        if port.isdecimal():
+            socket.create_connection((host.removeprefix("ray://"), int(port)), 5.0).close()
+        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
+    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+        raise MorphgenError(f"no Ray cluster at {address!r}: {error}") from error
+
+
+def _alone(cell: Cell, way: Way, show: Callable[[Part], Show] | None) -> Outcome | None:
+    """Do a cell; None if another process works on it."""
+    try:
+        cell.folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(cell.folder / LOCK, timeout=0):
+            do(cell, way, show)
+    except Timeout:
+        return None
+    except MorphgenError as error:
+        return Outcome(cell, str(error))
+    except OSError as error:
+        return Outcome(cell, f"{error.filename or cell.folder}: {error.strerror}")
+    return Outcome(cell)
+
+
+def _held(folder: Path) -> AbstractContextManager[None]:
+    """The cell's lock is held already."""
+    return nullcontext()
+
+
+def _score(data: Mapping[str, Any]) -> Score:
+    """A score from what ``as_data`` made of it."""
+    whole: dict[str, Any] = {k: math.nan if v is None else v for k, v in data.items()}
+    return Score(**whole)
+
+
+def _reference(cell: Cell, exam: Exam) -> list[Score]:
+    """Of both sides; those whose robots are at other tasks have none."""
+    found = []
+    for side in cell.sides:
+        source = other_side(cell.source, side)
+        if set(tasks_of(source)) & set(REFERENCES[cell.agent]):
+            found += evaluate_reference(cell.agent, source, exam)
+    return found
+
+
+def _plain(exam: Exam) -> Exam:
+    """Without what scores do not depend on."""
+    return replace(exam, workers=1)
+
+
+def as_record(cell: Cell) -> dict[str, Any]:
+    """What a cell is, for tables."""
+    return {"split": cell.split, "agent": cell.agent, "seed": cell.seed}

@@ -1,0 +1,239 @@
+"""The tables and figures of a study; what is missing is shown as missing."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tabulate import tabulate
+
+from morphgen.benchmark.split import SIDES, Side, Task
+from morphgen.formats.files import save
+from morphgen.rl.evaluation import Score, as_data
+from morphgen.rl.intervals import Interval, iqm_interval
+from morphgen.rl.recorders import read_metrics
+from morphgen.rl.study import Cell, as_record
+from morphgen.rl.training import parts_of
+
+TABLE, DATA, ROBOTS, CURVES = "table.md", "results.json", "results.csv", "curves.png"
+MISSING, NONE = "missing", "-"
+HEADERS = (
+    "agent",
+    "mode",
+    "seeds",
+    "MT mean",
+    "MT IQM",
+    "MT success",
+    "ZS mean",
+    "ZS IQM",
+    "ZS success",
+)
+
+Results = Mapping[Cell, Mapping[str, Sequence[Score]] | None]
+"""Scores of every cell by mode; None where they are missing."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """A side's scores over seeds and robots."""
+
+    mean: float
+    iqm: Interval
+    success: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """An agent on the robots of a split that are at one task."""
+
+    split: str
+    task: Task
+    agent: str
+    mode: str
+    """Empty if nothing is there to know it by."""
+    seeds: tuple[int | None, ...]
+    missing: tuple[int | None, ...]
+    groups: Mapping[Side, Group]
+    """Sides that there are scores of."""
+    sides: tuple[Side, ...]
+    """Sides that it is, or would be, evaluated on."""
+
+
+def rows(results: Results) -> list[Row]:
+    """A row for every split, task, agent and mode, in the order of the cells."""
+    found = []
+    lines = dict.fromkeys((cell.split, cell.agent) for cell in results)
+    for split, agent in lines:
+        own = {c: s for c, s in results.items() if (c.split, c.agent) == (split, agent)}
+        there = {cell: scores for cell, scores in own.items() if scores is not None}
+        missing = tuple(cell.seed for cell in own if cell not in there)
+        first = next(iter(own))
+        every = [s for scores in there.values() for each in scores.values() for s in each]
+        modes = dict.fromkeys(mode for scores in there.values() for mode in scores)
+        tasks: list[Task] = list(dict.fromkeys(score.task for score in every))
+        if not there:
+            found.append(Row(split, "reach", agent, "", (), missing, {}, first.sides))
+        for task in tasks:
+            for mode in modes:
+                groups = _groups(there, task, mode)
+                seeds = tuple(cell.seed for cell in there)
+                found.append(Row(split, task, agent, mode, seeds, missing, groups, first.sides))
+    return found
+
+
+def write_tables(folder: Path, results: Results) -> list[Path]:
+    """Write Markdown, JSON, CSV and curves.
+
+    Raises:
+        FormatError: If one cannot be written.
+    """
+    made = rows(results)
+    save(folder / TABLE, table_text(made))
+    data = {"rows": [_finite(asdict(row)) for row in made], "cells": _cells(results)}
+    save(folder / DATA, json.dumps(data, indent=2) + "\n")
+    save(folder / ROBOTS, _csv(results))
+    save(folder / CURVES, curves(results))
+    return [folder / name for name in (TABLE, DATA, ROBOTS, CURVES)]
+
+
+def table_text(made: Sequence[Row]) -> str:
+    """Markdown: a table for each split and task."""
+    parts = []
+    for split in dict.fromkeys(row.split for row in made):
+        own = [row for row in made if row.split == split]
+        tasks = dict.fromkeys(row.task for row in own if row.mode) or {own[0].task: None}
+        for task in tasks:
+            lines = [_line(row) for row in own if not row.mode or row.task == task]
+            title = split if len(tasks) == 1 else f"{split}: {task}"
+            table = tabulate(lines, HEADERS, tablefmt="github", disable_numparse=True)
+            parts.append(f"## {title}\n\n{table}\n")
+    return "\n".join(parts)
+
+
+def curves(results: Results) -> bytes:
+    """Scores while training, a panel a split: mean over seeds, and their range; PNG."""
+    from matplotlib.figure import Figure
+
+    splits = list(dict.fromkeys(cell.split for cell in results))
+    figure = Figure(figsize=(7.0, 4.0 * len(splits)), layout="constrained")
+    panels = figure.subplots(len(splits), 1, squeeze=False)[:, 0]
+    for panel, split in zip(panels, splits, strict=True):
+        panel.set(title=split, xlabel="transitions", ylabel="score of a step, in training")
+        panel.grid(alpha=0.3)
+        for agent in dict.fromkeys(c.agent for c in results if c.split == split and c.config):
+            own = [c for c in results if (c.split, c.agent) == (split, agent)]
+            found = [curve for curve in map(_curve, own) if curve is not None]
+            if not found:
+                panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
+                continue
+            length = min(len(steps) for steps, _ in found)
+            steps = found[0][0][:length]
+            values = np.array([value[:length] for _, value in found])
+            note = "" if len(found) == len(own) else f" ({len(found)} of {len(own)} seeds)"
+            (line,) = panel.plot(steps, values.mean(axis=0), label=agent + note)
+            panel.fill_between(
+                steps, values.min(axis=0), values.max(axis=0), alpha=0.2, color=line.get_color()
+            )
+        if panel.lines:
+            panel.legend()
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=150)
+    return content.getvalue()
+
+
+def _curve(cell: Cell) -> tuple[list[float], list[float]] | None:
+    """Transitions, and the mean score of a run's parts, by update; None if nothing was learned."""
+    assert cell.config is not None
+    parts = [read_metrics(part.folder) for part in parts_of(cell.folder, cell.config)]
+    length = min(map(len, parts))
+    if not length:
+        return None
+    steps = [sum(part[i]["transitions"] for part in parts) for i in range(length)]
+    return steps, [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
+
+
+def _groups(
+    there: Mapping[Cell, Mapping[str, Sequence[Score]]], task: Task, mode: str
+) -> dict[Side, Group]:
+    found: dict[Side, Group] = {}
+    for side in SIDES:
+        table = [
+            [each for each in scores[mode] if (each.side, each.task) == (side, task)]
+            for scores in there.values()
+        ]
+        if not table[0]:
+            continue
+        scores = np.array([[each.score for each in seed] for seed in table])
+        success = float(np.mean([each.success for seed in table for each in seed]))
+        apart = next(iter(there)).agent.startswith("se") and side == "train"
+        iqm = iqm_interval(scores, together=not apart)
+        found[side] = Group(float(scores.mean()), iqm, success)
+    return found
+
+
+def _line(row: Row) -> list[str]:
+    cells: list[str] = []
+    for side in SIDES:
+        group = row.groups.get(side)
+        if group is not None:
+            cells += [f"{group.mean:.2f}", _interval(group.iqm), f"{group.success:.0%}"]
+        elif not row.mode and side in row.sides:
+            cells += [MISSING] * 3
+        else:
+            cells += [NONE] * 3
+    return [row.agent, row.mode if row.mode != row.agent else "", _seeds(row), *cells]
+
+
+def _seeds(row: Row) -> str:
+    if row.seeds == (None,) or row.missing == (None,):
+        return NONE
+    count = str(len(row.seeds))
+    if not row.missing:
+        return count
+    gone = ", ".join(map(str, row.missing))
+    return f"{count} of {len(row.seeds) + len(row.missing)} ({MISSING}: {gone})"
+
+
+def _interval(found: Interval) -> str:
+    if math.isnan(found.low):
+        return f"{found.value:.2f}"
+    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+
+
+def _cells(results: Results) -> list[dict[str, Any]]:
+    return [
+        as_record(cell)
+        | {"scores": None if scores is None else {m: as_data(s) for m, s in scores.items()}}
+        for cell, scores in results.items()
+    ]
+
+
+def _csv(results: Results) -> str:
+    """A line for every split, agent, seed, mode and robot; one that says so where none is."""
+    text = io.StringIO()
+    names = ["split", "agent", "seed", "status", "mode", *(each.name for each in fields(Score))]
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    for cell, scores in results.items():
+        if scores is None:
+            writer.writerow(as_record(cell) | {"status": MISSING})
+            continue
+        for mode, own in scores.items():
+            for each in as_data(own):
+                writer.writerow(as_record(cell) | {"status": "done", "mode": mode} | each)
+    return text.getvalue()
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

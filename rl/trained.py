@@ -1,0 +1,59 @@
+"""A trained actor as a controller."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+
+from morphgen.rl.config import PolicyConfig
+from morphgen.rl.policies import layout_from, layout_of, make_networks, require_layout
+from morphgen.tasks.batch import Observation, TaskBatch
+
+Mode = Literal["deterministic", "stochastic"]
+MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
+"""A policy does what is likeliest, or draws."""
+
+
+class Policy:
+    """A trained actor as a controller."""
+
+    def __init__(
+        self, checkpoint: dict[str, Any], mode: Mode, seed: int, device: str = "cpu"
+    ) -> None:
+        """Prepare.
+
+        Args:
+            checkpoint: What a learner was.
+            mode: Whether it does what is likeliest, or draws.
+            seed: Of what it draws.
+            device: Where the network is.
+        """
+        self._layout = layout_from(checkpoint["layout"])
+        self._device = torch.device(device)
+        actor, _ = make_networks(PolicyConfig(**checkpoint["policy"]), self._layout, 0)
+        actor.load_state_dict(checkpoint["actor"])
+        self._actor = actor.to(self._device).eval()
+        self._likeliest = mode == "deterministic"
+        self._generator = torch.Generator(self._device).manual_seed(seed)
+
+    def require(self, observation: Observation) -> None:
+        """Require observations as those that it was trained with.
+
+        Raises:
+            TaskError: If they are others.
+        """
+        require_layout(self._layout, layout_of(observation), "the checkpoint")
+
+    @torch.no_grad()
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Actions, shape (n, L).
+
+        Raises:
+            TaskError: If the batch has other observations than the policy was made for.
+        """
+        seen = {name: each.to(self._device) for name, each in task.observe().items()}
+        self.require(seen)
+        head = self._actor.distribution(seen)
+        chosen = head.mode() if self._likeliest else head.sample(self._generator)
+        return chosen.to(task.device)

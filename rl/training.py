@@ -1,0 +1,233 @@
+"""Train: make a run's folder, learn, and leave at any time what can be taken up again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from morphgen.errors import TaskError
+from morphgen.formats.files import alone
+from morphgen.rl.ppo import Learner
+from morphgen.rl.recorders import recording
+from morphgen.rl.report import Report
+from morphgen.rl.runs import (
+    CHECKPOINT,
+    RunConfig,
+    open_run,
+    read_checkpoint,
+    require_open,
+    write_checkpoint,
+)
+from morphgen.rl.sources import apart, settings_of
+from morphgen.tasks.make import batch_of
+from morphgen.tasks.settings import Recipe
+
+OFTEN, SHARE = 25, 10
+"""Updates between checkpoints: so many, or this share of a run if that is fewer."""
+ROBOTS = "robots"
+"""Where the runs of single robots are in the folder of a run of ``se`` on a split."""
+
+Show = Callable[[Report, int], None]
+"""Told every report, and how many updates there will be."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a run is done; its weights do not depend on it."""
+
+    workers: int = 1
+    """Processes of PyBullet, threads of MuJoCo."""
+    tensorboard: bool = True
+    wandb: bool = False
+
+    def __post_init__(self) -> None:
+        """Check.
+
+        Raises:
+            TaskError: If there are no workers.
+        """
+        if self.workers < 1:
+            raise TaskError(f"--workers {self.workers}: expected 1 or more")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A run of one set of weights."""
+
+    folder: Path
+    config: RunConfig
+
+
+def parts_of(folder: Path, config: RunConfig) -> list[Part]:
+    """The runs that a run is made of: itself, or for ``se`` on a split one for each robot.
+
+    Each of these has a seed of its own, and its share of environments and transitions, rounded up.
+    """
+    if config.policy.agent != "se" or not config.source.split or config.source.only:
+        return [Part(folder, config)]
+    alone = list(apart(config.source))
+    share = 1 if config.whole else len(alone)
+    made = []
+    for i, source in enumerate(alone):
+        seed = int(np.random.SeedSequence([config.seed, i]).generate_state(1)[0])
+        ppo = replace(config.ppo, transitions=-(-config.ppo.transitions // share))
+        own = replace(config, source=source, ppo=ppo, seed=seed, envs=-(-config.envs // share))
+        made.append(Part(folder / ROBOTS / str(source.only), own))
+    return made
+
+
+def train(
+    folder: Path,
+    config: RunConfig,
+    *,
+    resume: bool = False,
+    way: Way | None = None,
+    show: Callable[[Part], Show] | None = None,
+    hold: Callable[[Path], AbstractContextManager[None]] = alone,
+) -> list[Part]:
+    """Train a run to its end; see ``parts_of``.
+
+    At any time it may be interrupted or killed; resumed, it takes up its last checkpoint, and comes
+    to the same weights as if it had not been. Nothing is written before learning can begin.
+
+    Args:
+        folder: Of the run.
+        config: What is asked for.
+        resume: Whether a run that is there is to be continued.
+        way: How it is done.
+        show: Called with every part that begins; what it returns, with its reports.
+        hold: Holds the folder against other runs.
+
+    Returns:
+        What it is made of, all of it trained.
+
+    Raises:
+        TaskError: If the folder is another run's, or a number is no longer finite.
+        FormatError: If another run is writing there.
+        MorphgenError: If a robot or simulator cannot be made.
+    """
+    way, made = way or Way(), parts_of(folder, config)
+    for part in made:
+        require_runnable(part.config)
+    require_open(folder, config, resume=resume)
+    with ExitStack() as held:
+        holds = False
+        for part in made:
+            if is_done(part):
+                continue
+            with _learner(part, way) as learner:
+                if not holds:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    held.enter_context(hold(folder))
+                    open_run(folder, config, resume=resume)
+                    holds = True
+                open_run(part.folder, part.config, resume=True)
+                _learn(learner, part, way, show(part) if show else _unseen)
+    return made
+
+
+def require_runnable(config: RunConfig) -> None:
+    """Require that a run has an update, and a device.
+
+    Raises:
+        TaskError: If it has not.
+    """
+    one = config.ppo.steps * config.envs
+    if config.envs < 1 or config.ppo.transitions < one:
+        raise TaskError(
+            f"--steps {config.ppo.transitions} with --envs {config.envs}: an update takes "
+            f"{one:,} transitions ({config.ppo.steps} steps of every environment)"
+        )
+    if config.seed < 0:
+        raise TaskError(f"--seed {config.seed}: expected 0 or more")
+    config.ppo.minibatch(config.envs)
+    require_device(config.device)
+
+
+def require_device(name: str) -> None:
+    """Require that there is such a device.
+
+    Raises:
+        TaskError: If there is none.
+    """
+    if name != "cpu" and not name.startswith("cuda"):
+        raise TaskError(f"unknown device {name!r}; valid: cpu, cuda")
+    if name != "cpu" and not torch.cuda.is_available():
+        raise TaskError(f"--device {name}: this machine has no CUDA device")
+
+
+def checkpoints(path: Path) -> Iterator[Path]:
+    """The checkpoints of what a user names: a file, a run's folder, or that of ``se`` on a split.
+
+    Raises:
+        TaskError: If there is none.
+    """
+    if path.is_file() or (path / CHECKPOINT).is_file():
+        yield path if path.is_file() else path / CHECKPOINT
+        return
+    found = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
+    if not found:
+        raise TaskError(f"{path}: no checkpoint, and no folder of a run with one")
+    yield from found
+
+
+def is_done(part: Part) -> bool:
+    """Whether all updates of a run have been made."""
+    if not (part.folder / CHECKPOINT).is_file():
+        return False
+    return bool(read_checkpoint(part.folder)[1]["update"] >= part.config.updates)
+
+
+@contextmanager
+def _learner(part: Part, way: Way) -> Iterator[Learner]:
+    """The learner of a part, as far as it got."""
+    config = part.config
+    settings = settings_of(config.source, Recipe(reach=config.reach, push=config.push))
+    batch = batch_of(
+        settings,
+        config.envs,
+        sim=config.sim,
+        seed=config.seed,
+        kind=config.policy.kind,
+        workers=way.workers,
+        reach=config.reach,
+        push=config.push,
+        library=map(Path, config.source.library),
+    )
+    try:
+        learner = Learner(batch, config.policy, config.ppo, seed=config.seed, device=config.device)
+        if (part.folder / CHECKPOINT).is_file():
+            learner.resume(read_checkpoint(part.folder)[1])
+        elif config.begin:
+            learner.adopt(read_checkpoint(Path(config.begin))[1])
+        yield learner
+    finally:
+        batch.close()
+
+
+def _learn(learner: Learner, part: Part, way: Way, show: Show) -> None:
+    often = max(min(OFTEN, learner.updates // SHARE), 1)
+    kept = recording(
+        part.folder,
+        part.config,
+        learner.update,
+        tensorboard=way.tensorboard,
+        wandb=way.wandb,
+    )
+    with kept as recorders:
+        while not learner.done:
+            report = learner.iterate()
+            for recorder in recorders:
+                recorder.record(report)
+            if learner.done or learner.update % often == 0:
+                write_checkpoint(part.folder, part.config, learner.checkpoint())
+            show(report, learner.updates)
+
+
+def _unseen(report: Report, updates: int) -> None:
+    """A report that is shown to nobody."""

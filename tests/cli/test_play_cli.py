@@ -1,0 +1,97 @@
+"""``morphgen play``: what it prints, the film that it leaves, and what it refuses."""
+
+import re
+
+import imageio.v2 as imageio
+import pytest
+
+from commands import tree
+from morphgen.cli import main
+
+LINE = re.compile(
+    r"episode (\d+): (success|failure), (\d+\.\d{3}) m from the (goal|line), "
+    r"score (-?\d+\.\d\d), (\d+\.\d\d) s"
+)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+
+def told(out):
+    """Facts of every episode that was printed."""
+    return [LINE.fullmatch(line).groups() for line in out.splitlines() if "episode" in line]
+
+
+def test_inverse_kinematics_reaches(run, tmp_path):
+    code, out, err = run("play", "reach", "arm3-stick", "--policy", "ik", "--sim", "mujoco")
+    assert (code, err) == (0, "")
+    ((number, result, distance, place, score, seconds),) = told(out)
+    assert (number, result, place, seconds) == ("1", "success", "goal", "6.00")
+    assert float(distance) < 0.03
+    assert float(score) > 0
+    assert tree(tmp_path) == {}
+
+
+def test_the_script_pushes_in_less_than_the_time_and_is_filmed(run, tmp_path):
+    words = ("play", "push", "prims", "--policy", "scripted", "--sim", "mujoco")
+    code, out, err = run(*words, "--out", "push.mp4")
+    assert (code, err) == (0, "")
+    ((_, result, distance, place, score, seconds),) = told(out)
+    assert (result, distance, place, score) == ("success", "0.000", "line", "1.00")
+    assert float(seconds) < 6
+    assert out.splitlines()[-1] == "push.mp4"
+    assert list(tree(tmp_path)) == ["push.mp4"]
+    with imageio.get_reader("push.mp4") as film:
+        frames, fps = film.count_frames(), film.get_meta_data()["fps"]
+    assert fps == 25
+    assert 0 <= frames / fps - float(seconds) <= 0.08
+
+
+def test_episodes_differ_and_are_the_same_again(run):
+    words = ("play", "reach", "arm3-stick", "--sim", "mujoco", "--episodes", "2", "--obstacles")
+    outs = [run(*words, "--seed", seed, "--kind", "discrete")[1] for seed in (1, 1, 2)]
+    assert outs[0] == outs[1] != outs[2]
+    first, second = told(outs[0])
+    assert first[2:] != second[2:]
+
+
+def test_zero_does_nothing(run):
+    code, out, _ = run("play", "push", "prims", "--policy", "zero", "--sim", "mujoco")
+    assert code == 0
+    ((_, result, distance, _, score, seconds),) = told(out)
+    assert (result, score, seconds) == ("failure", "0.00", "6.00")
+    assert 0.3 < float(distance) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("reach", "arm3-stick", "--policy", "scripted"), "valid: zero, random, ik"),
+        (("push", "prims", "--policy", "ik"), "valid: zero, random, scripted"),
+        (("push", "prism"), "did you mean 'prims'?"),
+        (("push", "prims", "--out", "film.avi"), "a film ends in .mp4 or .gif"),
+        (("push", "prims", "--out", "no/film.mp4"), "there is no folder no"),
+        (("push", "prims", "--episodes", "0"), "at least one"),
+        (("push", "prims", "--seed", "-1"), "no negative seed"),
+        (("push", "arm=ur5", "ee=plain"), "did you mean 'plane'?"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(refused, words, says):
+    assert says in refused("play", *words)
+
+
+@pytest.mark.parametrize(
+    "words", [("lift", "prims"), ("push", "prims", "--policy", "magic"), ("push",)]
+)
+def test_choices_are_told(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["play", *words])
+    assert stop.value.code == 2
+    assert "usage: morphgen play" in capsys.readouterr().err

@@ -1,0 +1,40 @@
+"""``morphgen speed``: what it prints, and what it refuses."""
+
+import json
+
+import pytest
+
+from morphgen.cli import main
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+def test_it_prints_rates_and_shares(sim, capsys):
+    words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]
+    assert main([*words, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["steps_per_second"] > 0
+    assert sum(facts["shares"].values()) == pytest.approx(1)
+    assert facts["shares"]["simulator"] > 0
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert f"reach, arm3, 2 environments, {sim}, 1 worker(s)" in text
+    assert "physics steps a second" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["reach", "arm3", "--seconds", "0"], "--seconds 0: expected more than 0"),
+        (["reach", "arm3", "--envs", "0"], "0 environments"),
+        (["reach", "arm3", "--workers", "0"], "0 workers"),
+        (["reach", "ur55-plane"], "'ur55' is no part"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(words, named, capsys):
+    assert main(["speed", *words]) == 2
+    assert named in capsys.readouterr().err

@@ -1,0 +1,260 @@
+"""``morphgen train``, ``eval``, ``finetune``, ``study`` and ``play`` with a trained policy."""
+
+import json
+import re
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from commands import start, tree
+from morphgen.benchmark.split_file import write_split
+from morphgen.cli import main
+from morphgen.rl.recorders import METRICS, read_metrics
+from morphgen.rl.runs import CHECKPOINT, read_config
+from small_runs import equal, small_split, weights
+
+NETWORK = ("--set", "mlp_width=8")
+ROLLOUT = ("--set", "steps=8", "--set", "minibatches=2", "--set", "epochs=1")
+SMALL = ("--sim", "mujoco", "--envs", "4", *ROLLOUT, *NETWORK)
+RUN = ("train", "planar-cube", "task=reach", "--agent", "me-mlp", *SMALL)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+
+@pytest.fixture
+def split_yaml(tmp_path):
+    write_split(small_split(), tmp_path / "split.yaml")
+    return "split.yaml"
+
+
+def test_one_body_is_trained_resumed_evaluated_and_played(run, tmp_path):
+    code, out, err = run(*RUN, "--steps", "128", "--seed", "3")
+    folder = tmp_path / "runs" / "planar-cube-reach" / "me-mlp" / "seed3"
+    assert (code, out) == (0, f"{folder.relative_to(tmp_path) / CHECKPOINT}\n")
+    assert "update 4 of 4, 128 steps, score -" in err
+    assert re.search(r"success (\d+%|unknown), ", err)
+    assert re.search(r"[\d,]+ steps/s, 0\.0 min left", err)
+    config = read_config(folder)
+    assert (config.seed, config.policy.discrete, config.policy.agent) == (3, True, "me-mlp")
+    assert [each["update"] for each in read_metrics(folder)] == [1, 2, 3, 4]
+    assert list(folder.glob("events/events.out.tfevents.*"))
+
+    before = tree(folder)
+    code, _, err = run(*RUN, "--steps", "128", "--seed", "3", "--resume")
+    assert (code, err) == (0, "")
+    assert tree(folder) == before
+
+    code, out, _ = run("eval", folder, "--episodes", "2", "--out", "scores.csv")
+    assert code == 0
+    assert [line.split()[3] for line in out.splitlines()[2:4]] == ["deterministic", "stochastic"]
+    assert "deterministic: MT reach " in out
+    assert len((tmp_path / "scores.csv").read_text().splitlines()) == 3
+    code, out, _ = run(
+        "eval", folder / CHECKPOINT, "--steps", "600", "--mode", "stochastic", "--json"
+    )
+    (score,) = json.loads(out)["stochastic"]
+    assert (score["robot"], score["episodes"], score["steps"]) == ("planar-cube", 2, 600)
+    assert score["score"] == pytest.approx(score["raw"] - score["random"])
+
+    code, out, _ = run("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
+    assert code == 0
+    assert out.startswith("episode 1: ")
+
+
+def test_the_policy_that_is_played_is_the_one_that_was_trained(run):
+    outs = []
+    for seed in (0, 1):
+        run(*RUN, "--steps", "64", "--out", f"run{seed}", "--seed", seed, "--no-discrete")
+        words = ("play", "reach", "planar-cube", "--sim", "mujoco", "--policy", f"run{seed}")
+        outs += [run(*words)[1], run(*words)[1]]
+    assert outs[0] == outs[1] != outs[2] == outs[3]
+
+
+def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml):
+    code, _, _ = run(
+        "train", split_yaml, "--agent", "me-mlp", *SMALL, "--steps", "64", "--out", "a"
+    )
+    assert code == 0
+    code, out, _ = run("eval", "a", "--episodes", "1", "--mode", "deterministic")
+    assert [line.split()[1] for line in out.splitlines()[2:5]] == ["train", "train", "test"]
+    assert re.search(r"deterministic: MT reach .*; ZS reach ", out)
+    code, out, _ = run("eval", "a", "--on", "test", "--episodes", "1", "--json")
+    assert {each["side"] for own in json.loads(out).values() for each in own} == {"test"}
+
+    code, out, _ = run("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard")
+    assert (code, out) == (0, f"a/finetuned/test-seed0/{CHECKPOINT}\n")
+    tuned = read_config(Path("a/finetuned/test-seed0"))
+    assert (tuned.source.side, tuned.ppo.transitions, tuned.ppo.steps) == ("test", 32, 8)
+    assert tuned.begin.endswith(f"a/{CHECKPOINT}")
+    code, _, err = run("finetune", "a", "--steps", "32", "--envs", "4")
+    assert code == 2
+    assert "say --resume" in err
+
+
+def test_every_switch_is_a_flag(run, tmp_path):
+    off = ("--no-symlog", "--no-slow-critic", "--no-discrete", "--no-curriculum")
+    flags = (*off, "--task-reweighting", "--mask-morphology", "--no-tensorboard")
+    code, out, _ = run(*RUN, "--steps", "32", *flags)
+    label = "me-mlp-symlog-slow-critic+task-reweighting-curriculum-discrete+mask-morphology"
+    assert (code, out) == (0, f"runs/planar-cube-reach/{label}/seed0/{CHECKPOINT}\n")
+    config = read_config(tmp_path / out.strip().removesuffix(f"/{CHECKPOINT}"))
+    ppo, policy = config.ppo, config.policy
+    assert (ppo.symlog, ppo.slow_critic, ppo.task_reweighting, ppo.curriculum) == (0, 0, 1, 0)
+    assert (policy.discrete, policy.mask_morphology, policy.mlp_width) == (False, True, 8)
+
+
+def test_actions_are_discrete_for_reach_alone(run, tmp_path):
+    run("train", "prims", "task=push", "--agent", "me-mlp", *SMALL, "--steps", "32", "--out", "p")
+    assert not read_config(tmp_path / "p").policy.discrete
+
+
+def test_references_are_evaluated_beside(run, split_yaml):
+    code, out, _ = run("eval", "ik", "--split", split_yaml, "--sim", "mujoco", "--episodes", "1")
+    assert code == 0
+    assert "ik: MT reach " in out
+    assert out.count("100%") == 5  # three robots, two means
+
+
+def test_ctrl_c_leaves_a_run_that_goes_on(run, tmp_path, cache):
+    words = (*RUN, "--steps", 32 * 2000, "--no-tensorboard")
+    process = start(*words, "--out", "cut", XDG_CACHE_HOME=str(cache))
+    try:
+        while not (tmp_path / "cut" / CHECKPOINT).is_file():
+            assert process.poll() is None
+            try:
+                process.wait(timeout=0.05)
+            except subprocess.TimeoutExpired:
+                continue
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate()
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "goes on from its last checkpoint with --resume" in err
+    assert "Traceback" not in err
+    assert sorted(tree(tmp_path / "cut")) == [CHECKPOINT, "config.json", METRICS]
+
+
+def test_a_run_cut_short_equals_one_that_was_not(run, tmp_path):
+    words = (*RUN, "--steps", "96", "--no-tensorboard")
+    for out in ("whole", "cut"):
+        assert run(*words, "--out", out)[0] == 0
+    (tmp_path / "cut" / CHECKPOINT).unlink()
+    assert run(*words, "--out", "cut", "--resume")[0] == 0
+    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
+    assert len(read_metrics(tmp_path / "cut")) == 3
+
+
+def test_a_study_is_a_table(run, split_yaml, tmp_path):
+    words = ("study", split_yaml, "--agents", "me-mlp,me-mlp-discrete", "--seeds", "0..1", *SMALL)
+    words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
+    code, out, _ = run(*words, "--report")
+    assert code == 0
+    assert out.count("missing") == 5 * 6 + 2
+    assert not list((tmp_path / "study").glob("mine/**/scores.json"))
+    code, out, err = run(*words)
+    assert code == 0
+    assert "missing" not in out
+    assert "7 of 7: " in err
+    assert [line.split("|")[1].strip() for line in out.splitlines()[4:11]] == [
+        "random",
+        "zero",
+        "ik",
+        "me-mlp",
+        "me-mlp",
+        "me-mlp-discrete",
+        "me-mlp-discrete",
+    ]
+    before = tree(tmp_path / "study" / "mine")
+    code, again, _ = run(*words)
+    assert (code, again) == (0, out)
+    assert tree(tmp_path / "study" / "mine") == before
+    code, _, err = run(*words, "--set", "gamma=0.5")
+    assert code == 2
+    assert "another run: ppo.gamma 0.99, not 0.5" in err
+    code, _, err = run(*words, "--eval-steps", "600", "--report")
+    assert code == 2
+    assert "scores.json: of another evaluation" in err
+
+
+def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tmp_path):
+    words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0..1", *SMALL)
+    words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
+    broken = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed0" / CHECKPOINT
+    broken.parent.mkdir(parents=True)
+    run(*words, "--report")
+    assert run(*words, "--seeds", "1")[0] == 0
+    config = (broken.parents[1] / "seed1" / "config.json").read_text()
+    (broken.parent / "config.json").write_text(config.replace('"seed": 1', '"seed": 0'))
+    broken.write_text("broken")
+    code, out, err = run(*words)
+    assert code == 1
+    assert f"{broken.relative_to(tmp_path)} is not a checkpoint" in err
+    assert "1 of 2 (missing: 0)" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("train", "interpolation/arm3/reech"), "did you mean 'interpolation/arm3/reach'?"),
+        (("train", "planar-cube"), "a robot needs task=reach or task=push"),
+        (("train", "base=planar", "ee=cube"), "a robot needs its task"),
+        (("train", "planar-cube", "task=lift"), "task=reach or task=push"),
+        (("train", "interpolation/arm3/reach", "--obstacles"), "--obstacles is for one robot"),
+        ((*RUN, "--agent", "me-tff"), "did you mean 'me-tf'?"),
+        ((*RUN, "--agent", "se+magic"), "after se come switches"),
+        ((*RUN, "--steps", "31"), "an update takes 32 transitions"),
+        ((*RUN, "--device", "tpu"), "unknown device 'tpu'"),
+        ((*RUN, "--set", "gama=1"), "did you mean 'gamma'?"),
+        ((*RUN, "--set", "gamma=much"), "expected a number"),
+        ((*RUN, "--set", "gamma=2"), "gamma 2: expected 0 to 1"),
+        ((*RUN, "--workers", "0"), "--workers 0"),
+        ((*RUN, "--seed", "-1"), "--seed -1"),
+        ((*RUN, "--goal-seed", "-1"), "--goal-seed -1"),
+        (("eval", "nothing"), "no checkpoint, and no folder of a run"),
+        (("eval", "ik"), "say on which robots, with --split"),
+        (("eval", "scripted", "--split", "planar-cube", "task=reach"), "no robot is there to push"),
+        (("finetune", "nothing"), "no checkpoint"),
+        (("study", "nothing"), "unknown split 'nothing'"),
+        (("study", "interpolation/arm3/reach", "--seeds", "2..x"), "--seeds 2..x"),
+        (("study", "interpolation/arm3/reach", "--agents", "se,se"), "is there twice"),
+        (("study", "interpolation/arm3/reach", "--agents", "me-tf@test"), "only se"),
+        (("study", "interpolation/arm3/reach", "--steps", "10"), "an update takes"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(refused, words, says):
+    assert says in refused(*words)
+
+
+def test_folders_and_checkpoints_that_are_others_are_refused(run, refused, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    assert "no run's folder" in refused(*RUN, "--steps", "32", "--out", "mine")
+    assert "not a checkpoint" in refused("eval", "mine/letter.txt")
+    assert "not a checkpoint" in refused(
+        "play", "reach", "planar-cube", "--policy", "mine/letter.txt"
+    )
+    run(*RUN, "--steps", "32", "--out", "run", "--no-tensorboard")
+    assert "say --resume" in refused(*RUN, "--steps", "32", "--out", "run")
+    assert "transitions 32, not 64" in refused(*RUN, "--steps", "64", "--out", "run", "--resume")
+    layout = ("eval", "run", "--split", "planar-cube", "task=reach", "--obstacles")
+    assert "for other observations: obstacles 0, here 3" in refused(*layout, "--episodes", "1")
+    assert "table.txt" in refused("eval", "run", "--out", "table.txt")
+
+
+@pytest.mark.parametrize("words", [("--steps", "1.5"), ("--steps", "inf"), ("--steps", "many")])
+def test_steps_are_whole_numbers(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*RUN, *words])
+    assert stop.value.code == 2
+    assert "argument --steps" in capsys.readouterr().err

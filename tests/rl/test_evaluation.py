@@ -1,0 +1,163 @@
+"""Scores of policies and reference controllers, robot by robot."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morphgen.errors import TaskError
+from morphgen.rl.evaluation import (
+    Exam,
+    as_data,
+    episodes_for,
+    evaluate_checkpoints,
+    evaluate_reference,
+    evaluate_run,
+    exam_of,
+)
+from morphgen.rl.runs import CHECKPOINT, read_checkpoint, write_checkpoint
+from morphgen.rl.score_tables import score_table, summary, write_scores
+from morphgen.rl.sources import other_side, robot_source
+from morphgen.rl.training import parts_of, train
+from morphgen.tasks.config import ReachConfig
+from small_runs import EXAM, QUIET, small_config, small_source
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Hardly trained, on the robots of a split."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    train(folder, small_config(small_source(), transitions=64), way=QUIET)
+    return folder
+
+
+def test_the_random_controller_is_no_better_than_itself():
+    scores = evaluate_reference("random", small_source(), EXAM)
+    assert [each.side for each in scores] == ["train", "train"]
+    for each in scores:
+        assert (each.score, each.low, each.high) == (0, 0, 0)
+        assert each.raw == each.random < 0
+        assert each.success == each.random_success
+        assert (each.episodes, each.steps) == (2, 600)
+        assert each.relative_distance > 0.03
+
+
+def test_inverse_kinematics_is_far_better():
+    for side in ("train", "test"):
+        for each in evaluate_reference("ik", other_side(small_source(), side), EXAM):
+            assert each.side == side
+            assert each.success == 1
+            assert each.distance < ReachConfig().near
+            assert each.score == pytest.approx(each.raw - each.random)
+            assert each.raw > 100 > 0 > each.random
+            assert each.low <= each.score <= each.high
+
+
+def test_episodes_are_those_of_the_seed():
+    source = small_source()
+    scores = [evaluate_reference("zero", source, replace(EXAM, seed=seed)) for seed in (0, 0, 1)]
+    assert scores[0] == scores[1]
+    assert scores[0][0].distance != scores[2][0].distance
+
+
+def test_the_likeliest_and_drawn_actions_are_each_the_same_again(run):
+    modes = ("deterministic", "deterministic", "stochastic", "stochastic")
+    found = [evaluate_run(run, "train", EXAM, mode) for mode in modes]
+    assert found[0] == found[1] != found[2] == found[3]
+    assert found[0][0].random == found[2][0].random
+
+
+def test_workers_change_nothing(run):
+    one, two = (evaluate_run(run, "test", replace(EXAM, workers=n), "stochastic") for n in (1, 2))
+    assert one == two
+
+
+def test_more_episodes_than_environments_are_rounds():
+    exam = replace(EXAM, episodes=35)
+    (score,) = evaluate_reference("zero", robot_source("planar-cube", "reach"), exam)
+    assert score.episodes == 36
+    assert score.steps == 36 * 300
+
+
+def test_ten_thousand_steps_are_34_episodes():
+    assert episodes_for(10_000, 300) == 34
+    assert episodes_for(1, 300) == 1
+    with pytest.raises(TaskError, match="--steps 0"):
+        episodes_for(0, 300)
+
+
+def test_push_scores_its_success_rate_and_references_are_for_their_task():
+    mixed = robot_source("prims", "push")
+    exam = Exam(episodes=3, sim="mujoco")
+    (zero,) = evaluate_reference("zero", mixed, exam)
+    assert (zero.task, zero.score, zero.success) == ("push", 0, 0)
+    assert math.isnan(zero.relative_distance)
+    (scripted,) = evaluate_reference("scripted", mixed, exam)
+    assert scripted.score == scripted.raw == scripted.success > 0
+    assert scripted.steps < 3 * 300
+    with pytest.raises(TaskError, match="no robot is there to reach"):
+        evaluate_reference("ik", mixed, exam)
+    with pytest.raises(TaskError, match="did you mean 'scripted'"):
+        evaluate_reference("script", mixed, exam)
+
+
+def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
+    config = small_config(small_source(), agent="se", transitions=64)
+    train(tmp_path, config, way=QUIET)
+    own = evaluate_run(tmp_path, "train", EXAM, "deterministic")
+    names = [part.config.source.only for part in parts_of(tmp_path, config)]
+    assert sorted(each.robot for each in own) == sorted(names)
+    assert [each.episodes for each in own] == [2, 2]
+    (test,) = evaluate_run(tmp_path, "test", EXAM, "deterministic")
+    assert (test.side, test.episodes) == ("test", 4)
+    files = [part.folder / CHECKPOINT for part in parts_of(tmp_path, config)]
+    source = other_side(small_source(), "test")
+    alone = [evaluate_checkpoints([file], source, EXAM, "deterministic")[0] for file in files]
+    assert test.score == pytest.approx(np.mean([each.score for each in alone]))
+
+
+def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_path):
+    config, learner = read_checkpoint(run)
+    learner["layout"]["obstacles"] = 0
+    boxes = robot_source("planar-cube", "reach", obstacles=True)
+    with pytest.raises(TaskError, match="the checkpoint is for other observations: obstacles 0, h"):
+        evaluate_checkpoints([run], boxes, EXAM, "deterministic")
+    write_checkpoint(tmp_path, config, learner)
+    evaluate_run(tmp_path, "test", EXAM, "deterministic")
+
+
+def test_one_robot_has_no_other_side(tmp_path):
+    train(tmp_path, small_config(transitions=32), way=QUIET)
+    assert len(evaluate_run(tmp_path, "train", EXAM, "deterministic")) == 1
+    with pytest.raises(TaskError, match="nothing to test on"):
+        evaluate_run(tmp_path, "test", EXAM, "deterministic")
+
+
+def test_an_evaluation_is_in_the_simulator_and_task_of_the_run(run):
+    config, _ = read_checkpoint(run)
+    assert exam_of(config, 3) == Exam(3, "mujoco")
+    with pytest.raises(TaskError, match="0 episodes"):
+        Exam(episodes=0)
+
+
+def test_tables_hold_every_robot_and_mode(run, tmp_path):
+    found = {
+        mode: evaluate_run(run, "train", EXAM, mode) for mode in ("deterministic", "stochastic")
+    }
+    lines = score_table(found).splitlines()
+    assert len(lines) == 2 + 4
+    assert "MT reach" in summary(found)
+    mean = np.mean([each.score for each in found["deterministic"]])
+    assert f"{mean:.2f}" in summary(found).splitlines()[0]
+    for suffix in (".csv", ".json", ".md"):
+        write_scores(tmp_path / f"table{suffix}", found)
+    stored = json.loads((tmp_path / "table.json").read_text())
+    assert stored["stochastic"] == as_data(found["stochastic"])
+    rows = (tmp_path / "table.csv").read_text().splitlines()
+    assert rows[0].startswith("mode,robot,side,task,episodes,steps,score,")
+    assert len(rows) == 1 + 4
+    assert (tmp_path / "table.md").read_text().startswith("| robot")
+    with pytest.raises(TaskError, match=r"table\.txt"):
+        write_scores(tmp_path / "table.txt", found)

@@ -1,0 +1,64 @@
+"""Averages and their bootstrap intervals."""
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+
+from morphgen.rl.intervals import iqm_interval, mean_interval
+
+
+def all_resamples(values):
+    """The exact distribution of the mean of resamples."""
+    return [np.mean(chosen) for chosen in product(values, repeat=len(values))]
+
+
+def test_the_interquartile_mean_leaves_a_quarter_away_at_each_end():
+    scores = [[-1000.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 1000.0]]
+    assert iqm_interval(scores, together=True).value == pytest.approx(np.mean([2, 3, 4, 5]))
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_of_one_robot_it_is_where_95_of_100_resamples_are(together):
+    values = [1.0, 2.0, 4.0]
+    found = iqm_interval(np.array(values)[:, None], together=together)
+    low, high = np.quantile(all_resamples(values), (0.025, 0.975), method="inverted_cdf")
+    assert (found.low, found.high) == pytest.approx((low, high))
+    alone = mean_interval(values)
+    assert (alone.low, alone.high) == pytest.approx((low, high))
+
+
+def test_seeds_that_are_drawn_whole_keep_robots_together():
+    # Robots go up and down together: by themselves they make up for each other.
+    scores = np.array([0.0, 1.0, 2.0, 3.0])[:, None] + np.zeros(8)
+    whole, apart = (iqm_interval(scores, together=together) for together in (True, False))
+    assert whole.value == apart.value == pytest.approx(1.5)
+    assert whole.high - whole.low > 2 * (apart.high - apart.low) > 0
+
+
+def test_robots_are_strata():
+    # Scores differ between robots only: no resample is another.
+    scores = np.tile([1.0, 5.0, 9.0, 100.0], (3, 1))
+    for together in (True, False):
+        found = iqm_interval(scores, together=together)
+        assert found.low == found.value == found.high == 7.0
+
+
+def test_it_is_the_same_again():
+    scores = np.random.default_rng(0).normal(size=(3, 5))
+    assert iqm_interval(scores, together=True) == iqm_interval(scores, together=True)
+
+
+def test_one_seed_has_no_interval():
+    found = iqm_interval([[1.0, 3.0]], together=True)
+    assert found.value == 2
+    assert math.isnan(found.low)
+    assert math.isnan(found.high)
+    assert math.isnan(mean_interval([3.0]).low)
+
+
+@pytest.mark.parametrize("scores", [[], [[]], [1.0, 2.0]])
+def test_nothing_has_no_average(scores):
+    with pytest.raises(ValueError, match="expected 2 axes"):
+        iqm_interval(scores, together=True)

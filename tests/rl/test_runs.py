@@ -1,0 +1,202 @@
+"""A run's folder: config, checkpoint, metrics and events."""
+
+import json
+import math
+import pickle
+import sys
+from dataclasses import asdict, fields, replace
+
+import pytest
+import torch
+
+from commands import tree
+from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.rl.recorders import (
+    METRICS,
+    Metrics,
+    TensorBoard,
+    read_metrics,
+    recording,
+    require_wandb,
+)
+from morphgen.rl.report import Report
+from morphgen.rl.runs import (
+    CHECKPOINT,
+    CONFIG,
+    config_from,
+    open_run,
+    read_checkpoint,
+    read_config,
+    write_checkpoint,
+)
+from morphgen.rl.sources import robot_source
+from small_runs import small_config, small_source
+
+
+def report(update, success=0.5):
+    numbers = [each.name for each in fields(Report) if each.type == "float"]
+    numbers.remove("success")
+    return Report(
+        update=update,
+        transitions=32 * update,
+        scores=(1.0, math.nan),
+        success=success,
+        episodes=3,
+        terms={"distance": -0.5},
+        **dict.fromkeys(numbers, 0.25),
+    )
+
+
+def test_a_config_is_saved_whole(tmp_path):
+    config = replace(
+        small_config(small_source(), agent="se", gamma=0.9), device="cuda", begin="a.pt", whole=True
+    )
+    open_run(tmp_path / "run", config, resume=False)
+    assert read_config(tmp_path / "run") == config
+    stored = json.loads((tmp_path / "run" / CONFIG).read_text())
+    assert stored["ppo"]["gamma"] == 0.9
+    assert stored["reach"]["near"] == 0.03
+    assert "planar" in stored["source"]["split"]
+    assert config_from(stored) == config
+
+
+def test_a_run_is_only_continued_on_purpose_and_as_it_was(tmp_path):
+    folder, config = tmp_path / "runs" / "one", small_config()
+    open_run(folder, config, resume=True)
+    before = tree(tmp_path)
+    with pytest.raises(TaskError, match="has a run: say --resume"):
+        open_run(folder, config, resume=False)
+    open_run(folder, config, resume=True)
+    other = replace(config, seed=3, ppo=replace(config.ppo, gamma=0.5))
+    with pytest.raises(TaskError, match=r"another run: .*gamma 0\.99, not 0\.5; .*seed 0, not 3"):
+        open_run(folder, other, resume=True)
+    with pytest.raises(TaskError, match=r"source\.name planar-cube, not mine/small"):
+        open_run(folder, small_config(small_source()), resume=True)
+    assert tree(tmp_path) == before
+
+
+def test_what_is_no_run_is_left_alone(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    for name, says in (("mine", "no run's folder"), ("mine/letter.txt", "is a file")):
+        for resume in (True, False):
+            with pytest.raises(TaskError, match=says):
+                open_run(tmp_path / name, small_config(), resume=resume)
+    assert list(tree(tmp_path)) == ["mine", "mine/letter.txt"]
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "so", '{"source": {"name": "a"}}'])
+def test_a_broken_config_is_refused(tmp_path, text):
+    (tmp_path / CONFIG).write_text(text)
+    with pytest.raises(TaskError, match="is not the config of a run"):
+        read_config(tmp_path)
+
+
+def test_a_checkpoint_tells_its_run(tmp_path):
+    config = small_config(robot_source("planar-cube", "push", obstacles=True))
+    write_checkpoint(tmp_path, config, {"update": 3, "weight": torch.ones(2)})
+    for path in (tmp_path, tmp_path / CHECKPOINT):
+        run, learner = read_checkpoint(path)
+        assert run == config
+        assert learner["update"] == 3
+        assert learner["weight"].equal(torch.ones(2))
+    assert list(tree(tmp_path)) == [CHECKPOINT]
+
+
+class Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return self.path.write_text, ("boom",)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+def test_a_checkpoint_executes_nothing(tmp_path):
+    torch.save({"run": Bomb(tmp_path / "crater")}, tmp_path / "evil.pt")
+    (tmp_path / "evil.pickle").write_bytes(pickle.dumps(Bomb(tmp_path / "crater")))
+    for name in ("evil.pt", "evil.pickle"):
+        with pytest.raises(TaskError, match="is not a checkpoint of morphgen train"):
+            read_checkpoint(tmp_path / name)
+    assert not (tmp_path / "crater").exists()
+
+
+def test_what_is_no_checkpoint_is_refused(tmp_path):
+    write_checkpoint(tmp_path, small_config(), {"update": 1})
+    whole = (tmp_path / CHECKPOINT).read_bytes()
+    torch.save({"weights": torch.ones(1)}, tmp_path / "other.pt")
+    contents = {"empty.pt": b"", "text.pt": b"hello", "half.pt": whole[: len(whole) // 2]}
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    for name in (*contents, "other.pt"):
+        with pytest.raises(TaskError, match=f"{name} is not a checkpoint"):
+            read_checkpoint(tmp_path / name)
+    with pytest.raises(TaskError, match="no such checkpoint"):
+        read_checkpoint(tmp_path / "none.pt")
+
+
+def test_metrics_go_on_after_the_checkpoint_and_forget_what_came_later(tmp_path):
+    kept = Metrics(tmp_path, 0)
+    for update in (1, 2, 3):
+        kept.record(report(update, success=math.nan if update == 1 else 0.5))
+    kept.close()
+    with (tmp_path / METRICS).open("a") as file:
+        file.write('{"update": 4, "tran')
+    assert [each["update"] for each in read_metrics(tmp_path)] == [1, 2, 3]
+    again = Metrics(tmp_path, 2)
+    again.record(report(3, success=0.75))
+    again.close()
+    found = read_metrics(tmp_path)
+    assert [each["update"] for each in found] == [1, 2, 3]
+    assert [each["success"] for each in found] == [None, 0.5, 0.75]
+    assert found[0]["scores"] == [1.0, None]
+    assert found[0]["terms"] == {"distance": -0.5}
+    assert found[1] == json.loads(json.dumps(asdict(report(2)) | {"scores": [1.0, None]}))
+
+
+def test_events_are_tensorboards(tmp_path):
+    accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    for begins in (0, 2):
+        board = TensorBoard(tmp_path, begins)
+        for update in range(begins + 1, 4):
+            board.record(report(update, success=math.nan if update == 1 else 0.1 * begins))
+        board.close()
+    shown = accumulators.EventAccumulator(str(tmp_path / "events")).Reload()
+    points = [(each.step, each.value) for each in shown.Scalars("success")]
+    assert points == [(2, 0.0), (3, pytest.approx(0.2))]
+    assert [each.value for each in shown.Scalars("terms/distance")] == [-0.5] * 3
+
+
+def test_what_is_not_installed_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(MissingDependencyError, match="pip install wandb"):
+        require_wandb()
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(MissingDependencyError, match="--no-tensorboard"):
+        TensorBoard(tmp_path, 0)
+    with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=False) as kept:
+        assert len(kept) == 1
+
+
+def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
+    sent = []
+
+    class Run:
+        def log(self, data, step):
+            sent.append((step, data))
+
+        def finish(self):
+            sent.append("finished")
+
+    class Wandb:
+        @staticmethod
+        def init(**options):
+            assert options["resume"] == "allow"
+            return Run()
+
+    monkeypatch.setitem(sys.modules, "wandb", Wandb)
+    with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=True) as kept:
+        for each in kept:
+            each.record(report(1))
+    (step, data), end = sent
+    assert (step, data["score"], data["terms/distance"], end) == (1, 0.25, -0.5, "finished")

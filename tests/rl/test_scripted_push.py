@@ -1,0 +1,251 @@
+"""The scripted push: it plans where nothing is in its way, and blocks get across."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.rl.cartesian import OneTool, towards
+from morphgen.rl.free_ways import FreeWays
+from morphgen.rl.push_contacts import poised
+from morphgen.rl.push_plans import PushPlanner
+from morphgen.rl.scripted_push import PLANS, ScriptedPush
+from morphgen.tasks.bodies import bodies_of
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.kinematics import tool_frames
+from morphgen.tasks.make import make_batch
+from morphgen.tasks.settings import push_setting, reach_setting
+from morphgen.tasks.sim.base import Block, Scene
+from scenes import robot
+
+UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
+PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)
+
+
+def batch(words, n, cache, task="push", **options):
+    robots = [robot(each) for each in words]
+    return make_batch(task, robots, n, cache=cache, push=PUSH, reach=REACH, **options)
+
+
+def successes(task, controller, steps=PUSH.steps):
+    """Which of the first episodes end with the block across, shape (n,), bool."""
+    task.reset()
+    over = torch.zeros(task.num_envs, dtype=torch.bool)
+    across = over.clone()
+    for _ in range(steps):
+        step = task.step(controller.act(task))
+        across |= step.success & ~over
+        over |= step.terminated | step.truncated
+        if over.all():
+            break
+    task.close()
+    return across
+
+
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+def test_blocks_get_across(sim, tmp_path):
+    across = successes(batch([PLANE, UR5], 6, tmp_path, sim=sim), ScriptedPush(0))
+    assert across[::2].sum() >= 2
+    assert across[1::2].sum() >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("words", [UR5, PANDA, PLANE])
+def test_four_of_five_blocks_get_across(words, sim, tmp_path):
+    across = successes(batch([words], 20, tmp_path, sim=sim), ScriptedPush(0))
+    assert across.float().mean() >= 0.8
+
+
+def test_actions_may_be_discrete(tmp_path):
+    task = batch([PLANE], 3, tmp_path, sim="mujoco", kind="discrete")
+    assert successes(task, ScriptedPush(0)).sum() >= 2
+
+
+def test_the_same_seed_does_the_same(tmp_path):
+    def actions(seed):
+        task, controller = batch([UR5], 2, tmp_path, sim="mujoco"), ScriptedPush(seed)
+        task.reset()
+        found = []
+        for _ in range(30):
+            found.append(controller.act(task))
+            task.step(found[-1])
+        task.close()
+        return torch.stack(found)
+
+    assert torch.equal(actions(0), actions(0))
+    assert not torch.equal(actions(0), actions(1))
+
+
+def test_actions_are_in_range_and_reaching_robots_stand_still(tmp_path):
+    task = batch([UR5, PLANE], 4, tmp_path, task=["reach", "push"], sim="mujoco")
+    controller = ScriptedPush(0)
+    task.reset()
+    moved = torch.zeros(4, dtype=torch.bool)
+    for _ in range(60):
+        actions = controller.act(task)
+        assert actions.abs().max() <= 1
+        moved |= actions.abs().amax(dim=1) > 0
+        task.step(actions)
+    task.close()
+    assert moved.tolist() == [False, True, False, True]
+
+
+def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
+    made = []
+    plan = PushPlanner.plan
+
+    def counted(self, *args):
+        made.append(args)
+        return plan(self, *args)
+
+    monkeypatch.setattr(PushPlanner, "plan", counted)
+    task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
+    task.reset()
+    env = torch.tensor([0])
+    for i in range(PUSH.steps):
+        if i % 100 == 99:
+            away = task.simulation.block_pose.clone()
+            away[0, 0] = -away[0, 0] + (0.15 if away[0, 0] < 0 else -0.15)
+            away[0, 1] = -0.2
+            task.simulation.reset(env, task.simulation.q.clone(), away)
+            task.targets[:] = task.q
+        if task.step(controller.act(task)).terminated.any():
+            break
+    task.close()
+    assert 2 <= len(made) <= PLANS
+    assert not np.allclose(made[0][1], made[1][1])
+
+
+def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
+    setting = push_setting(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
+    planner = PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
+    space, tool = FreeSpace(setting.scene), OneTool(bodies_of([setting.robot]), 0)
+    for q, block in zip(setting.pushes.q[:3], setting.pushes.blocks, strict=False):
+        plan = planner.plan(q, block)
+        points = [q, *plan.way]
+        for a, b in pairwise(points):
+            between = a + np.linspace(0, 1, 200)[:, None] * (b - a)
+            assert space.free(between, np.tile(block, (200, 1))).mean() > 0.99
+        position, rotation = (each[0] for each in tool.poses(points[-1][None]))
+        assert position[1] < block[1] - setting.pushes.block.size[1] / 2
+        assert position[2] == pytest.approx(plan.height)
+        assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
+
+
+def test_a_setting_of_another_task_is_refused(tmp_path):
+    setting = reach_setting(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
+    with pytest.raises(ValueError, match="does not push"):
+        PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
+
+
+def test_tools_are_moved_first_and_turned_with_what_is_left():
+    bodies = bodies_of([robot(PANDA), robot(PLANE), robot("nlink")])
+    body = torch.arange(3)
+    q = bodies.home + 0.2 * (bodies.upper - bodies.home).clamp(max=1.0)
+    T = tool_frames(bodies.chain, body, q)[:, -1]
+    goal = T[:, :3, 3] + torch.tensor([[0.0, 0.05, 0.02], [0.0, 0.05, -0.02], [-0.05, 0.05, 0.0]])
+    turned = T[:, :3, :3]
+    for _ in range(30):
+        q = towards(bodies, body, q, goal, turned)
+    found = tool_frames(bodies.chain, body, q)[:, -1]
+    assert (found[:, :3, 3] - goal).abs().max() < 5e-3
+    off = (found[:, :3, :3] - turned).abs().amax(dim=(1, 2))
+    assert off[:2].max() < 0.02
+    assert off[2] > 0.1, "two hinges have nothing left"
+
+
+def test_joints_at_their_limits_leave_it_to_the_others():
+    bodies = bodies_of([robot(UR5)])
+    body, q = torch.tensor([0]), bodies.home.clone()
+    T = tool_frames(bodies.chain, body, q)[:, -1]
+    for _ in range(100):
+        q = towards(bodies, body, q, T[:, :3, 3] + 9.0, T[:, :3, :3])
+        assert (q >= bodies.lower).all()
+        assert (q <= bodies.upper).all()
+
+
+def ball(height):
+    """A ball of 0.1 m on slides along x and y."""
+    base, cart, last = Link("base"), Link("cart"), Link("ball", collisions=(Shape(Sphere(0.1)),))
+    joints = (
+        Joint("x", "prismatic", "base", "cart", Pose((0, 0, height)), (1, 0, 0), (-2.0, 2.0)),
+        Joint("y", "prismatic", "cart", "ball", Pose(), (0, 1, 0), (-2.0, 2.0)),
+    )
+    return Robot("ball", (base, cart, last), joints, (Frame("tool", "ball"),), (0.0, 0.0))
+
+
+def test_contacts_are_where_the_block_would_be_touched():
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
+
+    def found(height):
+        scene = Scene(ball(height), block=Block((0.4, 0.4, 0.4)), ground=None)
+        return poised(FreeSpace(scene), q, block, 0.4)
+
+    low = found(0.2)
+    assert low.q.tolist() == q[:2].tolist()
+    assert low.gap == pytest.approx(0.2, abs=0.04)
+    assert low.middle == pytest.approx([0.0, 0.1], abs=0.05)
+    assert low.width == pytest.approx(0.5, abs=0.12)
+    assert low.roof.max() == 0
+    assert found(0.35).roof.min() > 0.5
+
+
+def test_ways_go_round_what_is_in_between():
+    wall = Block((0.2, 2.0, 0.4), Pose((0.0, -1.0, 0.2)))
+    scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=(wall,))
+    space, step = FreeSpace(scene), np.array([0.02, 0.02])
+    ways = FreeWays(space, step, np.random.default_rng(0))
+    start, ends = np.array([-0.5, -0.5]), np.array([[0.5, -0.5], [-0.5, 0.5]])
+    block = np.array([1.5, 1.5, 0.1, 1.0, 0.0, 0.0, 0.0])
+    assert ways.steps(start, ends) == pytest.approx([50, 50])
+    nearest = ways.find(start, ends, ends, np.zeros(2), block, 0)
+    assert nearest.end == 1
+    assert len(nearest.points) == 1
+    over = ways.find(start, ends[:1], np.array([[0.5, 0.5]]), np.zeros(1), block, 0)
+    assert over.end == 0
+    assert len(over.points) >= 2
+    for a, b in zip((start, *over.points), over.points, strict=False):
+        between = a + np.linspace(0, 1, 99)[:, None] * (b - a)
+        assert space.free(between).all()
+    inside = np.array([[0.0, -0.5]])
+    assert ways.find(start, inside, inside, np.zeros(1), block, 0) is None
+    on_the_end = np.array([-0.5, 0.5, 0.1, 1.0, 0.0, 0.0, 0.0])
+    assert ways.find(start, ends[1:], ends[1:], np.zeros(1), on_the_end, 0) is None
+
+
+def test_a_plate_touches_on_its_whole_breadth():
+    plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
+    wide = ball(0.2).with_links([plate])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = poised(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.width[0] == 1
+
+
+def test_a_way_round_about_is_found_where_no_simple_one_is():
+    """Out of a pocket that is open to the other side, to the nearer of two ends that is free."""
+    walls = (
+        Block((0.1, 1.2, 0.4), Pose((0.5, 0.0, 0.2))),
+        Block((1.0, 0.1, 0.4), Pose((0.0, 0.6, 0.2))),
+        Block((1.0, 0.1, 0.4), Pose((0.0, -0.6, 0.2))),
+    )
+    scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls)
+    space = FreeSpace(scene)
+    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
+    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
+    start, ends = np.array([0.2, 0.0]), np.array([[0.5, 0.0], [1.0, 0.0]])
+    found = ways.find_round_about(start, ends, block, 0)
+    assert found.end == 1
+    assert found.points[-1].tolist() == [1.0, 0.0]
+    for a, b in pairwise((start, *found.points)):
+        assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).all()
+    again = ways.find_round_about(start, ends, block, 0)
+    assert all((a == b).all() for a, b in zip(found.points, again.points, strict=True))
+    assert ways.find_round_about(start, ends[:1], block, 0) is None
+    assert ways.find_round_about(start, ends[:0], block, 0) is None

@@ -1,0 +1,256 @@
+"""A study: its cells, what it does again, what it shows of what is missing."""
+
+import csv
+import json
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filelock import FileLock
+from PIL import Image
+
+from commands import tree
+from morphgen.errors import TaskError
+from morphgen.formats.files import LOCK
+from morphgen.rl import study
+from morphgen.rl.evaluation import Score
+from morphgen.rl.recorders import METRICS
+from morphgen.rl.runs import CHECKPOINT
+from morphgen.rl.sources import other_side
+from morphgen.rl.study import (
+    SCORES,
+    agent_cell,
+    read_scores,
+    reference_cells,
+    work_here,
+    work_on_ray,
+)
+from morphgen.rl.tables import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
+from morphgen.rl.trained import MODES
+from small_runs import EXAM, QUIET, equal, small_config, small_source, weights
+
+
+def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1)):
+    source = small_source()
+    made = reference_cells(folder, source, EXAM)
+    for agent in agents:
+        for seed in seeds:
+            config = small_config(source, agent=agent, seed=seed, transitions=64)
+            made.append(agent_cell(folder, agent, config, EXAM))
+    return made
+
+
+def finished(cells):
+    outcomes = list(work_here(cells, QUIET))
+    assert [each.why for each in outcomes] == [""] * len(cells)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A study that was never interrupted."""
+    cells = cells_in(tmp_path_factory.mktemp("study"))
+    finished(cells)
+    return cells
+
+
+def results(cells):
+    return {cell: read_scores(cell) for cell in cells}
+
+
+def test_a_cell_is_a_runs_folder_with_scores(whole):
+    names = [cell.agent for cell in whole]
+    assert names == ["random", "zero", "ik", "se", "se", "me-mlp", "me-mlp"]
+    for cell in whole:
+        scores = read_scores(cell)
+        assert set(scores) == (set(MODES) if cell.config else {cell.agent})
+        for own in scores.values():
+            assert [each.side for each in own] == ["train", "train", "test"]
+        assert (cell.folder / CHECKPOINT).is_file() == (cell.agent == "me-mlp")
+
+
+def test_what_is_done_is_not_done_again(whole, monkeypatch):
+    folder = whole[0].folder.parents[2]
+    before = tree(folder)
+    for name in ("train", "evaluate_run", "evaluate_reference"):
+        monkeypatch.delattr(study, name)
+    finished(whole)
+    assert tree(folder) == before
+
+
+class Killed(BaseException):
+    """As a kill: nobody catches it."""
+
+
+def test_a_killed_study_goes_on_where_it_was(whole, tmp_path):
+    cells = cells_in(tmp_path)
+    begun = []
+
+    def show(part):
+        begun.append((part.folder.relative_to(tmp_path), len(begun)))
+
+        def told(report, updates):
+            # In the second robot of the first seed of se, after its first update.
+            if len(begun) == 2 and report.update == 1:
+                raise Killed
+
+        return told
+
+    with pytest.raises(Killed):
+        list(work_here(cells, QUIET, show))
+    done = [cell for cell in cells if read_scores(cell) is not None]
+    assert [cell.agent for cell in done] == ["random", "zero", "ik"]
+    first_robot = cells[3].folder / "robots" / begun[0][0].name
+    kept = {cell.folder: tree(cell.folder) for cell in done} | {first_robot: tree(first_robot)}
+    list(work_here(cells, QUIET, show))
+    assert [path for path, _ in begun].count(begun[0][0]) == 1
+    for folder, before in kept.items():
+        assert tree(folder) == before
+    for one, other in zip(whole, cells, strict=True):
+        assert repr(read_scores(one)) == repr(read_scores(other))
+    for one, other in zip(whole[-2:], cells[-2:], strict=True):
+        assert equal(weights(one.folder), weights(other.folder))
+
+
+def test_a_cell_that_another_process_works_on_is_left_for_last(tmp_path, monkeypatch):
+    cells = cells_in(tmp_path, agents=(), seeds=())
+    cells[0].folder.mkdir(parents=True)
+    other = FileLock(cells[0].folder / LOCK, thread_local=False)
+    other.acquire()
+    waits = []
+
+    def wait(seconds):
+        waits.append(seconds)
+        threading.Thread(target=other.release).start()
+
+    monkeypatch.setattr(study.time, "sleep", wait)
+    order = [outcome.cell.agent for outcome in work_here(cells, QUIET)]
+    assert order == ["zero", "ik", "random"]
+    assert waits
+
+
+def test_a_cell_that_fails_is_told_and_does_not_stop_the_others(tmp_path):
+    good, bad = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1))[-2:]
+    other = replace(bad, config=replace(bad.config, ppo=replace(bad.config.ppo, gamma=0.5)))
+    finished([other])
+    (bad.folder / SCORES).unlink()
+    outcomes = list(work_here([bad, good], QUIET))
+    assert "another run: ppo.gamma 0.5, not 0.99" in outcomes[0].why
+    assert outcomes[1].why == ""
+    assert read_scores(bad) is None
+
+
+def test_scores_of_another_evaluation_are_not_mixed_in(whole):
+    with pytest.raises(TaskError, match="of another evaluation"):
+        read_scores(replace(whole[0], exam=replace(EXAM, episodes=5)))
+
+
+def score(side, value, robot="a"):
+    return Score(
+        robot, side, "reach", 2, 600, value, 0, 0, value, 0, success=0.5, random_success=0,
+        distance=0.1, relative_distance=0.2,
+    )  # fmt: skip
+
+
+def by_hand(cells, values):
+    """Results of cells with given scores of two train robots and one test robot; None: missing."""
+    found = {}
+    for cell, value in zip(cells, values, strict=True):
+        found[cell] = None
+        if value is not None:
+            own = [score("train", value[0]), score("train", value[1]), score("test", value[2])]
+            found[cell] = {"deterministic": own}
+    return found
+
+
+def test_rows_are_averages_over_seeds_and_robots(tmp_path):
+    cells = cells_in(tmp_path)[3:]
+    found = rows(by_hand(cells, [(1, 3, 10), (2, 6, 20), (5, 5, 5), (5, 5, 5)]))
+    assert [(row.agent, row.mode, row.seeds) for row in found] == [
+        ("se", "deterministic", (0, 1)),
+        ("me-mlp", "deterministic", (0, 1)),
+    ]
+    train, test = found[0].groups["train"], found[0].groups["test"]
+    assert (train.mean, train.success) == (3, 0.5)
+    assert train.iqm.value == np.mean([2, 3])
+    assert (test.mean, test.iqm.low, test.iqm.high) == (15, 10, 20)
+    line = table_text(found).splitlines()[-1].split("|")
+    assert [each.strip() for each in line[4:7]] == ["5.00", "5.00 [5.00, 5.00]", "50%"]
+
+
+def test_what_is_missing_is_shown_as_missing(tmp_path):
+    cells = cells_in(tmp_path)
+    random, _, _, se0, se1, mlp0, mlp1 = cells
+    own = {random: {"random": [score("train", 0.0), score("test", 0.0)]}}
+    own |= by_hand([se0, se1, mlp0, mlp1], [(1, 3, 10), None, None, None])
+    own |= {cell: None for cell in cells[1:3]}
+    found = {cell: own[cell] for cell in cells}
+    written = write_tables(tmp_path, found)
+    assert [path.name for path in written] == [TABLE, DATA, ROBOTS, CURVES]
+    lines = (tmp_path / TABLE).read_text().splitlines()
+    cut = {
+        line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]] for line in lines[4:]
+    }
+    assert cut["random"][2] == "0.00"
+    assert cut["se"][1] == "1 of 2 (missing: 1)"
+    assert cut["se"][2] == "2.00"
+    assert cut["me-mlp"] == ["", "0 of 2 (missing: 0, 1)", *["missing"] * 6]
+    assert cut["ik"][2:] == ["missing"] * 6
+    with (tmp_path / ROBOTS).open() as file:
+        table = list(csv.DictReader(file))
+    gone = [line for line in table if line["agent"] == "me-mlp"]
+    assert [(line["seed"], line["status"], line["score"]) for line in gone] == [
+        ("0", "missing", ""),
+        ("1", "missing", ""),
+    ]
+    data = json.loads((tmp_path / DATA).read_text())
+    assert [each["scores"] for each in data["cells"] if each["agent"] == "me-mlp"] == [None, None]
+    (row,) = [each for each in data["rows"] if each["agent"] == "me-mlp"]
+    assert (row["groups"], row["missing"]) == ({}, [0, 1])
+
+
+def test_curves_are_of_those_that_learned(whole, tmp_path, monkeypatch):
+    drawn = []
+    from matplotlib.axes import Axes
+
+    plot = Axes.plot
+    monkeypatch.setattr(
+        Axes, "plot", lambda self, *a, **k: drawn.append((k["label"], a)) or plot(self, *a, **k)
+    )
+    found = results(whole)
+    (whole[-1].folder / METRICS).rename(tmp_path / "aside")
+    try:
+        write_tables(tmp_path, found)
+    finally:
+        (tmp_path / "aside").rename(whole[-1].folder / METRICS)
+    (se, (steps, values)), (mlp, _) = drawn
+    assert (se, mlp) == ("se", "me-mlp (1 of 2 seeds)")
+    assert list(steps) == [32, 64]
+    assert np.isfinite(values).all()
+    with Image.open(tmp_path / CURVES) as image:
+        assert image.size[0] > 500
+
+
+def test_an_agent_trained_on_the_test_robots_has_no_other_score(tmp_path):
+    source = other_side(small_source(), "test")
+    config = small_config(source, agent="se", transitions=32)
+    cell = agent_cell(tmp_path, "se@test", config, EXAM)
+    finished([cell])
+    found = results([cell])
+    (row, _) = rows(found)
+    assert set(row.groups) == {"test"}
+    assert " - " in table_text([row])
+    assert "missing" not in table_text([row])
+
+
+@pytest.mark.slow
+def test_ray_does_the_same(whole, tmp_path):
+    pytest.importorskip("ray")
+    cells = cells_in(tmp_path, seeds=(0,))
+    for _ in range(2):
+        outcomes = list(work_on_ray(None)(cells, QUIET))
+        assert sorted(each.cell.agent for each in outcomes) == sorted(c.agent for c in cells)
+        assert all(each.why == "" for each in outcomes)
+    same = [cell for cell in whole if cell.seed != 1]
+    for one, other in zip(same, cells, strict=True):
+        assert repr(read_scores(one)) == repr(read_scores(other))

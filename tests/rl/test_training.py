@@ -1,0 +1,228 @@
+"""Training: what it leaves, and that it may be stopped at any time."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from commands import tree
+from morphgen.errors import FormatError, TaskError
+from morphgen.formats.files import alone
+from morphgen.rl.ppo import Learner
+from morphgen.rl.recorders import METRICS, read_metrics
+from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
+from morphgen.rl.training import Way, checkpoints, parts_of, require_runnable, train
+from on_a_line import OnALine
+from small_runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
+
+TIMED = ("collect_seconds", "learn_seconds", "steps_per_second")
+
+
+class StoppedError(Exception):
+    """As Ctrl-C: at any update, after it was recorded."""
+
+
+def stop_after(update):
+    def show(part):
+        def told(report, updates):
+            if report.update == update:
+                raise StoppedError
+
+        return told
+
+    return show
+
+
+def untimed(folder):
+    return [{k: v for k, v in each.items() if k not in TIMED} for each in read_metrics(folder)]
+
+
+def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
+    seen = []
+    config = small_config()
+    (part,) = train(
+        tmp_path / "a" / "run",
+        config,
+        way=QUIET,
+        show=lambda part: lambda report, updates: seen.append((report.update, updates)),
+    )
+    assert part.folder == tmp_path / "a" / "run"
+    assert sorted(tree(part.folder)) == [CHECKPOINT, "config.json", METRICS]
+    assert read_config(part.folder) == config
+    assert seen == [(i, 6) for i in range(1, 7)]
+    metrics = read_metrics(part.folder)
+    assert [each["transitions"] for each in metrics] == [32 * i for i in range(1, 7)]
+    run, learner = read_checkpoint(part.folder)
+    assert (run, learner["update"]) == (config, 6)
+
+
+@pytest.mark.parametrize("stops", [(1,), (4,), (3, 5)], ids=str)
+def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp_path, stops):
+    config = small_config(small_source(), transitions=24 * 4 * 8, slow_critic=True)
+    train(tmp_path / "whole", config, way=QUIET)
+    assert config.updates == 24
+    often = 2  # updates between its checkpoints
+    for stop in stops:
+        with pytest.raises(StoppedError):
+            train(tmp_path / "cut", config, resume=True, way=QUIET, show=stop_after(stop))
+        saved = stop // often * often
+        assert (tmp_path / "cut" / CHECKPOINT).exists() == (saved > 0)
+        if saved:
+            assert read_checkpoint(tmp_path / "cut")[1]["update"] == saved
+    first = []
+    train(
+        tmp_path / "cut",
+        config,
+        resume=True,
+        way=QUIET,
+        show=lambda part: lambda report, updates: first.append(report.update),
+    )
+    assert first[0] == stops[-1] // often * often + 1
+    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
+    assert untimed(tmp_path / "whole") == untimed(tmp_path / "cut")
+
+
+def test_other_seeds_come_to_other_weights_and_other_workers_to_the_same(tmp_path):
+    ways = {"a": (0, QUIET), "b": (0, Way(2, tensorboard=False)), "c": (1, QUIET)}
+    for name, (seed, way) in ways.items():
+        train(tmp_path / name, small_config(seed=seed, transitions=64), way=way)
+    a, b, c = (weights(tmp_path / name) for name in ways)
+    assert equal(a, b)
+    assert not equal(a, c)
+
+
+def test_a_finished_run_is_not_trained_again(tmp_path):
+    config = small_config(transitions=64)
+    train(tmp_path / "run", config, way=QUIET)
+    before = tree(tmp_path)
+    never = stop_after(1)
+    assert train(tmp_path / "run", config, resume=True, way=QUIET, show=never)
+    with pytest.raises(TaskError, match="say --resume"):
+        train(tmp_path / "run", config, way=QUIET)
+    assert tree(tmp_path) == before
+
+
+def test_se_trains_a_policy_for_each_robot_which_share_environments_and_transitions(tmp_path):
+    config = small_config(small_source(), agent="se", transitions=128)
+    parts = train(tmp_path / "run", config, way=QUIET)
+    names = [part.folder.name for part in parts]
+    assert [part.config.source.only for part in parts] == names
+    assert len(set(names)) == 2
+    assert [(part.config.envs, part.config.ppo.transitions) for part in parts] == [(2, 64)] * 2
+    assert len({part.config.seed for part in parts} | {config.seed}) == 3
+    assert [file.parent.name for file in checkpoints(tmp_path / "run")] == sorted(names)
+    assert not equal(*(weights(part.folder) for part in parts))
+    whole = parts_of(tmp_path, replace(config, whole=True))
+    assert [(part.config.envs, part.config.ppo.transitions) for part in whole] == [(4, 128)] * 2
+
+
+def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
+    config = small_config(small_source(), agent="se", transitions=128)
+    train(tmp_path / "whole", config, way=QUIET)
+    parts = parts_of(tmp_path / "cut", config)
+    begun = []
+
+    def show(part):
+        begun.append(part.config.source.only)
+        return stop_after(1)(part) if len(begun) == 2 else lambda report, updates: None
+
+    for _ in range(2):
+        try:
+            train(tmp_path / "cut", config, resume=True, way=QUIET, show=show)
+        except StoppedError:
+            continue
+    first, second = (part.config.source.only for part in parts)
+    assert begun == [first, second, second]
+    for part, same in zip(parts, parts_of(tmp_path / "whole", config), strict=True):
+        assert equal(weights(part.folder), weights(same.folder))
+
+
+def test_an_agent_of_many_robots_and_one_robot_are_one_run(tmp_path):
+    assert len(parts_of(tmp_path, small_config(small_source()))) == 1
+    assert len(parts_of(tmp_path, small_config(agent="se"))) == 1
+
+
+def test_fine_tuning_begins_with_the_networks_of_a_checkpoint(tmp_path):
+    train(tmp_path / "first", small_config(transitions=64), way=QUIET)
+    config = replace(
+        small_config(transitions=32, learning_rate=1e-30, slow_critic=False),
+        begin=str(tmp_path / "first" / CHECKPOINT),
+    )
+    train(tmp_path / "second", config, way=QUIET)
+    assert equal(weights(tmp_path / "first"), weights(tmp_path / "second"))
+    assert read_checkpoint(tmp_path / "second")[1]["update"] == 1
+    wider = replace(config, policy=replace(config.policy, mlp_width=16))
+    with pytest.raises(TaskError, match="mlp_width 8, here 16"):
+        train(tmp_path / "third", wider, way=QUIET)
+    assert not (tmp_path / "third").exists()
+
+
+def test_what_cannot_begin_leaves_nothing(tmp_path):
+    config = small_config()
+    for wrong, says in (
+        (replace(config, envs=0), "an update takes"),
+        (small_config(transitions=31), "an update takes 32 transitions"),
+        (replace(config, seed=-1), "--seed -1"),
+        (replace(config, device="tpu"), "unknown device 'tpu'"),
+        (small_config(minibatches=5), "equal minibatches"),
+        (replace(config, begin=str(tmp_path / "none.pt")), "no such checkpoint"),
+        (replace(config, policy=replace(POLICY, discrete=True), sim="bullet"), "did you mean"),
+    ):
+        with pytest.raises(TaskError, match=says):
+            train(tmp_path / "run", wrong, way=QUIET)
+    assert tree(tmp_path) == {}
+    with pytest.raises(TaskError, match="--workers 0"):
+        Way(0)
+    require_runnable(config)
+
+
+def test_two_runs_do_not_write_to_one_folder(tmp_path):
+    config = small_config(transitions=64)
+    with pytest.raises(StoppedError):
+        train(tmp_path / "run", config, way=QUIET, show=stop_after(1))
+    with alone(tmp_path / "run"), pytest.raises(FormatError, match="by another run"):
+        train(tmp_path / "run", config, resume=True, way=QUIET)
+    train(tmp_path / "run", config, resume=True, way=QUIET)
+
+
+def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(tmp_path):
+    train(tmp_path / "run", small_config(transitions=64), way=QUIET)
+    config = small_config(transitions=64)
+    run, learner = read_checkpoint(tmp_path / "run")
+    learner["layout"]["links"] = 30
+    write_checkpoint(tmp_path / "run", run, learner | {"update": 1})
+    with pytest.raises(TaskError, match="other observations: links 30, here 23"):
+        train(tmp_path / "run", config, resume=True, way=QUIET)
+
+
+def test_first_episodes_do_not_all_end_at_once():
+    batch = OnALine(8)
+    Learner(batch, replace(POLICY, discrete=True), replace(PPO, transitions=64))
+    assert batch.spread
+
+
+def test_nothing_on_the_way_needs_pybullet(tmp_path):
+    code = (
+        "import sys; sys.modules['pybullet'] = None\n"
+        "from pathlib import Path\n"
+        "from morphgen.rl.evaluation import evaluate_run\n"
+        "from morphgen.rl.training import train\n"
+        "from small_runs import EXAM, QUIET, small_config\n"
+        "folder = Path(sys.argv[1])\n"
+        "train(folder, small_config(transitions=32), way=QUIET)\n"
+        "(score,) = evaluate_run(folder, 'train', EXAM, 'deterministic')\n"
+        "print(score.episodes)\n"
+    )
+    environment = {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "run")],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "2\n", "")
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["sim"] == "mujoco"

@@ -1,0 +1,261 @@
+"""Push sets: blocks that robots of every kind can get behind and across the line."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from morphgen.benchmark.workspace import workspace
+from morphgen.errors import TaskError
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.tasks import push_sets as module
+from morphgen.tasks import push_ways
+from morphgen.tasks.config import PushConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.inverse_kinematics import bring_tool, tool_jacobian
+from morphgen.tasks.push_proofs import CLOSE
+from morphgen.tasks.push_region import effective_reach, push_region
+from morphgen.tasks.push_sets import PushSet, push_set
+from morphgen.tasks.sim.base import Block, Scene
+from scenes import robot
+
+CONFIG = PushConfig(starts=5)
+ARMS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm=arm3 ee=claw")
+FREE = ("prims", "cubes", "chain beads=3")
+SWEEPS = ("stick", "nlink")
+SHORT = "stick beam.length=0.15"
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return tmp_path / "pushes"
+
+
+def made(words, cache, *, config=CONFIG, obstacles=False, seed=0, ground=0.0):
+    return push_set(
+        robot(words), config, obstacles=obstacles, seed=seed, ground=ground, cache=cache
+    )
+
+
+def space_of(words, found):
+    scene = Scene(robot(words), block=found.block, obstacles=found.obstacles, ground=found.ground)
+    return FreeSpace(scene)
+
+
+@pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
+@pytest.mark.parametrize("boxes", [False, True])
+def test_every_block_can_be_pushed_across(words, boxes, cache):
+    found = made(words, cache, obstacles=boxes)
+    body, space = robot(words), space_of(words, found)
+    edge, x, y = found.block.size[0], *found.blocks[:, :2].T
+    assert len(found.obstacles) == (3 if boxes else 0)
+    assert 5 == found.accepted == len(found.q) <= found.tried
+    assert found.blocks[:, 2] == pytest.approx(edge / 2)
+    assert np.linalg.norm(found.blocks[:, 3:], axis=1) == pytest.approx(1.0)
+    assert ((-0.2 * found.scale <= y) & (y <= -0.15 * found.scale)).all()
+    assert found.line == pytest.approx(0.2 * found.scale)
+    for q in (found.q, found.behind, found.across):
+        assert ((q >= bounds(body)[:, 0]) & (q <= bounds(body)[:, 1])).all()
+    assert space.free(found.q, found.blocks).all()
+    assert space.free(found.behind, found.blocks).all()
+    assert space.free(found.across).all()
+    behind, across = (frame_pose(body, q)[:, :3, 3] for q in (found.behind, found.across))
+    assert (behind[:, 1] < y - edge / 2).all()
+    assert np.abs(behind[:, 0] - x).max() < CLOSE
+    assert np.abs(across[:, :2] - np.column_stack([x, np.full(5, found.line)])).max() < CLOSE
+    for tools in (behind, across):
+        assert ((tools[:, 2] > 0) & (tools[:, 2] < edge)).all()
+    for share in np.linspace(0, 1, 9):
+        on_its_way = found.blocks.copy()
+        on_its_way[:, 1] += share * (found.line - y)
+        assert space.room(on_its_way).all()
+
+
+@pytest.mark.parametrize("words", ARMS)
+def test_arms_have_a_block_in_proportion_to_their_effective_reach(words, cache):
+    found, work = made(words, cache), workspace(robot(words))
+    edge = found.block.size[0]
+    reach = np.sqrt(work.reach**2 - (work.shoulder[2] - edge / 2) ** 2)
+    assert 0.15 * reach <= edge <= 0.2 * reach
+    x = found.blocks[:, 0] - work.shoulder[0]
+    assert ((0.4 * reach <= x) & (x <= 0.6 * reach)).all()
+    assert found.scale == 1
+
+
+@pytest.mark.parametrize("words", FREE)
+def test_free_bodies_have_it_in_metres_before_them(words, cache):
+    found = made(words, cache)
+    assert 0.15 <= found.block.size[0] <= 0.2
+    assert (np.abs(found.blocks[:, 0]) <= 0.2).all()
+    assert found.scale == 1
+
+
+def test_bodies_that_reach_less_have_all_of_it_smaller(cache):
+    """A rod of 0.15 m and its ball of 0.03 m, that swings on a slide."""
+    found = made(SHORT, cache)
+    assert found.scale == pytest.approx(0.18 / np.sqrt(2) / 0.4, rel=0.2)
+    assert 0.15 * found.scale <= found.block.size[0] <= 0.2 * found.scale
+    assert found.line == pytest.approx(0.2 * found.scale)
+
+
+def test_effective_reach_is_that_of_a_right_triangle():
+    reach, height, share = 1.0, 0.4, 0.2
+    e = effective_reach(reach, height, share)
+    assert np.hypot(e, height - share * e / 2) == pytest.approx(reach)
+    assert e > np.sqrt(reach**2 - height**2)
+    assert effective_reach(1.0, 0.0, 1e-9) == pytest.approx(1.0)
+    assert effective_reach(1.0, 1.5, 0.2) == 0
+
+
+def test_the_ground_may_be_lower(cache):
+    words = "arm=panda ee=panda_hand"
+    found = made(words, cache, ground=-0.05)
+    assert found.ground == -0.05
+    assert found.blocks[:, 2] == pytest.approx(found.block.size[0] / 2 - 0.05)
+    assert found.key != made(words, cache).key
+
+
+def test_the_block_is_as_the_config_has_it(cache):
+    config = replace(CONFIG, block_mass=0.3, friction=0.6, line=0.1, start=-0.1, start_depth=0.0)
+    found = made("prims", cache, config=config)
+    assert (found.block.mass, found.block.friction, found.line) == (0.3, 0.6, 0.1)
+    assert found.blocks[:, 1] == pytest.approx(-0.1)
+    x, y, z, *turn = found.blocks[0].tolist()
+    assert found.block.pose == Pose((x, y, z), tuple(turn))
+
+
+def test_blocks_are_turned_and_placed_at_random(cache):
+    found = made("prims", cache, config=replace(CONFIG, starts=60))
+    assert np.histogram(found.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
+    yaw = 2 * np.arctan2(found.blocks[:, 6], found.blocks[:, 3])
+    assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
+
+
+def test_fewer_starts_are_the_first_of_more(cache):
+    few = made("arm=ur5 ee=plane", cache)
+    more = made("arm=ur5 ee=plane", cache, config=replace(CONFIG, starts=40))
+    for name in ("q", "blocks", "behind", "across"):
+        assert (getattr(more, name)[:5] == getattr(few, name)).all()
+
+
+def test_what_is_stored_is_what_was_made(cache, monkeypatch):
+    fresh = made("prims", cache, obstacles=True)
+
+    def forbidden(*_):
+        raise AssertionError("it was made again")
+
+    monkeypatch.setattr(module, "FreeSpace", forbidden)
+    stored = made("prims", cache, obstacles=True)
+    for field in fields(PushSet):
+        a, b = getattr(stored, field.name), getattr(fresh, field.name)
+        assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    for folder in ("here", "there"):
+        made("prims", tmp_path / folder, obstacles=True)
+    files = [list((tmp_path / folder).iterdir()) for folder in ("here", "there")]
+    assert [path.name for path in files[0]] == [path.name for path in files[1]]
+    assert files[0][0].read_bytes() == files[1][0].read_bytes()
+
+
+def test_the_key_knows_all_that_matters_and_nothing_else(cache):
+    base = {"config": CONFIG}
+    changes = [
+        base,
+        {"config": replace(CONFIG, starts=6)},
+        {"config": replace(CONFIG, start_depth=0.01)},
+        {"config": replace(CONFIG, block_size=(0.15, 0.16))},
+        {"config": replace(CONFIG, block_mass=0.2)},
+        {"config": replace(CONFIG, free_x=(-0.1, 0.1))},
+        {**base, "seed": 1},
+        {**base, "obstacles": True},
+    ]
+    keys = [made("prims", cache, **change).key for change in changes]
+    assert len(set(keys)) == len(keys)
+    same = replace(CONFIG, steps=5, success_weight=3.0, curriculum_steps=2, obstacles=9)
+    other = replace(robot("prims"), name="other")
+    found = push_set(other, same, obstacles=False, seed=0, cache=cache)
+    assert (found.key, found.robot) == (keys[0], "other")
+
+
+def test_a_robot_that_cannot_push_is_refused_with_the_reason(cache):
+    with pytest.raises(
+        TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
+    ):
+        made("cartpole", cache)
+    with pytest.raises(TaskError, match="'prims' can hardly push: only 0 of 160 places") as caught:
+        made("prims", cache, config=replace(CONFIG, start=-0.9))
+    assert "acceptance rate 0), 5 are needed; the tool does not get behind it (100%)" in str(
+        caught.value
+    )
+    with pytest.raises(TaskError, match="its tool does not get down to the ground"):
+        push_region(robot(ARMS[0]), CONFIG, -3.0, np.random.default_rng(0))
+    with pytest.raises(TaskError, match="its tool is never as low as a block"):
+        push_region(robot("nlink"), CONFIG, -0.5, np.random.default_rng(0))
+    assert not cache.exists()
+
+
+def test_obstacles_that_always_stand_in_the_way_are_an_error(cache, monkeypatch):
+    def wall(*_, **__):
+        return (Block((9.0, 0.1, 0.1)),)
+
+    monkeypatch.setattr(push_ways, "draw_obstacles", wall)
+    with pytest.raises(TaskError, match="each of 8 layouts of 3 obstacles stands in more than 50%"):
+        made("prims", cache, obstacles=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"starts": 0}, "0 starts with seed 0: at least one start"),
+        ({"block_size": (0.2, 0.1)}, "a block of 0.2 to 0.1"),
+        ({"start": 0.3}, "is to cross 0.2: sizes are positive, and it starts before the line"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused(changes, text, cache):
+    with pytest.raises(TaskError, match=text):
+        made("prims", cache, config=replace(CONFIG, **changes))
+    with pytest.raises(TaskError, match="with seed -1"):
+        made("prims", cache, seed=-1)
+
+
+def test_a_broken_or_misnamed_file_is_named(cache):
+    first, second = made("prims", cache), made("prims", cache, seed=1)
+    paths = [cache / f"{each.key}.npz" for each in (first, second)]
+    paths[1].write_bytes(paths[0].read_bytes())
+    with pytest.raises(TaskError, match=f"5 starts and 0 obstacles of key {first.key}"):
+        made("prims", cache, seed=1)
+    paths[0].write_bytes(paths[0].read_bytes()[:-100])
+    with pytest.raises(TaskError, match=f"{paths[0].name}: no push set: .*; delete it"):
+        made("prims", cache)
+
+
+def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.warns(UserWarning, match="cannot keep a push set"):
+        found = made("prims", tmp_path / "file" / "pushes")
+    assert len(found.q) == 5
+
+
+def test_jacobians_are_the_tools_derivatives():
+    body = robot("arm=panda ee=panda_hand")
+    q = np.array([body.home]) + 0.1
+    tool, J = tool_jacobian(body, q)
+    assert tool == pytest.approx(frame_pose(body, q)[:, :3, 3])
+    for j in range(body.dof):
+        ahead = q.copy()
+        ahead[0, j] += 1e-6
+        assert (tool_jacobian(body, ahead)[0] - tool)[0] / 1e-6 == pytest.approx(
+            J[0, :, j], abs=1e-5
+        )
+
+
+def test_tools_are_brought_where_they_can_be_and_their_distance_is_told():
+    body = robot("arm=ur5 ee=plane")
+    goals = np.array([[0.5, 0.2, 0.3], [9.0, 0.0, 0.0]])
+    q, error = bring_tool(body, np.tile(body.home, (2, 1)), goals)
+    assert frame_pose(body, q)[0, :3, 3] == pytest.approx(goals[0], abs=1e-4)
+    assert goals - error == pytest.approx(frame_pose(body, q)[:, :3, 3])
+    assert np.linalg.norm(error[1]) > 7
