@@ -3,6 +3,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# A process a core, and in each one thread: torch's own would only get in each other's way.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
 
 .PHONY: demo test test-all check view format clean
 
@@ -13,10 +15,10 @@ demo: $(STAMP)
 	@echo "The robot is in robots/ur5-plane; its picture is robots/ur5-plane/preview.png"
 
 test: $(STAMP)
-	$(BIN)/pytest -m "not slow" -n auto
+	$(PYTEST) -m "not slow"
 
 test-all: $(STAMP)
-	$(BIN)/pytest -n auto
+	$(PYTEST)
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -24,6 +24,8 @@ from morphgen.rl.training import parts_of, train
 from morphgen.tasks.config import ReachConfig
 from small_runs import EXAM, QUIET, small_config, small_source
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):

@@ -300,6 +300,7 @@ def test_an_observation_without_obstacles_and_extras_will_do(agent):
         assert found.isfinite().all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
 def test_networks_compile_whole_and_are_the_same(agent):
     seen = observed()

@@ -421,6 +421,7 @@ def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
     return reports
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("discrete", "options"),
     [(True, {}), (False, {"symlog": False, "slow_critic": False, "task_reweighting": True})],

@@ -46,6 +46,7 @@ def successes(task, controller, steps=PUSH.steps):
     return across
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
 def test_blocks_get_across(sim, tmp_path):
     across = successes(batch([PLANE, UR5], 6, tmp_path, sim=sim), ScriptedPush(0))

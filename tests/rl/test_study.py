@@ -30,6 +30,8 @@ from morphgen.rl.tables import CURVES, DATA, ROBOTS, TABLE, rows, table_text, wr
 from morphgen.rl.trained import MODES
 from small_runs import EXAM, QUIET, equal, small_config, small_source, weights
 
+pytestmark = pytest.mark.slow
+
 
 def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1)):
     source = small_source()

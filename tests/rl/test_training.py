@@ -205,6 +205,7 @@ def test_first_episodes_do_not_all_end_at_once():
     assert batch.spread
 
 
+@pytest.mark.slow
 def test_nothing_on_the_way_needs_pybullet(tmp_path):
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
