@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from morphgen.benchmark.token_layout import POSITION
+from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.heads import Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
@@ -74,7 +74,12 @@ def require_layout(found: Layout, wanted: Layout, what: str) -> None:
 
 
 class Entities(nn.Module):
-    """Links, goal, object, line, obstacles and points as vectors of one size, links first."""
+    """Links, goal, object, line, obstacles and points as vectors of one size, links first.
+
+    The code of a joint position has frequencies so high that a step of the joint is many periods:
+    noise to a network that has not learned anything yet. Weights of a frequency begin in inverse
+    proportion to it, so that the first policy is smooth.
+    """
 
     def __init__(self, layout: Layout, features: int, blind: bool) -> None:
         super().__init__()
@@ -92,6 +97,9 @@ class Entities(nn.Module):
         self.project = nn.ModuleDict(
             {name: nn.Linear(size, features, bias=False) for name, size in sizes.items()}
         )
+        with torch.no_grad():
+            codes = self.project["links"].weight[:, POSITION.columns]
+            codes *= torch.from_numpy(FREQUENCIES[0] / FREQUENCIES).float().repeat(2)
         self.kind = nn.Parameter(0.02 * torch.randn(len(sizes), features))
         seen = torch.ones(link, dtype=torch.bool)
         if blind:

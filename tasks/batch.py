@@ -14,8 +14,8 @@ from morphgen.tasks.actions import ActionKind, next_targets, shares_of
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
 from morphgen.tasks.episodes import Push, Reach, State, Verdict, chosen
-from morphgen.tasks.kinematics import tool_positions
-from morphgen.tasks.observation import box_tokens, link_tokens, of_links
+from morphgen.tasks.kinematics import ToolPositions
+from morphgen.tasks.observation import LinkTokens, box_tokens, of_links
 from morphgen.tasks.points import PointClouds
 from morphgen.tasks.rewards import Terms, beyond_limits
 from morphgen.tasks.settings import Setting
@@ -138,6 +138,8 @@ class TaskBatch:
         self._shares = torch.zeros(n, bodies.max_links, device=device)
         self._lower, self._upper = bodies.lower[self.body], bodies.upper[self.body]
         self._channels = channels
+        self._tokens = LinkTokens(bodies, self.body)
+        self._tools = ToolPositions(bodies.chain, self.body)
         self._fixed = {
             "links": bodies.links[self.body],
             "actions": self.mask,
@@ -229,7 +231,7 @@ class TaskBatch:
     def observe(self) -> Observation:
         """What agents see now."""
         seen = {
-            "tokens": link_tokens(self.bodies, self.body, self.q),
+            "tokens": self._tokens(self.q),
             "goal": self._reach.goal.clone(),
             "object": box_tokens(self.simulation.block_pose, self._push.size)
             * self.pushes[:, None],
@@ -284,7 +286,7 @@ class TaskBatch:
     def _judge(self) -> Verdict:
         q, qd = self.q, self._widened(self.simulation.qd)
         state = State(
-            tool=tool_positions(self.bodies.chain, self.body, q),
+            tool=self._tools(q),
             block=self.simulation.block_pose[:, :3],
             beyond=beyond_limits(q, self._lower, self._upper),
             acceleration=(qd - self._qd).abs().sum(dim=1) / CONTROL_PERIOD,

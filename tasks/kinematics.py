@@ -26,12 +26,36 @@ def tool_frames(chain: Chain, body: torch.Tensor, q: torch.Tensor) -> torch.Tens
     return torch.stack(frames, dim=1)
 
 
+class ToolPositions:
+    """Where the tools of a batch's environments are; much faster than all frames."""
+
+    def __init__(self, chain: Chain, body: torch.Tensor) -> None:
+        """Prepare; arguments as of ``tool_frames``."""
+        still = chain.origin[:, :-1]
+        parts = torch.stack([still, *chain.motion], dim=2)[body, ..., :3, :]
+        parts = parts.permute(1, 2, 3, 4, 0).contiguous()
+        self._turn, self._shift = parts[..., :3, :], parts[..., 3, :]
+        """Of each joint (D, 3, 3, 3, n) and (D, 3, 3, n): at zero, and what its motion adds."""
+        self._tool = chain.origin[body, -1, :3, 3].T
+        self._joint = chain.gain[body].abs().argmax(dim=2)
+        self._gain = torch.gather(chain.gain[body], 2, self._joint[..., None])[..., 0]
+        self._offset, self._slides = chain.offset[body], chain.slides[body]
+
+    def __call__(self, q: torch.Tensor) -> torch.Tensor:
+        """In the root frames, shape (n, 3), metres, at independent joint positions (n, J)."""
+        moved = self._gain * torch.gather(q, 1, self._joint) + self._offset
+        first = torch.where(self._slides, moved, torch.sin(moved)).T
+        second = torch.where(self._slides, 0.0, 1 - torch.cos(moved)).T
+        point = self._tool
+        for d in reversed(range(len(first))):
+            still, by_first, by_second = (self._turn[d] * point).sum(dim=2) + self._shift[d]
+            point = still + first[d] * by_first + second[d] * by_second
+        return point.T
+
+
 def tool_positions(chain: Chain, body: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """Where tools are in their root frames, shape (n, 3), metres; faster than all frames."""
-    point = chain.origin[body, -1, :, 3:]
-    for step in _steps(chain, body, q).unbind(1)[::-1]:
-        point = step @ point
-    return point[:, :3, 0]
+    """Where tools are in their root frames, shape (n, 3), metres, once."""
+    return ToolPositions(chain, body)(q)
 
 
 def tool_poses(chain: Chain, body: torch.Tensor, q: torch.Tensor) -> torch.Tensor:

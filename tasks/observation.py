@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.tasks.bodies import Bodies
 
 
-def joint_positions(bodies: Bodies, body: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """The part of the tokens that moves: codes of the links' joint positions.
+class LinkTokens:
+    """Tokens of the links of a batch's environments; only codes of joint positions move."""
 
-    Args:
-        bodies: The robots.
-        body: Which robot each row is, shape (n,), int64.
-        q: Independent joint positions, shape (n, J).
+    def __init__(self, bodies: Bodies, body: torch.Tensor) -> None:
+        """Prepare.
 
-    Returns:
-        Shape (n, L, 16); zeros for links that do not move.
-    """
-    x = (bodies.to_link[body] @ q[:, :, None])[:, :, 0] + bodies.at_link[body]
-    wrapped = x - 2 * torch.ceil((x - 1) / 2)
-    x = torch.where(bodies.turns[body], wrapped, x)
-    angles = x[..., None] * _frequencies(x.device)
-    codes = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
-    return codes * bodies.moving[body][..., None]
+        Args:
+            bodies: The robots.
+            body: Which robot each row is, shape (n,), int64.
+        """
+        moving = bodies.moving[body]
+        most = int(moving.sum(dim=1).max())
+        self._links = (~moving).int().argsort(dim=1, stable=True)[:, :most]
+        """Links that move, before others where a robot has fewer, shape (n, M)."""
+        self._rows = torch.arange(len(body), device=body.device)[:, None]
+        self._still = bodies.tokens[body]
+        each = body[:, None], self._links
+        gains = bodies.to_link[each]
+        self._joint = gains.abs().argmax(dim=2)
+        self._gain = torch.gather(gains, 2, self._joint[..., None])[..., 0]
+        self._offset, self._turns = bodies.at_link[each], bodies.turns[each]
+        self._counts = bodies.moving[each][..., None]
+        self._frequencies = torch.from_numpy(FREQUENCIES).float().to(body.device)
 
-
-def link_tokens(bodies: Bodies, body: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """Tokens of all links in their configuration, shape (n, L, 48)."""
-    made = bodies.tokens[body]
-    made[..., POSITION.columns] = joint_positions(bodies, body, q)
-    return made
+    def __call__(self, q: torch.Tensor) -> torch.Tensor:
+        """Tokens (n, L, 48) at independent joint positions (n, J)."""
+        x = self._gain * torch.gather(q, 1, self._joint) + self._offset
+        x = torch.where(self._turns, x - 2 * torch.ceil((x - 1) / 2), x)
+        angles = x[..., None] * self._frequencies
+        codes = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1) * self._counts
+        made = self._still.clone()
+        made[..., POSITION.columns][self._rows, self._links] = codes
+        return made
 
 
 def of_links(bodies: Bodies, body: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -46,7 +54,3 @@ def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
     shape = torch.zeros_like(size)
     shape[..., 2] = 1
     return torch.cat([pose, shape, size], dim=-1)
-
-
-def _frequencies(device: torch.device) -> torch.Tensor:
-    return torch.from_numpy(np.asarray(FREQUENCIES, dtype=np.float32)).to(device)

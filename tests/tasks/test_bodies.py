@@ -14,8 +14,8 @@ from morphgen.model.kinematics import forward_kinematics, frame_pose, random_con
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
-from morphgen.tasks.kinematics import quaternions, tool_jacobians, tool_poses
-from morphgen.tasks.observation import joint_positions
+from morphgen.tasks.kinematics import quaternions, tool_jacobians, tool_poses, tool_positions
+from morphgen.tasks.observation import LinkTokens
 
 FOLDERS = default_library(()).folders
 WORDS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain beads=2", "prims", "arm3")
@@ -44,10 +44,12 @@ def configurations(robots, bodies, n=20):
 def test_tools_are_where_the_model_has_them(robots, bodies):
     body, q = configurations(robots, bodies)
     found = tool_poses(bodies.chain, body, q.float()).double().numpy()
+    positions = tool_positions(bodies.chain, body, q.float())
     for i, robot in enumerate(robots):
         T = frame_pose(robot, q[body == i, : robot.dof].numpy())
         mine = found[body == i]
         assert mine[:, :3] == pytest.approx(T[:, :3, 3], abs=1e-5)
+        assert positions[body == i].numpy() == pytest.approx(T[:, :3, 3], abs=1e-5)
         assert (mine[:, 3] >= 0).all()
         expected = quaternions(torch.from_numpy(T[:, :3, :3])).numpy()
         assert np.abs((mine[:, 3:] * expected).sum(axis=1)) == pytest.approx(1, abs=1e-5)
@@ -80,12 +82,11 @@ def test_quaternions_of_half_turns_too():
 
 def test_the_position_codes_are_those_of_the_tokens(robots, bodies):
     body, q = configurations(robots, bodies, n=4)
-    found = joint_positions(bodies, body, q.float())
+    found = LinkTokens(bodies, body)(q.float())
     for i, robot in enumerate(robots):
         shapes = token_shapes(robot, FOLDERS)
         expected = tokens(robot, shapes, q[body == i, : robot.dof].numpy())
-        together = bodies.tokens[i][None].repeat(4, 1, 1)
-        together[:, :, 32:] = found[body == i]
+        together = found[body == i]
         n = len(robot.links)
         # The fastest sine turns 64 pi a unit, so float32 costs it five digits.
         assert together[:, :n].numpy() == pytest.approx(expected, abs=2e-4)
