@@ -85,11 +85,16 @@ def _result(future: Future[list[R]]) -> list[R]:
         ) from error
 
 
-def _start(work: Callable[[Any], object]) -> None:
-    """Prepare a worker; Ctrl-C is for the parent, which lets it finish its chunk."""
-    global _work
+def prepare_worker() -> None:
+    """Prepare a worker: Ctrl-C is for the parent, and without it the worker ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _start(work: Callable[[Any], object]) -> None:
+    """Prepare a worker, which the parent lets finish its chunk."""
+    global _work
+    prepare_worker()
     _work = work
 
 

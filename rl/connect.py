@@ -17,6 +17,8 @@ STRETCH = 12.0
 """Longest piece of a tree, in control steps."""
 LEAST = 1.0
 """Shortest, likewise."""
+GROWN = 12
+"""Times that a tree grows for every configuration that is taken from it."""
 SHORTCUTS = 60
 """Random pairs of points on a way between which a straight one is tried."""
 
@@ -92,6 +94,25 @@ def connected(
                 return tuple(_shortened(way, free_part, rng))
         growing, other = other, growing
     return None
+
+
+def explored(
+    start: Array,
+    bounds: Array,
+    step: Array,
+    free_part: FreePart,
+    rng: np.random.Generator,
+    count: int,
+) -> Array:
+    """Configurations to which free ways lead from a start, shape (count, dof).
+
+    Arguments as of ``connected``. They are drawn from a tree, maybe more than once.
+    """
+    tree = _Tree(start[None], step)
+    for _ in range(GROWN * count):
+        drawn = rng.uniform(bounds[:, 0], bounds[:, 1])
+        tree.grow(tree.nearest(drawn), drawn, free_part)
+    return np.array(tree.nodes)[rng.integers(len(tree.nodes), size=count)]
 
 
 def _meet(tree: _Tree, q: Array, free_part: FreePart) -> int | None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.benchmark.split import Side, Task
 from morphgen.errors import TaskError, nearest
@@ -270,7 +269,7 @@ def _played(
 def _score(
     setting: Setting, side: Side, own: Sequence[Episode], chance: Sequence[Episode]
 ) -> Score:
-    raw, random = _raw(setting, own), _raw(setting, chance)
+    raw, random = (np.array([each.score for each in found]) for found in (own, chance))
     reaches = setting.task == "reach"
     above = raw - np.resize(random, len(raw)) if reaches else raw
     interval = mean_interval(above)
@@ -291,15 +290,6 @@ def _score(
         distance=distance,
         relative_distance=distance / reach(setting.robot) if reaches else math.nan,
     )
-
-
-def _raw(setting: Setting, episodes: Sequence[Episode]) -> NDArray[np.float64]:
-    """A number an episode, whose mean is the raw score; episodes of reach are equally long.
-
-    Episodes of reach have the same goals and starts in the same order, whatever acts.
-    """
-    reaches = setting.task == "reach"
-    return np.array([each.score if reaches else float(each.success) for each in episodes])
 
 
 def exam_of(config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1) -> Exam:

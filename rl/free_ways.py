@@ -6,10 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from morphgen.model.kinematics import bounds
-from morphgen.rl.connect import connected
+from morphgen.rl.connect import connected, explored
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
 
 Array = NDArray[np.float64]
@@ -20,6 +23,10 @@ ATTEMPTS = 4
 """Times that these are others."""
 STRIDE = 0.05
 """Largest change of a joint between configurations of a way that are tested, rad or m."""
+LEGS = 24
+"""Of a way that is followed, at most."""
+NEAR = 1.01 * min(share for share in BINS if share > 0)
+"""Part of a joint's step that is left where a leg ends: discrete actions get no nearer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,16 +42,24 @@ class Way:
 class FreeWays:
     """Ways of one robot."""
 
-    def __init__(self, space: FreeSpace, step: Array, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        space: FreeSpace,
+        step: Array,
+        rng: np.random.Generator,
+        moves: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Draw stops.
 
         Args:
-            space: What is free, with a block.
+            space: What is free.
             step: Largest change of every joint in a control step, shape (dof,).
             rng: Where stops come from.
+            moves: Which joints move, shape (dof,); by default all.
         """
         self._space, self._step = space, step
         robot = space.scene.robot
+        self._moves = np.ones(robot.dof, dtype=np.bool_) if moves is None else moves
         self._home, self._bounds = np.array(robot.home), bounds(robot)
         self._seed = int(rng.integers(2**63))
         self._stops, _ = space.draw(STOPS * ATTEMPTS, rng)
@@ -57,19 +72,20 @@ class FreeWays:
         self,
         start: Array,
         ends: Array,
-        vias: Array,
-        costs: Array,
-        block: Array,
-        attempt: int,
+        *,
+        vias: Array | None = None,
+        costs: Array | None = None,
+        block: Array | None = None,
+        attempt: int = 0,
     ) -> Way | None:
         """The free way that costs least, to one of several ends, by way of one stop at most.
 
         Args:
             start: Where it begins, shape (dof,).
             ends: Where it may end, shape (n, dof).
-            vias: By way of which each end may be reached, shape (n, dof).
+            vias: By way of which each end may also be reached, shape (n, dof).
             costs: What it costs to go on from each end, in control steps, shape (n,).
-            block: Where the block is, shape (7,).
+            block: Where the block is, shape (7,); nowhere without.
             attempt: Which stops there are: others for the next ``ATTEMPTS`` numbers.
 
         Returns:
@@ -84,7 +100,8 @@ class FreeWays:
             return known[key]
 
         first = STOPS * (attempt % ATTEMPTS)
-        stops = [self._home, *self._stops[first : first + STOPS]]
+        drawn = [self._home, *self._stops[first : first + STOPS]]
+        stops = [np.where(self._moves, stop, start) for stop in drawn]
         ways = self._ways(start, ends, vias, stops, costs)
         for _, way in sorted(ways, key=lambda each: each[0]):
             points = (start, *way.points)
@@ -93,32 +110,99 @@ class FreeWays:
                 return way
         return None
 
-    def find_round_about(self, start: Array, ends: Array, block: Array, attempt: int) -> Way | None:
+    def find_round_about(
+        self, start: Array, ends: Array, *, block: Array | None = None, attempt: int = 0
+    ) -> Way | None:
         """Any free way to one of several ends; see ``connected``. Arguments as of ``find``."""
 
         def free_part(a: Array, b: Array) -> float:
             return self._free_part(a, b, block)
 
         rng = np.random.default_rng([self._seed, attempt])
-        found = connected(start, ends, self._bounds, self._step, free_part, rng)
+        found = connected(start, ends, self._within(start), self._step, free_part, rng)
         if found is None:
             return None
         return Way(found[1:], int(np.abs(ends - found[-1]).max(axis=1).argmin()))
 
+    def reached(self, start: Array, count: int, *, attempt: int = 0) -> Array:
+        """Configurations to which free ways lead without the block, shape (count, dof)."""
+
+        def free_part(a: Array, b: Array) -> float:
+            return self._free_part(a, b, None)
+
+        rng = np.random.default_rng([self._seed, attempt])
+        return explored(start, self._within(start), self._step, free_part, rng, count)
+
+    def _within(self, start: Array) -> Array:
+        """Bounds of the joints; those that do not move are where they are."""
+        return np.where(self._moves[:, None], self._bounds, start[:, None])
+
     def _ways(
-        self, start: Array, ends: Array, vias: Array, stops: Sequence[Array], costs: Array
+        self,
+        start: Array,
+        ends: Array,
+        vias: Array | None,
+        stops: Sequence[Array],
+        costs: Array | None,
     ) -> Iterator[tuple[float, Way]]:
         """All ways there may be, with what they cost."""
-        for i, (end, via) in enumerate(zip(ends, vias, strict=True)):
+        for i, end in enumerate(ends):
+            lasts = ((end,),) if vias is None else ((end,), (vias[i], end))
             for before in ((), *((stop,) for stop in stops)):
-                for points in ((*before, end), (*before, via, end)):
+                for last in lasts:
+                    points = (*before, *last)
                     legs = np.diff(np.array([start, *points]), axis=0)
                     steps = (np.abs(legs) / self._step).max(axis=1).sum()
-                    yield float(steps + costs[i]), Way(points, i)
+                    yield float(steps + (0.0 if costs is None else costs[i])), Way(points, i)
 
-    def _free_part(self, start: Array, end: Array, block: Array) -> float:
+    def _free_part(self, start: Array, end: Array, block: Array | None) -> float:
         """Which part of the straight way between two configurations is free, from the start."""
         parts = max(int(np.abs(end - start).max() / STRIDE) + 1, 2)
         way = start + np.linspace(0, 1, parts)[:, None] * (end - start)
-        free = self._space.free(way, np.tile(block, (parts, 1)))
+        free = self._space.free(way, None if block is None else np.tile(block, (parts, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (parts - 1)
+
+
+class Routes:
+    """Ways that the robots of a batch follow, each a leg after the other."""
+
+    def __init__(self, task: TaskBatch) -> None:
+        """All stay where they are."""
+        self._task = task
+        self._points = task.targets[:, None].repeat(1, LEGS, 1)
+        self._leg, self._last = torch.zeros(2, task.num_envs, dtype=torch.int64).to(task.device)
+        self._rows = torch.arange(task.num_envs, device=task.device)
+
+    def take(self, env: int, points: Sequence[Array]) -> None:
+        """Begin a way through configurations, each (dof,)."""
+        for i, q in enumerate(points[:LEGS]):
+            self._points[env, i, : len(q)] = torch.from_numpy(q)
+        self._leg[env], self._last[env] = 0, len(points[:LEGS]) - 1
+
+    @property
+    def wanted(self) -> torch.Tensor:
+        """Where the leg of each robot ends, shape (n, J)."""
+        points: torch.Tensor = self._points[self._rows, self._leg]
+        return points
+
+    def go_on(self) -> torch.Tensor:
+        """Begin the next leg where one is at its end; where the last is, shape (n,), bool."""
+        task = self._task
+        step = task.bodies.step[task.body].clamp(min=1e-9)
+        done = ((self.wanted - task.targets) / step).abs().amax(dim=1) < NEAR
+        final: torch.Tensor = done & (self._leg == self._last)
+        self._leg = torch.where(done & ~final, self._leg + 1, self._leg)
+        return final
+
+
+def shares_to(task: TaskBatch, wanted: torch.Tensor) -> torch.Tensor:
+    """Shares of the joints' steps, a number a link (n, L), that bring targets to others (n, J).
+
+    All joints get there at once.
+    """
+    step = task.bodies.step[task.body]
+    ahead = wanted - task.targets
+    shares = torch.where(step > 0, ahead / step.clamp(min=1e-9), torch.zeros_like(ahead))
+    shares = shares / shares.abs().amax(dim=1, keepdim=True).clamp(min=1)
+    joint = task.bodies.joint_of_link[task.body]
+    return torch.gather(shares, 1, joint.clamp(min=0)) * (joint >= 0)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
-import torch
 
 from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.rl.trained import Policy
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import Frame
 from morphgen.tasks.free_space import FreeSpace
@@ -29,27 +26,6 @@ STRIDE = 2
 FPS = 1 / (STRIDE * CONTROL_PERIOD)
 """Pictures a second, so that films run as fast as what they show: 25."""
 _ONLY_FOR: dict[str, Task] = {"ik": "reach", "scripted": "push"}
-
-
-@dataclass(frozen=True)
-class Episode:
-    """How an episode went."""
-
-    success: bool
-    """At its end."""
-    distance: float
-    """From success then, metres; see ``Step``."""
-    score: float
-    """Reach: the mean of ``anybody_score`` over its steps; push: 1 for success, else 0."""
-    seconds: float
-    """How long it was, simulated."""
-
-
-class Controller(Protocol):
-    """What acts."""
-
-    def act(self, task: TaskBatch) -> torch.Tensor:
-        """Actions of all environments, shape (n, L)."""
 
 
 def require_policy(name: str, task: Task) -> None:
@@ -143,8 +119,7 @@ def play(
             if over or len(scores) % STRIDE == 0:
                 yield from _shown(env)
         score = float(np.mean(scores)) if env.task == "reach" else scores[-1]
-        seconds = len(scores) * CONTROL_PERIOD
-        report(Episode(info["success"], info["distance"], score, seconds))
+        report(Episode(0, 0, info["success"], info["distance"], score, len(scores)))
 
 
 def _is_file(policy: str) -> bool:

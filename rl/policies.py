@@ -83,7 +83,9 @@ class Entities(nn.Module):
 
     def __init__(self, layout: Layout, features: int, blind: bool) -> None:
         super().__init__()
-        link = layout.token + len(layout.channels)
+        self.seen = POSITION.columns if blind else slice(0, layout.token)
+        """Columns of the tokens that count."""
+        link = self.seen.stop - self.seen.start + len(layout.channels)
         sizes = {"links": link, "goal": 7, "object": 13, "line": 1}
         if layout.obstacles:
             sizes["obstacles"] = 13
@@ -97,16 +99,14 @@ class Entities(nn.Module):
         self.project = nn.ModuleDict(
             {name: nn.Linear(size, features, bias=False) for name, size in sizes.items()}
         )
+        smooth = torch.ones(link)
+        first = POSITION.start - self.seen.start
+        smooth[first : first + POSITION.size] = torch.from_numpy(
+            FREQUENCIES[0] / FREQUENCIES
+        ).repeat(2)
         with torch.no_grad():
-            codes = self.project["links"].weight[:, POSITION.columns]
-            codes *= torch.from_numpy(FREQUENCIES[0] / FREQUENCIES).float().repeat(2)
+            next(self.project["links"].parameters()).mul_(smooth)
         self.kind = nn.Parameter(0.02 * torch.randn(len(sizes), features))
-        seen = torch.ones(link, dtype=torch.bool)
-        if blind:
-            seen[: layout.token] = False
-            seen[POSITION.columns] = True
-        self.seen: torch.Tensor
-        self.register_buffer("seen", seen, persistent=False)
         self.count = layout.links + 3 + layout.obstacles + bool(layout.points)
 
     def forward(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor]:
@@ -122,10 +122,10 @@ class Entities(nn.Module):
     def _entries(self, seen: Observation) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Values (n, k, size) and masks (n, k) of each kind."""
         extra = [seen[name][..., None] for name in self.channels]
-        links = torch.cat([seen["tokens"], *extra], dim=-1)
+        links = torch.cat([seen["tokens"][..., self.seen], *extra], dim=-1)
         reach, push = seen["goal_mask"][:, None], seen["object_mask"][:, None]
         entries = {
-            "links": (torch.where(self.seen, links, 0.0), seen["links"]),
+            "links": (links, seen["links"]),
             "goal": (seen["goal"][:, None], reach),
             "object": (seen["object"][:, None], push),
             "line": (seen["line"][:, None], push),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
@@ -85,7 +86,9 @@ class Learner:
         self.actor, self.critic = actor.to(self.device), critic.to(self.device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
         self.optimiser = torch.optim.Adam(
-            [*self.actor.parameters(), *self.critic.parameters()], eps=config.adam_epsilon
+            [*self.actor.parameters(), *self.critic.parameters()],
+            eps=config.adam_epsilon,
+            fused=True,
         )
         self._generators = {
             name: torch.Generator(self.device).manual_seed(stream)
@@ -362,8 +365,8 @@ def learning_rate(config: PPOConfig, update: int, updates: int) -> float:
 @torch.no_grad()
 def follow(slow: nn.Module, fast: nn.Module, decay: float) -> None:
     """Move the weights of one network towards another's: ``decay`` of its own remain."""
-    for own, other in zip(slow.parameters(), fast.parameters(), strict=True):
-        own.lerp_(other, 1 - decay)
+    average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
+    average([*slow.parameters()], [*fast.parameters()], 0)
 
 
 def _require_same(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:

@@ -120,9 +120,9 @@ class PushPlanner:
         first = best[:_KEPT]
         start = self._parted(q, block)
         vias = self._lifted(found.q[first], position[first], rotation[first])
-        way = self._ways.find(start, found.q[first], vias, cost[first], block, attempt)
-        if way is None:
-            way = self._ways.find_round_about(start, found.q[best], block, attempt)
+        way = self._ways.find(
+            start, found.q[first], vias=vias, costs=cost[first], block=block, attempt=attempt
+        ) or self._ways.find_round_about(start, found.q[best], block=block, attempt=attempt)
         if way is None:
             return None
         i = best[way.end]

@@ -3,51 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematics import tool_frames, tool_jacobians
 
+Array = NDArray[np.float64]
+
 STARTS = 16
 """Configurations from which inverse kinematics is tried for every goal."""
+ROUNDS = 4
+"""Times that these are others, as long as no free way is found."""
 ITERATIONS = 60
-STOPS = 12
-"""Free configurations by way of which a goal may be reached, besides home."""
 DAMPING = 0.05
 """Of the least squares, in units of joints over metres."""
-STRIDE = 0.1
-"""Largest change of a joint between configurations of a way that are tested, rad or m."""
 CLOSE = 0.003
 """Distance from a goal that counts as solved, metres."""
-
-
-class Task(Protocol):
-    """What controllers need of a batch of environments."""
-
-    bodies: Bodies
-    body: torch.Tensor
-    mask: torch.Tensor
-    targets: torch.Tensor
-    elapsed: torch.Tensor
-
-    @property
-    def goal(self) -> torch.Tensor:
-        """Wanted poses of the tools, shape (n, 7)."""
-
-    @property
-    def kind(self) -> str:
-        """Of the actions."""
 
 
 class Zero:
     """Does nothing."""
 
-    def act(self, task: Task) -> torch.Tensor:
+    def act(self, task: TaskBatch) -> torch.Tensor:
         """No change of any target."""
         return as_actions(torch.zeros(task.mask.shape, device=task.mask.device), task.kind)
 
@@ -58,7 +42,7 @@ class Random:
     def __init__(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
 
-    def act(self, task: Task) -> torch.Tensor:
+    def act(self, task: TaskBatch) -> torch.Tensor:
         """Even over [-1, 1], or over the bins."""
         if task.kind == "discrete":
             drawn = torch.randint(len(BINS), task.mask.shape, generator=self._generator)
@@ -71,8 +55,8 @@ class InverseKinematics:
     """Finds a configuration whose tool is at the goal when an episode begins, and goes there.
 
     Damped least squares (Wampler 1986) from several starts within the joints' limits; the nearest
-    that arrives is taken. With ``spaces`` it is the nearest to which a straight way in joint space
-    is free, or one by way of home or another free configuration; only if there is none, any.
+    that arrives is taken. With ``spaces`` it is one to which a way is free, as ``FreeWays`` finds
+    them; only if there is none, the nearest.
     """
 
     def __init__(self, seed: int, spaces: Sequence[FreeSpace] = ()) -> None:
@@ -83,82 +67,109 @@ class InverseKinematics:
             spaces: What is free, by robot; nothing is looked at without.
         """
         self._generator = torch.Generator().manual_seed(seed)
-        self._spaces = spaces
-        rng = np.random.default_rng(seed)
-        self._stops = [torch.from_numpy(space.draw(STOPS, rng)[0]).float() for space in spaces]
-        self._way = torch.zeros(0, 0, 0)
-        self._leg = torch.zeros(0, dtype=torch.int64)
+        self._spaces, self._seed = spaces, seed
+        self._ways: dict[int, FreeWays] = {}
+        self._task: TaskBatch | None = None
 
-    def act(self, task: Task) -> torch.Tensor:
+    def act(self, task: TaskBatch) -> torch.Tensor:
         """A step along the way, all joints in proportion."""
-        n, joints = task.targets.shape
-        if self._way.shape != (n, 2, joints):
-            self._way = task.targets[:, None].repeat(1, 2, 1)
-            self._leg = torch.zeros_like(task.elapsed)
+        if self._task is not task:
+            self._task, self._routes, self._ways = task, Routes(task), {}
         new = torch.nonzero(task.elapsed == 0)[:, 0]
         if len(new):
             self._plan(task, new)
-        rows = torch.arange(n, device=task.targets.device)
-        ahead = self._way[rows, self._leg] - task.targets
-        self._leg = torch.where(ahead.abs().amax(dim=1) < 1e-5, 1, self._leg)
-        ahead = self._way[rows, self._leg] - task.targets
-        step = task.bodies.step[task.body]
-        shares = torch.where(step > 0, ahead / step.clamp(min=1e-9), torch.zeros_like(ahead))
-        shares = shares / shares.abs().amax(dim=1, keepdim=True).clamp(min=1)
-        joint = task.bodies.joint_of_link[task.body]
-        actions = torch.gather(shares, 1, joint.clamp(min=0)) * (joint >= 0)
-        return as_actions(actions, task.kind)
+        self._routes.go_on()
+        return as_actions(shares_to(task, self._routes.wanted), task.kind)
 
-    def _plan(self, task: Task, envs: torch.Tensor) -> None:
+    def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
+        for attempt in range(ROUNDS if self._spaces else 1):
+            found = self._solved(task, envs, attempt)
+            missed = []
+            for i, (env, ends) in enumerate(zip(envs.tolist(), found, strict=True)):
+                way = self._way(task, env, ends, attempt) if self._spaces else None
+                if way is None:
+                    missed.append(i)
+                if way or attempt == 0:
+                    self._routes.take(env, way.points if way else (ends[0],))
+            envs = envs[missed]
+            if not len(envs):
+                break
+
+    def _solved(self, task: TaskBatch, envs: torch.Tensor, attempt: int) -> list[Array]:
+        """Of each environment those configurations that arrive, nearest first; or the best."""
         body, starts = task.body[envs], task.targets[envs]
-        found, left = solve(task.bodies, body, task.goal[envs, :3], starts, self._generator)
+        tried = random_starts(task.bodies, body, starts, self._generator)
+        if attempt:
+            for i, robot in enumerate(body.tolist()):
+                ways, q = self._ways_of(task, robot, starts[i])
+                nodes = ways.reached(q, STARTS, attempt=attempt)
+                tried[:, i, : len(q)] = torch.from_numpy(nodes)
+        found, left = solve(task.bodies, body, task.goal[envs, :3], tried)
         step = task.bodies.step[body].clamp(min=1e-9)
         far = ((found - starts) / step).abs().amax(dim=2)
         order = torch.where(left < CLOSE, far, 1e9 * (1 + left)).argsort(dim=0)
-        for i, env in enumerate(envs.tolist()):
-            ends = found[order[:, i], i]
-            arrived = int((left[:, i] < CLOSE).sum())
-            robot = int(body[i])
-            via, end = starts[i], ends[0]
-            if self._spaces and arrived:
-                stops = task.bodies.home[robot].repeat(STOPS + 1, 1)
-                drawn = self._stops[robot]
-                stops[1:, : drawn.shape[1]] = drawn
-                via, end = _free_way(self._spaces[robot], starts[i], stops, ends[:arrived])
-            self._way[env] = torch.stack([via, end])
-            self._leg[env] = 0
+        count = (left < CLOSE).sum(dim=0).clamp(min=1).tolist()
+        rows = zip(order.T, count, body.tolist(), strict=True)
+        return [
+            _numbers(found[some[:k], i, : task.settings[robot].robot.dof])
+            for i, (some, k, robot) in enumerate(rows)
+        ]
+
+    def _way(self, task: TaskBatch, env: int, ends: Array, attempt: int) -> Way | None:
+        """A free way to one of the ends."""
+        robot = int(task.body[env])
+        ends = ends[self._spaces[robot].free(ends)]
+        if not len(ends):
+            return None
+        ways, start = self._ways_of(task, robot, task.targets[env])
+        return ways.find(start, ends, attempt=attempt) or ways.find_round_about(
+            start, ends, attempt=attempt
+        )
+
+    def _ways_of(self, task: TaskBatch, robot: int, q: torch.Tensor) -> tuple[FreeWays, Array]:
+        """The ways of a robot, and where its joints are, from (J,) to (dof,)."""
+        dof = task.settings[robot].robot.dof
+        if robot not in self._ways:
+            step, moves = task.bodies.step[robot, :dof], task.bodies.moves_tool[robot, :dof]
+            rng = np.random.default_rng([self._seed, robot])
+            space = self._spaces[robot]
+            self._ways[robot] = FreeWays(space, _numbers(step), rng, moves.cpu().numpy())
+        return self._ways[robot], _numbers(q[:dof])
+
+
+def random_starts(
+    bodies: Bodies, body: torch.Tensor, near: torch.Tensor, generator: torch.Generator
+) -> torch.Tensor:
+    """Configurations to start from, shape (STARTS, n, J): those given (n, J), and random ones."""
+    lower, upper = bodies.lower[body], bodies.upper[body]
+    drawn = torch.rand(STARTS - 1, *near.shape, generator=generator).to(near.device)
+    starts = torch.cat([near[None], lower + (upper - lower) * drawn])
+    return torch.where(bodies.moves_tool[body], starts, near)
 
 
 def solve(
-    bodies: Bodies,
-    body: torch.Tensor,
-    position: torch.Tensor,
-    near: torch.Tensor,
-    generator: torch.Generator,
+    bodies: Bodies, body: torch.Tensor, position: torch.Tensor, starts: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Configurations whose tools are at given positions, from ``STARTS`` starts.
+    """Configurations whose tools are at given positions.
 
     Args:
         bodies: The robots.
         body: Which robot each row is, shape (n,), int64.
         position: Where the tools are to be in the root frame, shape (n, 3), metres.
-        near: The first start, shape (n, J).
-        generator: Draws the other starts.
+        starts: Where to start from, shape (STARTS, n, J).
 
     Returns:
         Configurations within limits, shape (STARTS, n, J), and how far from their goals the tools
         then are, shape (STARTS, n), metres.
     """
-    n, joints = near.shape
+    _, n, joints = starts.shape
     lower, upper = bodies.lower[body], bodies.upper[body]
-    drawn = torch.rand(STARTS - 1, n, joints, generator=generator).to(near.device)
-    starts = torch.cat([near[None], lower + (upper - lower) * drawn])
     moves = bodies.moves_tool[body]
-    q = torch.where(moves, starts, near).reshape(-1, joints)
+    q = starts.reshape(-1, joints)
     rows = body.repeat(STARTS)
     goal = position.repeat(STARTS, 1)
     low, high, free = lower.repeat(STARTS, 1), upper.repeat(STARTS, 1), moves.repeat(STARTS, 1)
-    eye = DAMPING**2 * torch.eye(3, device=near.device)
+    eye = DAMPING**2 * torch.eye(3, device=starts.device)
     for _ in range(ITERATIONS):
         error = goal - tool_frames(bodies.chain, rows, q)[:, -1, :3, 3]
         J = tool_jacobians(bodies.chain, rows, q)[:, :3] * free[:, None]
@@ -169,29 +180,6 @@ def solve(
     return q.reshape(STARTS, n, joints), left.reshape(STARTS, n)
 
 
-def _free_way(
-    space: FreeSpace, start: torch.Tensor, stops: torch.Tensor, ends: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where to go first, and then: to the first end that is reached freely."""
-    for end in ends:
-        if _is_free(space, start, end):
-            return start, end
-    for stop in stops:
-        if _is_free(space, start, stop):
-            for end in ends:
-                if _is_free(space, stop, end):
-                    return stop, end
-    return start, ends[0]
-
-
-def _is_free(space: FreeSpace, start: torch.Tensor, end: torch.Tensor) -> bool:
-    """Whether the straight way between two configurations, shape (J,), is free."""
-    parts = max(int((end - start).abs().max() / STRIDE) + 1, 2)
-    way = start + torch.linspace(0, 1, parts, device=start.device)[:, None] * (end - start)
-    dof = space.scene.robot.dof
-    return bool(space.free(way[:, :dof].double().cpu().numpy()).all())
-
-
 def as_actions(shares: torch.Tensor, kind: str) -> torch.Tensor:
     """Shares of the joints' steps as actions: themselves, or the nearest bins towards zero."""
     if kind == "continuous":
@@ -199,3 +187,7 @@ def as_actions(shares: torch.Tensor, kind: str) -> torch.Tensor:
     bins = torch.tensor(BINS, device=shares.device)
     fits = (bins.abs() <= shares[..., None].abs() + 1e-6) & (bins * shares[..., None] >= 0)
     return torch.where(fits, bins.abs(), -torch.ones_like(bins)).argmax(dim=-1)
+
+
+def _numbers(values: torch.Tensor) -> Array:
+    return values.double().cpu().numpy()

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.config import CONTROL_PERIOD
 
 
 class Controller(Protocol):
@@ -30,8 +31,13 @@ class Episode:
     distance: float
     """From success then, metres; see ``Step``."""
     score: float
-    """Mean of its steps' scores."""
+    """Reach: the mean of ``anybody_score`` over its steps; push: 1 for success, else 0."""
     steps: int
+
+    @property
+    def seconds(self) -> float:
+        """How long it was, simulated."""
+        return self.steps * CONTROL_PERIOD
 
 
 def run_episodes(
@@ -68,17 +74,17 @@ def run_episodes(
         over = torch.nonzero(step.terminated | step.truncated)[:, 0]
         if not len(over):
             continue
+        score = torch.where(batch.pushes, step.score, total / steps)
         for env in over.tolist():
             if len(found[env]) < count:
-                taken = int(steps[env])
                 found[env].append(
                     Episode(
                         env,
                         bodies[env],
                         bool(step.success[env]),
                         float(step.distance[env]),
-                        float(total[env]) / taken,
-                        taken,
+                        float(score[env]),
+                        int(steps[env]),
                     )
                 )
                 done += 1

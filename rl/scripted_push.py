@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 
 from morphgen.rl.cartesian import towards
+from morphgen.rl.free_ways import Routes, shares_to
 from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
-from morphgen.tasks.bodies import Bodies
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
 from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.settings import Setting
-from morphgen.tasks.sim.base import Simulation
 
 PLANS = 5
 """Plans of an episode at most."""
@@ -39,30 +38,6 @@ LOST = 0.7
 UNDERWAY = 10
 """Control steps of a push before which it is not."""
 
-_FINEST = min(share for share in BINS if share > 0)
-_LEGS = 24
-
-
-class Task(Protocol):
-    """What the controller needs of a batch of environments; see ``TaskBatch``."""
-
-    bodies: Bodies
-    settings: tuple[Setting, ...]
-    simulation: Simulation
-    body: torch.Tensor
-    mask: torch.Tensor
-    targets: torch.Tensor
-    elapsed: torch.Tensor
-    pushes: torch.Tensor
-
-    @property
-    def kind(self) -> str:
-        """Of the actions."""
-
-    @property
-    def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J)."""
-
 
 class ScriptedPush:
     """Gets behind the block, pushes it along y, and plans again where that fails.
@@ -84,12 +59,12 @@ class ScriptedPush:
         self._planners: dict[int, PushPlanner] = {}
         self._state: _State | None = None
 
-    def act(self, task: Task) -> torch.Tensor:
+    def act(self, task: TaskBatch) -> torch.Tensor:
         """A step along the way behind the block, or of the push; shape (n, L)."""
         if self._settings is not task.settings:
             self._settings, self._planners, self._state = task.settings, {}, None
         state = self._state
-        if state is None or state.way.shape[::2] != task.targets.shape:
+        if state is None or state.task is not task:
             state = self._state = _no_state(task)
         block = task.simulation.block_pose
         tool = tool_positions(task.bodies.chain, task.body, task.q)
@@ -98,15 +73,11 @@ class ScriptedPush:
         failed = _watched(state, task, block, tool) | (task.pushes & ~state.active)
         for env in torch.nonzero(new | (failed & (state.plans < PLANS)))[:, 0].tolist():
             self._plan(state, task, env, block[env])
-        rows = torch.arange(len(state.leg), device=state.leg.device)
-        wanted = torch.where(
-            state.pushing[:, None],
-            _pushed(state, task, block, tool),
-            state.way[rows, state.leg],
-        )
+        pushed = _pushed(state, task, block, tool)
+        wanted = torch.where(state.pushing[:, None], pushed, state.routes.wanted)
         return _actions(task, torch.where(state.active[:, None], wanted, task.targets))
 
-    def _plan(self, state: _State, task: Task, env: int, block: torch.Tensor) -> None:
+    def _plan(self, state: _State, task: TaskBatch, env: int, block: torch.Tensor) -> None:
         index = int(task.body[env])
         if index not in self._planners:
             rng = np.random.default_rng([self._seed, index])
@@ -125,15 +96,15 @@ class ScriptedPush:
 class _State:
     """How far environments are with their plans; a row each."""
 
+    task: TaskBatch
+    routes: Routes
+    """Ways behind the block."""
     plans: torch.Tensor
     """Plans made in the episode."""
     active: torch.Tensor
     """Whether there is one."""
     pushing: torch.Tensor
     """Whether the tool is behind the block already."""
-    way: torch.Tensor
-    leg: torch.Tensor
-    last: torch.Tensor
     settled: torch.Tensor
     """Control steps since the targets got to the end of the way."""
     still: torch.Tensor
@@ -153,20 +124,16 @@ class _State:
 
     def take(self, env: int, plan: Plan, y: float) -> None:
         """Begin a plan, the block being at y."""
-        way = plan.way[:_LEGS]
-        for i, q in enumerate(way):
-            self.way[env, i, : len(q)] = torch.from_numpy(q)
-        self.leg[env], self.last[env] = 0, len(way) - 1
+        self.routes.take(env, plan.way)
         self.rotation[env] = plan.rotation
         self.height[env], self.aside[env], self.gap[env] = plan.height, plan.aside, plan.gap
         self.best[env], self.lead[env] = y, LEAD
         self.settled[env], self.still[env], self.stuck[env] = 0, 0, 0
 
 
-def _no_state(task: Task) -> _State:
+def _no_state(task: TaskBatch) -> _State:
     """No plans."""
-    n, joints = task.targets.shape
-    device = task.targets.device
+    n, device = task.num_envs, task.device
     sets = [task.settings[i].pushes for i in task.body.tolist()]
     edges = [1.0 if each is None else each.block.size[0] for each in sets]
 
@@ -180,12 +147,11 @@ def _no_state(task: Task) -> _State:
         return torch.zeros(n, *shape, device=device)
 
     return _State(
+        task=task,
+        routes=Routes(task),
         plans=count(),
         active=flag(),
         pushing=flag(),
-        way=zero(_LEGS, joints),
-        leg=count(),
-        last=count(),
         settled=count(),
         still=count(),
         stuck=count(),
@@ -199,14 +165,11 @@ def _no_state(task: Task) -> _State:
     )
 
 
-def _watched(state: _State, task: Task, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
+def _watched(
+    state: _State, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor
+) -> torch.Tensor:
     """Go from leg to leg, from the way to the push; whether the push fails, shape (n,), bool."""
-    rows = torch.arange(len(state.leg), device=state.leg.device)
-    step = task.bodies.step[task.body].clamp(min=1e-9)
-    left = ((state.way[rows, state.leg] - task.targets) / step).abs().amax(dim=1)
-    done = state.active & ~state.pushing & (left < 1.01 * _FINEST)
-    final = done & (state.leg == state.last)
-    state.leg = torch.where(done & ~final, state.leg + 1, state.leg)
+    final = state.active & ~state.pushing & state.routes.go_on()
     state.settled = torch.where(final, state.settled + 1, state.settled)
     arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
     state.pushing = state.pushing | (final & (arrived | (state.settled > SETTLE)))
@@ -219,7 +182,9 @@ def _watched(state: _State, task: Task, block: torch.Tensor, tool: torch.Tensor)
     return state.active & state.pushing & (slow | lost | (state.stuck > UNDERWAY))
 
 
-def _pushed(state: _State, task: Task, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
+def _pushed(
+    state: _State, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor
+) -> torch.Tensor:
     """Targets whose tools are a bit farther on, and aside where the blocks are."""
     goal = tool_positions(task.bodies.chain, task.body, task.targets)
     lead = goal[:, 1] - tool[:, 1]
@@ -237,14 +202,9 @@ def _pushed(state: _State, task: Task, block: torch.Tensor, tool: torch.Tensor) 
     return wanted
 
 
-def _actions(task: Task, wanted: torch.Tensor) -> torch.Tensor:
+def _actions(task: TaskBatch, wanted: torch.Tensor) -> torch.Tensor:
     """Actions towards targets (n, J), all joints in proportion or nearly so; shape (n, L)."""
-    step = task.bodies.step[task.body]
-    ahead = wanted - task.targets
-    shares = torch.where(step > 0, ahead / step.clamp(min=1e-9), torch.zeros_like(ahead))
-    shares = shares / shares.abs().amax(dim=1, keepdim=True).clamp(min=1)
-    joint = task.bodies.joint_of_link[task.body]
-    actions = torch.gather(shares, 1, joint.clamp(min=0)) * (joint >= 0)
+    actions = shares_to(task, wanted)
     if task.kind == "continuous":
         return actions
     bins = torch.tensor(BINS, device=actions.device)

@@ -9,8 +9,10 @@ from urllib.parse import parse_qsl, quote, urlencode
 
 from morphgen.errors import MorphgenError, nearest
 
-Page = Literal["library", "gallery", "robot", "compose", "compare", "split"]
+Page = Literal["library", "gallery", "robot", "compose", "compare", "split", "play"]
 PAGES: tuple[Page, ...] = get_args(Page)
+ROBOT: Page = "robot"
+"""Key of a page, and on the page ``play`` of the robots that play."""
 
 
 class AddressError(MorphgenError):
@@ -26,6 +28,8 @@ class Address:
     """What is shown: a folder, a robot, a split's name, words; several to compare."""
     state: Mapping[str, str] = field(default_factory=dict)
     """Sort order, filter, joint positions ...; what is at its default is left out."""
+    robots: tuple[str, ...] = ()
+    """Those that play; no other page has any."""
 
     @property
     def subject(self) -> str:
@@ -35,7 +39,8 @@ class Address:
     @property
     def query(self) -> str:
         """The text after the host, from the question mark on."""
-        pairs = [*((self.page, of) for of in self.of), *self.state.items()]
+        robots = ((ROBOT, robot) for robot in self.robots)
+        pairs = [*((self.page, of) for of in self.of), *robots, *self.state.items()]
         return "?" + urlencode(pairs, quote_via=quote, safe="/=:,@+")
 
     def with_state(self, **changes: str) -> Address:
@@ -60,11 +65,12 @@ def parse_address(query: str) -> Address | None:
     if not pairs:
         return None
     named = {key for key, _ in pairs}
-    pages = [page for page in PAGES if page in named]
+    robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in named else ()
+    pages = [page for page in PAGES if page in named and not (page == ROBOT and robots)]
     if not pages:
         raise AddressError(f"address {query!r} names no page{nearest(pairs[0][0], PAGES)}")
     if len(pages) > 1:
         raise AddressError(f"address {query!r} names two pages: {' and '.join(pages)}")
     of = tuple(value for key, value in pairs if key == pages[0])
     state = {key: value for key, value in pairs if key not in PAGES}
-    return Address(pages[0], of, state)
+    return Address(pages[0], of, state, robots)

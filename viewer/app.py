@@ -9,7 +9,6 @@ import socket
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -31,11 +30,19 @@ from morphgen.viewer import (
 )
 from morphgen.viewer.address import Address, Page, parse_address
 from morphgen.viewer.places import Places, target_address
-from morphgen.viewer.portraits import start_workers
 from morphgen.viewer.session import Session, close, post
+from morphgen.viewer.workers import Workers
 
 WORKERS = 2
 """Processes that draw thumbnails and compare robots."""
+
+
+def _show_play(session: Session) -> None:
+    # What simulates takes seconds and much memory to load, which other pages need not.
+    from morphgen.viewer import play_page
+
+    play_page.show(session)
+
 
 SHOW: Mapping[Page, Callable[[Session], None]] = {
     "library": library_page.show,
@@ -44,6 +51,7 @@ SHOW: Mapping[Page, Callable[[Session], None]] = {
     "compose": compose_page.show,
     "compare": compare_page.show,
     "split": split_page.show,
+    "play": _show_play,
 }
 """How each page is built."""
 
@@ -56,7 +64,7 @@ class Viewer:
     start: Address
     """The page that is shown to those who name none."""
     places: Places
-    pool: ProcessPoolExecutor
+    workers: Workers
     sessions: dict[int, Session] = field(default_factory=dict)
     shared: dict[str, object] = field(default_factory=dict)
     """What took long to find."""
@@ -72,7 +80,7 @@ class Viewer:
             close(session)
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
-        self.pool.shutdown(wait=False, cancel_futures=True)
+        self.workers.close()
         shutil.rmtree(self.places.uploads, ignore_errors=True)
 
 
@@ -108,10 +116,10 @@ def serve(
         server = viser.ViserServer(host=host, port=port, verbose=False)
     # What a browser misses that has just gone is no news.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    viewer = Viewer(server, start, places, start_workers(WORKERS))
+    viewer = Viewer(server, start, places, Workers(WORKERS))
 
     async def connect(client: viser.ClientHandle) -> None:
-        session = Session(client, places, viewer.pool, start, viewer.shared)
+        session = Session(client, places, viewer.workers, start, viewer.shared)
         viewer.sessions[client.client_id] = session
         post(session, lambda: open_page(session))
 

@@ -27,7 +27,7 @@ from morphgen.grammar.sampling import draw
 from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 from morphgen.viewer import markup, robot_tables
-from morphgen.viewer.address import Address
+from morphgen.viewer.address import Address, AddressError
 from morphgen.viewer.choice import (
     NOTHING,
     Choice,
@@ -43,6 +43,7 @@ from morphgen.viewer.choice import (
 )
 from morphgen.viewer.downloads import robot_files, zipped
 from morphgen.viewer.overlays import has_tool
+from morphgen.viewer.packed_text import packed, unpacked
 from morphgen.viewer.places import DERIVED, WORDS
 from morphgen.viewer.robot_page import SIDE, add_floor
 from morphgen.viewer.robot_view import RobotView, add_robot, look_at, robot_bounds
@@ -69,6 +70,8 @@ class ComposePage:
     choice: Choice
     grammar: str = ""
     """Name of the grammar in the text field."""
+    original: str = ""
+    """Its text before it was edited."""
     derivation: Derivation | None = None
     """Of the whole robot; the one that is shown may have fewer parts."""
     robot: Robot | None = None
@@ -96,7 +99,8 @@ def show(session: Session) -> None:
     choice = parse_choice(["arm=ur5", "ee=plane"] if is_grammar or not words else words, library)
     grammar = words[0] if is_grammar else "arm3"
     source = load_grammar(find_grammar(grammar, library.folders), library.folders)
-    page = ComposePage(session, choice, source.name)
+    page = ComposePage(session, choice, source.name, grammar_text(source))
+    text = unpacked(session.address.state["text"]) if "text" in session.address.state else None
     gui = session.client.gui
     gui.set_panel_label("morphgen")
     gui.main_panel.dock_right()
@@ -107,11 +111,11 @@ def show(session: Session) -> None:
     add_floor(session.client.scene, 2.0)
     tabs = gui.add_tab_group()
     if is_grammar:
-        _add_grammar_tab(page, tabs, grammar_text(source))
+        _add_grammar_tab(page, tabs, text or page.original)
         _add_parts_tab(page, tabs)
     else:
         _add_parts_tab(page, tabs)
-        _add_grammar_tab(page, tabs, grammar_text(source))
+        _add_grammar_tab(page, tabs, page.original)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.texts["findings"] = gui.add_html("")
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
@@ -212,6 +216,7 @@ def _add_grammar_tab(page: ComposePage, tabs: viser.GuiTabGroupHandle, text: str
         chosen = gui.add_dropdown("start from", names, initial_value=page.grammar)
         page.text = gui.add_text("text", text, multiline=True)
         page.texts["grammar fault"] = gui.add_html("")
+        page.texts["too long"] = gui.add_html("")
         state = session.address.state
         page.seed = gui.add_number("seed", _count(state.get("seed", "")), min=0, step=1)
         page.number = gui.add_number("robot number", _count(state.get("number", "")), min=0, step=1)
@@ -221,7 +226,7 @@ def _add_grammar_tab(page: ComposePage, tabs: viser.GuiTabGroupHandle, text: str
         )
         page.texts["tree"] = gui.add_html("")
     when(chosen, session, lambda: _load(page, chosen.value))
-    when(page.text, session, lambda: _read_grammar(page), "grammar")
+    when(page.text, session, lambda: _edited(page), "grammar")
     when(action, session, lambda: _draw(page, action.value))
     when(page.step, session, lambda: _show_step(page), "step")
 
@@ -231,8 +236,32 @@ def _load(page: ComposePage, name: str) -> None:
     page.grammar = name
     if page.text is not None:
         found = load_grammar(find_grammar(name, library.folders), library.folders)
-        set_value(page.text, grammar_text(found))
+        page.original = grammar_text(found)
+        set_value(page.text, page.original)
     _derive(page, drawn=False)
+
+
+def _edited(page: ComposePage) -> None:
+    """Check the text, and keep it in the address."""
+    page.session.address = Address("compose", (page.grammar,), _text_state(page))
+    show_state(page.session, f"compose {page.grammar}")
+    _read_grammar(page)
+
+
+def _text_state(page: ComposePage) -> dict[str, str]:
+    """The text as the address keeps it, if it was edited and is not too long; else it is said."""
+    page.texts["too long"].content = ""
+    if not _is_edited(page) or page.text is None:
+        return {}
+    try:
+        return {"text": packed(page.text.value)}
+    except AddressError as error:
+        page.texts["too long"].content = markup.framed(f'<div class="dim">{error}</div>')
+        return {}
+
+
+def _is_edited(page: ComposePage) -> bool:
+    return page.text is not None and page.text.value != page.original
 
 
 def _read_grammar(page: ComposePage) -> bool:
@@ -263,14 +292,16 @@ def _derive(page: ComposePage, *, drawn: bool) -> None:
         return
     library = page.session.places.library
     grammar = grammar_from_text(page.text.value, page.grammar)
-    command = f"morphgen compose {page.grammar}"
+    name = f"{page.grammar}.grammar" if _is_edited(page) else page.grammar
+    note = f"# with the text of the tab Grammar in {name}\n" if _is_edited(page) else ""
+    command = f"{note}morphgen compose {name}"
     if drawn:
         seed, number = page.seed.value, page.number.value
         say(page.session, f"drawing robot {number} of seed {seed}")
         sample = draw(grammar, library, number, seed=seed)
         say(page.session, "")
         robot, page.derivation = sample.robot, sample.derivation
-        command = f"morphgen sample {page.grammar} -n {number + 1} --seed {seed}"
+        command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
     else:
         page.derivation = derive(grammar, library, First())
         robot = compose(page.derivation, library, page.grammar)
@@ -278,6 +309,7 @@ def _derive(page: ComposePage, *, drawn: bool) -> None:
     page.step.max = max(n, 2)
     set_value(page.step, n)
     state = {"seed": str(page.seed.value), "number": str(page.number.value)} if drawn else {}
+    state |= _text_state(page)
     page.session.address = Address("compose", (page.grammar,), state)
     show_state(page.session, f"compose {page.grammar}")
     _show_tree(page, n)

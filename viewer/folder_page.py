@@ -14,7 +14,7 @@ from morphgen.viewer.entries import Entry
 from morphgen.viewer.gallery import Gallery
 from morphgen.viewer.listings import folder_entries, subfolders
 from morphgen.viewer.new_split import member_of, save_split
-from morphgen.viewer.session import Session, later, notify, result_of, say, when
+from morphgen.viewer.session import Session, later, notify, say, when
 
 
 def show(session: Session) -> None:
@@ -98,7 +98,7 @@ def _save(rows: Gallery, wanted: _Wanted) -> None:
 def _members(session: Session, entries: list[Entry], wanted: _Wanted) -> list[Member]:
     task = next(each for each in TASKS if each == wanted.task.value)
     waiting = [
-        session.pool.submit(
+        session.workers.submit(
             member_of, entry.place, entry.category, task, wanted.obstacles.value, session.places
         )
         for entry in entries
@@ -106,5 +106,5 @@ def _members(session: Session, entries: list[Entry], wanted: _Wanted) -> list[Me
     members = []
     for i, future in enumerate(waiting):
         say(session, f"composing {len(waiting)} robots", i / len(waiting))
-        members.append(result_of(future))
+        members.append(session.workers.result(future))
     return members

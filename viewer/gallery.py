@@ -28,7 +28,8 @@ from morphgen.viewer.entries import (
     with_facts,
 )
 from morphgen.viewer.portraits import Portrait, ask, thumbnail_of_picture
-from morphgen.viewer.session import Session, later, result_of, say, show_state, when
+from morphgen.viewer.session import Session, later, notify, say, show_state, when
+from morphgen.viewer.workers import WorkerDied, Workers
 
 REFRESH = 0.6
 """How often a gallery shows the portraits that were made since, seconds."""
@@ -223,16 +224,25 @@ def _take_pictures(gallery: Gallery) -> None:
 
 
 def _have_portraits_made(gallery: Gallery) -> None:
-    """Let the workers draw what is missing of the rows shown; what is done is shown meanwhile."""
+    """Let the workers draw what is missing of the rows shown; once more if one of them dies."""
+    try:
+        _ask_for_missing(gallery)
+    except WorkerDied:
+        notify(gallery.session, "A worker died", "another one goes on with the thumbnails")
+        _ask_for_missing(gallery)
+
+
+def _ask_for_missing(gallery: Gallery) -> None:
+    """Have thumbnails drawn; what is done is shown meanwhile."""
     session = gallery.session
     rows = gallery.shown
     known = gallery.portraits.keys() | gallery.faults.keys()
     missing = [entry for entry in rows if entry.place not in known]
-    waiting = {entry.place: ask(session.pool, entry.place, session.places) for entry in missing}
+    waiting = {entry.place: ask(session.workers, entry.place, session.places) for entry in missing}
     total = len(waiting)
     while waiting and not session.closed.is_set() and gallery.shown is rows:
         say(session, f"drawing {total} robots", (total - len(waiting)) / total)
-        for place, found in _collected(waiting).items():
+        for place, found in _collected(session.workers, waiting).items():
             _keep(gallery, place, found)
         _draw(gallery)
     for future in waiting.values():
@@ -240,11 +250,11 @@ def _have_portraits_made(gallery: Gallery) -> None:
     say(session, "")
 
 
-def _collected(waiting: dict[str, Future[Portrait]]) -> dict[str, Portrait]:
+def _collected(workers: Workers, waiting: dict[str, Future[Portrait]]) -> dict[str, Portrait]:
     """Wait a while for portraits; those that are done are taken out."""
     wait(waiting.values(), timeout=REFRESH, return_when=FIRST_COMPLETED)
     done = [place for place, future in waiting.items() if future.done()]
-    return {place: result_of(waiting.pop(place)) for place in done}
+    return {place: workers.result(waiting.pop(place)) for place in done}
 
 
 def _keep(gallery: Gallery, place: str, found: Portrait) -> None:

@@ -36,6 +36,9 @@ from morphgen.viewer.address import Address
 
 WORDS, DERIVED, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 SPLIT_SUFFIX = ".yaml"
+EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
+PLAYED = (EPISODE_SUFFIX, ".pt")
+"""What files end in that are played: episodes and checkpoints."""
 ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml")
 
 
@@ -101,6 +104,8 @@ def target_address(words: Sequence[str], places: Places) -> Address:
 def _single_address(word: str, places: Places) -> Address:
     if Path(word).exists():
         path = places.path(word)
+        if path.suffix in PLAYED or (path / CHECKPOINT).is_file():
+            return _played_address(word, places)
         if path.is_file():
             return Address("split" if path.suffix == SPLIT_SUFFIX else "robot", (word,))
         if (path / SPLIT).is_file():
@@ -114,6 +119,19 @@ def _single_address(word: str, places: Places) -> Address:
     raise PlaceError(
         f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}"
     )
+
+
+def _played_address(word: str, places: Places) -> Address:
+    """The page that plays an episode, or the policy of a checkpoint or a run's folder."""
+    if word.endswith(EPISODE_SUFFIX):
+        from morphgen.viewer.episode import read_episode
+
+        read_episode(places.path(word), places)
+        return Address("play", (word,))
+    from morphgen.rl.runs import read_checkpoint
+
+    read_checkpoint(places.path(word))
+    return Address("play", state={"policy": word})
 
 
 def is_robot(folder: Path) -> bool:

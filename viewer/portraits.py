@@ -5,15 +5,11 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
-import signal
 import tempfile
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread
 
 from PIL import Image
 from platformdirs import user_cache_path
@@ -25,6 +21,7 @@ from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
 from morphgen.formats.files import write_atomic
 from morphgen.formats.picture import render
 from morphgen.viewer.places import Places, content_key, is_robot, read_place
+from morphgen.viewer.workers import Workers
 
 SIZE = (240, 180)
 _QUALITY = 82
@@ -43,14 +40,9 @@ class Portrait:
     """Why there is no robot; empty if there is."""
 
 
-def start_workers(n: int) -> ProcessPoolExecutor:
-    """Processes that make portraits; shut them down when done."""
-    return ProcessPoolExecutor(n, get_context("spawn"), _prepare)
-
-
-def ask(pool: ProcessPoolExecutor, place: str, places: Places) -> Future[Portrait]:
+def ask(workers: Workers, place: str, places: Places) -> Future[Portrait]:
     """Have a portrait made."""
-    return pool.submit(portrait, place, places)
+    return workers.submit(portrait, place, places)
 
 
 def portrait(place: str, places: Places) -> Portrait:
@@ -117,16 +109,3 @@ def _data_url(picture: Image.Image) -> str:
     small.thumbnail(SIZE)
     small.save(content, "JPEG", quality=_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
-
-
-def _prepare() -> None:
-    """Ctrl-C is for the parent; without it a worker ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

@@ -8,6 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from morphgen.benchmark.split import TASKS
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollision
 from morphgen.errors import MorphgenError
@@ -77,7 +78,7 @@ def show(session: Session) -> None:
     gui.add_html(
         markup.framed(
             f"<h3>{escape(robot.name)}</h3>"
-            f'<div class="dim">{robot_tables.summary(robot, distance)}</div>'
+            f'<div class="dim">{robot_tables.summary(robot, distance)}{_plays(robot, place)}</div>'
         )
     )
     tabs = gui.add_tab_group()
@@ -131,6 +132,14 @@ def _way(session: Session, place: str) -> str:
     ]
     beside = f'<div class="dim">{" · ".join(ways)}</div>' if ways else ""
     return markup.crumbs(*steps, (name_of(place), None)) + markup.framed(beside)
+
+
+def _plays(robot: Robot, place: str) -> str:
+    """Links to the pages on which a robot does its tasks; a robot without tool has none."""
+    if not (overlays.has_tool(robot) and robot.dof):
+        return ""
+    links = (markup.link(Address("play", (task,), robots=(place,)), task) for task in TASKS)
+    return f"<br>see it {' · '.join(links)}"
 
 
 def _add_moves(page: RobotPage) -> None:

@@ -6,8 +6,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -17,6 +16,7 @@ from morphgen.errors import MorphgenError
 from morphgen.viewer import browser, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.places import Places
+from morphgen.viewer.workers import Workers
 
 Work = Callable[[], object]
 T = TypeVar("T")
@@ -34,7 +34,7 @@ class Session:
 
     client: viser.ClientHandle
     places: Places
-    pool: ProcessPoolExecutor
+    workers: Workers
     """Processes for what takes long."""
     address: Address
     shared: dict[str, object] = field(default_factory=dict)
@@ -50,6 +50,8 @@ class Session:
     waiting: set[str] = field(default_factory=set)
     """Keys of work that is not begun yet."""
     lock: threading.Lock = field(default_factory=threading.Lock)
+    ends: list[Work] = field(default_factory=list)
+    """What is to be done when the browser is gone."""
     status: Status | None = None
 
 
@@ -100,9 +102,22 @@ def when(handle: Any, session: Session, work: Work, key: str = "") -> None:  # n
     attach(changed)
 
 
+def at_end(session: Session, work: Work) -> None:
+    """Do something quick when the browser is gone; at once if it has gone already."""
+    with session.lock:
+        if not session.closed.is_set():
+            session.ends.append(work)
+            return
+    work()
+
+
 def close(session: Session) -> None:
     """End a session's work; what is being done ends by itself."""
-    session.closed.set()
+    with session.lock:
+        session.closed.set()
+        ends, session.ends = session.ends, []
+    for work in ends:
+        work()
     session.events.shutdown(wait=False, cancel_futures=True)
     session.background.shutdown(wait=False, cancel_futures=True)
 
@@ -113,21 +128,7 @@ def in_worker(session: Session, work: Callable[..., T], *arguments: object) -> T
     Raises:
         MorphgenError: What the work raises, or that the worker died.
     """
-    return result_of(session.pool.submit(work, *arguments))
-
-
-def result_of(future: Future[T]) -> T:
-    """What a worker found.
-
-    Raises:
-        MorphgenError: What the work raises, or that the worker died.
-    """
-    try:
-        return future.result()
-    except BrokenProcessPool as error:
-        raise MorphgenError(
-            "a worker died, perhaps for want of memory; start the viewer again"
-        ) from error
+    return session.workers.result(session.workers.submit(work, *arguments))
 
 
 def show_state(session: Session, title: str, **changes: str) -> None:

@@ -14,6 +14,7 @@ from morphgen.benchmark.scaling_map import scaling_map
 from morphgen.benchmark.similarity import MEASURES, distances
 from morphgen.benchmark.split import REGIMES, SIDES, Member, Split, split_id
 from morphgen.viewer import gallery, markup
+from morphgen.viewer.address import Address
 from morphgen.viewer.drawings import heatmap_svg, map_svg
 from morphgen.viewer.gallery import Gallery
 from morphgen.viewer.listings import split_entries
@@ -50,7 +51,9 @@ def show(session: Session) -> None:
     rows = Gallery(session, split.name, split_entries(place, split), columns=SIDES)
     page = SplitPage(session, place, split, rows)
     gui = session.client.gui
-    gallery.open_panels(rows, markup.crumbs((split.name, None)), _about(split), SIDE)
+    gallery.open_panels(
+        rows, markup.crumbs((split.name, None)), _about(split) + _plays(place, split), SIDE
+    )
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         gallery.build(rows)
@@ -111,6 +114,21 @@ def _about(split: Split) -> str:
     )
 
 
+def _plays(place: str, split: Split) -> str:
+    """A link to the page on which the first robots to test on do their task."""
+    first = split.test[0]
+    robots = tuple(
+        member_place(place, "test", member)
+        for member in split.test[:4]
+        if member.task == first.task
+    )
+    state = {"obstacles": "yes"} if first.obstacles else {}
+    link = markup.link(
+        Address("play", (first.task,), state, robots), "see robots to test on at work"
+    )
+    return f'<div class="dim">{link}</div>'
+
+
 def _figure(value: object) -> str:
     if isinstance(value, Mapping):
         return f"{value['mean']:.3g} ({value['min']:.3g} to {value['max']:.3g})"
@@ -126,7 +144,7 @@ def _study(page: SplitPage) -> None:
         def progress(done: int, total: int) -> None:
             say(session, f"comparing {total} robots", done / total)
 
-        session.shared[key] = study(page.split, session.places.folders, session.pool, progress)
+        session.shared[key] = study(page.split, session.places.folders, session.workers, progress)
         say(session, "")
     page.study = cast(Study, session.shared[key])
     if page.study.statistics:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.viewer.session import result_of
+from morphgen.viewer.workers import Workers
 
 Array = NDArray[np.float64]
 
@@ -53,7 +52,7 @@ class Study:
 def study(
     split: Split,
     folders: tuple[Path, ...],
-    pool: ProcessPoolExecutor,
+    workers: Workers,
     progress: Callable[[int, int], None],
 ) -> Study:
     """Examine a split's robots in worker processes.
@@ -61,7 +60,7 @@ def study(
     Args:
         split: At most ``LARGEST`` robots.
         folders: Of the library.
-        pool: The workers.
+        workers: The processes.
         progress: Told how many robots are done, and of how many.
 
     Raises:
@@ -74,12 +73,12 @@ def study(
             f"morphgen split audit and morphgen split stats take them all"
         )
     derivations = list(dict.fromkeys(member.derivation for member in members))
-    futures = [pool.submit(examine, derivation, folders) for derivation in derivations]
+    futures = [workers.submit(examine, derivation, folders) for derivation in derivations]
     found = {}
     for i, (derivation, future) in enumerate(zip(derivations, futures, strict=True)):
-        found[derivation] = result_of(future)
+        found[derivation] = workers.result(future)
         progress(i + 1, len(derivations))
-    return result_of(pool.submit(conclude, split, found, folders))
+    return workers.result(workers.submit(conclude, split, found, folders))
 
 
 def examine(derivation: str, folders: tuple[Path, ...]) -> Examined | Fault:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli.options import Subparsers, add_library
 
 if TYPE_CHECKING:
-    from morphgen.rl.play import Episode
+    from morphgen.rl.rollouts import Episode
 
 
 POLICIES = ("zero", "random", "ik", "scripted")

@@ -14,19 +14,21 @@ def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "view",
-        help="look at robots in the browser: browse, compose, compare",
+        help="look at robots in the browser: browse, compose, compare, see them at work",
         description="Look at robots in the browser, until interrupted. Without a target: the "
         "library, the splits and the robots of this folder.",
         epilog="examples: morphgen view; morphgen view robots/arm3; "
         "morphgen view extrapolation/arms/reach; morphgen view arm=ur5 ee=plane; "
-        "morphgen view some.urdf",
+        "morphgen view some.urdf; morphgen view runs/reach/checkpoint.pt; "
+        "morphgen view episode.npz",
     )
     parser.add_argument(
         "words",
         nargs="*",
         metavar="TARGET",
-        help="a folder of robots, a bundle, a URDF or xacro, a split's name or file, a grammar, or "
-        "words as for morphgen compose",
+        help="a folder of robots, a bundle, a URDF or xacro, a split's name or file, a grammar, "
+        "words as for morphgen compose, a checkpoint or a run's folder whose policy is to be seen "
+        "at work, or an episode that the page has saved",
     )
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to bind (default: this machine)"

@@ -205,19 +205,20 @@ def test_ways_go_round_what_is_in_between():
     start, ends = np.array([-0.5, -0.5]), np.array([[0.5, -0.5], [-0.5, 0.5]])
     block = np.array([1.5, 1.5, 0.1, 1.0, 0.0, 0.0, 0.0])
     assert ways.steps(start, ends) == pytest.approx([50, 50])
-    nearest = ways.find(start, ends, ends, np.zeros(2), block, 0)
+    nearest = ways.find(start, ends, block=block)
     assert nearest.end == 1
     assert len(nearest.points) == 1
-    over = ways.find(start, ends[:1], np.array([[0.5, 0.5]]), np.zeros(1), block, 0)
+    over = ways.find(start, ends[:1], vias=np.array([[0.5, 0.5]]), block=block)
     assert over.end == 0
     assert len(over.points) >= 2
     for a, b in zip((start, *over.points), over.points, strict=False):
         between = a + np.linspace(0, 1, 99)[:, None] * (b - a)
         assert space.free(between).all()
     inside = np.array([[0.0, -0.5]])
-    assert ways.find(start, inside, inside, np.zeros(1), block, 0) is None
+    assert ways.find(start, inside, block=block) is None
     on_the_end = np.array([-0.5, 0.5, 0.1, 1.0, 0.0, 0.0, 0.0])
-    assert ways.find(start, ends[1:], ends[1:], np.zeros(1), on_the_end, 0) is None
+    assert ways.find(start, ends[1:], block=on_the_end) is None
+    assert ways.find(start, ends[1:]).points[-1].tolist() == ends[1].tolist()
 
 
 def test_a_plate_touches_on_its_whole_breadth():
@@ -241,12 +242,12 @@ def test_a_way_round_about_is_found_where_no_simple_one_is():
     ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
     block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
     start, ends = np.array([0.2, 0.0]), np.array([[0.5, 0.0], [1.0, 0.0]])
-    found = ways.find_round_about(start, ends, block, 0)
+    found = ways.find_round_about(start, ends, block=block)
     assert found.end == 1
     assert found.points[-1].tolist() == [1.0, 0.0]
     for a, b in pairwise((start, *found.points)):
         assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).all()
-    again = ways.find_round_about(start, ends, block, 0)
+    again = ways.find_round_about(start, ends, block=block)
     assert all((a == b).all() for a, b in zip(found.points, again.points, strict=True))
-    assert ways.find_round_about(start, ends[:1], block, 0) is None
-    assert ways.find_round_about(start, ends[:0], block, 0) is None
+    assert ways.find_round_about(start, ends[:1], block=block) is None
+    assert ways.find_round_about(start, ends[:0], block=block) is None

@@ -29,17 +29,23 @@ WAIT = 120_000
 
 
 @pytest.fixture(scope="session")
-def chromium():
+def browser_command():
+    """The browser that is installed, and its options."""
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip("there is no chromium (apt-get install chromium)")
+    return [path, *SOFTWARE_GL, *(() if os.geteuid() else ("--no-sandbox",))]
+
+
+@pytest.fixture(scope="session")
+def chromium(browser_command):
     """A browser; every test opens pages of its own."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
     )
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.skip("there is no chromium (apt-get install chromium)")
-    sandbox = () if os.geteuid() else ("--no-sandbox",)
+    path, *options = browser_command
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=[*SOFTWARE_GL, *sandbox])
+        browser = started.chromium.launch(executable_path=path, args=options)
         yield browser
         browser.close()
 

@@ -20,6 +20,12 @@ def test_what_is_written_is_read(page, of, state):
     assert parse_address(address.query) == address
 
 
+@given(st.lists(TEXTS, max_size=3), st.dictionaries(st.just("seed"), TEXTS.filter(bool)))
+def test_robots_that_play_are_read_in_their_order(robots, state):
+    address = Address("play", ("reach",), state, tuple(robots))
+    assert parse_address(address.query) == address
+
+
 def test_a_place_stays_readable():
     address = Address("robot", ("words:arm=ur5 ee=plane",), {"q": "0.1,-2"})
     assert address.query == "?robot=words:arm=ur5%20ee=plane&q=0.1,-2"
@@ -32,7 +38,11 @@ def test_no_query_is_the_first_page():
 
 @pytest.mark.parametrize(
     ("query", "why"),
-    [("?robbot=a", "did you mean 'robot'"), ("?robot=a&split=b", "two pages: robot and split")],
+    [
+        ("?robbot=a", "did you mean 'robot'"),
+        ("?robot=a&split=b", "two pages: robot and split"),
+        ("?play=reach&robot=a&split=b", "two pages: split and play"),
+    ],
 )
 def test_what_leads_nowhere_is_refused(query, why):
     with pytest.raises(AddressError, match=why):

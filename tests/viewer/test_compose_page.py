@@ -66,6 +66,23 @@ def test_a_grammar_is_edited_drawn_and_stepped_through(see, picture):
     assert page.failures == []
 
 
+def test_an_edited_grammar_is_kept_in_the_address(see):
+    page = see("?compose=planar_arm")
+    page.get_by_text("Derivation").first.wait_for()
+    text = page.locator("textarea").first
+    edited = f"# my own\n{text.input_value()}"
+    text.fill(edited)
+    page.wait_for_url(re.compile(r"compose=planar_arm&text=[\w-]+$"))
+    page.get_by_role("button", name="next").click()
+    page.wait_for_url(re.compile(r"seed=0&number=1&text="))
+    page.reload()
+    page.get_by_text("planar_arm-000001").wait_for()
+    assert page.locator("textarea").first.input_value() == edited
+    text.fill(edited + "".join(f"# {i**9:x}\n" for i in range(1000)))
+    page.get_by_text(re.compile("too long for the page's address")).wait_for()
+    page.wait_for_url(re.compile(r"compose=planar_arm$"))
+
+
 def test_a_drawn_robot_has_an_address(see):
     page = see("?compose=chain&seed=3&number=2")
     page.get_by_text("chain-000002").wait_for()

@@ -60,6 +60,19 @@ def test_thumbnails_are_drawn_by_workers_and_a_broken_robot_says_so(see):
 
 
 @pytest.mark.slow
+def test_a_worker_that_dies_is_told_once_and_thumbnails_are_drawn_all_the_same(see, viewer):
+    on = viewer()
+    page = see("?gallery=robots/prims", on=on)
+    page.locator(".card img").first.wait_for()
+    for process in list(on.workers._pool._processes.values()):
+        process.kill()
+    page.get_by_text("A worker died").wait_for()
+    page.wait_for_function("document.querySelectorAll('.card img').length == 24")
+    assert page.get_by_text("A worker died").count() <= 1
+    assert page.locator(".card .empty").count() == 0
+
+
+@pytest.mark.slow
 def test_the_library_leads_to_all(see):
     page = see()
     page.locator(".card").first.wait_for()

@@ -1,7 +1,11 @@
 """The page of a robot in a browser."""
 
 import io
+import os
 import re
+import signal
+import subprocess
+import time
 import zipfile
 
 import pytest
@@ -33,6 +37,13 @@ def wait_for_page(page):
 
 def show_tab(page, name):
     page.get_by_role("tab", name=name).click()
+
+
+def wait_until(condition):
+    until = time.monotonic() + 60
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert condition()
 
 
 def node(viewer, name):
@@ -202,6 +213,27 @@ def test_a_browser_that_goes_while_its_page_is_made_harms_nobody(see, viewer, ca
 
 
 @pytest.mark.slow
+def test_a_browser_that_is_killed_leaves_nothing(see, viewer, browser_command, tmp_path, capfd):
+    on = viewer()
+    query = "?robot=words:arm=panda%20ee=panda_hand&show=visual,workspace,primitives"
+    own = ("--headless", f"--user-data-dir={tmp_path}", f"http://127.0.0.1:{on.port}/{query}")
+    browser = subprocess.Popen(
+        [*browser_command, *own], stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        wait_until(lambda: any(session.status for session in list(on.sessions.values())))
+        (session,) = on.sessions.values()
+    finally:
+        os.killpg(browser.pid, signal.SIGKILL)
+        browser.wait()
+    wait_until(lambda: not on.sessions)
+    for threads in (session.events, session.background):
+        threads.shutdown(wait=True)
+    wait_for_page(see(ARM, on=on))
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -212,7 +244,7 @@ def test_a_browser_that_goes_while_its_page_is_made_harms_nobody(see, viewer, ca
             b'<mesh filename="../../secret.stl"/></geometry></visual></link></robot>',
             "leads out of its folder",
         ),
-        ("large.urdf", b" " * (101 * 2**20), "at most 100 MB"),
+        ("large.urdf", b" " * (200 * 2**20), "large.urdf: 200 MB; at most 100 MB are taken"),
     ],
     ids=["no-urdf", "climbs-out", "large"],
 )

@@ -4,9 +4,10 @@ import re
 
 import pytest
 
-from morphgen.benchmark.split_file import read_split
+from morphgen.benchmark.split_file import find_split, read_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
+from morphgen.viewer.address import parse_address
 from morphgen.viewer.entries import Entry
 from morphgen.viewer.folder_page import sides_of
 from morphgen.viewer.new_split import member_of, save_split
@@ -22,6 +23,11 @@ def test_both_sides_the_map_and_the_audit(see, picture):
     page.get_by_text("test (2)").wait_for()
     page.wait_for_selector(".card:has-text('chain-000001') img")
     picture(page, "split")
+    at_work = page.get_by_role("link", name="see robots to test on at work").get_attribute("href")
+    assert parse_address(at_work).of == ("reach",)
+    assert [robot.rpartition("/")[2] for robot in parse_address(at_work).robots] == [
+        member.name for member in read_split(find_split(SPLIT)).test
+    ]
     page.get_by_role("tab", name="Statistics").click()
     page.get_by_text("Cosine of test to train").wait_for()
     page.get_by_role("tab", name="Audit").click()

@@ -1,0 +1,352 @@
+"""PPO beside that of stable-baselines3: transitions a second, collected and learned from.
+
+    python benchmarks/ppo_speed.py [--robot ur5-plane] [--envs 64] [--rounds 3] [--threads 1,2]
+        [--sims pybullet,mujoco] [--json rows.json]
+    python benchmarks/ppo_speed.py --device cuda [--envs 128] [--rounds 3] [--json rows.json]
+
+A row is an update: every environment acts for 128 control steps, and four epochs of 16 minibatches
+learn from it. Equal in all rows of a simulator and number of threads:
+
+- the environments: reach of one robot, the same batch made anew, with its padding and with the
+  share of their episodes that has passed when they begin; stable-baselines3 gets it as
+  ``morphgen.tasks.vector.sb3_vector`` makes it. Continuous actions.
+- steps, environments, epochs, minibatches and their size, and so the number of gradient steps;
+  clip range, discount, lambda, entropy weight, Adam; one value and one policy network, apart.
+- threads of torch, and as many workers of the simulator (processes of PyBullet, threads of MuJoCo).
+
+"same network" is our MLP of ``se`` as features extractor of stable-baselines3, one for the policy
+and one for values, with its linear layers behind: the same layers with the same number of
+parameters, which is checked. "own MLP" is what stable-baselines3 makes by itself: the flattened
+observation, and as many layers of the same width, tanh between. "Gymnasium" has that network too,
+and as many environments ``morphgen/Reach-v0`` in its ``DummyVecEnv``: what one writes without our
+batch. These have no padding, so that the network is smaller, and no workers.
+
+What is not equal: we compute values once more over the whole rollout before learning, keep a
+moving average of the critic, and clip the gradients of policy and values apart. The symlog and the
+slow critic of the paper are off.
+
+Rows are measured in turn, in every round, after one update that is not counted; the figures are
+medians of the rounds.
+
+With ``--device`` it measures the learner alone: ``me-tf`` learns from random rollouts of the right
+shapes, with bfloat16 and ``torch.compile`` on and off; samples a second are transitions times
+epochs over the time of learning. No simulator is needed for that.
+
+stable-baselines3 comes with `pip install morphgen[bench]`; without it its rows are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from functools import partial
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from tabulate import tabulate
+from tqdm import tqdm
+
+from morphgen.benchmark.tokens import MAX_LINKS, TOKEN_SIZE
+from morphgen.model.robot import Robot
+from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.heads import START
+from morphgen.rl.policies import MLP, layout_of
+from morphgen.rl.ppo import Learner
+from morphgen.tasks.batch import Observation, Step, TaskBatch
+from morphgen.tasks.config import BINS
+
+Update = Callable[[], tuple[float, float]]
+"""Makes an update; returns the seconds of collection and of learning."""
+Row = dict[str, str | int | float]
+
+SE = PolicyConfig("se", discrete=False)
+PLAIN = PPOConfig(transitions=10**9, symlog=False, slow_critic=False)
+ROBOTS, OBSTACLES = 10, 3
+"""Of the random rollouts."""
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    cores = os.cpu_count() or 1
+    parser.add_argument("--robot", default="ur5-plane")
+    parser.add_argument("--envs", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", default=f"1,{cores}", help="numbers, parted by commas")
+    parser.add_argument("--sims", default="pybullet,mujoco")
+    parser.add_argument("--device", help="measure the learner alone, on cuda or cpu")
+    parser.add_argument("--json", type=Path, help="also write the rows here")
+    args = parser.parse_args()
+    if args.device:
+        rows = _learners(args.device, args.envs, args.rounds)
+    else:
+        threads = dict.fromkeys(int(text) for text in args.threads.split(","))
+        rows = [
+            row
+            for sim, count in product(args.sims.split(","), threads)
+            for row in _beside(args.robot, sim, args.envs, count, args.rounds)
+        ]
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    print(tabulate(rows, headers="keys", floatfmt=",.2f"))
+    if not args.device and find_spec("stable_baselines3") is None:
+        print("stable-baselines3 is not installed: no peer (pip install 'morphgen[bench]')")
+    return 0
+
+
+def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Iterator[Row]:  # noqa: ANN401
+    """Rows of a simulator and a number of threads."""
+    from morphgen.tasks.make import make_batch
+    from morphgen.tasks.robots import robot_of
+
+    body = robot_of(robot)
+    torch.set_num_threads(threads)
+    with ExitStack() as stack:
+
+        def batch() -> TaskBatch:
+            made = make_batch("reach", [body], envs, sim=sim, workers=threads)
+            stack.callback(made.close)
+            return made
+
+        learner = Learner(batch(), SE, PLAIN)
+        updates: dict[str, Update] = {"morphgen": partial(_own_update, learner)}
+        if find_spec("stable_baselines3") is not None:
+            for name, like in (("same network", learner), ("own MLP", None)):
+                updates[f"stable-baselines3, {name}"] = _peer(_spread(batch()), like)
+            single = _single(body, sim, envs)
+            stack.callback(single.close)
+            updates["stable-baselines3, own MLP, Gymnasium"] = _peer(single, None)
+        found = _measured(updates, rounds, f"{sim}, {threads} threads")
+    made = PLAIN.steps * envs
+    ours = sum(found["morphgen"])
+    for name, (collecting, learning) in found.items():
+        yield {
+            "sim": sim,
+            "threads": threads,
+            "with": name,
+            "transitions/s": made / (collecting + learning),
+            "collected/s": made / collecting,
+            "learned/s": made / learning,
+            "morphgen is faster by": (collecting + learning) / ours,
+        }
+
+
+def _measured(
+    updates: Mapping[str, Update], rounds: int, what: str
+) -> dict[str, tuple[float, float]]:
+    """Median seconds of collection and of learning, by name."""
+    for update in updates.values():
+        update()
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in updates}
+    for _ in tqdm(range(rounds), unit="round", desc=what):
+        for name, update in updates.items():
+            seconds[name].append(update())
+    medians = {
+        name: [statistics.median(each) for each in zip(*own, strict=True)]
+        for name, own in seconds.items()
+    }
+    return {name: (collecting, learning) for name, (collecting, learning) in medians.items()}
+
+
+def _own_update(learner: Learner) -> tuple[float, float]:
+    report = learner.iterate()
+    return report.collect_seconds, report.learn_seconds
+
+
+def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
+    """Updates of stable-baselines3, with the network of a learner or with one of its own."""
+    from stable_baselines3 import PPO
+
+    network: dict[str, Any]
+    if learner:
+        network = {
+            "features_extractor_class": _extractor(),
+            "features_extractor_kwargs": {"like": learner.batch.observe()},
+            "share_features_extractor": False,
+            "net_arch": [],
+        }
+    else:
+        layers = [SE.mlp_width] * SE.mlp_layers
+        network = {"net_arch": {"pi": layers, "vf": layers}}
+    model = PPO(
+        "MultiInputPolicy",
+        envs,
+        learning_rate=PLAIN.learning_rate,
+        n_steps=PLAIN.steps,
+        batch_size=PLAIN.minibatch(envs.num_envs),
+        n_epochs=PLAIN.epochs,
+        gamma=PLAIN.gamma,
+        gae_lambda=PLAIN.lam,
+        clip_range=PLAIN.clip,
+        ent_coef=PLAIN.entropy,
+        max_grad_norm=PLAIN.gradient_clip,
+        policy_kwargs={**network, "log_std_init": START},
+        seed=0,
+        device="cpu",
+    )
+    if learner:
+        ours, theirs = _parameters(learner.actor, learner.critic), _parameters(model.policy)
+        if ours != theirs:
+            raise ValueError(f"the networks differ: {ours} and {theirs} parameters")
+    spent = 0.0
+    train = model.train
+
+    def timed() -> None:
+        nonlocal spent
+        began = time.perf_counter()
+        train()
+        spent = time.perf_counter() - began
+
+    model.train = timed  # type: ignore[method-assign]
+
+    def update() -> tuple[float, float]:
+        began = time.perf_counter()
+        model.learn(PLAIN.steps * envs.num_envs, reset_num_timesteps=False)
+        return time.perf_counter() - began - spent, spent
+
+    return update
+
+
+def _spread(batch: TaskBatch) -> Any:  # noqa: ANN401 - a class of what may not be installed
+    """The batch for stable-baselines3; like a learner's, its first episodes are under way."""
+    from morphgen.tasks.sb3 import SB3Vector
+    from morphgen.tasks.spaces import arrays
+    from morphgen.tasks.vector import TaskVector
+
+    class Spread(SB3Vector):
+        def reset(self) -> dict[str, Any]:
+            return arrays(self.vector.batch.reset(spread=True))
+
+    return Spread(TaskVector(batch))
+
+
+def _single(robot: Robot, sim: Any, envs: int) -> Any:  # noqa: ANN401
+    """Gymnasium's environments, one beside the other in one process."""
+    import gymnasium
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    made = partial(gymnasium.make, "morphgen/Reach-v0", robot=robot, sim=sim)
+    return DummyVecEnv([made] * envs)
+
+
+def _extractor() -> type[Any]:
+    """Our MLP up to its last layer, as a features extractor of stable-baselines3."""
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+    class Extractor(BaseFeaturesExtractor):
+        def __init__(self, space: Any, like: Observation) -> None:  # noqa: ANN401
+            super().__init__(space, SE.mlp_width)
+            self.kinds = {name: (each.dtype, each.shape[1:]) for name, each in like.items()}
+            self.network = MLP(SE, layout_of(like), 1, per_link=False)
+            self.network.leave = cast(torch.nn.Linear, torch.nn.Identity())
+            self.network.shape = (SE.mlp_width,)
+
+        def forward(self, seen: Observation) -> torch.Tensor:
+            restored = {}
+            for name, each in seen.items():
+                dtype, shape = self.kinds[name]
+                restored[name] = each.to(dtype).reshape(-1, *shape)
+            return cast(torch.Tensor, self.network(restored))
+
+    return Extractor
+
+
+def _parameters(*networks: torch.nn.Module) -> int:
+    """How many numbers are learned."""
+    return sum(each.numel() for network in networks for each in network.parameters())
+
+
+def _learners(device: str, envs: int, rounds: int) -> list[Row]:
+    """Rows of the learner alone."""
+    updates: dict[str, Update] = {}
+    settings = list(product((False, True), repeat=2))
+    for bf16, compiled in settings:
+        config = PPOConfig(transitions=10**9, bf16=bf16, compile=compiled)
+        batch = cast(TaskBatch, _RandomBatch(envs, device))
+        learner = Learner(batch, PolicyConfig("me-tf"), config, device=device)
+        updates[f"{bf16} {compiled}"] = partial(_own_update, learner)
+    found = _measured(updates, rounds, device)
+    config = PPOConfig()
+    samples = config.steps * envs * config.epochs
+    name = torch.cuda.get_device_name(device) if device.startswith("cuda") else device
+    return [
+        {
+            "device": name,
+            "bf16": "on" if bf16 else "off",
+            "compile": "on" if compiled else "off",
+            "samples/s": samples / found[f"{bf16} {compiled}"][1],
+            "learning an update, s": found[f"{bf16} {compiled}"][1],
+        }
+        for bf16, compiled in settings
+    ]
+
+
+class _RandomBatch:
+    """What a learner needs of a batch; everything in it is random."""
+
+    kind = "discrete"
+
+    def __init__(self, envs: int, device: str) -> None:
+        self.num_envs, self.device = envs, torch.device(device)
+        self.body = torch.arange(envs, device=device) % ROBOTS
+        generator = torch.Generator(device).manual_seed(0)
+
+        def drawn(*shape: int) -> torch.Tensor:
+            return torch.rand(envs, *shape, generator=generator, device=device)
+
+        some = torch.arange(MAX_LINKS, device=device) < 6 + drawn(1) * (MAX_LINKS - 6)
+        none = torch.zeros(envs, dtype=torch.bool, device=device)
+        self._seen = {
+            "tokens": 2 * drawn(MAX_LINKS, TOKEN_SIZE) - 1,
+            "links": some,
+            "actions": some & (drawn(MAX_LINKS) < 0.8),
+            "goal": drawn(7),
+            "goal_mask": ~none,
+            "object": torch.zeros(envs, 13, device=device),
+            "object_mask": none,
+            "line": torch.zeros(envs, 1, device=device),
+            "obstacles": drawn(OBSTACLES, 13),
+            "obstacle_mask": torch.ones(envs, OBSTACLES, dtype=torch.bool, device=device),
+        }
+        self._score, self._never = drawn(), none
+
+    def advance(self, progress: float) -> None:
+        """There is no line."""
+
+    def observe(self) -> Observation:
+        """The same each time."""
+        return self._seen
+
+    def reset(self, *, spread: bool) -> Observation:
+        """Nothing begins."""
+        return self._seen
+
+    def step(self, actions: torch.Tensor) -> Step:
+        """A score for the action, and nothing else."""
+        reward = self._score * torch.tensor(BINS, device=self.device)[actions].mean(dim=1)
+        return Step(
+            observation=self._seen,
+            reward=reward,
+            terminated=self._never,
+            truncated=self._never,
+            final_observation=self._seen,
+            success=self._never,
+            distance=self._score,
+            score=self._score,
+            terms={"random": reward},
+            q=torch.zeros(self.num_envs, 1, device=self.device),
+            block_pose=torch.zeros(self.num_envs, 7, device=self.device),
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+"""Bodies do their tasks in a browser."""
+
+import re
+import threading
+import time
+
+import pytest
+import zstandard
+
+from morphgen.rl.training import train
+from morphgen.viewer.episode import read_episode, score_until
+from small_runs import QUIET, small_config, small_source
+
+pytestmark = pytest.mark.slow
+
+CUBE = "words:base=planar ee=cube"
+
+
+def number(page, label):
+    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
+    return row.locator("input").last
+
+
+def choose(page, label, option):
+    field = page.get_by_text(label, exact=True).first
+    field.locator("xpath=ancestor::*[.//input][1]//input").first.click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def press(page, name):
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def wait_for_end(page, seconds="6.00"):
+    page.get_by_text(re.compile(rf"^{seconds} s; simulated: {seconds} s")).wait_for()
+
+
+def players():
+    """Threads that play, for all browsers."""
+    return [each for each in threading.enumerate() if each.name == "morphgen-player"]
+
+
+def download(page, button):
+    with page.expect_download() as found:
+        page.get_by_role("button", name=button).click()
+    return found.value
+
+
+def test_a_body_reaches_and_is_scrubbed_and_stepped(see, viewer, picture):
+    on = viewer()
+    page = see(f"?play=reach&robot={CUBE}&policy=ik&seed=3", on=on)
+    wait_for_end(page)
+    page.get_by_text("success", exact=True).wait_for()
+    picture(page, "play-reach")
+    number(page, "time (s)").fill("2")
+    page.get_by_text("2.00 s; simulated: 6.00 s").wait_for()
+    press(page, "step")
+    page.get_by_text("2.02 s; simulated: 6.00 s").wait_for()
+    press(page, "back")
+    press(page, "back")
+    page.get_by_text("1.98 s; simulated: 6.00 s").wait_for()
+    assert page.failures == []
+
+
+def test_an_address_is_told_and_new_episodes_have_other_seeds(see, viewer):
+    page = see(f"?play=reach&robot={CUBE}&policy=random")
+    page.wait_for_url(re.compile(r"policy=random&seed=0"))
+    page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
+    press(page, "New episode")
+    page.wait_for_url(re.compile(r"seed=1"))
+    assert number(page, "seed").input_value() == "1"
+    choose(page, "policy", "ik")
+    page.wait_for_url(re.compile(r"policy=ik&seed=1"))
+    wait_for_end(page)
+    page.get_by_text("success", exact=True).wait_for()
+
+
+def test_an_episode_is_saved_opened_and_made_into_a_scene_and_a_film(
+    see, viewer, folder, picture, tmp_path
+):
+    on = viewer()
+    page = see(f"?play=reach&robot={CUBE}&robot=words:base=gantry ee=cube&seed=1", on=on)
+    wait_for_end(page)
+    saved = download(page, "Save episode")
+    assert saved.suggested_filename == "reach-planar-cube-1.npz"
+    saved.save_as(folder / "episode.npz")
+    episode = read_episode(folder / "episode.npz", on.places)
+    assert [len(track.q) for track in episode.tracks] == [301, 301]
+    assert all(score_until(track, "reach", 300) > 100 for track in episode.tracks)
+    scene = download(page, "Scene (.viser)").path().read_bytes()
+    size = int.from_bytes(scene[:8], "little")
+    assert len(zstandard.ZstdDecompressor().decompressobj().decompress(scene[8:])) == size
+    film = download(page, "Film (.mp4)").path().read_bytes()
+    assert film[4:8] == b"ftyp"
+    page.goto(f"http://127.0.0.1:{on.port}/?play=episode.npz")
+    wait_for_end(page)
+    assert page.get_by_text("success", exact=True).count() == 2
+    picture(page, "play-recorded")
+    assert page.failures == []
+
+
+def test_bodies_are_changed_and_put_beside(see, viewer, picture):
+    page = see("?play=reach&robot=robots/prims/prims-000001&policy=ik")
+    page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
+    choose(page, "body", "prims-000002")
+    page.wait_for_url(re.compile(r"robot=robots/prims/prims-000002&policy=ik"))
+    number(page, "or words").fill("base=planar ee=cube")
+    press(page, "beside")
+    page.wait_for_url(re.compile(r"prims-000002&robot=words:base=planar%20ee=cube"))
+    page.get_by_role("cell", name="planar-cube").wait_for()
+    press(page, "alone")
+    page.wait_for_url(re.compile(r"play=reach&robot=robots/prims/prims-000002&policy"))
+
+
+def test_what_cannot_play_says_why_in_a_sentence(see, viewer):
+    page = see(f"?play=push&robot={CUBE}")
+    page.get_by_text(re.compile("robot 'planar-cube' can hardly push")).wait_for()
+    choose(page, "task", "reach")
+    page.wait_for_url(re.compile(r"play=reach.*policy=ik"))
+    wait_for_end(page)
+    assert page.get_by_text("can hardly push").count() == 0
+
+
+@pytest.mark.parametrize(
+    ("query", "why"),
+    [
+        ("?play=rech", "did you mean 'reach'"),
+        ("?play=reach&seed=x", "seed 'x': expected a whole number"),
+        ("?play=reach&sim=bullet", "did you mean 'pybullet'"),
+        ("?play=reach&policy=scripted", "policy 'scripted' is for push, not for reach"),
+        ("?play=reach&policy=../x.pt", "outside of the folders"),
+        ("?play=robots/prims/index.jsonl", "no task"),
+        ("?play=nothing.npz", "no such file"),
+    ],
+)
+def test_addresses_that_play_nothing_say_why(see, query, why):
+    see(query).get_by_text(re.compile(re.escape(why))).first.wait_for()
+
+
+def test_a_checkpoint_plays_the_body_it_was_trained_on(see, viewer, folder, tmp_path):
+    train(folder / "runs" / "small", small_config(small_source()), way=QUIET)
+    on = viewer("runs/small")
+    page = see(on=on)
+    page.wait_for_url(re.compile(r"play=reach&robot=derivation:.*policy=runs/small&seed=0"))
+    page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
+    page.get_by_role("cell", name=re.compile("^planar-cube")).wait_for()
+    page.get_by_text("obstacles", exact=True).click()
+    page.get_by_text(re.compile("the checkpoint is for other observations: obstacles 0")).wait_for()
+
+
+def test_nothing_is_left_when_the_browser_goes_or_turns_to_another_page(see, viewer, capfd):
+    on = viewer()
+    page = see(f"?play=reach&robot={CUBE}&policy=random", on=on)
+    page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
+    other = see(f"?robot={CUBE}", on=on)
+    other.get_by_text("no self-collision").wait_for()
+    (player,) = players()
+    other.get_by_role("link", name="reach", exact=True).click()
+    other.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
+    assert len(players()) == 2
+    page.goto(f"http://127.0.0.1:{on.port}/?robot={CUBE}")
+    page.get_by_text("no self-collision").wait_for()
+    player.join(30)
+    assert not player.is_alive()
+    other.close()
+    until = time.monotonic() + 30
+    while players() and time.monotonic() < until:
+        time.sleep(0.1)
+    assert players() == []
+    assert "Traceback" not in capfd.readouterr().err

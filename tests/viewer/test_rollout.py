@@ -1,0 +1,231 @@
+"""Episodes of playback are those of ``morphgen play``, and come back from their files."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+import zstandard
+
+from morphgen.errors import MorphgenError
+from morphgen.formats.bundle import write_bundle
+from morphgen.grammar.library import default_library
+from morphgen.model.kinematics import frame_pose
+from morphgen.rl import runs
+from morphgen.rl.play import controller, play
+from morphgen.tasks.gym_env import ReachEnv
+from morphgen.viewer.address import Address
+from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, still
+from morphgen.viewer.places import CHECKPOINT, Places, target_address
+from morphgen.viewer.play_choices import address_of, wanted_of
+from morphgen.viewer.play_files import recording, setting_of
+from morphgen.viewer.play_scene import GAP, area, places_in_grid
+from morphgen.viewer.rollout import Recorded, Rollout, Wanted, simulators
+from robots import arm
+
+CUBE = "words:base=planar ee=cube"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    root = tmp_path_factory.mktemp("here").resolve()
+    write_bundle(arm(), root / "robots" / "one", picture=False)
+    return root
+
+
+@pytest.fixture(scope="module")
+def places(root):
+    return Places(default_library().folders, (root,), root / "none")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def episode(places, cache):
+    """Two bodies that reached: one composed, one a bundle."""
+    rollout = Rollout(Wanted("reach", (CUBE, "robots/one"), "ik", 3), places)
+    while rollout.advance():
+        pass
+    rollout.close()
+    return rollout.episode
+
+
+def test_an_episode_is_the_one_that_morphgen_play_has(episode):
+    env = ReachEnv("planar-cube", sim="mujoco")
+    results = []
+    list(play(env, controller("ik", env, 3), 1, 3, results.append))
+    env.close()
+    track = episode.tracks[0]
+    (result,) = results
+    assert track.steps == 300
+    assert track.distance[-1] == pytest.approx(result.distance)
+    assert score_until(track, "reach", 300) == pytest.approx(result.score)
+    assert track.success[-1] == result.success
+
+
+def test_a_score_is_of_the_steps_until_then(episode):
+    track = episode.tracks[0]
+    assert score_until(track, "reach", 0) is None
+    assert score_until(track, "reach", 2) == pytest.approx(sum(track.score[:2]) / 2)
+    assert score_until(track, "push", 2) == track.score[1]
+
+
+def test_an_episode_comes_back_from_its_file(episode, places, root):
+    content = episode_bytes(episode)
+    assert content == episode_bytes(episode)
+    (root / "episode.npz").write_bytes(content)
+    read = read_episode(root / "episode.npz", places)
+    assert (read.task, read.policy, read.seed, read.simulator) == ("reach", "ik", 3, "mujoco")
+    for one, other in zip(read.tracks, episode.tracks, strict=True):
+        assert one.place == other.place
+        assert np.array_equal(one.q, other.q)
+        assert np.array_equal(one.goal, other.goal)
+        assert one.score == pytest.approx(other.score, rel=1e-6)
+        assert one.success == other.success
+    assert episode_bytes(read) == content
+    with np.load(root / "episode.npz") as file:
+        about = json.loads(str(file["about"]))
+        assert [row["place"] for row in about["bodies"]] == [CUBE, "robots/one"]
+        assert file["0/q"].shape == (301, episode.tracks[0].robot.dof)
+        last = frame_pose(episode.tracks[1].robot, file["1/q"][-1])
+        assert file["1/tool"][-1, :3] == pytest.approx(last[:3, 3], abs=1e-6)
+
+
+def test_an_episode_is_what_a_viewer_can_be_started_for(episode, places, root, monkeypatch):
+    monkeypatch.chdir(root)
+    (root / "episode.npz").write_bytes(episode_bytes(episode))
+    assert target_address(("episode.npz",), places) == Address("play", ("episode.npz",))
+
+
+def test_an_episode_at_its_start_can_be_saved(places, root, cache):
+    rollout = Rollout(Wanted("reach", ("robots/one",), "zero"), places)
+    (root / "start.npz").write_bytes(episode_bytes(rollout.episode))
+    rollout.close()
+    read = read_episode(root / "start.npz", places)
+    assert read.steps == 0
+    assert not Recorded(read).advance()
+
+
+def changed(path, **arrays):
+    """An episode's file with other arrays; None leaves one out."""
+    with np.load(path) as file:
+        found = {name: file[name] for name in file.files}
+    found |= {name.replace("_", "/", 1): values for name, values in arrays.items()}
+    np.savez(path, **{name: values for name, values in found.items() if values is not None})
+
+
+@pytest.mark.parametrize(
+    ("arrays", "why"),
+    [
+        ({"about": None}, "is no episode of morphgen view"),
+        ({"about": np.array("{")}, "is no episode of morphgen view"),
+        ({"about": np.array('{"format": 9, "task": "reach"}')}, "format 9"),
+        ({"0_q": None}, "0/q"),
+        ({"0_q": np.zeros(3)}, "expected"),
+        ({"0_q": np.zeros((301, 1))}, "q has shape"),
+        ({"0_goal": np.full(7, np.nan)}, "goal is not finite"),
+        ({"0_score": np.zeros(2)}, "score has shape"),
+    ],
+)
+def test_what_is_no_episode_is_refused(episode, places, root, arrays, why):
+    path = root / "changed.npz"
+    path.write_bytes(episode_bytes(episode))
+    changed(path, **arrays)
+    with pytest.raises(EpisodeError, match=why):
+        read_episode(path, places)
+
+
+def test_files_of_another_kind_are_refused(places, root):
+    (root / "text.npz").write_text("no archive")
+    with pytest.raises(EpisodeError, match="is no episode of morphgen view"):
+        read_episode(root / "text.npz", places)
+
+
+def test_an_episode_of_a_robot_that_has_changed_is_refused(places, root, cache):
+    write_bundle(arm(), root / "robots" / "two", picture=False)
+    rollout = Rollout(Wanted("reach", ("robots/two",), "zero"), places)
+    rollout.close()
+    (root / "two.npz").write_bytes(episode_bytes(rollout.episode))
+    urdf = root / "robots" / "two" / "robot.urdf"
+    urdf.write_text(urdf.read_text().replace('upper="2"', 'upper="1.5"'))
+    with pytest.raises(EpisodeError, match="the robot at robots/two is not the one"):
+        read_episode(root / "two.npz", places)
+
+
+def test_one_that_cannot_play_does_not_keep_the_others_from_it(places, cache):
+    rollout = Rollout(Wanted("reach", ("robots/none", "robots/one"), "zero"), places)
+    assert list(rollout.faults) == ["robots/none"]
+    assert "no such file" in rollout.faults["robots/none"]
+    assert [track.place for track in rollout.episode.tracks] == ["robots/one"]
+    rollout.close()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "why"),
+    [
+        (Wanted("reach", (), "zero"), "no robot is named"),
+        (Wanted("reach", ("robots/none",), "zero"), "no such file"),
+        (Wanted("reach", ("robots/one",), "scripted"), "is for push, not for reach"),
+        (Wanted("push", ("robots/one",), "ik"), "is for reach, not for push"),
+        (Wanted("reach", ("robots/one",), "zeros"), "did you mean 'zero'"),
+        (Wanted("reach", ("robots/one",), "../x.pt"), "outside of the folders"),
+        (Wanted("reach", ("robots/one",), "x.pt"), "no such file"),
+        (Wanted("reach", ("robots/one",), "robots/one/robot.urdf"), "is not a checkpoint"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(places, cache, wanted, why):
+    with pytest.raises(MorphgenError, match=why):
+        Rollout(wanted, places)
+
+
+def test_a_run_is_known_by_its_checkpoint():
+    assert CHECKPOINT == runs.CHECKPOINT
+
+
+def test_an_address_tells_what_is_played():
+    for simulator in simulators():
+        wanted = Wanted("push", ("robots/one", CUBE), "random", 7, True, simulator)
+        assert wanted_of(address_of(wanted), []) == wanted
+    default = wanted_of(address_of(Wanted("push", (), "zero")), [("it", "robots/one")])
+    assert default.places == ("robots/one",)
+
+
+def test_an_episode_as_it_is_now_does_not_grow(episode):
+    kept = still(episode)
+    for track in kept.tracks:
+        track.q.append(track.q[-1])
+    assert [track.steps for track in episode.tracks] == [300, 300]
+
+
+def test_bodies_stand_apart(episode):
+    areas = [area(track) for track in (*episode.tracks, episode.tracks[0])]
+    spots = np.array(places_in_grid(areas))
+    for i, (low, high) in enumerate(areas):
+        for k in range(i):
+            other_low, other_high = areas[k]
+            apart = np.maximum(
+                low + spots[i] - (other_high + spots[k]), other_low + spots[k] - (high + spots[i])
+            )
+            assert apart[:2].max() >= GAP - 1e-9
+
+
+def test_a_recording_is_of_all_moments_that_are_shown(episode):
+    content = recording(episode)
+    payload = zstandard.ZstdDecompressor().decompressobj().decompress(content[8:])
+    assert len(payload) == int.from_bytes(content[:8], "little")
+    length = int.from_bytes(payload[:8], "little")
+    told = msgspec.msgpack.decode(payload[8 : 8 + length])
+    assert told["durationSeconds"] == pytest.approx((150 + 1) * 2 * episode.period)
+    kinds = {message["type"] for _, message in told["messages"]}
+    assert {"SetPositionMessage", "SetOrientationMessage", "MeshMessage"} <= kinds
+
+
+def test_the_camera_of_a_film_sees_what_the_episode_has(episode):
+    setting = setting_of(episode.tracks[0])
+    assert np.allclose(setting.goals.poses[0], episode.tracks[0].goal)
+    assert np.allclose(setting.goals.q[-1], episode.tracks[0].q[-1])

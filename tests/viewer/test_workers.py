@@ -1,0 +1,46 @@
+"""Workers that die are replaced."""
+
+import os
+import time
+
+import pytest
+
+from morphgen.viewer.workers import WorkerDied, Workers
+from work import die, power
+
+
+@pytest.fixture
+def workers():
+    made = Workers(1)
+    yield made
+    made.close()
+
+
+def test_a_worker_that_dies_is_told_once_and_replaced(workers):
+    value, first = workers.result(workers.submit(power, 2, 3))
+    assert value == 9
+    dying, waiting = workers.submit(die, 0), workers.submit(power, 2, 4)
+    for future in (dying, waiting):
+        with pytest.raises(WorkerDied, match="others were started: try again"):
+            workers.result(future)
+    value, second = workers.result(workers.submit(power, 2, 5))
+    assert value == 25
+    assert second not in (first, os.getpid())
+
+
+def test_nothing_is_left_of_closed_workers():
+    workers = Workers(1)
+    _, process = workers.result(workers.submit(power, 2, 3))
+    workers.close()
+    until = time.monotonic() + 30
+    while alive(process) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not alive(process)
+
+
+def alive(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True

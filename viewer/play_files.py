@@ -1,0 +1,125 @@
+"""Films of episodes, and recordings of the scene; made by worker processes."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from morphgen.tasks.film import SIZE, Frame, Stage, write_film
+from morphgen.tasks.goals import GoalSet
+from morphgen.tasks.push_sets import PushSet
+from morphgen.tasks.settings import Setting
+from morphgen.tasks.sim.base import Block, Scene
+from morphgen.viewer.episode import Episode, Track
+from morphgen.viewer.play_scene import add_episode, show_step
+
+STRIDE = 2
+"""Control steps between two pictures."""
+_SEEN = 32
+"""Moments that are in view for certain."""
+
+
+def film(episode: Episode) -> bytes:
+    """An ``.mp4`` of an episode at its own speed; several bodies are beside each other.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+        MissingDependencyError: If there is no offscreen OpenGL.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "episode.mp4"
+        write_film(_frames(episode), path, 1 / (STRIDE * episode.period))
+        return path.read_bytes()
+
+
+def recording(episode: Episode) -> bytes:
+    """A ``.viser`` file: the scene with all that moves in it, for viser's own player.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        shown = add_episode(server.scene, episode)
+        serializer = server.get_scene_serializer()
+        for step in _steps(episode):
+            show_step(shown, step)
+            serializer.insert_sleep(STRIDE * episode.period)
+        return serializer.serialize()
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def setting_of(track: Track) -> Setting:
+    """What surrounds a body, with a view of all that its episode has."""
+    every = np.linspace(0, track.steps, min(_SEEN, track.steps + 1)).astype(int)
+    q = np.array([track.q[i] for i in every], dtype=np.float64)
+    block = None if track.block_size is None else Block(track.block_size)
+    scene = Scene(track.robot, block=block, obstacles=track.obstacles, ground=track.ground)
+    if track.goal is not None:
+        poses = track.goal[None].astype(np.float64)
+        goals = GoalSet(track.robot.name, "", q, poses, track.obstacles, 0, len(q), 0)
+        return Setting(track.robot, "reach", scene, goals=goals)
+    if block is None or track.line is None:
+        return Setting(track.robot, "push", scene)
+    blocks = np.array([track.block[i] for i in every], dtype=np.float64)
+    pushes = PushSet(
+        robot=track.robot.name,
+        key="",
+        q=q,
+        blocks=blocks,
+        block=block,
+        line=track.line,
+        scale=1.0,
+        ground=track.ground or 0.0,
+        obstacles=track.obstacles,
+        tried=0,
+        accepted=len(q),
+        seed=0,
+        behind=q,
+        across=q,
+    )
+    return Setting(track.robot, "push", scene, pushes=pushes)
+
+
+def _frames(episode: Episode) -> Iterator[Frame]:
+    columns = int(np.ceil(np.sqrt(len(episode.tracks))))
+    width, height = (2 * round(edge / columns / 2) for edge in SIZE)
+    with contextlib.ExitStack() as open_stages:
+        stages = []
+        for track in episode.tracks:
+            stages.append(Stage(setting_of(track), (width, height)))
+            open_stages.callback(stages[-1].close)
+        for step in _steps(episode):
+            tiles = [
+                _frame(stage, track, step)
+                for stage, track in zip(stages, episode.tracks, strict=True)
+            ]
+            yield _tiled(tiles, columns)
+
+
+def _frame(stage: Stage, track: Track, step: int) -> Frame:
+    at = min(step, track.steps)
+    block = track.block[at] if track.block else None
+    return stage.frame(track.q[at], block=block, goal=track.goal, line=track.line)
+
+
+def _tiled(tiles: list[Frame], columns: int) -> Frame:
+    empty = np.full_like(tiles[0], 255)
+    tiles = tiles + [empty] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    return np.vstack(rows)
+
+
+def _steps(episode: Episode) -> list[int]:
+    """What is shown: the start, every other moment, and the end."""
+    steps = list(range(0, episode.steps, STRIDE))
+    return [*steps, episode.steps]

@@ -1,0 +1,177 @@
+"""An episode in a scene: its bodies beside each other, each with its goal, obstacles and block."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from morphgen.model.geometry import Pose
+from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.sim.base import Block
+from morphgen.viewer.episode import Episode, Track
+from morphgen.viewer.robot_view import Rgb, RobotView, add_robot, move, robot_bounds
+
+Array = NDArray[np.float64]
+Position = tuple[float, float, float]
+
+NODE = "/play"
+"""Of all that belongs to an episode."""
+GAP = 0.3
+"""Between the areas of two bodies, metres."""
+_GOAL: Rgb = (26, 166, 64)
+_BLOCK: Rgb = (230, 140, 38)
+_OBSTACLE: Rgb = (140, 64, 64)
+_LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002
+_ASIDE = 0.3
+"""How far a line reaches to both sides of its block, metres."""
+
+
+@dataclass(eq=False)
+class Stand:
+    """A body in the scene."""
+
+    track: Track
+    view: RobotView
+    block: viser.BoxHandle | None
+
+
+@dataclass(eq=False)
+class PlayScene:
+    """An episode in a scene."""
+
+    episode: Episode
+    root: viser.FrameHandle
+    stands: list[Stand]
+    low: Array
+    """Lowest corner of what holds all of it, shape (3,), metres."""
+    high: Array
+
+
+def add_episode(scene: viser.SceneApi, episode: Episode) -> PlayScene:
+    """Draw an episode's bodies and surroundings at its start.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    areas = [area(track) for track in episode.tracks]
+    root = scene.add_frame(NODE, show_axes=False)
+    spots = places_in_grid(areas)
+    stands = [
+        _add_track(scene, f"{NODE}/{i}", track, spot, named=len(spots) > 1)
+        for i, (track, spot) in enumerate(zip(episode.tracks, spots, strict=True))
+    ]
+    low = np.min([a[0] + spot for a, spot in zip(areas, spots, strict=True)], axis=0)
+    high = np.max([a[1] + spot for a, spot in zip(areas, spots, strict=True)], axis=0)
+    shown = PlayScene(episode, root, stands, low, high)
+    _add_ground(scene, shown)
+    show_step(shown, 0)
+    return shown
+
+
+def show_step(shown: PlayScene, step: int) -> None:
+    """Move everything to where it was after some control steps; what ended before stays."""
+    for stand in shown.stands:
+        at = min(step, stand.track.steps)
+        move(stand.view, stand.track.q[at])
+        if stand.block is not None:
+            pose = stand.track.block[at].tolist()
+            stand.block.position, stand.block.wxyz = tuple(pose[:3]), tuple(pose[3:])
+
+
+def area(track: Track) -> tuple[Array, Array]:
+    """Lowest and highest corner of what a body has around it at the start, metres."""
+    points = [np.zeros(3)]
+    for q in (track.robot.home, track.q[0]):
+        points += robot_bounds(track.robot, q)
+    if track.goal is not None:
+        points.append(track.goal[:3].astype(np.float64))
+    if track.block and track.line is not None:
+        start = track.block[0][:3].astype(np.float64)
+        points += [start, np.array([start[0], track.line, start[2]])]
+    points += [np.array(block.pose.position) for block in track.obstacles]
+    return np.min(points, axis=0), np.max(points, axis=0)
+
+
+def places_in_grid(areas: Sequence[tuple[Array, Array]]) -> list[Position]:
+    """Where bodies stand so that none is in the area of another: rows along y, roots at z = 0."""
+    columns = math.ceil(math.sqrt(len(areas)))
+    reach = np.max([np.maximum(np.abs(low), np.abs(high))[:2] for low, high in areas], axis=0)
+    across, along = (2 * reach + GAP).tolist()
+    middle = (columns - 1) / 2
+    return [
+        (-(i // columns) * across, (middle - i % columns) * along, 0.0) for i in range(len(areas))
+    ]
+
+
+def _add_track(
+    scene: viser.SceneApi, name: str, track: Track, spot: Position, *, named: bool
+) -> Stand:
+    scene.add_frame(name, show_axes=False, position=spot)
+    view = add_robot(scene, track.robot, f"{name}/robot")
+    for i, obstacle in enumerate(track.obstacles):
+        _add_box(scene, f"{name}/obstacle{i}", obstacle, _OBSTACLE)
+    if track.goal is not None:
+        _add_goal(scene, f"{name}/goal", track.goal.tolist())
+    block = None
+    if track.block and track.block_size is not None:
+        start = Pose(tuple(track.block[0][:3].tolist()), tuple(track.block[0][3:].tolist()))
+        block = _add_box(scene, f"{name}/block", Block(track.block_size, start), _BLOCK)
+        _add_line(scene, f"{name}/line", track)
+    if named:
+        top = float(robot_bounds(track.robot)[1][2])
+        scene.add_label(f"{name}/label", track.robot.name, position=(0.0, 0.0, top + 0.1))
+    return Stand(track, view, block)
+
+
+def _add_goal(scene: viser.SceneApi, name: str, pose: Sequence[float]) -> None:
+    """A ball in which the tool is near, and axes of the wanted pose."""
+    x, y, z, *quaternion = pose
+    near = ReachConfig.near
+    scene.add_frame(
+        name,
+        axes_length=2 * near,
+        axes_radius=0.1 * near,
+        origin_radius=0.15 * near,
+        position=(x, y, z),
+        wxyz=np.array(quaternion),
+    )
+    scene.add_icosphere(f"{name}/near", near, _GOAL, opacity=0.45, cast_shadow=False)
+
+
+def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> viser.BoxHandle:
+    return scene.add_box(
+        name, colour, block.size, position=block.pose.position, wxyz=block.pose.quaternion
+    )
+
+
+def _add_line(scene: viser.SceneApi, name: str, track: Track) -> None:
+    if track.line is None or track.block_size is None:
+        return
+    length = 2 * (max(track.block_size) + _ASIDE)
+    height = (track.ground or 0.0) + _LINE_HEIGHT / 2
+    scene.add_box(
+        name,
+        _GOAL,
+        (length, _LINE_WIDTH, _LINE_HEIGHT),
+        position=(float(track.block[0][0]), track.line, height),
+        cast_shadow=False,
+    )
+
+
+def _add_ground(scene: viser.SceneApi, shown: PlayScene) -> None:
+    """A grid as low as the lowest ground: a cell is 10 cm, a section 1 m."""
+    size, middle = shown.high - shown.low, (shown.low + shown.high) / 2
+    heights = [track.ground for track in shown.episode.tracks if track.ground is not None]
+    scene.add_grid(
+        f"{NODE}/ground",
+        width=2.0 * math.ceil(float(size[0]) / 2 + 1),
+        height=2.0 * math.ceil(float(size[1]) / 2 + 1),
+        cell_size=0.1,
+        section_size=1.0,
+        position=(float(middle[0]), float(middle[1]), min(heights, default=0.0)),
+    )

@@ -1,0 +1,251 @@
+"""Episodes while they are simulated: bodies at a task, each in an environment of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from morphgen.benchmark.split import Task
+from morphgen.errors import MorphgenError
+from morphgen.fitting.dressed import as_primitives
+from morphgen.formats.bundle import split_colours
+from morphgen.rl.play import POLICIES, controller, kind_of, require_policy
+from morphgen.rl.rollouts import Controller
+from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.sources import members
+from morphgen.tasks.batch import Step
+from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.film import moment
+from morphgen.tasks.gym_env import PushEnv, ReachEnv, TaskEnv
+from morphgen.tasks.make import SIMULATORS, SimulatorName
+from morphgen.tasks.robots import robot_of
+from morphgen.viewer.episode import Array, Episode, Track
+from morphgen.viewer.places import (
+    CHECKPOINT,
+    DERIVED,
+    PlaceError,
+    Places,
+    as_in_library,
+    name_of,
+    read_place,
+)
+
+MOST = 9
+"""Bodies that play at once."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be played."""
+
+    task: Task
+    places: tuple[str, ...]
+    """Of the bodies."""
+    policy: str
+    """A name of ``morphgen.rl.play``, or the path of a checkpoint as an address has it."""
+    seed: int = 0
+    obstacles: bool = False
+    simulator: SimulatorName = "mujoco"
+
+
+class Source(Protocol):
+    """What an episode comes from."""
+
+    episode: Episode
+    longest: int
+    """Control steps of the episode at most."""
+    faults: dict[str, str]
+    """Why bodies that were wanted cannot play, by place."""
+
+    def advance(self) -> bool:
+        """Simulate a control step more; false if the episode is over."""
+
+    def close(self) -> None:
+        """Free everything."""
+
+
+class Recorded:
+    """An episode that is over."""
+
+    def __init__(self, episode: Episode) -> None:
+        self.episode, self.longest = episode, episode.steps
+        self.faults: dict[str, str] = {}
+
+    def advance(self) -> bool:
+        """There is no more."""
+        return False
+
+    def close(self) -> None:
+        """There is nothing to free."""
+
+
+@dataclass(eq=False)
+class _Player:
+    """A body in its environment."""
+
+    env: TaskEnv
+    acting: Controller
+    track: Track
+    running: bool = True
+
+
+class Rollout:
+    """Bodies under a policy; each has the episode that ``morphgen play`` has of the same seed."""
+
+    def __init__(
+        self,
+        wanted: Wanted,
+        places: Places,
+        progress: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        """Begin an episode.
+
+        Args:
+            wanted: What is to be played.
+            places: Where robots and checkpoints are.
+            progress: Told what is being done.
+
+        Raises:
+            MorphgenError: If none of the bodies can play; if only some cannot, ``faults`` says why.
+        """
+        self.faults: dict[str, str] = {}
+        self._players: list[_Player] = []
+        policy = policy_file(wanted.policy, wanted.task, places)
+        first: MorphgenError | None = None
+        for place in wanted.places[:MOST]:
+            progress(f"preparing {name_of(place)}")
+            try:
+                self._players.append(_player(wanted, place, policy, places))
+            except MorphgenError as error:
+                first = first or error
+                self.faults[place] = str(error)
+        if not self._players:
+            raise first or PlaceError("no robot is named: add one with &robot=")
+        self.longest = max(int(each.env.batch.longest[0]) for each in self._players)
+        self.episode = Episode(
+            wanted.task,
+            wanted.policy,
+            wanted.seed,
+            wanted.obstacles,
+            wanted.simulator,
+            CONTROL_PERIOD,
+            [each.track for each in self._players],
+        )
+
+    def advance(self) -> bool:
+        """Simulate a control step more of all that are not over; false if all are."""
+        running = [each for each in self._players if each.running]
+        for each in running:
+            _step(each)
+        return bool(running)
+
+    def close(self) -> None:
+        """Free the simulations."""
+        for each in self._players:
+            each.env.close()
+
+
+def simulators() -> list[SimulatorName]:
+    """Those that are installed, MuJoCo first."""
+    return [name for name in reversed(SIMULATORS) if find_spec(name)]
+
+
+def policy_file(policy: str, task: Task, places: Places) -> str:
+    """A policy as ``morphgen.rl.play`` knows it; the path of a checkpoint becomes absolute.
+
+    Raises:
+        TaskError: If there is none of that name, or it is for the other task.
+        PlaceError: If it is a file that may not be looked at.
+    """
+    if policy not in POLICIES:
+        with suppress(PlaceError):
+            return str(places.path(policy))
+        if "/" in policy or policy.endswith(".pt"):
+            places.path(policy)
+    require_policy(policy, task)
+    return policy
+
+
+def checkpoints(places: Places, most: int = 50) -> list[str]:
+    """The first checkpoints below the folder ``runs``, as addresses have them."""
+    root = places.roots[0]
+    found = sorted((root / "runs").rglob(CHECKPOINT))
+    return [path.relative_to(root).as_posix() for path in found[:most]]
+
+
+def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[str, str]]]:
+    """What the policy of a checkpoint was trained on.
+
+    Returns:
+        The task of the first body, whether any had obstacles (then the policy sees where some are),
+        and names and places of all.
+
+    Raises:
+        MorphgenError: If it is no checkpoint, or its robot has no parts to be made of.
+    """
+    source = read_checkpoint(places.path(policy))[0].source
+    rows = members(source)
+    if rows:
+        named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]
+        return rows[0].task, any(row.obstacles for row in rows), named
+    derivation = robot_of(source.name, library=places.folders).provenance.get("derivation")
+    place = f"{DERIVED}{derivation}" if derivation else source.name
+    return source.task or "reach", source.obstacles, [(source.name, place)]
+
+
+def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
+    read = read_place(place, places)
+    body = as_primitives(as_in_library(read, places.library), places.folders)
+    env = {"reach": ReachEnv, "push": PushEnv}[wanted.task](
+        body,
+        sim=wanted.simulator,
+        obstacles=wanted.obstacles,
+        kind=kind_of(policy) or "continuous",
+        library=places.folders,
+    )
+    try:
+        acting = controller(policy, env, wanted.seed)
+        env.batch.reset(wanted.seed)
+    except MorphgenError:
+        env.close()
+        raise
+    now, scene = moment(env.batch), env.setting.scene
+    track = Track(
+        split_colours(read),
+        place,
+        scene.ground,
+        scene.obstacles,
+        now.get("goal"),
+        scene.block.size if scene.block else None,
+        now.get("line"),
+        [now["q"]],
+        [now["block"]] if "block" in now else [],
+    )
+    return _Player(env, acting, track)
+
+
+def _step(player: _Player) -> None:
+    """Act once; an episode that ends is not followed by another."""
+    batch, track = player.env.batch, player.track
+    try:
+        step: Step = batch.step(player.acting.act(batch))
+    except MorphgenError as error:
+        player.running, track.fault = False, str(error)
+        return
+    if track.block:
+        track.block.append(_numbers(step.block_pose[0]))
+    track.score.append(float(step.score[0]))
+    track.distance.append(float(step.distance[0]))
+    track.success.append(bool(step.success[0]))
+    track.q.append(_numbers(step.q[0, : track.robot.dof]))
+    player.running = not bool(step.terminated[0] | step.truncated[0])
+
+
+def _numbers(values: torch.Tensor) -> Array:
+    return np.array(values.cpu().numpy(), dtype=np.float32)
