@@ -12,8 +12,10 @@ from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_reader import parse_split
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
+from morphgen.tasks.goal_npz import Goals
 from morphgen.tasks.robots import robot_of
 from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
+from morphgen.tasks.split_goals import read_goals
 
 
 @dataclass(frozen=True)
@@ -34,16 +36,29 @@ class Source:
     """The one member that is meant, if it is not all of the side."""
     goal_seed: int = 0
     """Of goals, starts and obstacles."""
+    goals: str = ""
+    """The folder where the split is built with the goal sets that are meant; or they are drawn."""
     library: tuple[str, ...] = ()
     """Folders of own parts."""
 
 
 def split_source(
-    split: Split, *, goal_seed: int = 0, library: tuple[Path, ...] = (), side: Side = "train"
+    split: Split,
+    *,
+    goal_seed: int = 0,
+    goals: Path | None = None,
+    library: tuple[Path, ...] = (),
+    side: Side = "train",
 ) -> Source:
-    """The robots of a side of a split."""
-    folders = tuple(str(folder.resolve()) for folder in library)
-    return Source(split.name, split_text(split), side=side, goal_seed=goal_seed, library=folders)
+    """The robots of a side of a split; ``goals`` is the folder where it is built with its sets."""
+    return Source(
+        split.name,
+        split_text(split),
+        side=side,
+        goal_seed=goal_seed,
+        goals=str(goals.resolve()) if goals is not None else "",
+        library=tuple(str(folder.resolve()) for folder in library),
+    )
 
 
 def robot_source(
@@ -117,12 +132,20 @@ def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
     """
     recipe = replace(recipe, seed=source.goal_seed)
     if source.split:
-        return [_of_member(member, source.library, recipe) for member in members(source)]
+        own = replace(source, split="", only=None)
+        return [_of_member(member, own, recipe) for member in members(source)]
     assert source.task is not None
     robot = robot_of(source.name, library=map(Path, source.library))
     return [setting_of(robot, source.task, recipe, obstacles=source.obstacles)]
 
 
 @lru_cache(maxsize=64)
-def _of_member(member: Member, library: tuple[str, ...], recipe: Recipe) -> Setting:
-    return member_setting(member, default_library(tuple(map(Path, library))), recipe)
+def _of_member(member: Member, source: Source, recipe: Recipe) -> Setting:
+    shipped = _shipped(source.goals, source.side)[member.name] if source.goals else None
+    library = default_library(tuple(map(Path, source.library)))
+    return member_setting(member, library, recipe, shipped=shipped)
+
+
+@lru_cache(maxsize=2)
+def _shipped(folder: str, side: Side) -> dict[str, Goals]:
+    return read_goals(folder, side)

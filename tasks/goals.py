@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
-import warnings
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +18,7 @@ from platformdirs import user_cache_path
 
 from morphgen.benchmark.split import robot_hash
 from morphgen.benchmark.workspace import shoulder
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, TaskError
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose, movable_positions
@@ -29,6 +26,7 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import draw_obstacles
+from morphgen.tasks.set_files import blocks_of, boxes_of, keep, load, require_own
 from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
@@ -66,8 +64,9 @@ def goal_set(
     seed: int,
     ground: float = 0.0,
     cache: Path | None = None,
+    shipped: GoalSet | None = None,
 ) -> GoalSet:
-    """A robot's goal set, from the cache or made and kept there.
+    """A robot's goal set: one that came with a split, or from the cache, or made and kept there.
 
     Configurations are drawn uniformly within the joint limits; what collides, with the ground and
     obstacles too, is drawn again. The same body, pairs to ignore, seed, ground, goals and obstacles
@@ -80,10 +79,12 @@ def goal_set(
         seed: Of all that is drawn, at least 0.
         ground: Height of the ground in the root frame, metres.
         cache: Folder of stored sets; by default ``goals`` in the user's cache.
+        shipped: The set to take, which must be of all this.
 
     Raises:
         BenchmarkError: If the set cannot be drawn: the robot has no tool that moves, hardly a free
-            configuration, or no room for obstacles; or if its file is broken.
+            configuration, or no room for obstacles.
+        TaskError: If its file is broken, or the one that is shipped is another.
         MeshError: If a mesh cannot be read.
     """
     if seed < 0 or config.goals < 1:
@@ -93,6 +94,9 @@ def goal_set(
     shoulder(robot)  # refuses a robot whose tool does not move
     body = robot_hash(robot)
     key = _key(robot, body, config, obstacles, seed, ground)
+    if shipped is not None:
+        require_own(shipped.key, key, robot.name)
+        return shipped
     folder = user_cache_path("morphgen") / "goals" if cache is None else cache
     path = folder / f"{key}.npz"
     if path.is_file():
@@ -107,7 +111,14 @@ def goal_set(
     q, tried = space.draw(config.goals, of_goals)
     poses = _vectors(frame_pose(robot, q, TOOL))
     made = GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
-    _keep(path, made)
+    arrays = {
+        "key": np.array(key),
+        "q": q,
+        "poses": poses,
+        "obstacles": boxes_of(placed),
+        "tried": np.array(tried),
+    }
+    keep(path, arrays, "goals")
     return made
 
 
@@ -198,44 +209,16 @@ def _key(
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _keep(path: Path, goals: GoalSet) -> None:
-    boxes = [
-        [*block.size, *block.pose.position, *block.pose.quaternion] for block in goals.obstacles
-    ]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
-            partial = Path(folder) / path.name
-            np.savez(
-                partial,
-                key=np.array(goals.key),
-                q=goals.q,
-                poses=goals.poses,
-                obstacles=np.array(boxes, dtype=np.float64).reshape(len(boxes), 10),
-                tried=np.array(goals.tried),
-            )
-            partial.replace(path)
-    except OSError as error:
-        warnings.warn(f"cannot keep goals in {path}: {error.strerror}", stacklevel=3)
-
-
 def _read(
     path: Path, robot: Robot, config: ReachConfig, obstacles: bool, seed: int, key: str
 ) -> GoalSet:
-    names = ("key", "q", "poses", "obstacles", "tried")
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            stored_key, q, poses, boxes, tried = (np.asarray(data[name]) for name in names)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise BenchmarkError(f"{path}: no goal set: {error}; delete it") from error
+    stored = load(path, ("key", "q", "poses", "obstacles", "tried"), "goal set")
+    q, boxes = stored["q"], stored["obstacles"]
     count = config.obstacles if obstacles else 0
-    if str(stored_key) != key or len(q) != config.goals or len(boxes) != count:
-        raise BenchmarkError(
-            f"{path}: {len(q)} goals and {len(boxes)} obstacles of key {stored_key}, not what its "
-            "name says; delete it"
+    if str(stored["key"]) != key or len(q) != config.goals or len(boxes) != count:
+        raise TaskError(
+            f"{path}: {len(q)} goals and {len(boxes)} obstacles of key {stored['key']}, not what "
+            "its name says; delete it"
         )
-    blocks = tuple(
-        Block((row[0], row[1], row[2]), Pose((row[3], row[4], row[5]), tuple(row[6:])))
-        for row in boxes.tolist()
-    )
-    return GoalSet(robot.name, key, q, poses, blocks, int(tried), len(q), seed)
+    tried, poses = int(stored["tried"]), stored["poses"]
+    return GoalSet(robot.name, key, q, poses, blocks_of(boxes), tried, len(q), seed)

@@ -20,6 +20,7 @@ from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.robots import robot_of
 from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
 from morphgen.tasks.sim.base import Contacts, Scene, Simulation
+from morphgen.tasks.split_goals import read_goals
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -98,6 +99,7 @@ def make_split_batch(
     num_envs: int,
     *,
     goal_seed: int = 0,
+    goals: Path | None = None,
     cache: Path | None = None,
     library: Iterable[Path] = (),
     **options: Unpack[BatchOptions],
@@ -109,16 +111,22 @@ def make_split_batch(
         side: Which of them.
         num_envs: How many environments, n; environment i has robot i modulo their number.
         goal_seed: Of goals, starts and obstacles.
+        goals: The folder where the split is built with goals: the sets there are taken.
         cache: Folder of these; by default the user's.
         library: Folders of your own parts.
         **options: See ``batch_of``.
 
     Raises:
-        MorphgenError: As ``make_batch``; or if a robot is not the one that the split was made with.
+        MorphgenError: As ``make_batch``; or if a robot is not the one that the split was made with,
+            or a set that is shipped not the one that it says.
     """
     folders = tuple(library)
     parts, recipe = default_library(folders), _recipe(goal_seed, options)
-    settings = [member_setting(member, parts, recipe, cache=cache) for member in split.side(side)]
+    shipped = read_goals(goals, side) if goals is not None else {}
+    settings = [
+        member_setting(member, parts, recipe, cache=cache, shipped=shipped.get(member.name))
+        for member in split.side(side)
+    ]
     return batch_of(settings, num_envs, library=folders, **options)
 
 

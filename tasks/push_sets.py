@@ -22,7 +22,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push_proofs import Prover
 from morphgen.tasks.push_region import Region, push_region
 from morphgen.tasks.push_ways import clear_obstacles, draw_places
-from morphgen.tasks.set_files import blocks_of, boxes_of, keep, load
+from morphgen.tasks.set_files import blocks_of, boxes_of, keep, load, require_own
 from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
@@ -75,6 +75,7 @@ def push_set(
     seed: int,
     ground: float = 0.0,
     cache: Path | None = None,
+    shipped: PushSet | None = None,
 ) -> PushSet:
     """A robot's push set, from the cache or made and kept there.
 
@@ -93,16 +94,21 @@ def push_set(
         seed: Of all that is drawn, at least 0.
         ground: Height of the ground in the root frame, metres.
         cache: Folder of stored sets; by default ``pushes`` in the user's cache.
+        shipped: The set to take, which must be of all this.
 
     Raises:
         TaskError: If the numbers are none, the robot cannot push, too few of the places tried can
-            be proven, obstacles stand in the way whatever is drawn, or the set's file is broken.
+            be proven, obstacles stand in the way whatever is drawn, the set's file is broken, or
+            the one that is shipped is another.
         BenchmarkError: If the robot has no tool that moves, or hardly a free configuration.
         MeshError: If a mesh cannot be read.
     """
     _require(config, seed)
     body = robot_hash(robot)
     key = _key(robot, body, config, obstacles, seed, ground)
+    if shipped is not None:
+        require_own(shipped.key, key, robot.name)
+        return shipped
     folder = user_cache_path("morphgen") / "pushes" if cache is None else cache
     path = folder / f"{key}.npz"
     if path.is_file():

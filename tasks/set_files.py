@@ -55,6 +55,19 @@ def load(path: Path, names: Iterable[str], what: str) -> dict[str, NDArray[Any]]
         raise TaskError(f"{path}: no {what}: {error}; delete it") from error
 
 
+def require_own(shipped: str, wanted: str, robot: str) -> None:
+    """Require that a set that came with a split is what would be drawn here, by their keys.
+
+    Raises:
+        TaskError: If it is not.
+    """
+    if shipped != wanted:
+        raise TaskError(
+            f"robot {robot!r}: the set that is shipped is of another body, seed, ground or other "
+            "constants of the task; morphgen split build --goals makes it anew"
+        )
+
+
 def boxes_of(blocks: Iterable[Block]) -> NDArray[np.float64]:
     """Sizes and poses of blocks, shape (n, 10)."""
     rows = [[*block.size, *block.pose.position, *block.pose.quaternion] for block in blocks]

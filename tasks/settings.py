@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 
 from morphgen.benchmark.split import Member, Task, member_robot
+from morphgen.errors import TaskError
 from morphgen.fitting.dressed import as_primitives
 from morphgen.grammar.library import Library
 from morphgen.model.inertia import bounding_box
@@ -39,6 +41,12 @@ class Recipe:
 BENCHMARK = Recipe()
 
 
+class _Own(TypedDict):
+    obstacles: bool
+    seed: int
+    cache: Path | None
+
+
 @dataclass(frozen=True, eq=False)
 class Setting:
     """A robot at a task; one of ``goals`` and ``pushes`` is there."""
@@ -61,39 +69,82 @@ def member_body(member: Member, library: Library) -> Robot:
 
 
 def member_setting(
-    member: Member, library: Library, recipe: Recipe = BENCHMARK, *, cache: Path | None = None
+    member: Member,
+    library: Library,
+    recipe: Recipe = BENCHMARK,
+    *,
+    cache: Path | None = None,
+    shipped: GoalSet | PushSet | None = None,
 ) -> Setting:
     """The robot of a member at its task; see ``member_body`` and ``setting_of``."""
     robot = member_body(member, library)
-    return setting_of(robot, member.task, recipe, obstacles=member.obstacles, cache=cache)
+    return setting_of(
+        robot, member.task, recipe, obstacles=member.obstacles, cache=cache, shipped=shipped
+    )
 
 
 def setting_of(
-    robot: Robot, task: Task, recipe: Recipe, *, obstacles: bool, cache: Path | None = None
+    robot: Robot,
+    task: Task,
+    recipe: Recipe,
+    *,
+    obstacles: bool,
+    cache: Path | None = None,
+    shipped: GoalSet | PushSet | None = None,
 ) -> Setting:
-    """A robot at a task; see ``reach_setting`` and ``push_setting``."""
-    if task == "reach":
-        return reach_setting(
-            robot, recipe.reach, obstacles=obstacles, seed=recipe.seed, cache=cache
-        )
-    return push_setting(robot, recipe.push, obstacles=obstacles, seed=recipe.seed, cache=cache)
+    """A robot at a task.
+
+    Args:
+        robot: The body.
+        task: What it does.
+        recipe: Seed and constants.
+        obstacles: Whether there are any.
+        cache: Folder of stored sets; by default the user's.
+        shipped: The set that a split brings, if it does.
+
+    Raises:
+        TaskError: If that set is another robot's, task's or recipe's.
+        MorphgenError: As ``goal_set`` and ``push_set``.
+    """
+    own: _Own = {"obstacles": obstacles, "seed": recipe.seed, "cache": cache}
+    if task == "reach" and (shipped is None or isinstance(shipped, GoalSet)):
+        return reach_setting(robot, recipe.reach, **own, shipped=shipped)
+    if task == "push" and (shipped is None or isinstance(shipped, PushSet)):
+        return push_setting(robot, recipe.push, **own, shipped=shipped)
+    raise TaskError(f"robot {robot.name!r}: the set that is shipped is not for {task}")
 
 
 def reach_setting(
-    robot: Robot, config: ReachConfig, *, obstacles: bool, seed: int, cache: Path | None = None
+    robot: Robot,
+    config: ReachConfig,
+    *,
+    obstacles: bool,
+    seed: int,
+    cache: Path | None = None,
+    shipped: GoalSet | None = None,
 ) -> Setting:
     """A robot that reaches for the goals of its set; see ``goal_set``."""
     ground = ground_under(robot)
-    goals = goal_set(robot, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
+    goals = goal_set(
+        robot, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache, shipped=shipped
+    )
     return Setting(robot, "reach", Scene(robot, obstacles=goals.obstacles, ground=ground), goals)
 
 
 def push_setting(
-    robot: Robot, config: PushConfig, *, obstacles: bool, seed: int, cache: Path | None = None
+    robot: Robot,
+    config: PushConfig,
+    *,
+    obstacles: bool,
+    seed: int,
+    cache: Path | None = None,
+    shipped: PushSet | None = None,
 ) -> Setting:
     """A robot that pushes the block of its set; see ``push_set``."""
     ground = ground_under(robot)
-    pushes = push_set(robot, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
+    pushes = push_set(
+        robot, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache, shipped=shipped
+    )
     scene = Scene(robot, block=pushes.block, obstacles=pushes.obstacles, ground=ground)
     return Setting(robot, "push", scene, pushes=pushes)
 

@@ -57,7 +57,9 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    parser.add_argument("--goal-seed", type=int, default=0, help="with --split: of all goals")
+    parser.add_argument(
+        "--goal-seed", type=int, help="with --split: of all goals (default: as shipped, else 0)"
+    )
     parser.add_argument("--out", metavar="FILE", type=Path, help="a table: .csv, .json or .md")
     add_library(parser)
     add_json(parser)

@@ -49,7 +49,9 @@ def add_parser(commands: Subparsers) -> None:
         "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
     )
     parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
-    parser.add_argument("--goal-seed", type=int, default=0, help="with --split: of all goals")
+    parser.add_argument(
+        "--goal-seed", type=int, help="with --split: of all goals (default: as shipped, else 0)"
+    )
     parser.add_argument(
         "--set",
         metavar="NAME=VALUE",

@@ -87,7 +87,9 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
         "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
     )
     parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
-    parser.add_argument("--goal-seed", type=int, default=0, help="of all goals (default: 0)")
+    parser.add_argument(
+        "--goal-seed", type=int, help="of all goals (default: as shipped with the split, else 0)"
+    )
     parser.add_argument(
         "--whole",
         action="store_true",
@@ -140,32 +142,47 @@ def source_of(words: list[str], args: argparse.Namespace) -> Source:
     """The robots that words mean.
 
     Raises:
-        TaskError: If a robot has no task, or the seed of the goals is none.
+        TaskError: If a robot has no task, or the seed of the goals is none, or not of those that
+            a built split ships.
         MorphgenError: If there is no such split.
     """
     from morphgen.cli.goals import read_split_or_built
     from morphgen.errors import BenchmarkError, TaskError
     from morphgen.rl.sources import robot_source, split_source
+    from morphgen.tasks.split_goals import has_goals, read_split_goals
 
-    if args.goal_seed < 0:
-        raise TaskError(f"--goal-seed {args.goal_seed}: expected 0 or more")
-    common = {"goal_seed": args.goal_seed, "library": tuple(args.library)}
+    seed = args.goal_seed or 0
+    if seed < 0:
+        raise TaskError(f"--goal-seed {seed}: expected 0 or more")
+    library = tuple(args.library)
     given = [word for word in words if word.startswith("task=")]
     robot = [word for word in words if not word.startswith("task=")]
     if given:
         task = given[-1].partition("=")[2]
         if len(given) > 1 or task not in ("reach", "push") or not robot:
             raise TaskError(f"{' '.join(words)}: name a robot and one task=reach or task=push")
-        return robot_source(" ".join(robot), task, obstacles=args.obstacles, **common)  # type: ignore[arg-type]
+        return robot_source(
+            " ".join(robot),
+            task,  # type: ignore[arg-type]
+            obstacles=args.obstacles,
+            goal_seed=seed,
+            library=library,
+        )
     if len(words) > 1 or "=" in words[0]:
         raise TaskError(f"{' '.join(words)}: a robot needs its task, task=reach or task=push")
     if args.obstacles:
         raise TaskError("--obstacles is for one robot; a split says which robots have any")
     try:
-        split, _ = read_split_or_built(words[0])
+        split, home = read_split_or_built(words[0])
     except BenchmarkError as error:
         raise BenchmarkError(f"{error}; a robot needs task=reach or task=push") from error
-    return split_source(split, side=args.on, **common)
+    shipped = home if home is not None and has_goals(home) else None
+    if shipped is not None:
+        made_with = read_split_goals(shipped).recipe.seed
+        if args.goal_seed not in (None, made_with):
+            raise TaskError(f"--goal-seed {seed}: the goals in {shipped} are of seed {made_with}")
+        seed = made_with
+    return split_source(split, side=args.on, goal_seed=seed, goals=shipped, library=library)
 
 
 def variant_of(args: argparse.Namespace) -> Variant:

@@ -13,6 +13,9 @@ from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_config
+from morphgen.rl.sources import settings_of
+from morphgen.tasks.settings import Recipe
+from morphgen.tasks.split_goals import read_goals
 from small_runs import equal, small_split, weights
 
 NETWORK = ("--set", "mlp_width=8")
@@ -99,6 +102,24 @@ def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_ya
     code, _, err = run("finetune", "a", "--steps", "32", "--envs", "4")
     assert code == 2
     assert "say --resume" in err
+
+
+def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_yaml):
+    build = ("split", "build", split_yaml, "--out", "built", "--goals", "--goal-seed", "5")
+    assert run(*build)[0] == 0
+    (index,) = Path("built").rglob("goals/index.json")
+    home = index.parents[1]
+    words = ("train", home, "--agent", "me-mlp", *SMALL, "--steps", "32", "--no-tensorboard")
+    assert run(*words, "--out", "a")[0] == 0
+    source = read_config(Path("a")).source
+    assert (source.goal_seed, source.goals) == (5, str(home.resolve()))
+    shipped = read_goals(home, "train")
+    for setting in settings_of(source, Recipe(5)):
+        assert (setting.goals.q == shipped[setting.robot.name].q).all()
+
+    code, _, err = run(*words, "--out", "b", "--goal-seed", "4")
+    assert (code, "the goals in " in err, "are of seed 5" in err) == (2, True, True)
+    assert not Path("b").exists()
 
 
 def test_every_switch_is_a_flag(run, tmp_path):

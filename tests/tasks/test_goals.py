@@ -11,7 +11,7 @@ import pytest
 
 from morphgen.benchmark.workspace import shoulder, workspace
 from morphgen.checks.self_collision import ignore_pairs
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import bounds, frame_pose
 from morphgen.model.robot import Link
@@ -251,7 +251,7 @@ def test_a_broken_file_is_named(body, cache, keep):
     made(body, cache)
     (path,) = cache.iterdir()
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(BenchmarkError, match=f"{path.name}: no goal set: .*; delete it"):
+    with pytest.raises(TaskError, match=f"{path.name}: no goal set: .*; delete it"):
         made(body, cache)
 
 
@@ -262,14 +262,14 @@ def test_a_changed_byte_is_noticed(body, cache):
     assert found.q.tobytes() in data
     at = data.index(found.q.tobytes()) + 5
     path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-    with pytest.raises(BenchmarkError, match="delete it"):
+    with pytest.raises(TaskError, match="delete it"):
         made(body, cache)
 
 
 def test_a_file_under_another_name_is_noticed(body, cache):
     first, second = made(body, cache), made(body, cache, seed=1)
     (cache / f"{first.key}.npz").replace(cache / f"{second.key}.npz")
-    with pytest.raises(BenchmarkError, match=f"12 goals and 0 obstacles of key {first.key}"):
+    with pytest.raises(TaskError, match=f"12 goals and 0 obstacles of key {first.key}"):
         made(body, cache, seed=1)
 
 

@@ -5,6 +5,7 @@ import json
 import pickle
 import re
 import zipfile
+from contextlib import closing
 from dataclasses import fields, replace
 
 import numpy as np
@@ -16,11 +17,12 @@ from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.tasks import free_space, goal_making, goals, settings, split_goals
+from morphgen.tasks import free_space, goal_making, goals, push_sets, settings, split_goals
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.goal_making import gathered, robot_goals
 from morphgen.tasks.goal_making import split_goals as make
 from morphgen.tasks.goal_npz import arrays_of, goals_from_npz, goals_npz
+from morphgen.tasks.make import make_split_batch
 from morphgen.tasks.settings import Recipe
 from morphgen.tasks.split_goals import read_goals, read_split_goals, write_goals
 from scenes import robot
@@ -197,6 +199,25 @@ def test_a_file_carries_no_time(cache):
     content = goals_npz(made(reaching(), cache)[0].goals)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_a_batch_takes_the_sets_that_are_shipped_and_refuses_others(home, cache, monkeypatch):
+    which = mixed()
+    write_goals(home, made(which, cache), RECIPE)
+    monkeypatch.setattr(push_sets, "_made", forbidden)
+    options = {"sim": "mujoco", "reach": RECIPE.reach, "push": RECIPE.push, "goals": home}
+    for side in ("train", "test"):
+        shipped = read_goals(home, side)
+        with closing(make_split_batch(which, side, 2, cache=home / "none", **options)) as batch:
+            for setting in batch.settings:
+                own = setting.goals or setting.pushes
+                assert same(own, shipped[setting.robot.name])
+    for wrong, words in (
+        ({"goal_seed": 1}, "seed"),
+        ({"reach": ReachConfig(goals=3)}, "constants"),
+    ):
+        with pytest.raises(MorphgenError, match=f"robot 'gantry-plane': the set .* {words}"):
+            make_split_batch(which, "train", 2, **{**options, **wrong})
 
 
 def test_the_index_says_what_the_sets_are(home, cache):
