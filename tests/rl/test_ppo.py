@@ -428,7 +428,7 @@ def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
     ids=["discrete", "continuous"],
 )
 def test_it_learns_two_bodies_and_two_tasks_at_once(discrete, options):
-    reports = trained(discrete=discrete, **options)
+    reports = trained(discrete=discrete, updates=20, **options)
     assert reports[0].success < 0.4
     assert reports[-1].success > 0.85
     assert min(reports[-1].scores) > max(reports[0].scores) + 0.2
