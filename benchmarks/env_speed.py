@@ -6,7 +6,8 @@ Reach and push of a Panda with its hand and reach of a UR5 with a plate, collisi
 primitives; random actions; steps of 5 ms, four to an action. Rows of a task:
 
 - raw PyBullet: the same scenes under the same actions, and of that only what is spent within
-  `stepSimulation`: as if targets, states, observations and rewards cost nothing.
+  `stepSimulation`: as if targets, states, observations and rewards cost nothing. In two processes,
+  each with half of the environments, it is what the machine's cores have to give.
 - morphgen with PyBullet in one process and in two, with MuJoCo in one thread and in two:
   observations, rewards and new episodes on.
 - morphgen with PyBullet and without self-collision, which panda-gym does not have.
@@ -23,10 +24,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -107,7 +110,10 @@ def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
         ("morphgen, MuJoCo, 1 thread", "mujoco", 1),
         ("morphgen, MuJoCo, 2 threads", "mujoco", 2),
     ]
-    rows = [Row(case, RAW, partial(_raw, task, robot, envs))]
+    rows = [
+        Row(case, RAW, partial(_raw, task, robot, envs)),
+        Row(case, f"{RAW}, 2 processes", partial(_raw_twice, task, robot, envs)),
+    ]
     for name, sim, workers in ours:
         rows.append(Row(case, name, partial(_ours, task, robot, envs, sim, workers, Contacts())))
     if peer:
@@ -163,6 +169,15 @@ def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
         finally:
             pybullet.stepSimulation = step
     return calls / spent
+
+
+def _raw_twice(task: Task, robot: str, envs: int, seconds: float) -> float:
+    """The same of two processes at once."""
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for size in (1, envs // 2):  # both have loaded everything before the clock starts
+            found = [pool.submit(_raw, task, robot, size, seconds) for _ in range(2)]
+            rates = [each.result() for each in found]
+    return sum(rates)
 
 
 def _peer(name: str, count: int, seconds: float) -> float:
