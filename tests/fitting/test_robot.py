@@ -217,8 +217,8 @@ def test_a_user_s_part_is_stored_beside_its_manifest(tmp_path):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("ur5", TOKEN),
         ("panda_hand", COLLISION),
+        pytest.param("ur5", TOKEN, marks=pytest.mark.slow),
         pytest.param("ur5", COLLISION, marks=pytest.mark.slow),
         pytest.param("xarm7", COLLISION, marks=pytest.mark.slow),
     ],
