@@ -5,15 +5,18 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from threading import Thread
+from types import ModuleType
 from typing import Any, TypeVar
 
-from morphgen.errors import MorphgenError
+from morphgen.errors import MissingDependencyError, MorphgenError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -23,6 +26,8 @@ Progress = Callable[[int, int], None]
 
 CHUNK = 8
 """Things that a worker does before it reports, unless told otherwise."""
+PATIENCE = 5.0
+"""Seconds to wait for an answer from a Ray cluster's address; Ray itself waits for minutes."""
 
 _work: Callable[[Any], object] | None = None
 
@@ -110,3 +115,42 @@ def _do(things: Sequence[Any]) -> list[Any]:
     if _work is None:
         raise RuntimeError("the worker was not prepared")
     return [_work(thing) for thing in things]
+
+
+def require_ray() -> ModuleType:
+    """The package ray.
+
+    Raises:
+        MissingDependencyError: If it is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--ray needs the package ray: pip install 'morphgen[ray]'"
+        ) from error
+    module: ModuleType = ray
+    return module
+
+
+@contextmanager
+def ray_cluster(address: str | None) -> Iterator[None]:
+    """Be connected to the Ray cluster at an address; without one, to a local Ray.
+
+    Raises:
+        MorphgenError: If there is none.
+    """
+    ray = require_ray()
+    own = not ray.is_initialized()
+    host, _, port = (address or "").rpartition(":")
+    try:
+        if port.isdecimal():
+            socket.create_connection((host.removeprefix("ray://"), int(port)), PATIENCE).close()
+        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
+    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+        raise MorphgenError(f"no Ray cluster at {address!r}: {error}") from error
+    try:
+        yield
+    finally:
+        if own:
+            ray.shutdown()

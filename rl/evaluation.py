@@ -14,27 +14,19 @@ from morphgen.benchmark.split import Side, Task
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics import reach
 from morphgen.rl.intervals import mean_interval
-from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.named import REFERENCES, reference
+from morphgen.rl.references import Random
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import RunConfig, read_checkpoint
-from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.rl.sources import Source, other_side, settings_of
 from morphgen.rl.trained import Mode, Policy
 from morphgen.rl.training import checkpoints
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import PushConfig, ReachConfig
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import SimulatorName, batch_of
 from morphgen.tasks.settings import Recipe, Setting
 
-REFERENCES: dict[str, tuple[Task, ...]] = {
-    "random": ("reach", "push"),
-    "zero": ("reach", "push"),
-    "ik": ("reach",),
-    "scripted": ("push",),
-}
-"""Controllers that learn nothing, and the tasks that they are for."""
 STEPS = 10_000
 """Control steps of an evaluation, a robot (paper)."""
 AT_ONCE = 34
@@ -170,12 +162,7 @@ def evaluate_reference(name: str, source: Source, exam: Exam) -> list[Score]:
         raise TaskError(f"unknown reference {name!r}{nearest(name, REFERENCES)}")
 
     def acting(batch: TaskBatch) -> Controller:
-        if name == "ik":
-            spaces = [FreeSpace(setting.scene) for setting in batch.settings]
-            return InverseKinematics(exam.seed, spaces)
-        if name == "scripted":
-            return ScriptedPush(exam.seed)
-        return Random(exam.seed) if name == "random" else Zero()
+        return reference(name, batch, exam.seed)
 
     return evaluate([acting], source, exam, kind="continuous", tasks=REFERENCES[name])
 

@@ -9,15 +9,13 @@ import numpy as np
 
 from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.named import REFERENCES, reference
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import read_checkpoint
-from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.rl.trained import Policy
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import Frame
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.gym_env import TaskEnv
 
 POLICIES = ("zero", "random", "ik", "scripted")
@@ -25,7 +23,6 @@ STRIDE = 2
 """Control steps between two pictures."""
 FPS = 1 / (STRIDE * CONTROL_PERIOD)
 """Pictures a second, so that films run as fast as what they show: 25."""
-_ONLY_FOR: dict[str, Task] = {"ik": "reach", "scripted": "push"}
 
 
 def require_policy(name: str, task: Task) -> None:
@@ -36,10 +33,11 @@ def require_policy(name: str, task: Task) -> None:
     """
     if _is_file(name):
         return
-    valid = [policy for policy in POLICIES if _ONLY_FOR.get(policy, task) == task]
+    valid = [policy for policy in POLICIES if task in REFERENCES[policy]]
     if name in POLICIES and name not in valid:
         raise TaskError(
-            f"policy {name!r} is for {_ONLY_FOR[name]}, not for {task}; valid: {', '.join(valid)}"
+            f"policy {name!r} is for {REFERENCES[name][0]}, not for {task}; "
+            f"valid: {', '.join(valid)}"
         )
     if name not in POLICIES:
         raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
@@ -76,11 +74,7 @@ def controller(name: str, env: TaskEnv, seed: int) -> Controller:
         policy = Policy(learner, "deterministic", seed)
         policy.require(env.batch.observe())
         return policy
-    if name == "ik":
-        return InverseKinematics(seed, [FreeSpace(env.setting.scene)])
-    if name == "scripted":
-        return ScriptedPush(seed)
-    return Random(seed) if name == "random" else Zero()
+    return reference(name, env.batch, seed)
 
 
 def play(

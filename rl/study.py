@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import json
 import math
-import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from morphgen.benchmark.split import Side
-from morphgen.errors import FormatError, MissingDependencyError, MorphgenError, TaskError
+from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_atomic
+from morphgen.processes import ray_cluster, require_ray
 from morphgen.rl.evaluation import (
-    REFERENCES,
     Exam,
     Score,
     as_data,
     evaluate_reference,
     evaluate_run,
 )
+from morphgen.rl.named import REFERENCES
 from morphgen.rl.runs import RunConfig, require_open
 from morphgen.rl.sources import Source, other_side, tasks_of
 from morphgen.rl.trained import MODES
@@ -185,17 +184,10 @@ def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
     Raises:
         MissingDependencyError: If ray is not installed.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingDependencyError(
-            "--ray needs the package ray: pip install 'morphgen[ray]'"
-        ) from error
+    ray = require_ray()
 
     def work(cells: Sequence[Cell], way: Way) -> Iterator[Outcome]:
-        own = not ray.is_initialized()
-        _connect(ray, address)
-        try:
+        with ray_cluster(address):
             remote = ray.remote(num_cpus=way.workers, num_gpus=gpus, max_retries=0)(_on_ray)
             running = {
                 remote.remote(replace(cell, folder=cell.folder.resolve()), way): cell
@@ -210,9 +202,6 @@ def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
                     raise error.cause if error.cause is not None else error from None
                 except ray.exceptions.RayError as error:
                     yield Outcome(cell, f"its Ray worker died: {type(error).__name__}")
-        finally:
-            if own:
-                ray.shutdown()
 
     return work
 
@@ -220,16 +209,6 @@ def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
 def _on_ray(cell: Cell, way: Way) -> str:
     (outcome,) = work_here([cell], way)
     return outcome.why
-
-
-def _connect(ray: ModuleType, address: str | None) -> None:
-    host, _, port = (address or "").rpartition(":")
-    try:
-        if port.isdecimal():
-            socket.create_connection((host.removeprefix("ray://"), int(port)), 5.0).close()
-        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
-    except (OSError, OverflowError, RuntimeError, ValueError) as error:
-        raise MorphgenError(f"no Ray cluster at {address!r}: {error}") from error
 
 
 def _alone(cell: Cell, way: Way, show: Callable[[Part], Show] | None) -> Outcome | None:

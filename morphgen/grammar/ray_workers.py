@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import socket
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
-from morphgen.errors import MissingDependencyError, MorphgenError
+from morphgen.errors import MorphgenError
 from morphgen.grammar.robot_set import Maker, Record, SetPlan, Work
-from morphgen.processes import CHUNK
-
-PATIENCE = 5.0
-"""Seconds to wait for an answer from the cluster's address; Ray itself waits for minutes."""
+from morphgen.processes import CHUNK, ray_cluster, require_ray
 
 
 def make_on_ray(address: str | None) -> Work:
@@ -25,41 +21,22 @@ def make_on_ray(address: str | None) -> Work:
     Raises:
         MissingDependencyError: If ray is not installed.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingDependencyError(
-            "--ray needs the package ray: pip install 'morphgen[ray]'"
-        ) from error
+    ray = require_ray()
 
     def work(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
         if not indices:
             return
-        own = not ray.is_initialized()
-        _connect(ray, address)
         try:
-            yield from _spread(ray, replace(plan, folder=plan.folder.resolve()), indices)
+            with ray_cluster(address):
+                yield from _spread(ray, replace(plan, folder=plan.folder.resolve()), indices)
         except ray.exceptions.RayTaskError as error:
             raise error.cause if isinstance(error.cause, MorphgenError) else error from None
         except ray.exceptions.RayError as error:
             raise MorphgenError(
                 f"a Ray worker died ({error}); what is done is kept: run again"
             ) from error
-        finally:
-            if own:
-                ray.shutdown()
 
     return work
-
-
-def _connect(ray: ModuleType, address: str | None) -> None:
-    host, _, port = (address or "").rpartition(":")
-    try:
-        if port.isdecimal():
-            socket.create_connection((host.removeprefix("ray://"), int(port)), PATIENCE).close()
-        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
-    except (OSError, OverflowError, RuntimeError, ValueError) as error:
-        raise MorphgenError(f"no Ray cluster at {address!r}: {error}") from error
 
 
 def _spread(ray: ModuleType, plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
