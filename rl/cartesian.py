@@ -18,6 +18,9 @@ DAMPING_TURN = 0.1
 LARGEST = 0.3
 """Largest change of a joint in an iteration of ``OneTool.brought``, rad or m."""
 
+_PARTS = (0.25, 0.5, 0.75, 1.0)
+"""Of a turn that are tried, if there is not the time for all of it."""
+
 
 def towards(
     bodies: Bodies,
@@ -25,6 +28,8 @@ def towards(
     q: torch.Tensor,
     position: torch.Tensor,
     rotation: torch.Tensor,
+    *,
+    hasty: bool = False,
 ) -> torch.Tensor:
     """Configurations whose tools are nearer to poses, first in position, then in rotation.
 
@@ -37,6 +42,7 @@ def towards(
         q: Where joints are, shape (n, J).
         position: Where the tools are to be in their root frames, shape (n, 3), metres.
         rotation: How they are to be turned there, shape (n, 3, 3).
+        hasty: Turn only as far as no joint needs more than a control step for it.
 
     Returns:
         Within limits, shape (n, J).
@@ -55,7 +61,8 @@ def towards(
         step = inverse @ off
         rest = eye - inverse @ linear
         left = angular @ rest
-        step = step + rest @ (_damped_inverse(left, DAMPING_TURN) @ (turn - angular @ step))
+        back = rest @ (_damped_inverse(left, DAMPING_TURN) @ (turn - angular @ step))
+        step = step + (_affordable(step, back, bodies.step[body]) if hasty else back)
         found = q + step[..., 0]
         moves = moves & (found >= lower) & (found <= upper)
     return torch.clamp(found, lower, upper)
@@ -102,6 +109,15 @@ class OneTool:
         rows = torch.zeros(len(q), self._bodies.max_joints, device=device)
         rows[:, : self._dof] = torch.from_numpy(q).to(rows)
         return torch.full((len(q),), self._index, device=device), rows
+
+
+def _affordable(step: torch.Tensor, more: torch.Tensor, most: torch.Tensor) -> torch.Tensor:
+    """The largest of some parts of a change that joints can make beside another, all (n, J, 1)."""
+    found = torch.zeros_like(more)
+    for part in _PARTS:
+        within = ((step + part * more)[..., 0].abs() <= most).all(dim=1)
+        found = torch.where(within[:, None, None], part * more, found)
+    return found
 
 
 def _damped_inverse(J: torch.Tensor, damping: float) -> torch.Tensor:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.kinematics import bounds
+from morphgen.model.robot import Robot
 from morphgen.rl.connect import connected, explored
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
@@ -61,12 +62,24 @@ class FreeWays:
         robot = space.scene.robot
         self._moves = np.ones(robot.dof, dtype=np.bool_) if moves is None else moves
         self._home, self._bounds = np.array(robot.home), bounds(robot)
+        self._turns = whole_turns(robot)
         self._seed = int(rng.integers(2**63))
         self._stops, _ = space.draw(STOPS * ATTEMPTS, rng)
 
     def steps(self, start: Array, ends: Array) -> Array:
         """Control steps that straight ways to ends (..., dof) take, shape (...,)."""
         return np.asarray((np.abs(ends - start) / self._step).max(axis=-1))
+
+    def unwound(self, start: Array, ends: Array) -> Array:
+        """The same poses as of configurations (..., dof), with joints turned as little as may be.
+
+        Joints that may turn more than once around are turned back by whole turns to where they are
+        nearest to the start (dof,).
+        """
+        lower, upper = self._bounds.T
+        turns = np.round((start - ends) / (2 * np.pi)) * self._turns
+        least, most = ((bound - ends) / (2 * np.pi) for bound in (lower, upper))
+        return np.asarray(ends + 2 * np.pi * np.clip(turns, np.ceil(least), np.floor(most)))
 
     def find(
         self,
@@ -100,7 +113,7 @@ class FreeWays:
             return known[key]
 
         first = STOPS * (attempt % ATTEMPTS)
-        drawn = [self._home, *self._stops[first : first + STOPS]]
+        drawn = self.unwound(start, np.array([self._home, *self._stops[first : first + STOPS]]))
         stops = [np.where(self._moves, stop, start) for stop in drawn]
         ways = self._ways(start, ends, vias, stops, costs)
         for _, way in sorted(ways, key=lambda each: each[0]):
@@ -161,6 +174,13 @@ class FreeWays:
         way = start + np.linspace(0, 1, parts)[:, None] * (end - start)
         free = self._space.free(way, None if block is None else np.tile(block, (parts, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (parts - 1)
+
+
+def whole_turns(robot: Robot) -> NDArray[np.bool_]:
+    """Joints that are as they were after a whole turn, shape (dof,): no other joint follows one."""
+    followed = (robot.mimic_map[0] != 0).sum(axis=0) > 1
+    turning = [robot.joints[k].kind in ("revolute", "continuous") for k in robot.independent]
+    return np.array(turning, dtype=np.bool_) & ~followed
 
 
 class Routes:

@@ -26,8 +26,9 @@ SPEED = 0.006
 
 _BEHIND = (0.1, 0.4, 0.8, 1.3)
 """Distances of the tool behind the block's hindmost point that are tried, in its edges."""
-_NEAREST = 24
-"""Configurations from which each of them is tried."""
+_NEAREST, _QUICKEST = 24, 36
+"""Configurations from which each of them is tried: where the tool is near it, and those to which
+the joints get soonest."""
 _LOW, _HIGH = 0.2, 0.7
 """Heights of the tool that are aimed at, in edges."""
 _KEPT = 14
@@ -139,20 +140,22 @@ class PushPlanner:
         edge = self._edge
         yaw = 2 * np.arctan2(block[6], block[3])
         hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
+        bank = self._ways.unwound(q, self._bank)
+        quick = np.argsort(self._ways.steps(q, bank), kind="stable")[:_QUICKEST]
         goals, starts = [], []
         for distance in _BEHIND:
             place = np.array([block[0], hindmost - distance * edge])
             apart = np.linalg.norm(self._tools[:, :2] - place, axis=1)
-            near = np.argsort(apart, kind="stable")[:_NEAREST]
+            near = np.concatenate([np.argsort(apart, kind="stable")[:_NEAREST], quick])
             height = np.clip(self._tools[near, 2] - self._ground, _LOW * edge, _HIGH * edge)
             goals.append(np.column_stack([np.tile(place, (len(near), 1)), self._ground + height]))
-            starts.append(self._bank[near])
+            starts.append(bank[near])
         start, goal = np.concatenate(starts), np.concatenate(goals)
         start[::2, self._others] = q[self._others]
         start[1::2, self._others] = np.array(self._robot.home)[self._others]
         found, error = bring_tool(self._robot, start, goal)
         there = (np.abs(error[:, :2]) < _REACHED * edge).all(axis=1)
-        found = found[there & (np.abs(error[:, 2]) < edge / 2)]
+        found = self._ways.unwound(q, found[there & (np.abs(error[:, 2]) < edge / 2)])
         return found[self._space.free(found, np.tile(block, (len(found), 1)))]
 
     def _given_way(self, q: Array) -> Array:

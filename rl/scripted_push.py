@@ -195,7 +195,7 @@ def _pushed(
     on = torch.where(lead < state.lead, SPEED, 0.0)
     goal += torch.stack([aside.clamp(-SPEED, SPEED), on, torch.zeros_like(on)], dim=1)
     goal[:, 2] = state.height
-    wanted = towards(task.bodies, task.body, task.targets, goal, state.rotation)
+    wanted = towards(task.bodies, task.body, task.targets, goal, state.rotation, hasty=True)
     missed = goal[:, 1] - tool_positions(task.bodies.chain, task.body, wanted)[:, 1]
     stands = state.pushing & (on > 0) & (missed > 0.8 * SPEED)
     state.stuck = torch.where(stands, state.stuck + 1, 0)

@@ -27,7 +27,7 @@ from morphgen.rl.evaluation import (
 )
 from morphgen.rl.named import REFERENCES
 from morphgen.rl.runs import RunConfig, require_open
-from morphgen.rl.sources import Source, other_side, tasks_of
+from morphgen.rl.sources import Source, members, other_side, tasks_of
 from morphgen.rl.trained import MODES
 from morphgen.rl.training import Part, Show, Way, train
 
@@ -84,6 +84,19 @@ def agent_cell(folder: Path, agent: str, config: RunConfig, exam: Exam) -> Cell:
     source = config.source
     place = folder / source.name / agent / f"seed{config.seed}"
     return Cell(place, source.name, agent, config.seed, source, _plain(exam), config)
+
+
+def for_its_robots(config: RunConfig) -> RunConfig:
+    """A run on a split's test robots with as much of each as a run on its train robots has.
+
+    Others are as they are, and so are all that give each robot the whole.
+    """
+    if config.source.side == "train" or config.whole:
+        return config
+    own, other = len(members(config.source)), len(members(other_side(config.source, "train")))
+    transitions = -(-config.ppo.transitions * own // other)
+    ppo = replace(config.ppo, transitions=transitions)
+    return replace(config, ppo=ppo, envs=-(-config.envs * own // other))
 
 
 def read_scores(cell: Cell) -> dict[str, list[Score]] | None:

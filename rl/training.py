@@ -27,8 +27,13 @@ from morphgen.rl.sources import apart, settings_of
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.settings import Recipe
 
-OFTEN, SHARE = 25, 10
-"""Updates between checkpoints: so many, or this share of a run if that is fewer."""
+LEAST, MOST = 1500, 3000
+"""Control steps of an environment between checkpoints: five and ten of the tasks' episodes.
+
+After each episodes begin anew, so that few of them are cut short; a checkpoint has no simulator's
+state."""
+PARTS, FEWEST = 10, 4
+"""Checkpoints of a run if these steps allow it, and if they are too many for it."""
 ROBOTS = "robots"
 """Where the runs of single robots are in the folder of a run of ``se`` on a split."""
 
@@ -183,6 +188,13 @@ def is_done(part: Part) -> bool:
     return bool(read_checkpoint(part.folder)[1]["update"] >= part.config.updates)
 
 
+def updates_between(config: RunConfig) -> int:
+    """How many updates there are from a checkpoint of a run to the next."""
+    steps = config.ppo.steps
+    span = min(max(config.updates * steps // PARTS, LEAST), MOST)
+    return max(min(-(-span // steps), config.updates // FEWEST), 1)
+
+
 @contextmanager
 def _learner(part: Part, way: Way) -> Iterator[Learner]:
     """The learner of a part, as far as it got."""
@@ -211,7 +223,7 @@ def _learner(part: Part, way: Way) -> Iterator[Learner]:
 
 
 def _learn(learner: Learner, part: Part, way: Way, show: Show) -> None:
-    often = max(min(OFTEN, learner.updates // SHARE), 1)
+    often = updates_between(part.config)
     kept = recording(
         part.folder,
         part.config,

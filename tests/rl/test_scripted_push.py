@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.kinematics import bounds, forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.rl.cartesian import OneTool, towards
-from morphgen.rl.free_ways import FreeWays
+from morphgen.rl.free_ways import FreeWays, whole_turns
 from morphgen.rl.push_contacts import poised
 from morphgen.rl.push_plans import PushPlanner
 from morphgen.rl.scripted_push import PLANS, ScriptedPush
@@ -170,6 +171,24 @@ def test_joints_at_their_limits_leave_it_to_the_others():
         assert (q <= bodies.upper).all()
 
 
+def test_who_is_in_haste_turns_no_farther_than_joints_get_in_a_step():
+    bodies = bodies_of([robot(PANDA)])
+    body, q = torch.tensor([0]), bodies.home.clone()
+    T = tool_frames(bodies.chain, body, q)[:, -1]
+    goal = T[:, :3, 3] + torch.tensor([[0.0, 0.004, 0.0]])
+    quarter = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    turned = quarter @ T[:, :3, :3]
+    slow = towards(bodies, body, q, goal, turned) - q
+    fast = towards(bodies, body, q, goal, turned, hasty=True) - q
+    assert (slow.abs() > bodies.step).any()
+    assert (fast.abs() <= bodies.step).all()
+    moved = tool_frames(bodies.chain, body, q + fast)[0, -1, :3, 3]
+    assert moved.numpy() == pytest.approx(goal[0].numpy(), abs=5e-4)
+    near = T[:, :3, :3]
+    both = [towards(bodies, body, q, goal, near, hasty=hasty) for hasty in (False, True)]
+    assert torch.equal(*both), "where all joints are fast enough nothing is given up"
+
+
 def ball(height):
     """A ball of 0.1 m on slides along x and y."""
     base, cart, last = Link("base"), Link("cart"), Link("ball", collisions=(Shape(Sphere(0.1)),))
@@ -219,6 +238,31 @@ def test_ways_go_round_what_is_in_between():
     on_the_end = np.array([-0.5, 0.5, 0.1, 1.0, 0.0, 0.0, 0.0])
     assert ways.find(start, ends[1:], block=on_the_end) is None
     assert ways.find(start, ends[1:]).points[-1].tolist() == ends[1].tolist()
+
+
+def test_ends_are_those_that_turn_least():
+    body = robot(UR5)
+    ways = FreeWays(FreeSpace(Scene(body)), np.full(6, 0.1), np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    start, ends = rng.uniform(-6, 6, 6), random_configurations(body, 200, rng)
+    found = ways.unwound(start, ends)
+    assert forward_kinematics(body, found) == pytest.approx(forward_kinematics(body, ends))
+    lower, upper = bounds(body).T
+    assert (lower <= found).all()
+    assert (found <= upper).all()
+    apart = np.abs(found - start)
+    assert (apart <= np.abs(ends - start) + 1e-9).all()
+    others = [found + turn for turn in (-2 * np.pi, 2 * np.pi)]
+    nearer = [
+        (np.abs(each - start) < apart - 1e-9) & (lower <= each) & (each <= upper) for each in others
+    ]
+    assert not np.any(nearer)
+    assert (apart < np.abs(ends - start) - 6).any()
+
+
+def test_a_joint_that_another_follows_is_not_turned_back():
+    turns = whole_turns(robot(PANDA))
+    assert turns.tolist() == [True] * 7 + [False]
 
 
 def test_a_plate_touches_on_its_whole_breadth():

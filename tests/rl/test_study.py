@@ -4,6 +4,7 @@ import csv
 import json
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,10 +18,11 @@ from morphgen.rl import study
 from morphgen.rl.evaluation import Score
 from morphgen.rl.recorders import METRICS
 from morphgen.rl.runs import CHECKPOINT
-from morphgen.rl.sources import other_side
+from morphgen.rl.sources import members, other_side
 from morphgen.rl.study import (
     SCORES,
     agent_cell,
+    for_its_robots,
     read_scores,
     reference_cells,
     work_here,
@@ -28,6 +30,7 @@ from morphgen.rl.study import (
 )
 from morphgen.rl.tables import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
 from morphgen.rl.trained import MODES
+from morphgen.rl.training import parts_of
 from small_runs import EXAM, QUIET, equal, small_config, small_source, weights
 
 pytestmark = pytest.mark.slow
@@ -243,6 +246,19 @@ def test_an_agent_trained_on_the_test_robots_has_no_other_score(tmp_path):
     assert set(row.groups) == {"test"}
     assert " - " in table_text([row])
     assert "missing" not in table_text([row])
+
+
+def test_an_agent_on_the_test_robots_has_as_much_data_of_each_as_on_the_train_robots():
+    source = other_side(small_source(), "test")
+    train, test = (len(members(other_side(source, side))) for side in ("train", "test"))
+    config = small_config(source, agent="se", transitions=6400)
+    own = for_its_robots(config)
+    assert own.ppo.transitions == -(-6400 * test // train)
+    assert own.envs == -(-config.envs * test // train)
+    (part, *_) = parts_of(Path("se"), replace(config, source=other_side(source, "train")))
+    (alone, *_) = parts_of(Path("se@test"), own)
+    assert (alone.config.ppo, alone.config.envs) == (part.config.ppo, part.config.envs)
+    assert for_its_robots(replace(config, whole=True)) == replace(config, whole=True)
 
 
 @pytest.mark.slow

@@ -15,7 +15,14 @@ from morphgen.formats.files import alone
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
-from morphgen.rl.training import Way, checkpoints, parts_of, require_runnable, train
+from morphgen.rl.training import (
+    Way,
+    checkpoints,
+    parts_of,
+    require_runnable,
+    train,
+    updates_between,
+)
 from on_a_line import OnALine
 from small_runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
 
@@ -60,12 +67,12 @@ def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
     assert (run, learner["update"]) == (config, 6)
 
 
-@pytest.mark.parametrize("stops", [(1,), (4,), (3, 5)], ids=str)
+@pytest.mark.parametrize("stops", [(1,), (8,), (7, 13)], ids=str)
 def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp_path, stops):
     config = small_config(small_source(), transitions=24 * 4 * 8, slow_critic=True)
     train(tmp_path / "whole", config, way=QUIET)
     assert config.updates == 24
-    often = 2  # updates between its checkpoints
+    often = 6  # updates between its checkpoints
     for stop in stops:
         with pytest.raises(StoppedError):
             train(tmp_path / "cut", config, resume=True, way=QUIET, show=stop_after(stop))
@@ -84,6 +91,22 @@ def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp
     assert first[0] == stops[-1] // often * often + 1
     assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
     assert untimed(tmp_path / "whole") == untimed(tmp_path / "cut")
+
+
+@pytest.mark.parametrize(
+    ("updates", "steps", "expected"),
+    [
+        (100_000, 128, 24),  # ten episodes
+        (150, 128, 15),  # a tenth
+        (150, 32, 37),  # a fourth
+        (400, 32, 47),  # five episodes
+        (3, 8, 1),
+    ],
+)
+def test_checkpoints_are_five_to_ten_episodes_apart_and_four_at_least(updates, steps, expected):
+    config = small_config(transitions=4 * steps * updates, steps=steps)
+    assert config.updates == updates
+    assert updates_between(config) == expected
 
 
 def test_other_seeds_come_to_other_weights_and_other_workers_to_the_same(tmp_path):
