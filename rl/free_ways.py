@@ -179,8 +179,8 @@ class FreeWays:
 def whole_turns(robot: Robot) -> NDArray[np.bool_]:
     """Joints that are as they were after a whole turn, shape (dof,): no other joint follows one."""
     followed = (robot.mimic_map[0] != 0).sum(axis=0) > 1
-    turning = [robot.joints[k].kind in ("revolute", "continuous") for k in robot.independent]
-    return np.array(turning, dtype=np.bool_) & ~followed
+    kinds = np.array([robot.joints[k].kind for k in robot.independent])
+    return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~followed)
 
 
 class Routes:

@@ -102,7 +102,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
             for seed in seeds:
                 config = config_of(other_side(source, side), variant, _with(args, seed))
                 config = for_its_robots(replace(config, seed=seed))
-                for part in parts_of(args.out, config):
+                for part in () if args.report else parts_of(args.out, config):
                     require_runnable(part.config)
                 made.append(agent_cell(args.out, text, config, exam))
     return made

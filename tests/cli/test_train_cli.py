@@ -176,6 +176,13 @@ def test_a_run_cut_short_equals_one_that_was_not(run, tmp_path):
     assert len(read_metrics(tmp_path / "cut")) == 3
 
 
+def test_tables_of_runs_on_a_gpu_are_written_without_one(run, split_yaml, tmp_path):
+    words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0", *SMALL)
+    code, out, _ = run(*words, "--device", "cuda", "--report")
+    assert code == 0
+    assert "missing" in out
+
+
 def test_a_study_is_a_table(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp,me-mlp-discrete", "--seeds", "0..1", *SMALL)
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
