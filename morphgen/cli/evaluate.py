@@ -24,7 +24,7 @@ def add_parser(commands: Subparsers) -> None:
     parser = commands.add_parser(
         "eval",
         help="score a trained policy, or a reference controller, robot by robot",
-        description="Run episodes of every robot and print scores with 95%% bootstrap intervals "
+        description="Run episodes of every robot and print scores with 95% bootstrap intervals "
         "over episodes. The score of reach is above that of random actions; that of push is the "
         "success rate.",
         epilog="examples: morphgen eval runs/interpolation/arm3/reach/me-tf/seed0 --on test; "
