@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from morphgen.benchmark.split import Task
 from morphgen.rl.references import InverseKinematics, Random, Zero
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
 
-REFERENCES: dict[str, tuple[Task, ...]] = {
-    "random": ("reach", "push"),
-    "zero": ("reach", "push"),
-    "ik": ("reach",),
-    "scripted": ("push",),
-}
-"""Their names, and the tasks that they are for."""
-
 
 def reference(name: str, batch: TaskBatch, seed: int) -> Controller:
-    """The controller of a name in ``REFERENCES``, for a batch.
+    """The controller of a name in ``morphgen.rl.names.REFERENCES``, for a batch.
 
     Raises:
         BenchmarkError: If a robot has hardly a free configuration.

@@ -9,7 +9,8 @@ import numpy as np
 
 from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.named import REFERENCES, reference
+from morphgen.rl.named import reference
+from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.trained import Policy
@@ -18,7 +19,6 @@ from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import Frame
 from morphgen.tasks.gym_env import TaskEnv
 
-POLICIES = ("zero", "random", "ik", "scripted")
 STRIDE = 2
 """Control steps between two pictures."""
 FPS = 1 / (STRIDE * CONTROL_PERIOD)
@@ -33,13 +33,13 @@ def require_policy(name: str, task: Task) -> None:
     """
     if _is_file(name):
         return
-    valid = [policy for policy in POLICIES if task in REFERENCES[policy]]
-    if name in POLICIES and name not in valid:
+    valid = references_for(task)
+    if name in REFERENCES and name not in valid:
         raise TaskError(
             f"policy {name!r} is for {REFERENCES[name][0]}, not for {task}; "
             f"valid: {', '.join(valid)}"
         )
-    if name not in POLICIES:
+    if name not in REFERENCES:
         raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
 
 
@@ -117,7 +117,7 @@ def play(
 
 
 def _is_file(policy: str) -> bool:
-    return policy not in POLICIES and Path(policy).exists()
+    return policy not in REFERENCES and Path(policy).exists()
 
 
 def _shown(env: TaskEnv) -> Iterator[Frame]:

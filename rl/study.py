@@ -25,7 +25,7 @@ from morphgen.rl.evaluation import (
     evaluate_reference,
     evaluate_run,
 )
-from morphgen.rl.named import REFERENCES
+from morphgen.rl.names import REFERENCES
 from morphgen.rl.runs import RunConfig, require_open
 from morphgen.rl.sources import Source, members, other_side, tasks_of
 from morphgen.rl.trained import MODES

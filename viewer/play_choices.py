@@ -8,9 +8,9 @@ from typing import Any
 
 import viser
 
-from morphgen.benchmark.split import TASKS, Task
+from morphgen.benchmark.split import TASKS
 from morphgen.errors import MorphgenError, nearest
-from morphgen.rl.play import POLICIES
+from morphgen.rl.names import REFERENCES, references_for
 from morphgen.viewer import browser, play_bodies
 from morphgen.viewer.address import Address
 from morphgen.viewer.places import WORDS, name_of
@@ -19,11 +19,6 @@ from morphgen.viewer.play_screen import PlayPage, asked, playing
 from morphgen.viewer.rollout import MOST, Rollout, Wanted, checkpoints, simulators, trained_with
 from morphgen.viewer.session import say, set_value, when
 
-REFERENCES: dict[Task, tuple[str, ...]] = {
-    "reach": ("ik", "random", "zero"),
-    "push": ("scripted", "random", "zero"),
-}
-"""Policies that learn nothing, the one that does the task first."""
 BODY = "words:arm=ur5 ee=plane"
 """What plays if an address names nobody."""
 
@@ -53,7 +48,7 @@ def wanted_of(address: Address, trained: Bodies) -> Wanted:
     return Wanted(
         task,
         (address.robots or (default,))[:MOST],
-        state.get("policy") or REFERENCES[task][0],
+        state.get("policy") or references_for(task)[0],
         int(seed),
         bool(state.get("obstacles")),
         simulator,
@@ -75,7 +70,7 @@ def trained_bodies(page: PlayPage) -> Bodies:
     """The bodies of the address's checkpoint; where it names no task or body, it gets them."""
     address, places = page.session.address, page.session.places
     policy = address.state.get("policy", "")
-    if not policy or policy in POLICIES:
+    if not policy or policy in REFERENCES:
         return []
     task, obstacles, bodies = trained_with(policy, places)
     if not address.subject:
@@ -118,7 +113,7 @@ def add_choices(page: PlayPage, wanted: Wanted) -> None:
 
 def _policies(page: PlayPage, wanted: Wanted) -> tuple[str, ...]:
     """Those of the task, checkpoints of this folder, and the one that is wanted."""
-    found = (*REFERENCES[wanted.task], *checkpoints(page.session.places), wanted.policy)
+    found = (*references_for(wanted.task), *checkpoints(page.session.places), wanted.policy)
     return tuple(dict.fromkeys(found))
 
 
@@ -154,8 +149,8 @@ def _change_task(page: PlayPage) -> None:
     wanted = asked(page)
     task = next(each for each in TASKS if each == page.controls["task"].value)
     policy = wanted.policy
-    if policy in POLICIES and policy not in REFERENCES[task]:
-        policy = REFERENCES[task][0]
+    if policy in REFERENCES and policy not in references_for(task):
+        policy = references_for(task)[0]
     changed = replace(wanted, task=task, policy=policy)
     page.controls["policy"].options = _policies(page, changed)
     set_value(page.controls["policy"], policy)

@@ -15,7 +15,8 @@ from morphgen.benchmark.split import Task
 from morphgen.errors import MorphgenError
 from morphgen.fitting.dressed import as_primitives
 from morphgen.formats.bundle import split_colours
-from morphgen.rl.play import POLICIES, controller, kind_of, require_policy
+from morphgen.rl.names import REFERENCES
+from morphgen.rl.play import controller, kind_of, require_policy
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.sources import members
@@ -163,7 +164,7 @@ def policy_file(policy: str, task: Task, places: Places) -> str:
         TaskError: If there is none of that name, or it is for the other task.
         PlaceError: If it is a file that may not be looked at.
     """
-    if policy not in POLICIES:
+    if policy not in REFERENCES:
         with suppress(PlaceError):
             return str(places.path(policy))
         if "/" in policy or policy.endswith(".pt"):

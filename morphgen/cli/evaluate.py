@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_json, add_library
 from morphgen.cli.train import count
+from morphgen.rl.names import REFERENCES
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
     from morphgen.rl.evaluation import Exam, Score
     from morphgen.rl.sources import Source
     from morphgen.rl.trained import Mode
-
-REFERENCES = ("random", "zero", "ik", "scripted")
 
 
 def add_parser(commands: Subparsers) -> None:

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library
+from morphgen.rl.names import REFERENCES
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Episode
-
-
-POLICIES = ("zero", "random", "ik", "scripted")
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -54,8 +52,10 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def _policy(text: str) -> str:
-    if text not in POLICIES and not Path(text).exists():
-        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(POLICIES)}, and no file")
+    if text not in REFERENCES and not Path(text).exists():
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is none of {', '.join(REFERENCES)}, and no file"
+        )
     return text
 
 
