@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from morphgen.benchmark.split import Task
 
 REFERENCES: dict[str, tuple[Task, ...]] = {
-    "zero": ("reach", "push"),
     "random": ("reach", "push"),
+    "zero": ("reach", "push"),
     "ik": ("reach",),
     "scripted": ("push",),
 }

@@ -73,8 +73,8 @@ def test_zero_does_nothing(run):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("reach", "arm3-stick", "--policy", "scripted"), "valid: ik, random, zero"),
-        (("push", "prims", "--policy", "ik"), "valid: scripted, random, zero"),
+        (("reach", "arm3-stick", "--policy", "scripted"), "valid: ik, zero, random"),
+        (("push", "prims", "--policy", "ik"), "valid: scripted, zero, random"),
         (("push", "prism"), "did you mean 'prims'?"),
         (("push", "prims", "--out", "film.avi"), "a film ends in .mp4 or .gif"),
         (("push", "prims", "--out", "no/film.mp4"), "there is no folder no"),

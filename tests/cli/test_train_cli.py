@@ -195,8 +195,8 @@ def test_a_study_is_a_table(run, split_yaml, tmp_path):
     assert "missing" not in out
     assert "7 of 7: " in err
     assert [line.split("|")[1].strip() for line in out.splitlines()[4:11]] == [
-        "zero",
         "random",
+        "zero",
         "ik",
         "me-mlp",
         "me-mlp",
