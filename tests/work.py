@@ -1,6 +1,7 @@
 """Work for several processes, which import it from here."""
 
 import os
+import time
 
 from morphgen.errors import BenchmarkError
 
@@ -17,3 +18,8 @@ def fail(number):
 
 def die(number):
     os._exit(number)
+
+
+def die_later(seconds):
+    time.sleep(seconds)
+    os._exit(0)

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from morphgen.viewer.workers import WorkerDied, Workers
-from work import die, power
+from work import die_later, power
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def workers():
 def test_a_worker_that_dies_is_told_once_and_replaced(workers):
     value, first = workers.result(workers.submit(power, 2, 3))
     assert value == 9
-    dying, waiting = workers.submit(die, 0), workers.submit(power, 2, 4)
+    dying, waiting = workers.submit(die_later, 1.0), workers.submit(power, 2, 4)
     for future in (dying, waiting):
         with pytest.raises(WorkerDied, match="others were started: try again"):
             workers.result(future)
