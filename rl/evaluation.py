@@ -14,9 +14,8 @@ from morphgen.benchmark.split import Side, Task
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics import reach
 from morphgen.rl.intervals import mean_interval
-from morphgen.rl.named import reference
 from morphgen.rl.names import REFERENCES
-from morphgen.rl.references import Random
+from morphgen.rl.references import Random, reference
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import RunConfig, read_checkpoint
 from morphgen.rl.sources import Source, other_side, settings_of

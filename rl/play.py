@@ -9,8 +9,8 @@ import numpy as np
 
 from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.named import reference
 from morphgen.rl.names import REFERENCES, references_for
+from morphgen.rl.references import reference
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.trained import Policy

@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
+from morphgen.rl.rollouts import Controller
+from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import BINS
@@ -178,6 +180,19 @@ def solve(
     apart = goal - tool_frames(bodies.chain, rows, q)[:, -1, :3, 3]
     left = torch.linalg.vector_norm(apart, dim=1)
     return q.reshape(STARTS, n, joints), left.reshape(STARTS, n)
+
+
+def reference(name: str, batch: TaskBatch, seed: int) -> Controller:
+    """The controller of a name in ``morphgen.rl.names.REFERENCES``, for a batch.
+
+    Raises:
+        BenchmarkError: If a robot has hardly a free configuration.
+    """
+    if name == "ik":
+        return InverseKinematics(seed, [FreeSpace(setting.scene) for setting in batch.settings])
+    if name == "scripted":
+        return ScriptedPush(seed)
+    return Random(seed) if name == "random" else Zero()
 
 
 def as_actions(shares: torch.Tensor, kind: str) -> torch.Tensor:

@@ -86,17 +86,17 @@ def agent_cell(folder: Path, agent: str, config: RunConfig, exam: Exam) -> Cell:
     return Cell(place, source.name, agent, config.seed, source, _plain(exam), config)
 
 
-def for_its_robots(config: RunConfig) -> RunConfig:
+def matched_budget(config: RunConfig) -> RunConfig:
     """A run on a split's test robots with as much of each as a run on its train robots has.
 
     Others are as they are, and so are all that give each robot the whole.
     """
     if config.source.side == "train" or config.whole:
         return config
-    own, other = len(members(config.source)), len(members(other_side(config.source, "train")))
-    transitions = -(-config.ppo.transitions * own // other)
+    own, trained = len(members(config.source)), len(members(other_side(config.source, "train")))
+    transitions = -(-config.ppo.transitions * own // trained)
     ppo = replace(config.ppo, transitions=transitions)
-    return replace(config, ppo=ppo, envs=-(-config.envs * own // other))
+    return replace(config, ppo=ppo, envs=-(-config.envs * own // trained))
 
 
 def read_scores(cell: Cell) -> dict[str, list[Score]] | None:

@@ -78,7 +78,7 @@ def _unpacked(name: str, content: bytes) -> dict[str, bytes]:
             for entry in entries:
                 _require_inside(name, entry.filename)
             return {entry.filename: archive.read(entry) for entry in entries}
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
+    except (zipfile.BadZipFile, RuntimeError) as error:
         raise UploadError(f"{name}: no readable zip: {error}") from error
 
 

@@ -86,7 +86,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
     from morphgen.cli.train import config_of, source_of
     from morphgen.rl.evaluation import Exam, episodes_for
     from morphgen.rl.sources import other_side
-    from morphgen.rl.study import agent_cell, for_its_robots, reference_cells
+    from morphgen.rl.study import agent_cell, matched_budget, reference_cells
     from morphgen.rl.training import parts_of, require_runnable
     from morphgen.rl.variants import parse_agents
     from morphgen.tasks.config import ReachConfig
@@ -101,7 +101,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
         for text, variant, side in agents:
             for seed in seeds:
                 config = config_of(other_side(source, side), variant, _with(args, seed))
-                config = for_its_robots(replace(config, seed=seed))
+                config = matched_budget(replace(config, seed=seed))
                 for part in () if args.report else parts_of(args.out, config):
                     require_runnable(part.config)
                 made.append(agent_cell(args.out, text, config, exam))

@@ -22,7 +22,7 @@ from morphgen.rl.sources import members, other_side
 from morphgen.rl.study import (
     SCORES,
     agent_cell,
-    for_its_robots,
+    matched_budget,
     read_scores,
     reference_cells,
     work_here,
@@ -252,13 +252,13 @@ def test_an_agent_on_the_test_robots_has_as_much_data_of_each_as_on_the_train_ro
     source = other_side(small_source(), "test")
     train, test = (len(members(other_side(source, side))) for side in ("train", "test"))
     config = small_config(source, agent="se", transitions=6400)
-    own = for_its_robots(config)
+    own = matched_budget(config)
     assert own.ppo.transitions == -(-6400 * test // train)
     assert own.envs == -(-config.envs * test // train)
     (part, *_) = parts_of(Path("se"), replace(config, source=other_side(source, "train")))
     (alone, *_) = parts_of(Path("se@test"), own)
     assert (alone.config.ppo, alone.config.envs) == (part.config.ppo, part.config.envs)
-    assert for_its_robots(replace(config, whole=True)) == replace(config, whole=True)
+    assert matched_budget(replace(config, whole=True)) == replace(config, whole=True)
 
 
 @pytest.mark.slow
