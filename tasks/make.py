@@ -205,13 +205,9 @@ def simulator(
         from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
         return MujocoSimulation(scenes, contacts, threads=workers)
-    if workers > 1:
-        from morphgen.tasks.sim.bullet_workers import BulletWorkers
-
-        return BulletWorkers(scenes, contacts, workers=workers)
     from morphgen.tasks.sim.bullet import BulletSimulation
 
-    return BulletSimulation(scenes, contacts)
+    return BulletSimulation(scenes, contacts, processes=workers)
 
 
 def own_step(name: SimulatorName) -> tuple[ModuleType, str]:

@@ -60,7 +60,7 @@ def reset(simulation, q=None, pose=None, envs=None):
 
 def client_of(simulation, env=0):
     """The PyBullet client of an environment."""
-    return simulation._batch._loaded[env]
+    return simulation._own[0]._loaded[env]
 
 
 def state(simulation):

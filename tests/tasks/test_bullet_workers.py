@@ -16,10 +16,9 @@ import torch
 
 from commands import heed_ctrl_c
 from morphgen.errors import SimulationError
-from morphgen.tasks.sim import bullet_workers
+from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.sim.bullet import BulletSimulation
-from morphgen.tasks.sim.bullet_workers import BulletWorkers, divide
+from morphgen.tasks.sim.bullet import BulletSimulation, divide
 from scenes import mixed_scenes, push_scene
 
 TESTS = Path(__file__).parents[1]
@@ -27,7 +26,7 @@ TESTS = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def workers():
-    simulation = BulletWorkers([*mixed_scenes(), *mixed_scenes()[:2]], workers=2)
+    simulation = BulletSimulation([*mixed_scenes(), *mixed_scenes()[:2]], processes=3)
     yield simulation
     simulation.close()
 
@@ -116,38 +115,42 @@ def test_wrong_arguments_leave_the_workers_at_work(workers):
     assert workers.q[0, : workers.scenes[0].robot.dof].any()
 
 
-def test_errors_of_a_worker_are_raised_here():
+@pytest.mark.parametrize("heavy", [0, 1], ids=["here", "in a worker"])
+def test_errors_are_raised_wherever_they_are_and_the_others_step(heavy):
     """The weight of such a block is not finite."""
-    block = Block((0.1, 0.1, 0.1), mass=1e308)
-    scenes = [push_scene(), Scene(push_scene().robot, block=block)]
-    with closing(BulletWorkers(scenes, workers=2)) as simulation:
+    scenes = [push_scene(), push_scene()]
+    scenes[heavy] = Scene(push_scene().robot, block=Block((0.1, 0.1, 0.1), mass=1e308))
+    with closing(BulletSimulation(scenes, processes=2)) as simulation:
         envs, q, pose = starts(simulation)
         simulation.reset(envs, q, pose)
-        with pytest.raises(SimulationError, match=r"environment 1 \('prims'\) became unstable"):
+        before = state(simulation)[1 - heavy]
+        message = rf"environment {heavy} \('prims'\) became unstable"
+        with pytest.raises(SimulationError, match=message):
             simulation.step(q)
+        assert not torch.equal(state(simulation)[1 - heavy], before)
         simulation.reset(envs, q, pose)
         assert torch.isfinite(state(simulation)).all()
 
 
 def test_a_robot_that_cannot_be_loaded_is_named_here(monkeypatch, scratch):
-    original = bullet_workers.export_robots
+    original = bullet.export_robots
 
     def lost(scenes, folder):
         return [(path.with_name("none.urdf"), body) for path, body in original(scenes, folder)]
 
-    monkeypatch.setattr(bullet_workers, "export_robots", lost)
+    monkeypatch.setattr(bullet, "export_robots", lost)
     with pytest.raises(SimulationError, match="robot 'prims': PyBullet cannot load it"):
-        BulletWorkers([push_scene()], workers=1)
+        BulletSimulation([push_scene()])
     assert leftovers(scratch, os.getpid()) == []
 
 
 def test_a_killed_worker_is_reported_at_once_and_all_is_freed(scratch):
-    simulation = BulletWorkers([push_scene(), push_scene()], workers=2)
+    simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     envs, q, pose = starts(simulation)
     simulation.reset(envs, q, pose)
     simulation.step(q)
     running = pids(simulation)
-    os.kill(running[1], signal.SIGKILL)
+    os.kill(running[0], signal.SIGKILL)
     begin = time.monotonic()
     with pytest.raises(SimulationError, match=r"worker 1 .* died \(exit code -9\)"):
         keep_stepping(simulation, q)
@@ -161,7 +164,7 @@ def test_a_killed_worker_is_reported_at_once_and_all_is_freed(scratch):
 
 def test_a_worker_killed_in_the_middle_of_a_step_is_reported():
     scenes = [push_scene() for _ in range(8)]
-    simulation = BulletWorkers(scenes, workers=1)
+    simulation = BulletSimulation(scenes, processes=2)
     envs, q, pose = starts(simulation)
     simulation.reset(envs, q, pose)
     (pid,) = pids(simulation)
@@ -181,7 +184,7 @@ def test_a_worker_killed_in_the_middle_of_a_step_is_reported():
 
 
 def test_nothing_is_left_after_closing(scratch):
-    simulation = BulletWorkers([push_scene(), push_scene()], workers=2)
+    simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     running = pids(simulation)
     kept = simulation.q
     simulation.close()
@@ -194,7 +197,7 @@ def test_nothing_is_left_after_closing(scratch):
 
 
 def test_a_forgotten_simulation_ends_its_workers(scratch):
-    simulation = BulletWorkers([push_scene()], workers=1)
+    simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     running = pids(simulation)
     del simulation
     gc.collect()
@@ -209,9 +212,9 @@ def main():
     sys.path.insert(0, sys.argv[1])
     from scenes import push_scene
     from tasks.test_bullet_workers import pids, starts
-    from morphgen.tasks.sim.bullet_workers import BulletWorkers
+    from morphgen.tasks.sim.bullet import BulletSimulation
 
-    simulation = BulletWorkers([push_scene(), push_scene()], workers=2)
+    simulation = BulletSimulation([push_scene(), push_scene(), push_scene()], processes=3)
     envs, q, pose = starts(simulation)
     simulation.reset(envs, q, pose)
     print(*pids(simulation), flush=True)
@@ -223,7 +226,7 @@ if __name__ == "__main__":
 
 
 def script(tmp_path, ending):
-    """Start a process that simulates with two workers; it writes their ids, then goes on."""
+    """Start a process that simulates with two others; it writes their ids, then goes on."""
     path = tmp_path / "script.py"
     path.write_text(SCRIPT + textwrap.indent(textwrap.dedent(ending), " " * 4) + MAIN)
     process = subprocess.Popen(
@@ -285,7 +288,7 @@ def test_the_work_is_shared_evenly():
     assert divide(scenes[:2], 5) == [[0], [1]]
 
 
-@pytest.mark.parametrize(("scenes", "workers"), [([], 2), ([1], 0)])
-def test_workers_need_something_to_do(scenes, workers):
+@pytest.mark.parametrize(("scenes", "processes"), [([], 2), ([1], 0)])
+def test_processes_need_something_to_do(scenes, processes):
     with pytest.raises(ValueError, match="both must be at least 1"):
-        BulletWorkers(scenes, workers=workers)
+        BulletSimulation(scenes, processes=processes)
