@@ -9,6 +9,7 @@ import io
 import re
 import secrets
 import zipfile
+import zlib
 from pathlib import PurePosixPath
 
 from morphgen.errors import MorphgenError
@@ -78,7 +79,7 @@ def _unpacked(name: str, content: bytes) -> dict[str, bytes]:
             for entry in entries:
                 _require_inside(name, entry.filename)
             return {entry.filename: archive.read(entry) for entry in entries}
-    except (zipfile.BadZipFile, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise UploadError(f"{name}: no readable zip: {error}") from error
 
 

@@ -28,9 +28,9 @@ def places(tmp_path):
     return Places(default_library().folders, (tmp_path.resolve(),), folder.resolve())
 
 
-def archive(files):
+def archive(files, how=zipfile.ZIP_STORED):
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as made:
+    with zipfile.ZipFile(content, "w", how) as made:
         for name, data in files.items():
             made.writestr(name, data)
     return content.getvalue()
@@ -74,6 +74,15 @@ def test_a_zipped_bundle_comes_back_as_it_left(places, tmp_path):
 def test_what_is_no_robot_or_climbs_out_is_refused(places, name, content, why):
     with pytest.raises(MorphgenError, match=why):
         keep(name, content, places)
+    assert list(places.uploads.iterdir()) == []
+
+
+@pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_damaged_zip_is_refused(places, how):
+    whole = archive({"a.urdf": 50 * URDF}, how)
+    at = whole.index(b"a.urdf") + len(b"a.urdf")
+    with pytest.raises(UploadError, match="no readable zip"):
+        keep("a.zip", whole[:at] + b"\xff" * 10 + whole[at + 10 :], places)
     assert list(places.uploads.iterdir()) == []
 
 
