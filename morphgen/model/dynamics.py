@@ -20,8 +20,15 @@ REFLECTED = 0.05
 Geared motors add their rotor's inertia, times the square of the gear ratio, to the joint; a wrist
 with the gains of its own few grams would give way to a touch. Descriptions hardly ever name it.
 """
+MOTOR_INERTIA = 0.02
+"""Least inertia of a joint that turns, kg m^2.
+
+For bodies that are light everywhere: what the motor of a small hobby arm adds would otherwise be
+left out, and the friction of a block of 0.1 kg turn the wrist that pushes it. MuJoCo Menagerie
+(SO-ARM100, UR10e) has 0.1 in every joint.
+"""
 MIN_INERTIA = 1e-5
-"""Least inertia of any joint, kg m^2 or kg."""
+"""Least inertia of a joint that slides, kg."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +90,14 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
 
     Stiffness is omega^2 I and damping 2 omega I (critical), with omega = ``BANDWIDTH`` and I
     the joint's diagonal entry of the joint-space inertia at home, with the motor's: see
-    ``REFLECTED``.
+    ``REFLECTED`` and ``MOTOR_INERTIA``.
     """
     inertia = np.diag(mass_matrix(robot, robot.home))
     slides = np.array([robot.joints[k].kind == "prismatic" for k in robot.independent], dtype=bool)
-    least = np.full(robot.dof, MIN_INERTIA)
+    least = np.zeros(robot.dof)
     for kind in (slides, ~slides):
-        least[kind] = max(REFLECTED * inertia[kind].max(initial=0.0), MIN_INERTIA)
+        floor = MIN_INERTIA if kind is slides else MOTOR_INERTIA
+        least[kind] = max(REFLECTED * inertia[kind].max(initial=0.0), floor)
     total = np.maximum(inertia, least)
     return tuple(
         Actuation(

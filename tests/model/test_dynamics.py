@@ -9,6 +9,7 @@ from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import (
     BANDWIDTH,
     MIN_INERTIA,
+    MOTOR_INERTIA,
     REFLECTED,
     actuation,
     mass_matrix,
@@ -92,8 +93,8 @@ def test_motors_lift_light_joints_to_a_share_of_the_heaviest_of_their_kind():
     for k, gain in zip(robot.independent, actuation(robot), strict=True):
         kind = sliding if robot.joints[k].kind == "prismatic" else turning
         kind.append(gain.stiffness / BANDWIDTH**2)
-    for totals in (turning, sliding):
-        assert min(totals) >= REFLECTED * max(totals) * (1 - 1e-9)
+    for totals, least in ((turning, MOTOR_INERTIA), (sliding, MIN_INERTIA)):
+        assert min(totals) >= max(REFLECTED * max(totals), least) * (1 - 1e-9)
     robot = compose("arm=ur5 ee=plane")
     gains = actuation(robot)
     inertia = np.diag(mass_matrix(robot, robot.home))
@@ -101,10 +102,16 @@ def test_motors_lift_light_joints_to_a_share_of_the_heaviest_of_their_kind():
     assert gains[-1].armature == pytest.approx(REFLECTED * inertia.max() - inertia[-1])
 
 
-def test_gains_take_a_smallest_inertia():
-    joint = Joint("spin", "revolute", "root", "leaf")
+@pytest.mark.parametrize(
+    ("kind", "least"),
+    [("revolute", MOTOR_INERTIA), ("continuous", MOTOR_INERTIA), ("prismatic", MIN_INERTIA)],
+)
+def test_gains_take_a_smallest_inertia(kind, least):
+    limits = None if kind == "continuous" else (-1.0, 1.0)
+    joint = Joint("moves", kind, "root", "leaf", limits=limits)
     (gain,) = actuation(Robot("light", (Link("root"), Link("leaf")), (joint,), home=(0.0,)))
-    assert gain.stiffness == pytest.approx(BANDWIDTH**2 * MIN_INERTIA)
+    assert gain.armature == pytest.approx(least)
+    assert gain.stiffness == pytest.approx(BANDWIDTH**2 * least)
 
 
 def test_a_single_joint_settles_without_overshoot():
