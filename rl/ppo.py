@@ -25,6 +25,9 @@ from morphgen.tasks.batch import Observation, TaskBatch
 TOLD = ("reward", "score", "success", "terminated", "truncated")
 """What of every step is kept besides observations and actions."""
 
+KL_FACTOR = 1.2
+"""Between the actor's learning rates of two updates, where they follow ``target_kl``."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
@@ -86,10 +89,11 @@ class Learner:
         self.actor, self.critic = actor.to(self.device), critic.to(self.device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
         self.optimiser = torch.optim.Adam(
-            [*self.actor.parameters(), *self.critic.parameters()],
+            [{"params": [*net.parameters()]} for net in (self.actor, self.critic)],
             eps=config.adam_epsilon,
             fused=True,
         )
+        self._share = 1.0
         self._generators = {
             name: torch.Generator(self.device).manual_seed(stream)
             for name, stream in zip(("actions", "minibatches", "weights"), streams, strict=True)
@@ -143,6 +147,7 @@ class Learner:
             **copy.deepcopy({**learned, "optimiser": self.optimiser.state_dict()}),
             "generators": {name: each.get_state() for name, each in self._generators.items()},
             "batch": self.batch.state_dict(),
+            "share": self._share,
             "update": self.update,
             "updates": self.updates,
             "device": self.device.type,
@@ -168,7 +173,7 @@ class Learner:
         self.optimiser.load_state_dict(checkpoint["optimiser"])
         for name, generator in self._generators.items():
             generator.set_state(checkpoint["generators"][name].cpu())
-        self.update = checkpoint["update"]
+        self.update, self._share = checkpoint["update"], checkpoint["share"]
         self._observation = None
 
     def adopt(self, checkpoint: Mapping[str, Any]) -> None:
@@ -285,8 +290,8 @@ class Learner:
     def _learn(self, rollout: Rollout) -> Numbers:
         """Improve the policy and the critic; returns what the report says of it."""
         rate = learning_rate(self.config, self.update, self.updates)
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
+        actor, critic = self.optimiser.param_groups
+        actor["lr"], critic["lr"] = rate * self._share, rate
         values, advantages, returns = self._targets(rollout)
         normal = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         seen = {name: each.flatten(0, 1) for name, each in rollout.observation.items()}
@@ -307,8 +312,9 @@ class Learner:
                 found.append(self._descend(here, {k: v[rows] for k, v in data.items()}))
         names = found[0].keys()
         means = {name: float(torch.stack([each[name] for each in found]).mean()) for name in names}
+        self._share = next_share(self.config, self._share, means["kl"])
         explained = float(explained_variance(values, returns))
-        return {**means, "explained_variance": explained, "learning_rate": rate}
+        return {**means, "explained_variance": explained, "learning_rate": actor["lr"]}
 
     def _descend(self, seen: Observation, data: Observation) -> dict[str, torch.Tensor]:
         """One gradient step on a minibatch; actor and critic are clipped apart."""
@@ -360,6 +366,21 @@ def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float) -
 def learning_rate(config: PPOConfig, update: int, updates: int) -> float:
     """That of an update, counted from 0, of so many: a line that ends at zero after the last."""
     return config.learning_rate * (1 - update / updates)
+
+
+def next_share(config: PPOConfig, share: float, kl: float) -> float:
+    """The actor's share of the learning rate in the next update, at most 1.
+
+    Args:
+        config: The algorithm; without a ``target_kl`` it is 1.
+        share: In the last update.
+        kl: Divergence of the last update, nats, the mean over its gradient steps.
+    """
+    if not config.target_kl:
+        return 1.0
+    if kl > config.target_kl:
+        return share / KL_FACTOR
+    return min(share * KL_FACTOR, 1.0)
 
 
 @torch.no_grad()

@@ -44,6 +44,7 @@ class Report:
     explained_variance: float
     """Of the returns, by the values before the update."""
     learning_rate: float
+    """Of the actor."""
     collect_seconds: float
     learn_seconds: float
     steps_per_second: float

@@ -10,12 +10,12 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.ppo import Learner, follow, learning_rate, policy_loss
+from morphgen.rl.ppo import KL_FACTOR, Learner, follow, learning_rate, next_share, policy_loss
 from morphgen.rl.report import explained_variance
 from morphgen.rl.symlog import symlog
 from on_a_line import OnALine
 
-SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4)
+SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4, target_kl=0)
 """Four updates of eight environments."""
 
 
@@ -73,6 +73,30 @@ def test_the_learning_rate_falls_over_the_updates_that_happen():
     assert made.updates == 4
     assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
     assert learning_rate(SMALL, 4, 4) == 0
+
+
+def test_the_actors_share_of_the_rate_follows_the_divergence():
+    config = replace(SMALL, target_kl=0.01)
+    assert next_share(config, 1.0, 0.02) == 1 / KL_FACTOR
+    assert next_share(config, 0.5, 0.02) == 0.5 / KL_FACTOR
+    assert next_share(config, 0.5, 0.005) == 0.5 * KL_FACTOR
+    assert next_share(config, 1.0, 0.005) == 1
+    assert next_share(SMALL, 1.0, 9.9) == 1
+
+
+def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
+    options = {"learning_rate": 5e-3, "transitions": 30 * 64}
+    divergence = {}
+    for target in (0, 0.01):
+        made = learner(**options, target_kl=target)
+        first, *_ = (made.iterate() for _ in range(3))
+        assert first.kl > 0.1
+        divergence[target] = sum(made.iterate().kl for _ in range(7)) / 7
+        actor, critic = (group["lr"] for group in made.optimiser.param_groups)
+        assert critic == pytest.approx(5e-3 * (1 - 9 / 30))
+        assert actor <= 0.5 * critic if target else actor == critic
+    assert divergence[0] > 0.03
+    assert divergence[0.01] < 0.02
 
 
 def test_transitions_are_rounded_up_to_whole_updates():
@@ -291,7 +315,13 @@ def test_the_curriculum_goes_with_the_updates(moves):
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
 @pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
 def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
-    options = {"agent": agent, "discrete": discrete, "task_reweighting": True}
+    options = {
+        "agent": agent,
+        "discrete": discrete,
+        "task_reweighting": True,
+        "learning_rate": 3e-3,
+        "target_kl": 1e-3,
+    }
     went_on = learner(**options)
     went_on.iterate(), went_on.iterate()
     checkpoint = stored(went_on.checkpoint())
@@ -310,13 +340,14 @@ def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
     assert went_on.batch.state_dict() == again.batch.state_dict()
 
 
-@pytest.mark.parametrize("part", ["optimiser", "generators", "batch", "slow", "update"])
+@pytest.mark.parametrize("part", ["optimiser", "generators", "batch", "slow", "update", "share"])
 def test_a_run_that_forgets_a_part_does_not_equal_one_that_went_on(part):
-    went_on = learner(task_reweighting=True)
+    options = {"task_reweighting": True, "learning_rate": 3e-3, "target_kl": 1e-3}
+    went_on = learner(**options)
     went_on.iterate(), went_on.iterate()
     checkpoint = stored(went_on.checkpoint())
     went_on.iterate()
-    again = learner(OnALine(8, seed=99), seed=77, task_reweighting=True)
+    again = learner(OnALine(8, seed=99), seed=77, **options)
     again.iterate()
     again.resume({**checkpoint, part: again.checkpoint()[part]})
     again.iterate()
