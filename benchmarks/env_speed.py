@@ -10,6 +10,9 @@ primitives; random actions; steps of 5 ms, four to an action. Rows of a task:
   each with half of the environments, it is what the machine's cores have to give.
 - morphgen with PyBullet in one process and in two, with MuJoCo in one thread and in two:
   observations, rewards and new episodes on.
+- two processes of morphgen with PyBullet that know nothing of each other: what two in one batch
+  could be if they never had to wait; and MuJoCo where nothing touches anything, as if finding
+  contacts cost nothing.
 - morphgen with PyBullet and without self-collision, which panda-gym does not have; and with the 50
   iterations of the solver that panda-gym has, where we have 200 if there is a block.
 - panda-gym, its own scene and observation, joint control, its physics set to the same steps; one
@@ -45,7 +48,6 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.benchmark.split import Task
-from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.make import SimulatorName, make_batch
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
@@ -114,12 +116,21 @@ def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
     ]
     rows = [
         Row(case, RAW, partial(_raw, task, robot, envs)),
-        Row(case, f"{RAW}, 2 processes", partial(_raw_twice, task, robot, envs)),
+        Row(case, f"{RAW}, 2 processes", partial(_twice, _raw, task, robot, envs)),
     ]
     for name, sim, workers in ours:
-        rows.append(Row(case, name, partial(_ours, task, robot, envs, sim, workers, Contacts())))
+        how = {"sim": sim, "workers": workers}
+        rows.append(Row(case, name, partial(_ours, task, robot, envs, **how)))
+    rows += [
+        Row(case, "the same, 2 processes apart", partial(_twice, _ours, task, robot, envs)),
+        Row(
+            case,
+            "the same, MuJoCo, 1 thread, nothing touches",
+            partial(_ours, task, robot, envs, sim="mujoco", contacts=Contacts(False, False)),
+        ),
+    ]
     if peer:
-        alone = partial(_ours, task, robot, envs, "pybullet", 1, Contacts(self_collision=False))
+        alone = partial(_ours, task, robot, envs, contacts=Contacts(self_collision=False))
         rows.append(Row(case, "the same, 1 process, links pass through each other", alone))
         if task == "push":
             rows.append(Row(case, "the same, and 50 iterations", partial(_hasty, alone)))
@@ -130,22 +141,17 @@ def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
     return rows
 
 
-def _batch(
-    task: Task, robot: str, envs: int, sim: SimulatorName, workers: int, contacts: Contacts
-) -> TaskBatch:
-    return make_batch(task, [robot], envs, sim=sim, workers=workers, contacts=contacts)
-
-
 def _ours(
     task: Task,
     robot: str,
     envs: int,
-    sim: SimulatorName,
-    workers: int,
-    contacts: Contacts,
     seconds: float,
+    sim: SimulatorName = "pybullet",
+    workers: int = 1,
+    contacts: Contacts | None = None,
 ) -> float:
-    with closing(_batch(task, robot, envs, sim, workers, contacts)) as batch:
+    batch = make_batch(task, [robot], envs, sim=sim, workers=workers, contacts=contacts)
+    with closing(batch):
         return measure(batch, seconds).steps_per_second
 
 
@@ -162,7 +168,7 @@ def _hasty(rate: Rate, seconds: float) -> float:
 def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
     """Of the calls of ``stepSimulation`` that the same environments make."""
     spent, calls = 0.0, 0
-    with closing(_batch(task, robot, envs, "pybullet", 1, Contacts())) as batch:
+    with closing(make_batch(task, [robot], envs)) as batch:
         batch.reset()
         step = pybullet.stepSimulation
 
@@ -185,11 +191,17 @@ def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
     return calls / spent
 
 
-def _raw_twice(task: Task, robot: str, envs: int, seconds: float) -> float:
-    """The same of two processes at once."""
+def _twice(
+    one: Callable[[Task, str, int, float], float],
+    task: Task,
+    robot: str,
+    envs: int,
+    seconds: float,
+) -> float:
+    """Of two processes at once, each with half of the environments."""
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         for size in (1, envs // 2):  # both have loaded everything before the clock starts
-            found = [pool.submit(_raw, task, robot, size, seconds) for _ in range(2)]
+            found = [pool.submit(one, task, robot, size, seconds) for _ in range(2)]
             rates = [each.result() for each in found]
     return sum(rates)
 
