@@ -119,8 +119,8 @@ def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
         Row(case, f"{RAW}, 2 processes", partial(_twice, _raw, task, robot, envs)),
     ]
     for name, sim, workers in ours:
-        how = {"sim": sim, "workers": workers}
-        rows.append(Row(case, name, partial(_ours, task, robot, envs, **how)))
+        one = partial(_ours, task, robot, envs, sim=sim, workers=workers)
+        rows.append(Row(case, name, one))
     rows += [
         Row(case, "the same, 2 processes apart", partial(_twice, _ours, task, robot, envs)),
         Row(
