@@ -22,6 +22,9 @@ class PolicyConfig:
     agent: AgentName = "me-tf"
     discrete: bool = True
     """Bins or numbers as actions (paper: bins for reach, numbers for push)."""
+    fixed_deviation: bool = False
+    """Numbers as actions keep the deviation that they start with (as in the paper's released code,
+    by a clamp); otherwise it is learned."""
     mask_morphology: bool = False
     """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
     mlp_features: int = 16
@@ -44,6 +47,8 @@ class PolicyConfig:
         """
         if self.agent not in AGENTS:
             raise TaskError(f"agent {self.agent!r}{nearest(self.agent, AGENTS)}")
+        if self.fixed_deviation and self.discrete:
+            raise TaskError("fixed-deviation: bins have no deviation; it goes with --no-discrete")
         for name in ("mlp_features", "mlp_width", "features", "heads", "feedforward", "decoder"):
             _at_least(name, getattr(self, name), 1)
         if self.features % self.heads:

@@ -229,7 +229,9 @@ class Actor(nn.Module):
         self.discrete = config.discrete
         self.network = _network(config, layout, len(BINS) if config.discrete else 1, True)
         if not config.discrete:
-            self.deviation = nn.Parameter(torch.zeros(layout.links))
+            self.deviation = nn.Parameter(
+                torch.zeros(layout.links), requires_grad=not config.fixed_deviation
+            )
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Numbers of ``head``, shape (n, L, 11) for discrete actions, else (n, L, 1), float32."""

@@ -27,6 +27,7 @@ SWITCHES = {
     "discrete": "bins as actions (default: on if all robots reach)",
     "task-reweighting": "robots count with random weights (default: off)",
     "curriculum": "the line of push moves (default: on)",
+    "fixed-deviation": "numbers as actions keep their first deviation (default: off)",
     "mask-morphology": "hide the robot's body from the agent (default: off)",
 }
 

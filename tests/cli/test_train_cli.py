@@ -124,14 +124,20 @@ def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_y
 
 def test_every_switch_is_a_flag(run, tmp_path):
     off = ("--no-symlog", "--no-slow-critic", "--no-discrete", "--no-curriculum")
-    flags = (*off, "--task-reweighting", "--mask-morphology", "--no-tensorboard")
+    on = ("--task-reweighting", "--fixed-deviation", "--mask-morphology")
+    flags = (*off, *on, "--no-tensorboard")
     code, out, _ = run(*RUN, "--steps", "32", *flags)
-    label = "me-mlp-symlog-slow-critic+task-reweighting-curriculum-discrete+mask-morphology"
+    label = "me-mlp-symlog-slow-critic+task-reweighting-curriculum-discrete"
+    label += "+fixed-deviation+mask-morphology"
     assert (code, out) == (0, f"runs/planar-cube-reach/{label}/seed0/{CHECKPOINT}\n")
     config = read_config(tmp_path / out.strip().removesuffix(f"/{CHECKPOINT}"))
     ppo, policy = config.ppo, config.policy
     assert (ppo.symlog, ppo.slow_critic, ppo.task_reweighting, ppo.curriculum) == (0, 0, 1, 0)
     assert (policy.discrete, policy.mask_morphology, policy.mlp_width) == (False, True, 8)
+    assert policy.fixed_deviation
+    code, _, err = run(*RUN, "--steps", "32", "--fixed-deviation", "--out", "bins")
+    assert (code, "fixed-deviation: bins have no deviation" in err) == (2, True)
+    assert not Path("bins").exists()
 
 
 def test_actions_are_discrete_for_reach_alone(run, tmp_path):

@@ -268,6 +268,15 @@ def test_entropy_grows_if_it_is_all_that_counts():
     assert reports[-1].entropy > reports[0].entropy + 0.05
 
 
+@pytest.mark.parametrize("fixed", [False, True])
+def test_the_deviation_is_learned_or_stays(fixed):
+    policy = PolicyConfig("me-mlp", discrete=False, fixed_deviation=fixed)
+    made = Learner(OnALine(8, kind="continuous"), policy, replace(SMALL, entropy=1.0))
+    reports = [made.iterate() for _ in range(3)]
+    assert made.actor.deviation.any() != fixed
+    assert (reports[0].entropy == pytest.approx(reports[2].entropy, rel=1e-6)) == fixed
+
+
 def test_robots_count_alike_or_with_random_weights_of_mean_one():
     assert learner()._weights().tolist() == [1, 1]
     made = learner(task_reweighting=True)
