@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library
-from morphgen.cli.train import count, trained
+from morphgen.cli.train import add_learning, trained
 
 if TYPE_CHECKING:
     from morphgen.rl.runs import RunConfig
@@ -36,35 +36,16 @@ def add_parser(commands: Subparsers) -> None:
         "--on", choices=["train", "test"], default="test", help="side of the split (default: test)"
     )
     parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
-    parser.add_argument(
-        "--steps",
-        type=count,
-        default=30_000,
-        help="transitions, of all environments together (default: 30,000)",
-    )
-    parser.add_argument("--envs", type=int, default=16, help="default: 16")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
     parser.add_argument("--sim", choices=["pybullet", "mujoco"], help="default: the training's")
     parser.add_argument(
-        "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
-    )
-    parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
-    parser.add_argument(
         "--goal-seed", type=int, help="with --split: of all goals (default: as shipped, else 0)"
-    )
-    parser.add_argument(
-        "--set",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="another constant of PPO, such as learning_rate=1e-4; may be repeated",
     )
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="default: finetuned/SIDE-seedN in the run's folder"
     )
     parser.add_argument("--resume", action="store_true", help="go on with the run that is there")
-    parser.add_argument("--no-tensorboard", action="store_true", help="write no events")
-    parser.add_argument("--wandb", action="store_true", help="send to Weights & Biases, too")
+    add_learning(parser, steps=30_000, envs=16)
     add_library(parser)
     parser.set_defaults(run=run)
 

@@ -70,7 +70,23 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:
-    """Options of everything that trains."""
+    """Options of what trains from the start."""
+    add_learning(parser, steps=steps, envs=envs)
+    parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
+    parser.add_argument(
+        "--goal-seed", type=int, help="of all goals (default: as shipped with the split, else 0)"
+    )
+    parser.add_argument(
+        "--whole",
+        action="store_true",
+        help="se on a split: all steps and environments for each robot, not shares of them",
+    )
+    parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
+    parser.add_argument("--compile", action="store_true", help="networks by torch.compile")
+
+
+def add_learning(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:
+    """Options of everything that learns."""
     parser.add_argument(
         "--steps",
         type=count,
@@ -83,19 +99,10 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
         default=envs,
         help=f"environments, which the robots share (default: {envs})",
     )
-    parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
     parser.add_argument(
         "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
     )
     parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
-    parser.add_argument(
-        "--goal-seed", type=int, help="of all goals (default: as shipped with the split, else 0)"
-    )
-    parser.add_argument(
-        "--whole",
-        action="store_true",
-        help="se on a split: all steps and environments for each robot, not shares of them",
-    )
     parser.add_argument(
         "--set",
         metavar="NAME=VALUE",
@@ -103,8 +110,6 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
         default=[],
         help="another constant, such as learning_rate=1e-4 or minibatches=8; may be repeated",
     )
-    parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
-    parser.add_argument("--compile", action="store_true", help="networks by torch.compile")
     parser.add_argument("--no-tensorboard", action="store_true", help="write no events")
     parser.add_argument("--wandb", action="store_true", help="send to Weights & Biases, too")
 
