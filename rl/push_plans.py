@@ -9,12 +9,13 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.dynamics import actuation
+from morphgen.model.kinematics import frame_jacobian
 from morphgen.rl.cartesian import OneTool
 from morphgen.rl.free_ways import FreeWays
 from morphgen.rl.push_contacts import Poised, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.inverse_kinematics import bring_tool, tool_jacobian
+from morphgen.tasks.inverse_kinematics import bring_tool
 from morphgen.tasks.push_proofs import free_within
 from morphgen.tasks.settings import Setting
 from morphgen.tasks.sim.base import GRAVITY
@@ -160,7 +161,7 @@ class PushPlanner:
 
     def _given_way(self, q: Array) -> Array:
         """How far tools give way along y where the block's friction pushes back, (n,), metres."""
-        _, J = tool_jacobian(self._robot, q)
+        _, J = frame_jacobian(self._robot, q)
         return np.asarray(self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1))
 
     def _tried_out(

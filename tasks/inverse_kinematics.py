@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.model.kinematics import bounds, forward_kinematics
-from morphgen.model.robot import TOOL, Robot
+from morphgen.model.kinematics import bounds, frame_jacobian, frame_pose
+from morphgen.model.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -15,37 +15,6 @@ DAMPING = 0.02
 """Of the least squares, in units of joints over metres."""
 LARGEST = 0.3
 """Largest change of a joint in an iteration, rad or m."""
-
-
-def tool_jacobian(robot: Robot, q: Array) -> tuple[Array, Array]:
-    """Where the tool is, and how the joints move it.
-
-    Args:
-        robot: The body, with a tool.
-        q: Independent joint positions, shape (n, dof), rad or m.
-
-    Returns:
-        Its position in the root frame, shape (n, 3), and its linear Jacobian, shape (n, 3, dof).
-
-    Raises:
-        RobotError: If the robot has no tool.
-    """
-    frame = robot.frame(TOOL)
-    T_root_link = forward_kinematics(robot, q)
-    at = robot.link_index[frame.link]
-    tool = (T_root_link[:, at] @ frame.T_link_frame.matrix)[:, :3, 3]
-    matrix, _ = robot.mimic_map
-    row = {k: i for i, k in enumerate(robot.movable)}
-    jacobian = np.zeros((len(q), 3, robot.dof))
-    for k in robot.joints_to(frame.link):
-        joint = robot.joints[k]
-        if not joint.is_movable:
-            continue
-        axis = T_root_link[:, k + 1, :3, :3] @ np.array(joint.unit_axis)
-        if joint.kind != "prismatic":
-            axis = np.cross(axis, tool - T_root_link[:, k + 1, :3, 3])
-        jacobian += axis[:, :, None] * matrix[row[k]]
-    return tool, jacobian
 
 
 def bring_tool(robot: Robot, q: Array, positions: Array) -> tuple[Array, Array]:
@@ -67,8 +36,9 @@ def bring_tool(robot: Robot, q: Array, positions: Array) -> tuple[Array, Array]:
     damping = DAMPING**2 * np.eye(3)
     q = np.clip(q, low, high)
     for _ in range(ITERATIONS):
-        tool, J = tool_jacobian(robot, q)
-        lever = np.linalg.solve(J @ J.transpose(0, 2, 1) + damping, (positions - tool)[..., None])
+        T_root_tool, J = frame_jacobian(robot, q)
+        J, error = J[:, :3], positions - T_root_tool[:, :3, 3]
+        lever = np.linalg.solve(J @ J.transpose(0, 2, 1) + damping, error[..., None])
         step = (J.transpose(0, 2, 1) @ lever)[..., 0]
         q = np.clip(q + np.clip(step, -LARGEST, LARGEST), low, high)
-    return q, positions - tool_jacobian(robot, q)[0]
+    return q, positions - frame_pose(robot, q)[:, :3, 3]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from morphgen.model.kinematics import bounds, forward_kinematics
+from morphgen.model.kinematics import bounds, frame_jacobian
 from morphgen.model.robot import TOOL, Robot
 
 Array = NDArray[np.float64]
@@ -19,39 +19,6 @@ LARGEST = 0.3
 """Largest change of a joint in one step, rad or m."""
 EXACT = 1e-5
 """Error at which a search ends, metres and radians times ``turn``."""
-
-
-def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array, Array]:
-    """Pose of a frame, and how independent joints move it, in the root frame.
-
-    Args:
-        robot: The body.
-        q: Independent joint positions, shape (dof,), rad or m.
-        frame: Name of the frame.
-
-    Returns:
-        ``T_root_frame``, shape (4, 4), and the Jacobian, shape (6, dof): linear velocity of the
-        frame's origin, then angular velocity; mimic joints are folded into their leaders.
-
-    Raises:
-        RobotError: If there is no such frame.
-    """
-    named = robot.frame(frame)
-    T_root_link = forward_kinematics(robot, q)
-    T_root_frame = T_root_link[robot.link_index[named.link]] @ named.T_link_frame.matrix
-    row = {k: i for i, k in enumerate(robot.movable)}
-    columns = np.zeros((6, len(robot.movable)))
-    for k in robot.joints_to(named.link):
-        joint = robot.joints[k]
-        if not joint.is_movable:
-            continue
-        axis = T_root_link[k + 1, :3, :3] @ np.array(joint.unit_axis)
-        if joint.kind == "prismatic":
-            columns[:3, row[k]] = axis
-        else:
-            arm = T_root_frame[:3, 3] - T_root_link[k + 1, :3, 3]
-            columns[:3, row[k]], columns[3:, row[k]] = np.cross(axis, arm), axis
-    return T_root_frame, columns @ robot.mimic_map[0]
 
 
 def solve(

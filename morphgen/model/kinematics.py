@@ -81,6 +81,41 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = "tool") -> Array:
     return np.asarray(T_root_link @ named.T_link_frame.matrix)
 
 
+def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Array, Array]:
+    """Pose of a named frame, and how independent joints move it, in the root frame.
+
+    Args:
+        robot: The body.
+        q: Independent joint positions, shape (..., dof), rad or m.
+        frame: Name of the frame.
+
+    Returns:
+        ``T_root_frame``, shape (..., 4, 4), and the Jacobian, shape (..., 6, dof): linear velocity
+        of the frame's origin, then angular velocity; mimic joints are folded into their leaders.
+
+    Raises:
+        RobotError: If there is no such frame.
+    """
+    named = robot.frame(frame)
+    T_root_link = forward_kinematics(robot, q)
+    T_root_frame = T_root_link[..., robot.link_index[named.link], :, :] @ named.T_link_frame.matrix
+    matrix, _ = robot.mimic_map
+    row = {k: i for i, k in enumerate(robot.movable)}
+    jacobian = np.zeros((*T_root_frame.shape[:-2], 6, robot.dof))
+    for k in robot.joints_to(named.link):
+        joint = robot.joints[k]
+        if not joint.is_movable:
+            continue
+        axis, by_leader = T_root_link[..., k + 1, :3, :3] @ joint.unit_axis, matrix[row[k]]
+        if joint.kind == "prismatic":
+            jacobian[..., :3, :] += axis[..., None] * by_leader
+            continue
+        arm = T_root_frame[..., :3, 3] - T_root_link[..., k + 1, :3, 3]
+        jacobian[..., :3, :] += np.cross(axis, arm)[..., None] * by_leader
+        jacobian[..., 3:, :] += axis[..., None] * by_leader
+    return np.asarray(T_root_frame), jacobian
+
+
 def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6) -> float:
     """Largest distance between a frame and the root's origin, metres.
 

@@ -5,10 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from morphgen.api import compose
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     bounds,
     forward_kinematics,
+    frame_jacobian,
     frame_pose,
     movable_positions,
     random_configurations,
@@ -82,3 +84,23 @@ def test_random_configurations_stay_in_bounds():
     limits = bounds(robot)
     assert (q >= limits[:, 0]).all()
     assert (q <= limits[:, 1]).all()
+
+
+@pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "base=gantry ee=stick", "arm=panda", "own"])
+def test_jacobians_are_derivatives_of_poses(words):
+    robot = arm() if words == "own" else compose(words)
+    rng = np.random.default_rng(0)
+    q = random_configurations(robot, 2, rng)
+    T, jacobian = frame_jacobian(robot, q)
+    assert pytest.approx(frame_pose(robot, q)) == T
+    for k in range(robot.dof):
+        step = np.zeros(robot.dof)
+        step[k] = 1e-6
+        moved = (frame_pose(robot, q + step) - frame_pose(robot, q - step)) / 2e-6
+        spin = moved[:, :3, :3] @ T[:, :3, :3].swapaxes(1, 2)
+        turned = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        assert jacobian[:, :3, k] == pytest.approx(moved[:, :3, 3], abs=1e-6)
+        assert jacobian[:, 3:, k] == pytest.approx(turned, abs=1e-6)
+    one, of_one = frame_jacobian(robot, q[1])
+    assert (one == T[1]).all()
+    assert of_one == pytest.approx(jacobian[1])

@@ -13,7 +13,7 @@ from morphgen.tasks import push_sets as module
 from morphgen.tasks import push_ways
 from morphgen.tasks.config import PushConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.inverse_kinematics import bring_tool, tool_jacobian
+from morphgen.tasks.inverse_kinematics import bring_tool
 from morphgen.tasks.push_proofs import CLOSE
 from morphgen.tasks.push_region import effective_reach, push_region
 from morphgen.tasks.push_sets import PushSet, push_set
@@ -237,19 +237,6 @@ def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path):
     with pytest.warns(UserWarning, match="cannot keep a push set"):
         found = made("prims", tmp_path / "file" / "pushes")
     assert len(found.q) == 5
-
-
-def test_jacobians_are_the_tools_derivatives():
-    body = robot("arm=panda ee=panda_hand")
-    q = np.array([body.home]) + 0.1
-    tool, J = tool_jacobian(body, q)
-    assert tool == pytest.approx(frame_pose(body, q)[:, :3, 3])
-    for j in range(body.dof):
-        ahead = q.copy()
-        ahead[0, j] += 1e-6
-        assert (tool_jacobian(body, ahead)[0] - tool)[0] / 1e-6 == pytest.approx(
-            J[0, :, j], abs=1e-5
-        )
 
 
 def test_tools_are_brought_where_they_can_be_and_their_distance_is_told():
