@@ -91,7 +91,7 @@ def add_learning(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
         "--steps",
         type=count,
         default=int(steps),
-        help=f"transitions, of all environments together (default: {steps:g})",
+        help=f"transitions, of all environments together (default: {steps:,.0f})",
     )
     parser.add_argument(
         "--envs",
