@@ -43,25 +43,30 @@ def shares_of(
     return torch.tensor(BINS, device=device)[actions.long()]
 
 
-def next_targets(
-    bodies: Bodies,
-    body: torch.Tensor,
-    targets: torch.Tensor,
-    shares: torch.Tensor,
-    mask: torch.Tensor,
-) -> torch.Tensor:
-    """Targets after an action: from the targets before, not from where the joints are.
+class Targets:
+    """What actions make of the targets of a batch's joints."""
 
-    Args:
-        bodies: The robots.
-        body: Which robot each row is, shape (n,), int64.
-        targets: Of the independent joints, shape (n, J).
-        shares: Of the joints' steps, shape (n, L).
-        mask: Links whose action counts, shape (n, L), bool.
+    def __init__(self, bodies: Bodies, body: torch.Tensor, mask: torch.Tensor) -> None:
+        """Prepare.
 
-    Returns:
-        Shape (n, J), within limits.
-    """
-    counted = torch.where(mask, shares, torch.zeros_like(shares))
-    change = torch.gather(counted, 1, bodies.link_of_joint[body]) * bodies.step[body]
-    return torch.clamp(targets + change, bodies.lower[body], bodies.upper[body])
+        Args:
+            bodies: The robots.
+            body: Which robot each row is, shape (n,), int64.
+            mask: Links whose action counts, shape (n, L), bool.
+        """
+        self._link = bodies.link_of_joint[body]
+        self._step = bodies.step[body] * torch.gather(mask, 1, self._link)
+        self._lower, self._upper = bodies.lower[body], bodies.upper[body]
+
+    def __call__(self, targets: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
+        """Targets after an action: from the targets before, not from where the joints are.
+
+        Args:
+            targets: Of the independent joints, shape (n, J).
+            shares: Of the joints' steps, shape (n, L).
+
+        Returns:
+            Shape (n, J), within limits.
+        """
+        change = torch.gather(shares, 1, self._link) * self._step
+        return torch.clamp(targets + change, self._lower, self._upper)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.tasks.actions import ActionKind, next_targets, shares_of
+from morphgen.tasks.actions import ActionKind, Targets, shares_of
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
 from morphgen.tasks.episodes import Push, Reach, State, Verdict, chosen
@@ -140,6 +140,7 @@ class TaskBatch:
         self._channels = channels
         self._tokens = LinkTokens(bodies, self.body)
         self._tools = ToolPositions(bodies.chain, self.body)
+        self._moved = Targets(bodies, self.body, self.mask)
         self._fixed = {
             "links": bodies.links[self.body],
             "actions": self.mask,
@@ -281,7 +282,7 @@ class TaskBatch:
     def _act(self, actions: torch.Tensor) -> None:
         shape = (self.num_envs, self.bodies.max_links)
         self._shares = shares_of(actions, self.kind, shape, self.device) * self.mask
-        self.targets = next_targets(self.bodies, self.body, self.targets, self._shares, self.mask)
+        self.targets = self._moved(self.targets, self._shares)
 
     def _judge(self) -> Verdict:
         q, qd = self.q, self._widened(self.simulation.qd)

@@ -32,24 +32,26 @@ class ToolPositions:
     def __init__(self, chain: Chain, body: torch.Tensor) -> None:
         """Prepare; arguments as of ``tool_frames``."""
         still = chain.origin[:, :-1]
-        parts = torch.stack([still, *chain.motion], dim=2)[body, ..., :3, :]
-        parts = parts.permute(1, 2, 3, 4, 0).contiguous()
-        self._turn, self._shift = parts[..., :3, :], parts[..., 3, :]
-        """Of each joint (D, 3, 3, 3, n) and (D, 3, 3, n): at zero, and what its motion adds."""
-        self._tool = chain.origin[body, -1, :3, 3].T
-        self._joint = chain.gain[body].abs().argmax(dim=2)
-        self._gain = torch.gather(chain.gain[body], 2, self._joint[..., None])[..., 0]
-        self._offset, self._slides = chain.offset[body], chain.slides[body]
+        parts = torch.stack([still, *chain.motion])[:, body, :, :3]
+        self._still, self._by_first, self._by_second = parts.permute(0, 2, 3, 4, 1).contiguous()
+        """Frames of the joints at zero, and what their motions add; each (D, 3, 4, n)."""
+        self._tool = chain.origin[body, -1, :3, 3].T.contiguous()
+        gain = chain.gain[body].transpose(0, 1)
+        self._joint = gain.abs().argmax(dim=2)
+        self._gain = torch.gather(gain, 2, self._joint[..., None])[..., 0].contiguous()
+        self._offset = chain.offset[body].T.contiguous()
+        self._slides = chain.slides[body].T.contiguous()
 
     def __call__(self, q: torch.Tensor) -> torch.Tensor:
         """In the root frames, shape (n, 3), metres, at independent joint positions (n, J)."""
-        moved = self._gain * torch.gather(q, 1, self._joint) + self._offset
-        first = torch.where(self._slides, moved, torch.sin(moved)).T
-        second = torch.where(self._slides, 0.0, 1 - torch.cos(moved)).T
+        moved = self._gain * torch.gather(q.T, 0, self._joint) + self._offset
+        first = torch.where(self._slides, moved, torch.sin(moved))[:, None, None]
+        second = torch.where(self._slides, 0.0, 1 - torch.cos(moved))[:, None, None]
+        frames = self._still + first * self._by_first + second * self._by_second
+        turns, shifts = frames[:, :, :3].unbind(), frames[:, :, 3].unbind()
         point = self._tool
-        for d in reversed(range(len(first))):
-            still, by_first, by_second = (self._turn[d] * point).sum(dim=2) + self._shift[d]
-            point = still + first[d] * by_first + second[d] * by_second
+        for turn, shift in zip(reversed(turns), reversed(shifts), strict=True):
+            point = (turn * point).sum(dim=1) + shift
         return point.T
 
 

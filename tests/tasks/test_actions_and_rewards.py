@@ -7,7 +7,7 @@ import torch
 import morphgen
 from morphgen.errors import TaskError
 from morphgen.grammar.library import default_library
-from morphgen.tasks.actions import next_targets, shares_of
+from morphgen.tasks.actions import Targets, shares_of
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.config import BINS, PushConfig, ReachConfig
 from morphgen.tasks.rewards import (
@@ -61,7 +61,7 @@ def test_targets_move_by_the_step_of_each_joint_from_the_targets_before(bodies):
     mask = bodies.action_mask(fingers=True)[body]
     before = bodies.home[body]
     shares = torch.ones(3, bodies.max_links)
-    after = next_targets(bodies, body, before, shares, mask)
+    after = Targets(bodies, body, mask)(before, shares)
     expected = torch.minimum(before + bodies.step[body], bodies.upper[body])
     assert torch.equal(after, expected)
     assert (after[0, 6:] == 0).all()
@@ -71,8 +71,9 @@ def test_targets_stay_within_limits_and_masked_links_do_not_move(bodies):
     body = torch.tensor([1])
     mask = bodies.action_mask(fingers=False)[body]
     targets = bodies.home[body]
+    moved_by = Targets(bodies, body, mask)
     for _ in range(400):
-        targets = next_targets(bodies, body, targets, torch.ones(1, bodies.max_links), mask)
+        targets = moved_by(targets, torch.ones(1, bodies.max_links))
     moved = bodies.moves_tool[1]
     assert torch.equal(targets[0, moved], bodies.upper[1, moved])
     assert torch.equal(targets[0, ~moved], bodies.home[1, ~moved])
