@@ -45,7 +45,12 @@ def test_an_arm_of_three_joints_learns_to_reach():
     assert successes(Random(0), robot) < 0.1
     policy = PolicyConfig("se", discrete=False, mlp_width=96, mlp_layers=2)
     config = PPOConfig(
-        transitions=4_000_000, steps=32, minibatches=8, gamma=0.95, learning_rate=5e-4
+        transitions=4_000_000,
+        steps=32,
+        minibatches=8,
+        gamma=0.95,
+        learning_rate=5e-4,
+        target_kl=0.01,
     )
     with closing(
         make_batch("reach", [robot], 512, sim="mujoco", kind="continuous", max_links=10)
