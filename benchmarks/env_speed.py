@@ -122,10 +122,12 @@ def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
         one = partial(_ours, task, robot, envs, sim=sim, workers=workers)
         rows.append(Row(case, name, one))
     rows += [
-        Row(case, "the same, 2 processes apart", partial(_twice, _ours, task, robot, envs)),
+        Row(
+            case, "morphgen, PyBullet, 2 processes apart", partial(_twice, _ours, task, robot, envs)
+        ),
         Row(
             case,
-            "the same, MuJoCo, 1 thread, nothing touches",
+            "morphgen, MuJoCo, 1 thread, nothing touches",
             partial(_ours, task, robot, envs, sim="mujoco", contacts=Contacts(False, False)),
         ),
     ]

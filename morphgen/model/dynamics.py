@@ -95,8 +95,7 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
     inertia = np.diag(mass_matrix(robot, robot.home))
     slides = np.array([robot.joints[k].kind == "prismatic" for k in robot.independent], dtype=bool)
     least = np.zeros(robot.dof)
-    for kind in (slides, ~slides):
-        floor = MIN_INERTIA if kind is slides else MOTOR_INERTIA
+    for kind, floor in ((slides, MIN_INERTIA), (~slides, MOTOR_INERTIA)):
         least[kind] = max(REFLECTED * inertia[kind].max(initial=0.0), floor)
     total = np.maximum(inertia, least)
     return tuple(
