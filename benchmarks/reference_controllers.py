@@ -98,21 +98,28 @@ def main() -> int:
         if args.task in (None, member.task) and args.only in member.name
     ]
     work = Measuring(sims, args.envs, args.episodes, args.obstacles)
-    found = mapped(work, members, args.jobs, chunk=1)
-    rows = list(tqdm(found, total=len(members), unit="robot"))
+    rows: list[Row] = []
+    for row in tqdm(mapped(work, members, args.jobs, chunk=1), total=len(members), unit="robot"):
+        rows.append(row)
+        _write(args.json, rows)
     for task in ("reach", "push"):
         of_task = [row for row in rows if row["task"] == task]
         if of_task:
             numbers = [key for key in of_task[0] if key not in ("robot", "task")]
             means = {key: mean(float(row[key]) for row in of_task) for key in numbers}
             rows.append({"robot": "mean", "task": task, **means})
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    _write(args.json, rows)
     print(tabulate(rows, headers="keys", floatfmt=".2f"))
     for sim in SIMULATORS:
         if sim not in sims:
             print(f"{sim}: left out")
     return 0
+
+
+def _write(path: Path | None, rows: list[Row]) -> None:
+    """Keep what is measured so far, should the hour be cut short."""
+    if path:
+        path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 def _members() -> Iterator[Member]:
