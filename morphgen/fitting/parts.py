@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 
 from morphgen.fitting.dressed import link_shapes
@@ -25,6 +23,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Mesh, Shape
+from morphgen.processes import mapped
 
 TOKEN = FitOptions(max_primitives=1)
 COLLISION = FitOptions(max_primitives=4, iou=0.9)
@@ -55,17 +54,9 @@ def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Pat
     Raises:
         FormatError: If a file cannot be written.
         MeshError: If a mesh cannot be read.
+        MorphgenError: If a process died.
     """
-    if jobs == 1:
-        yield from map(store_part, manifests)
-        return
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        futures = [pool.submit(store_part, manifest) for manifest in manifests]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    yield from mapped(store_part, manifests, jobs, chunk=1)
 
 
 def store_part(manifest: Manifest) -> Path:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -19,6 +18,7 @@ from morphgen.fitting.solid import Solid, solid_of
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Link, Robot
+from morphgen.processes import mapped
 
 Progress = Callable[[str], object]
 """Told the name of every link that is done."""
@@ -102,6 +102,7 @@ def fit_links(
 
     Raises:
         MeshError: If a mesh cannot be read.
+        MorphgenError: If a process died.
     """
     links = [
         link for link in robot.links if link_shapes(link) and (only is None or link.name in only)
@@ -142,31 +143,17 @@ def _fit_all(
     jobs: int,
     progress: Progress,
 ) -> dict[str, Attempt]:
-    work = {link.name: (link_shapes(link), _solid(solids[link.name])) for link in links}
+    work = [(link_shapes(link), _solid(solids[link.name])) for link in links]
+    attempts = mapped(partial(_try_fit, options), work, jobs, chunk=1)
     fits: dict[str, Attempt] = {}
-    for name, fit in _attempts(work, options, jobs):
-        fits[name] = fit
-        progress(name)
+    for link, fit in zip(links, attempts, strict=True):
+        fits[link.name] = fit
+        progress(link.name)
     return fits
 
 
-def _attempts(
-    work: Mapping[str, tuple[tuple[Shape, ...], Solid]], options: FitOptions, jobs: int
-) -> Iterator[tuple[str, Attempt]]:
-    if jobs == 1 or len(work) < 2:
-        for name, (shapes, solid) in work.items():
-            yield name, _try_fit(shapes, solid, options)
-        return
-    with ProcessPoolExecutor(min(jobs, len(work)), get_context("spawn")) as pool:
-        futures = {pool.submit(_try_fit, *each, options): name for name, each in work.items()}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _try_fit(shapes: Sequence[Shape], solid: Solid, options: FitOptions) -> Attempt:
+def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> Attempt:
+    shapes, solid = work
     try:
         return fit_shapes(shapes, options, solid=solid)
     except FitError as error:
