@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.scripted_push import ScriptedPush
+from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import BINS
@@ -35,7 +36,7 @@ class Zero:
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """No change of any target."""
-        return as_actions(torch.zeros(task.mask.shape, device=task.mask.device), task.kind)
+        return actions_of(torch.zeros(task.mask.shape, device=task.mask.device), task.kind)
 
 
 class Random:
@@ -81,7 +82,7 @@ class InverseKinematics:
         if len(new):
             self._plan(task, new)
         self._routes.go_on()
-        return as_actions(shares_to(task, self._routes.wanted), task.kind)
+        return actions_of(shares_to(task, self._routes.wanted), task.kind)
 
     def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
         for attempt in range(ROUNDS if self._spaces else 1):
@@ -193,15 +194,6 @@ def reference(name: str, batch: TaskBatch, seed: int) -> Controller:
     if name == "scripted":
         return ScriptedPush(seed)
     return Random(seed) if name == "random" else Zero()
-
-
-def as_actions(shares: torch.Tensor, kind: str) -> torch.Tensor:
-    """Shares of the joints' steps as actions: themselves, or the nearest bins towards zero."""
-    if kind == "continuous":
-        return shares
-    bins = torch.tensor(BINS, device=shares.device)
-    fits = (bins.abs() <= shares[..., None].abs() + 1e-6) & (bins * shares[..., None] >= 0)
-    return torch.where(fits, bins.abs(), -torch.ones_like(bins)).argmax(dim=-1)
 
 
 def _numbers(values: torch.Tensor) -> Array:

@@ -11,8 +11,8 @@ import torch
 from morphgen.rl.cartesian import towards
 from morphgen.rl.free_ways import Routes, shares_to
 from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
+from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import BINS
 from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.settings import Setting
 
@@ -75,7 +75,8 @@ class ScriptedPush:
             self._plan(state, task, env, block[env])
         pushed = _pushed(state, task, block, tool)
         wanted = torch.where(state.pushing[:, None], pushed, state.routes.wanted)
-        return _actions(task, torch.where(state.active[:, None], wanted, task.targets))
+        wanted = torch.where(state.active[:, None], wanted, task.targets)
+        return actions_of(shares_to(task, wanted), task.kind)
 
     def _plan(self, state: _State, task: TaskBatch, env: int, block: torch.Tensor) -> None:
         index = int(task.body[env])
@@ -200,12 +201,3 @@ def _pushed(
     stands = state.pushing & (on > 0) & (missed > 0.8 * SPEED)
     state.stuck = torch.where(stands, state.stuck + 1, 0)
     return wanted
-
-
-def _actions(task: TaskBatch, wanted: torch.Tensor) -> torch.Tensor:
-    """Actions towards targets (n, J), all joints in proportion or nearly so; shape (n, L)."""
-    actions = shares_to(task, wanted)
-    if task.kind == "continuous":
-        return actions
-    bins = torch.tensor(BINS, device=actions.device)
-    return (actions[..., None] - bins).abs().argmin(dim=-1)

@@ -43,6 +43,18 @@ def shares_of(
     return torch.tensor(BINS, device=device)[actions.long()]
 
 
+def actions_of(shares: torch.Tensor, kind: ActionKind) -> torch.Tensor:
+    """Shares of the joints' steps, (n, L), as actions: themselves, or the next bins towards zero.
+
+    Towards zero, a bin never carries a joint past where it is to be.
+    """
+    if kind == "continuous":
+        return shares
+    bins = torch.tensor(BINS, device=shares.device)
+    fits = (bins.abs() <= shares[..., None].abs() + 1e-6) & (bins * shares[..., None] >= 0)
+    return torch.where(fits, bins.abs(), -torch.ones_like(bins)).argmax(dim=-1)
+
+
 class Targets:
     """What actions make of the targets of a batch's joints."""
 

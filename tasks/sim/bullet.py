@@ -17,13 +17,12 @@ from morphgen.tasks.sim.bullet_batch import BulletBatch, RowTensors, export_robo
 from morphgen.tasks.sim.bullet_workers import (
     STEP,
     Share,
+    SharedArrays,
     Worker,
     end,
     gather,
     load,
     send,
-    shared_memory,
-    shared_rows,
     start,
 )
 
@@ -66,8 +65,8 @@ class BulletSimulation(RowTensors):
                 f"{processes} processes for {len(scenes)} scenes; both must be at least 1"
             )
         n, joints = len(scenes), most_joints(scenes)
-        memory = shared_memory(n, joints)
-        rows, self._targets = shared_rows(memory, n, joints)
+        arrays = SharedArrays.zeros(n, joints)
+        rows, self._targets = arrays.split()
         super().__init__(scenes, rows)
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
         self._workers: list[Worker] = []
@@ -85,7 +84,7 @@ class BulletSimulation(RowTensors):
                 for envs in divide(scenes, processes)
             )
             for number, share in enumerate(others, start=1):
-                self._workers.append(start(number, share, memory, n, joints))
+                self._workers.append(start(number, share, arrays))
             self._own.append(load(first, rows))
             self._envs = np.array(first.envs)
             failures = gather(self._workers)

@@ -54,18 +54,26 @@ class Worker:
         return f"worker {self.process.name} of {len(self.envs)} environments"
 
 
-def shared_memory(n: int, joints: int) -> Memory:
-    """Room for what n environments of so many joints report, and for their targets; zeros."""
-    memory: Memory = _CONTEXT.RawArray("f", n * (3 * joints + 7 + 6))
-    return memory
+@dataclass(frozen=True, eq=False)
+class SharedArrays:
+    """What n environments of J joints report, and their targets, in memory of all processes."""
 
+    memory: Memory
+    n: int
+    joints: int
 
-def shared_rows(memory: Memory, n: int, joints: int) -> tuple[Rows, Float32]:
-    """What a simulation reports, and its targets (n, J), in shared memory."""
-    flat = np.ctypeslib.as_array(memory)
-    ends = np.cumsum([n * joints, n * joints, n * 7, n * 6])
-    q, qd, pose, velocity, targets = (part.reshape(n, -1) for part in np.split(flat, ends))
-    return Rows(q, qd, pose, velocity), targets
+    @classmethod
+    def zeros(cls, n: int, joints: int) -> SharedArrays:
+        """Make room."""
+        return cls(_CONTEXT.RawArray("f", n * (3 * joints + 7 + 6)), n, joints)
+
+    def split(self) -> tuple[Rows, Float32]:
+        """What a simulation reports, and its targets (n, J)."""
+        n, joints = self.n, self.joints
+        flat = np.ctypeslib.as_array(self.memory)
+        ends = np.cumsum([n * joints, n * joints, n * 7, n * 6])
+        q, qd, pose, velocity, targets = (part.reshape(n, -1) for part in np.split(flat, ends))
+        return Rows(q, qd, pose, velocity), targets
 
 
 def load(share: Share, rows: Rows) -> BulletBatch:
@@ -73,23 +81,19 @@ def load(share: Share, rows: Rows) -> BulletBatch:
     return BulletBatch(share.scenes, share.contacts, share.exported, rows, share.envs)
 
 
-def start(number: int, share: Share, memory: Memory, n: int, joints: int) -> Worker:
+def start(number: int, share: Share, arrays: SharedArrays) -> Worker:
     """Start a worker, which loads its share and then answers.
 
     Args:
         number: Its name.
         share: What it holds.
-        memory: Of ``shared_memory``.
-        n: Environments of all processes.
-        joints: J of all.
+        arrays: Of all processes.
 
     Raises:
         SimulationError: If it died already.
     """
     ours, theirs = _CONTEXT.Pipe()
-    process = _CONTEXT.Process(
-        target=_serve, args=(theirs, memory, n, joints), name=str(number), daemon=True
-    )
+    process = _CONTEXT.Process(target=_serve, args=(theirs, arrays), name=str(number), daemon=True)
     worker = Worker(process, ours, np.array(share.envs))
     try:
         process.start()
@@ -149,10 +153,10 @@ def _death(worker: Worker) -> SimulationError:
     )
 
 
-def _serve(pipe: Connection, memory: Memory, n: int, joints: int) -> None:
+def _serve(pipe: Connection, arrays: SharedArrays) -> None:
     """What a worker does until its pipe ends; Ctrl-C is for the parent, which then closes it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    rows, targets = shared_rows(memory, n, joints)
+    rows, targets = arrays.split()
     batch: BulletBatch | None = None
     try:
         while True:

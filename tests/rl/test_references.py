@@ -11,9 +11,10 @@ from morphgen.model.kinematics import bounds
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.rl.connect import explored
 from morphgen.rl.free_ways import LEGS, FreeWays, Routes, shares_to
-from morphgen.rl.references import STARTS, InverseKinematics, as_actions, random_starts, solve
+from morphgen.rl.references import STARTS, InverseKinematics, random_starts, solve
 from morphgen.rl.rollouts import run_episodes
 from morphgen.rl.scripted_push import ScriptedPush
+from morphgen.tasks.actions import actions_of
 from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematics import tool_positions
@@ -55,7 +56,7 @@ def test_a_robot_gets_past_a_stop(made, kind):
     routes.take(0, [stop, end])
     for _ in range(200):
         final = routes.go_on()
-        batch.step(as_actions(shares_to(batch, routes.wanted), kind))
+        batch.step(actions_of(shares_to(batch, routes.wanted), kind))
     assert final.all()
     step = batch.bodies.step[0]
     assert ((batch.targets[0] - torch.from_numpy(end)).abs() <= step / 16 + 1e-6).all()

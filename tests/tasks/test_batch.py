@@ -7,7 +7,8 @@ import torch
 
 import morphgen
 from morphgen.errors import TaskError
-from morphgen.rl.references import InverseKinematics, Random, Zero, as_actions
+from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import BINS, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
@@ -165,7 +166,7 @@ def test_an_environment_is_the_same_in_whichever_batch(made):
 
 def test_shares_become_the_nearest_bins_towards_zero():
     shares = torch.tensor([[0.0, 1.0, -1.0, 0.3, -0.3, 0.01]])
-    found = [BINS[i] for i in as_actions(shares, "discrete")[0].tolist()]
+    found = [BINS[i] for i in actions_of(shares, "discrete")[0].tolist()]
     assert found == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
 
 
