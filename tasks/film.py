@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FormatError
+from morphgen.formats.files import replacing_file
 from morphgen.formats.picture import gl_context
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.batch import TaskBatch
@@ -179,13 +179,11 @@ def write_film(frames: Iterable[Frame], path: Path, fps: float) -> None:
     """
     require_film(path)
     try:
-        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
-            partial = Path(folder) / path.name
+        with replacing_file(path) as partial:
             writer: Any = imageio.get_writer(partial, **_writing(path.suffix, fps))
             with writer:
                 for frame in frames:
                     writer.append_data(frame)
-            partial.replace(path)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
 

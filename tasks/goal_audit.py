@@ -21,8 +21,9 @@ from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, mapped, unseen
 from morphgen.tasks.goal_leaks import repeated, shared
 from morphgen.tasks.goal_making import Made, SplitGoals, goals_of, unproven
-from morphgen.tasks.goal_npz import Goals, arrays_of
+from morphgen.tasks.goal_npz import Goals
 from morphgen.tasks.goals import EXACT
+from morphgen.tasks.set_files import arrays_of
 from morphgen.tasks.settings import Recipe, member_body, setting_of
 
 _FIXES = {

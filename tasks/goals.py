@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -18,7 +19,7 @@ from platformdirs import user_cache_path
 
 from morphgen.benchmark.split import robot_hash
 from morphgen.benchmark.workspace import shoulder
-from morphgen.errors import BenchmarkError, TaskError
+from morphgen.errors import BenchmarkError
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose, movable_positions
@@ -26,7 +27,7 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import draw_obstacles
-from morphgen.tasks.set_files import blocks_of, boxes_of, keep, load, require_own
+from morphgen.tasks.set_files import cached, require_own
 from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
@@ -95,12 +96,22 @@ def goal_set(
     body = robot_hash(robot)
     key = _key(robot, body, config, obstacles, seed, ground)
     if shipped is not None:
-        require_own(shipped.key, key, robot.name)
+        require_own(shipped, key, robot.name)
         return shipped
-    folder = user_cache_path("morphgen") / "goals" if cache is None else cache
-    path = folder / f"{key}.npz"
-    if path.is_file():
-        return _read(path, robot, config, obstacles, seed, key)
+    folder = user_cache_path("morphgen") / "goals-2" if cache is None else cache
+    make = partial(_made, robot, body, config, obstacles, seed, ground)
+    return cached(GoalSet, folder / f"{key}.npz", robot.name, make)
+
+
+def _made(
+    robot: Robot,
+    body: str,
+    config: ReachConfig,
+    obstacles: bool,
+    seed: int,
+    ground: float,
+    key: str,
+) -> GoalSet:
     seeds = np.random.SeedSequence([seed, int(body, 16), int(obstacles)])
     of_goals, of_obstacles = (np.random.default_rng(child) for child in seeds.spawn(2))
     placed: tuple[Block, ...] = ()
@@ -110,16 +121,7 @@ def goal_set(
     space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
     q, tried = space.draw(config.goals, of_goals)
     poses = _vectors(frame_pose(robot, q, TOOL))
-    made = GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
-    arrays = {
-        "key": np.array(key),
-        "q": q,
-        "poses": poses,
-        "obstacles": boxes_of(placed),
-        "tried": np.array(tried),
-    }
-    keep(path, arrays, "goals")
-    return made
+    return GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
 
 
 def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
@@ -207,18 +209,3 @@ def _key(
     boxes = [config.obstacles, *map(float, config.obstacle_size)] if obstacles else None
     parts = [FORMAT, body, ignored, config.goals, boxes, seed, float(ground)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def _read(
-    path: Path, robot: Robot, config: ReachConfig, obstacles: bool, seed: int, key: str
-) -> GoalSet:
-    stored = load(path, ("key", "q", "poses", "obstacles", "tried"), "goal set")
-    q, boxes = stored["q"], stored["obstacles"]
-    count = config.obstacles if obstacles else 0
-    if str(stored["key"]) != key or len(q) != config.goals or len(boxes) != count:
-        raise TaskError(
-            f"{path}: {len(q)} goals and {len(boxes)} obstacles of key {stored['key']}, not what "
-            "its name says; delete it"
-        )
-    tried, poses = int(stored["tried"]), stored["poses"]
-    return GoalSet(robot.name, key, q, poses, blocks_of(boxes), tried, len(q), seed)

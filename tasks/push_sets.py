@@ -6,8 +6,8 @@ import hashlib
 import json
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push_proofs import Prover
 from morphgen.tasks.push_region import Region, push_region
 from morphgen.tasks.push_ways import clear_obstacles, draw_places
-from morphgen.tasks.set_files import blocks_of, boxes_of, keep, load, require_own
+from morphgen.tasks.set_files import cached, require_own
 from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
@@ -107,15 +107,11 @@ def push_set(
     body = robot_hash(robot)
     key = _key(robot, body, config, obstacles, seed, ground)
     if shipped is not None:
-        require_own(shipped.key, key, robot.name)
+        require_own(shipped, key, robot.name)
         return shipped
-    folder = user_cache_path("morphgen") / "pushes" if cache is None else cache
-    path = folder / f"{key}.npz"
-    if path.is_file():
-        return _read(path, robot, config, obstacles, seed, ground, key)
-    made = _made(robot, body, config, obstacles, seed, ground, key)
-    keep(path, _arrays(made), "a push set")
-    return made
+    folder = user_cache_path("morphgen") / "pushes-2" if cache is None else cache
+    make = partial(_made, robot, body, config, obstacles, seed, ground)
+    return cached(PushSet, folder / f"{key}.npz", robot.name, make)
 
 
 def _require(config: PushConfig, seed: int) -> None:
@@ -245,54 +241,3 @@ def _key(
     places = [*map(float, ranges), *map(float, numbers)]
     parts = [FORMAT, body, ignored, config.starts, places, boxes, seed, float(ground)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def _arrays(made: PushSet) -> dict[str, NDArray[Any]]:
-    return {
-        "key": np.array(made.key),
-        "q": made.q,
-        "blocks": made.blocks,
-        "behind": made.behind,
-        "across": made.across,
-        "obstacles": boxes_of(made.obstacles),
-        "numbers": np.array([made.block.size[0], made.line, made.scale]),
-        "tried": np.array(made.tried),
-    }
-
-
-def _read(
-    path: Path,
-    robot: Robot,
-    config: PushConfig,
-    obstacles: bool,
-    seed: int,
-    ground: float,
-    key: str,
-) -> PushSet:
-    names = ("key", "q", "blocks", "behind", "across", "obstacles", "numbers", "tried")
-    stored = load(path, names, "push set")
-    q, places = stored["q"], stored["blocks"]
-    count = config.obstacles if obstacles else 0
-    if str(stored["key"]) != key or len(q) != config.starts or len(stored["obstacles"]) != count:
-        raise TaskError(
-            f"{path}: {len(q)} starts and {len(stored['obstacles'])} obstacles of key "
-            f"{stored['key']}, not what its name says; delete it"
-        )
-    edge, line, scale = stored["numbers"].tolist()
-    block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
-    return PushSet(
-        robot=robot.name,
-        key=key,
-        q=q,
-        blocks=places,
-        block=_standing(block, places),
-        line=line,
-        scale=scale,
-        ground=ground,
-        obstacles=blocks_of(stored["obstacles"]),
-        tried=int(stored["tried"]),
-        accepted=len(q),
-        seed=seed,
-        behind=stored["behind"],
-        across=stored["across"],
-    )

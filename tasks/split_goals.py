@@ -22,7 +22,8 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.files import alone, replacing_folder, write_atomic
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.goal_making import Made, SplitGoals, gathered
-from morphgen.tasks.goal_npz import Goals, goals_from_npz, goals_npz
+from morphgen.tasks.goal_npz import Goals, goals_from_npz
+from morphgen.tasks.set_files import set_npz
 from morphgen.tasks.settings import Recipe
 
 GOALS = "goals"
@@ -172,7 +173,7 @@ def _files(made: Sequence[Made], recipe: Recipe) -> Iterator[tuple[str, bytes]]:
         if one.goals is None:
             raise ValueError(f"{one.robot} has no goals")
         name = f"{one.side}/{one.robot}.npz"
-        content = goals_npz(one.goals)
+        content = set_npz(one.goals)
         records.append(record_of(one) | {"file": name, "sha256": _sha256(content)})
         yield name, content
     head = json.dumps({"format": FORMAT, **asdict(recipe)}, indent=2).removesuffix("\n}")

@@ -18,7 +18,7 @@ from morphgen.benchmark.survey import facts_of
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
-from morphgen.formats.files import write_atomic
+from morphgen.formats.files import keep, write_atomic
 from morphgen.formats.picture import render
 from morphgen.viewer.places import Places, content_key, is_robot, read_place
 from morphgen.viewer.workers import Workers
@@ -48,8 +48,8 @@ def ask(workers: Workers, place: str, places: Places) -> Future[Portrait]:
 def portrait(place: str, places: Places) -> Portrait:
     """The portrait of the robot at a place, from the cache or made and kept there."""
     try:
-        kept = user_cache_path("morphgen") / f"viewer-{_FORMAT}"
-        path = kept / f"{content_key(place, places)}.json"
+        name = f"{content_key(place, places)}.json"
+        path = user_cache_path("morphgen") / f"viewer-{_FORMAT}" / name
         if path.is_file():
             data = json.loads(path.read_text(encoding="utf-8"))
             facts = {**data["facts"], "findings": tuple(data["facts"]["findings"])}
@@ -58,8 +58,7 @@ def portrait(place: str, places: Places) -> Portrait:
     except (MorphgenError, OSError) as error:
         return Portrait("", {"findings": ("broken",)}, str(error))
     with suppress(OSError):  # where nothing can be kept it is drawn again next time
-        kept.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
+        keep(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
     return made
 
 

@@ -22,7 +22,7 @@ from morphgen.fitting.stored import (
     shapes_scale,
     stored_fit,
 )
-from morphgen.formats.files import write_atomic
+from morphgen.formats.files import keep
 from morphgen.model.geometry import Shape
 from morphgen.model.inertia import union_moments
 from morphgen.model.robot import Robot
@@ -87,8 +87,7 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
     shape = _fitted(shapes)
     data = None if shape is None else shape_data(scaled_shape(shape, 1 / factor))
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps(data))
+        keep(path, json.dumps(data))
     except OSError as error:
         warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=3)
     return shape

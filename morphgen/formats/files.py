@@ -50,6 +50,33 @@ def partial_of(path: Path) -> Path:
 
 
 @contextmanager
+def replacing_file(path: Path) -> Iterator[Path]:
+    """A file in a temporary folder beside ``path`` that takes its place if the block succeeds.
+
+    Other processes may do the same at once, which ``write_atomic`` does not bear: its partial file
+    has a name by which a run knows its own.
+
+    Raises:
+        OSError: If it cannot be written; then nothing is left behind.
+    """
+    with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+        partial = Path(folder) / path.name
+        yield partial
+        partial.replace(path)
+
+
+def keep(path: Path, content: str | bytes) -> None:
+    """Write a file of a cache, which several processes may do at once; makes its folder.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing_file(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """Hold a folder against a second run; a killed one holds nothing.
 

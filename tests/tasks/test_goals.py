@@ -251,7 +251,7 @@ def test_a_broken_file_is_named(body, cache, keep):
     made(body, cache)
     (path,) = cache.iterdir()
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(TaskError, match=f"{path.name}: no goal set: .*; delete it"):
+    with pytest.raises(TaskError, match=f"{path.name}: no GoalSet: .*; delete it"):
         made(body, cache)
 
 
@@ -269,13 +269,13 @@ def test_a_changed_byte_is_noticed(body, cache):
 def test_a_file_under_another_name_is_noticed(body, cache):
     first, second = made(body, cache), made(body, cache, seed=1)
     (cache / f"{first.key}.npz").replace(cache / f"{second.key}.npz")
-    with pytest.raises(TaskError, match=f"12 goals and 0 obstacles of key {first.key}"):
+    with pytest.raises(TaskError, match=f"a set of key {first.key}, not"):
         made(body, cache, seed=1)
 
 
 def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot keep goals"):
+    with pytest.warns(UserWarning, match="cannot keep a GoalSet"):
         found = made(body, tmp_path / "file" / "goals")
     assert len(found.q) == 12
 
@@ -283,7 +283,7 @@ def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
 def test_the_users_cache_is_the_default(body, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / name)
     found = made(body, None)
-    assert (tmp_path / "morphgen" / "goals" / f"{found.key}.npz").is_file()
+    assert (tmp_path / "morphgen" / "goals-2" / f"{found.key}.npz").is_file()
 
 
 def test_a_certificate_names_every_fault(body, cache):

@@ -21,8 +21,9 @@ from morphgen.tasks import free_space, goal_making, goals, push_sets, settings, 
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.goal_making import gathered, robot_goals
 from morphgen.tasks.goal_making import split_goals as make
-from morphgen.tasks.goal_npz import arrays_of, goals_from_npz, goals_npz
+from morphgen.tasks.goal_npz import goals_from_npz
 from morphgen.tasks.make import make_split_batch
+from morphgen.tasks.set_files import arrays_of, set_npz
 from morphgen.tasks.settings import Recipe
 from morphgen.tasks.split_goals import read_goals, read_split_goals, write_goals
 from scenes import robot
@@ -196,7 +197,7 @@ def test_two_builds_are_equal_byte_for_byte(home, tmp_path):
 
 
 def test_a_file_carries_no_time(cache):
-    content = goals_npz(made(reaching(), cache)[0].goals)
+    content = set_npz(made(reaching(), cache)[0].goals)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
@@ -316,14 +317,14 @@ def test_a_broken_index_is_named(home, cache, old, new, message):
 
 def test_a_broken_file_is_named(cache, tmp_path):
     whole = made(reaching(), cache)[0].goals
-    content = goals_npz(whole)
+    content = set_npz(whole)
     path = tmp_path / "some.npz"
     for broken in (b"", content[:100], content[:-200]):
         with pytest.raises(BenchmarkError, match=r"some\.npz: no goal set for reach"):
             goals_from_npz(broken, "reach", path)
     for wrong in (replace(whole, poses=whole.poses[1:]), replace(whole, q=whole.q[0])):
         with pytest.raises(BenchmarkError, match=r"some\.npz: configurations and poses are of"):
-            goals_from_npz(goals_npz(wrong), "reach", path)
+            goals_from_npz(set_npz(wrong), "reach", path)
 
 
 def test_sets_travel_between_processes(cache):
