@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -83,7 +84,7 @@ def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", choices=["reach", "push"])
-    parser.add_argument("--only", default="", help="robots whose name has this in it")
+    parser.add_argument("--only", default="", help="robots whose name matches this expression")
     parser.add_argument("--envs", type=int, default=8)
     parser.add_argument("--episodes", type=int, default=2, help="of each environment")
     parser.add_argument("--sims", default=",".join(SIMULATORS))
@@ -95,7 +96,7 @@ def main() -> int:
     members = [
         member
         for member in _members()
-        if args.task in (None, member.task) and args.only in member.name
+        if args.task in (None, member.task) and re.search(args.only, member.name)
     ]
     work = Measuring(sims, args.envs, args.episodes, args.obstacles)
     rows: list[Row] = []

@@ -122,7 +122,7 @@ def curves(results: Results) -> bytes:
     from matplotlib.figure import Figure
 
     splits = list(dict.fromkeys(cell.split for cell in results))
-    figure = Figure(figsize=(7.0, 4.0 * len(splits)), layout="constrained")
+    figure = Figure(figsize=(7.0, 4.8 * len(splits)), layout="constrained")
     panels = figure.subplots(len(splits), 1, squeeze=False)[:, 0]
     for panel, split in zip(panels, splits, strict=True):
         panel.set(title=split, xlabel="transitions", ylabel="score of a step, in training")
@@ -142,7 +142,7 @@ def curves(results: Results) -> bytes:
                 steps, values.min(axis=0), values.max(axis=0), alpha=0.2, color=line.get_color()
             )
         if panel.lines:
-            panel.legend()
+            panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize="small")
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=150)
     return content.getvalue()

@@ -236,7 +236,8 @@ def _learn(learner: Learner, part: Part, way: Way, show: Show) -> None:
             report = learner.iterate()
             for recorder in recorders:
                 recorder.record(report)
-            if learner.done or learner.update % often == 0:
+            rest = learner.updates - learner.update
+            if not rest or (learner.update % often == 0 and rest >= often):
                 write_checkpoint(part.folder, part.config, learner.checkpoint())
             show(report, learner.updates)
 

@@ -43,7 +43,7 @@ def successes(controller, robot):
 def test_an_arm_of_three_joints_learns_to_reach():
     robot = arm_of_three_joints()
     assert successes(Random(0), robot) < 0.1
-    policy = PolicyConfig("se", discrete=False, mlp_width=96, mlp_layers=2)
+    policy = PolicyConfig("se", discrete=False)
     config = PPOConfig(
         transitions=4_000_000,
         steps=32,

@@ -12,6 +12,7 @@ import pytest
 from commands import tree
 from morphgen.errors import FormatError, TaskError
 from morphgen.formats.files import alone
+from morphgen.rl import training
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
@@ -107,6 +108,15 @@ def test_checkpoints_are_five_to_ten_episodes_apart_and_four_at_least(updates, s
     config = small_config(transitions=4 * steps * updates, steps=steps)
     assert config.updates == updates
     assert updates_between(config) == expected
+
+
+def test_no_checkpoint_is_made_right_before_the_last(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        training, "write_checkpoint", lambda folder, config, state: made.append(state["update"])
+    )
+    train(tmp_path, small_config(transitions=9 * 4 * 8), way=QUIET)
+    assert made == [2, 4, 6, 9]
 
 
 def test_other_seeds_come_to_other_weights_and_other_workers_to_the_same(tmp_path):
