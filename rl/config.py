@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 from morphgen.errors import TaskError, nearest
@@ -49,8 +50,9 @@ class PolicyConfig:
             raise TaskError(f"agent {self.agent!r}{nearest(self.agent, AGENTS)}")
         if self.fixed_deviation and self.discrete:
             raise TaskError("fixed-deviation: bins have no deviation; it goes with --no-discrete")
-        for name in ("mlp_features", "mlp_width", "features", "heads", "feedforward", "decoder"):
-            _at_least(name, getattr(self, name), 1)
+        for each in fields(self):
+            if each.type == "int":
+                _at_least(each.name, getattr(self, each.name), 1)
         if self.features % self.heads:
             raise TaskError(f"features {self.features}: expected a multiple of heads {self.heads}")
 
@@ -63,6 +65,14 @@ class PolicyConfig:
     def blind(self) -> bool:
         """Whether the agent sees no morphology."""
         return self.mask_morphology or self.agent == "se"
+
+
+SIZES: Mapping[str, tuple[AgentName, ...]] = {
+    each.name: ("se", "me-mlp") if each.name.startswith("mlp_") else ("me-tf",)
+    for each in fields(PolicyConfig)
+    if each.type == "int"
+}
+"""Whose networks have which sizes."""
 
 
 @dataclass(frozen=True)

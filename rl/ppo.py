@@ -74,6 +74,8 @@ class Learner:
         """
         if batch.kind != policy.kind:
             raise TaskError(f"the policy's actions are {policy.kind}, the batch's {batch.kind}")
+        if config.compile:
+            torch.compiler.reset()  # else learners of one process soon reach its limit of variants
         self.batch, self.policy, self.config = batch, policy, config
         self.device = torch.device(device)
         self.update, self.updates = 0, config.updates(batch.num_envs)

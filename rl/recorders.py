@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -101,7 +102,7 @@ class WeightsAndBiases:
         self._run = require_wandb().init(
             project="morphgen",
             name=str(folder),
-            id=folder.resolve().as_posix().strip("/").replace("/", "-")[-64:],
+            id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
             resume="allow",
             dir=folder,
             config=asdict(config),

@@ -46,6 +46,15 @@ class RunConfig:
     reach: ReachConfig = field(default_factory=ReachConfig)
     push: PushConfig = field(default_factory=PushConfig)
 
+    def __post_init__(self) -> None:
+        """Check.
+
+        Raises:
+            TaskError: If the seed is none.
+        """
+        if self.seed < 0:
+            raise TaskError(f"--seed {self.seed}: expected 0 or more")
+
     @property
     def updates(self) -> int:
         """How many there will be."""

@@ -55,6 +55,8 @@ def require_table(path: Path) -> None:
     """
     if path.suffix not in SUFFIXES:
         raise TaskError(f"{path}: a table's name ends in{nearest(path.suffix, SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise TaskError(f"{path}: there is no folder {path.parent}")
 
 
 def write_scores(path: Path, found: Scores) -> None:

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from morphgen.benchmark.split import Member, Side, Split, Task
+from morphgen.benchmark.split import Member, Side, Split, Task, robot_hash
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_reader import parse_split
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.tasks.goal_npz import Goals
-from morphgen.tasks.robots import robot_of
+from morphgen.tasks.robots import is_file, robot_of
 from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
-from morphgen.tasks.split_goals import read_goals
+from morphgen.tasks.split_goals import read_goals, shipped_set
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Source:
     """Robots at tasks, told in text alone, so that a run's folder says all of them."""
 
     name: str
-    """Of the split, or words of the robot."""
+    """Of the split, or words of the robot, or the path of its file."""
     split: str = ""
     """Text of the split's file; empty for one robot."""
     task: Task | None = None
@@ -32,6 +32,8 @@ class Source:
     """Of the one robot."""
     side: Side = "train"
     """Of the split."""
+    body: str = ""
+    """Hash of the one robot; a split has that of each."""
     only: str | None = None
     """The one member that is meant, if it is not all of the side."""
     goal_seed: int = 0
@@ -69,9 +71,19 @@ def robot_source(
     goal_seed: int = 0,
     library: tuple[Path, ...] = (),
 ) -> Source:
-    """One robot, which is whatever ``morphgen.tasks.robots.robot_of`` knows."""
-    folders = tuple(str(folder.resolve()) for folder in library)
-    return Source(robot, task=task, obstacles=obstacles, goal_seed=goal_seed, library=folders)
+    """One robot, which is whatever ``morphgen.tasks.robots.robot_of`` knows.
+
+    Raises:
+        MorphgenError: As ``robot_of``.
+    """
+    return Source(
+        str(Path(robot).resolve()) if is_file(robot) else robot,
+        task=task,
+        obstacles=obstacles,
+        body=robot_hash(robot_of(robot, library=library)),
+        goal_seed=goal_seed,
+        library=tuple(str(folder.resolve()) for folder in library),
+    )
 
 
 def members(source: Source) -> tuple[Member, ...]:
@@ -136,12 +148,17 @@ def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
         return [_of_member(member, own, recipe) for member in members(source)]
     assert source.task is not None
     robot = robot_of(source.name, library=map(Path, source.library))
+    if robot_hash(robot) != source.body:
+        raise TaskError(f"{source.name}: it is not the body that it was when the run began")
     return [setting_of(robot, source.task, recipe, obstacles=source.obstacles)]
 
 
 @lru_cache(maxsize=64)
 def _of_member(member: Member, source: Source, recipe: Recipe) -> Setting:
-    shipped = _shipped(source.goals, source.side)[member.name] if source.goals else None
+    shipped = None
+    if source.goals:
+        sets = _shipped(source.goals, source.side)
+        shipped = shipped_set(sets, member.name, Path(source.goals))
     library = default_library(tuple(map(Path, source.library)))
     return member_setting(member, library, recipe, shipped=shipped)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -103,7 +105,7 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
     """Scores by mode, or by the reference's name; None if the cell is not done.
 
     Raises:
-        TaskError: If they are of another evaluation.
+        TaskError: If they are of another evaluation, or of other robots or goals.
         FormatError: If they are malformed.
     """
     path = cell.folder / SCORES
@@ -112,11 +114,13 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         found = {mode: [_score(each) for each in own] for mode, own in data["scores"].items()}
-        exam = data["exam"]
+        made_with = data["exam"], data["source"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: not the scores of a cell: {error}") from error
-    if exam != json.loads(json.dumps(asdict(cell.exam))):
-        raise TaskError(f"{path}: of another evaluation; delete it, or name another --out")
+    wanted = json.loads(json.dumps([asdict(cell.exam), asdict(cell.source)]))
+    for what, theirs, ours in zip(("evaluation", "set of robots"), made_with, wanted, strict=True):
+        if theirs != ours:
+            raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
     return found
 
 
@@ -156,6 +160,7 @@ def do(cell: Cell, way: Way, show: Callable[[Part], Show] | None = None) -> None
         }
     data = {
         "exam": asdict(cell.exam),
+        "source": asdict(cell.source),
         "scores": {mode: as_data(scores) for mode, scores in found.items()},
     }
     write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
@@ -211,10 +216,8 @@ def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
                 cell = running.pop(done)
                 try:
                     yield Outcome(cell, ray.get(done))
-                except ray.exceptions.RayTaskError as error:
-                    raise error.cause if error.cause is not None else error from None
                 except ray.exceptions.RayError as error:
-                    yield Outcome(cell, f"its Ray worker died: {type(error).__name__}")
+                    yield Outcome(cell, f"its Ray task failed: {type(error).__name__}: {error}")
 
     return work
 
@@ -236,6 +239,9 @@ def _alone(cell: Cell, way: Way, show: Callable[[Part], Show] | None) -> Outcome
         return Outcome(cell, str(error))
     except OSError as error:
         return Outcome(cell, f"{error.filename or cell.folder}: {error.strerror}")
+    except Exception as error:  # such as a GPU without memory: the other cells may do without
+        traceback.print_exc(file=sys.stderr)
+        return Outcome(cell, f"{type(error).__name__}: {error}")
     return Outcome(cell)
 
 

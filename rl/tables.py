@@ -133,13 +133,19 @@ def curves(results: Results) -> bytes:
             if not found:
                 panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
                 continue
-            length = min(len(steps) for steps, _ in found)
-            steps = found[0][0][:length]
-            values = np.array([value[:length] for _, value in found])
-            note = "" if len(found) == len(own) else f" ({len(found)} of {len(own)} seeds)"
-            (line,) = panel.plot(steps, values.mean(axis=0), label=agent + note)
+            steps = max((steps for steps, _ in found), key=len)
+            values = np.full((len(found), len(steps)), np.nan)
+            for row, (_, value) in zip(values, found, strict=True):
+                row[: len(value)] = value
+            done = sum(len(value) == len(steps) for _, value in found)
+            note = "" if done == len(own) else f" ({done} of {len(own)} seeds to the end)"
+            (line,) = panel.plot(steps, np.nanmean(values, axis=0), label=agent + note)
             panel.fill_between(
-                steps, values.min(axis=0), values.max(axis=0), alpha=0.2, color=line.get_color()
+                steps,
+                np.nanmin(values, axis=0),
+                np.nanmax(values, axis=0),
+                alpha=0.2,
+                color=line.get_color(),
             )
         if panel.lines:
             panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize="small")
@@ -172,7 +178,8 @@ def _groups(
             continue
         scores = np.array([[each.score for each in seed] for seed in table])
         success = float(np.mean([each.success for seed in table for each in seed]))
-        apart = next(iter(there)).agent.startswith("se") and side == "train"
+        first = next(iter(there))
+        apart = first.agent.startswith("se") and side == first.source.side
         iqm = iqm_interval(scores, together=not apart)
         found[side] = Group(float(scores.mean()), iqm, success)
     return found

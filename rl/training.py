@@ -13,17 +13,18 @@ import torch
 from morphgen.errors import TaskError
 from morphgen.formats.files import alone
 from morphgen.rl.ppo import Learner
-from morphgen.rl.recorders import recording
+from morphgen.rl.recorders import recording, require_wandb
 from morphgen.rl.report import Report
 from morphgen.rl.runs import (
     CHECKPOINT,
     RunConfig,
     open_run,
     read_checkpoint,
+    read_config,
     require_open,
     write_checkpoint,
 )
-from morphgen.rl.sources import apart, settings_of
+from morphgen.rl.sources import apart, members, settings_of
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.settings import Recipe
 
@@ -119,6 +120,9 @@ def train(
     way, made = way or Way(), parts_of(folder, config)
     for part in made:
         require_runnable(part.config)
+    require_device(config.device)
+    if way.wandb:
+        require_wandb()
     require_open(folder, config, resume=resume)
     with ExitStack() as held:
         holds = False
@@ -137,21 +141,23 @@ def train(
 
 
 def require_runnable(config: RunConfig) -> None:
-    """Require that a run has an update, and a device.
+    """Require that a run has an update, and every robot an environment.
 
     Raises:
         TaskError: If it has not.
     """
+    robots = len(members(config.source))
+    if config.envs < robots:
+        raise TaskError(
+            f"--envs {config.envs}: fewer than the {robots} robots, each of which has one"
+        )
     one = config.ppo.steps * config.envs
     if config.envs < 1 or config.ppo.transitions < one:
         raise TaskError(
             f"--steps {config.ppo.transitions} with --envs {config.envs}: an update takes "
             f"{one:,} transitions ({config.ppo.steps} steps of every environment)"
         )
-    if config.seed < 0:
-        raise TaskError(f"--seed {config.seed}: expected 0 or more")
     config.ppo.minibatch(config.envs)
-    require_device(config.device)
 
 
 def require_device(name: str) -> None:
@@ -160,17 +166,20 @@ def require_device(name: str) -> None:
     Raises:
         TaskError: If there is none.
     """
-    if name != "cpu" and not name.startswith("cuda"):
-        raise TaskError(f"unknown device {name!r}; valid: cpu, cuda")
-    if name != "cpu" and not torch.cuda.is_available():
+    kind, _, number = name.partition(":")
+    if name != "cpu" and (kind != "cuda" or not (number or "0").isdecimal()):
+        raise TaskError(f"unknown device {name!r}; valid: cpu, cuda, or such as cuda:1")
+    if kind == "cuda" and not torch.cuda.is_available():
         raise TaskError(f"--device {name}: this machine has no CUDA device")
+    if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
+        raise TaskError(f"--device {name}: there are {torch.cuda.device_count()} CUDA devices")
 
 
 def checkpoints(path: Path) -> Iterator[Path]:
     """The checkpoints of what a user names: a file, a run's folder, or that of ``se`` on a split.
 
     Raises:
-        TaskError: If there is none.
+        TaskError: If there is none, or ``se`` has not begun with some of its robots.
     """
     if path.is_file() or (path / CHECKPOINT).is_file():
         yield path if path.is_file() else path / CHECKPOINT
@@ -178,6 +187,13 @@ def checkpoints(path: Path) -> Iterator[Path]:
     found = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
     if not found:
         raise TaskError(f"{path}: no checkpoint, and no folder of a run with one")
+    parts = parts_of(path, read_config(path))
+    missing = [part.folder.name for part in parts if not (part.folder / CHECKPOINT).is_file()]
+    if missing:
+        raise TaskError(
+            f"{path}: {len(missing)} of its {len(parts)} robots have no policy yet, such as "
+            f"{missing[0]}; train goes on with --resume"
+        )
     yield from found
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_json, add_library
-from morphgen.cli.train import count
+from morphgen.cli.train import count, require_words
 from morphgen.rl.names import REFERENCES
 
 if TYPE_CHECKING:
@@ -73,13 +74,13 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         require_table(args.out)
     found = _references(args) if args.checkpoint in REFERENCES else _policies(args)
-    if args.out is not None:
-        write_scores(args.out, found)
     if args.json:
         print(json.dumps({mode: as_data(scores) for mode, scores in found.items()}))
-        return 0
-    print(score_table(found))
-    print(summary(found))
+    else:
+        print(score_table(found))
+        print(summary(found))
+    if args.out is not None:
+        write_scores(args.out, found)
     return 0
 
 
@@ -89,6 +90,9 @@ def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
 
     if not args.words:
         raise TaskError(f"{args.checkpoint}: say on which robots, with --split")
+    if args.mode or args.device != "cpu":
+        option = "--mode" if args.mode else "--device"
+        raise TaskError(f"{option} is for policies; {args.checkpoint} has none")
     sources = _sources(args)
     exam = Exam(_episodes(args), args.sim or "pybullet", args.seed, args.workers)
     found = (evaluate_reference(args.checkpoint, source, exam) for source in sources)
@@ -96,8 +100,19 @@ def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
 
 
 def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
+    from morphgen.rl.runs import read_checkpoint
     from morphgen.rl.trained import MODES
+    from morphgen.rl.training import checkpoints
 
+    require_words(args)
+    for file in checkpoints(Path(args.checkpoint)):
+        config, learner = read_checkpoint(file)
+        if learner["update"] < config.updates:
+            print(
+                f"morphgen: {file} is not at its end: update {learner['update']} of "
+                f"{config.updates}",
+                file=sys.stderr,
+            )
     modes: tuple[Mode, ...] = (args.mode,) if args.mode else MODES
     return {mode: _policy(args, mode) for mode in modes}
 
@@ -152,6 +167,6 @@ def _sources(args: argparse.Namespace) -> list[Source]:
     source = source_of(args.words, args)
     args.on = wanted
     if not source.split:
-        return [source]
+        return [other_side(source, wanted or "train")]
     sides: tuple[Side, ...] = ("train", "test") if wanted is None else (wanted,)
     return [other_side(source, side) for side in sides]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library
-from morphgen.cli.train import add_learning, trained
+from morphgen.cli.train import add_learning, require_words, trained
 
 if TYPE_CHECKING:
     from morphgen.rl.runs import RunConfig
@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.rl.runs import CHECKPOINT
     from morphgen.rl.training import checkpoints
 
+    require_words(args)
     files = list(checkpoints(args.checkpoint))
     if len(files) > 1:
         raise TaskError(

@@ -87,10 +87,12 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.evaluation import Exam, episodes_for
     from morphgen.rl.sources import other_side
     from morphgen.rl.study import agent_cell, matched_budget, reference_cells
-    from morphgen.rl.training import parts_of, require_runnable
+    from morphgen.rl.training import parts_of, require_device, require_runnable
     from morphgen.rl.variants import parse_agents
     from morphgen.tasks.config import ReachConfig
 
+    if args.ray is None and not args.report:
+        require_device(args.device)
     exam = Exam(episodes_for(args.eval_steps, ReachConfig().steps), args.sim)
     args.on, args.obstacles = "train", False
     agents, seeds = parse_agents(args.agents), seeds_of(args.seeds)
@@ -136,7 +138,7 @@ def _work(args: argparse.Namespace, cells: list[Cell]) -> int:
     from morphgen.rl.study import work_here, work_on_ray
 
     failed = 0
-    with shown() as show:
+    with shown("if the same command is given again") as show:
         if args.ray is None:
             outcomes = work_here(cells, way_of(args), show)
         else:

@@ -125,10 +125,14 @@ def count(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Train and say where it is."""
     from morphgen.rl.runs import CHECKPOINT
+    from morphgen.rl.sources import other_side
 
     source = source_of(args.words, args)
+    if not source.split:
+        source = other_side(source, args.on)
     variant = variant_of(args)
     config = config_of(source, variant, args)
+    _require_meant(config, args)
     folder = args.out or Path("runs") / place(source) / str(variant) / f"seed{args.seed}"
     parts = trained(folder, config, args)
     for part in parts:
@@ -142,6 +146,19 @@ def trained(folder: Path, config: RunConfig, args: argparse.Namespace) -> list[P
 
     with shown() as show:
         return train(folder, config, resume=args.resume, way=way_of(args), show=show)
+
+
+def require_words(args: argparse.Namespace) -> None:
+    """Require that what describes other robots than the checkpoint's comes with ``--split``.
+
+    Raises:
+        TaskError: If it does not.
+    """
+    from morphgen.errors import TaskError
+
+    for name in ("obstacles", "library", "goal_seed"):
+        if not args.words and getattr(args, name) not in (None, False, []):
+            raise TaskError(f"--{name.replace('_', '-')} goes with --split")
 
 
 def source_of(words: list[str], args: argparse.Namespace) -> Source:
@@ -227,14 +244,42 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
         sim=args.sim,
         envs=args.envs,
         device=args.device,
-        whole=args.whole,
+        whole=args.whole and variant.agent == "se",
     )
 
 
+def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:
+    """Require that no option is for another agent; in a study it may be for another cell.
+
+    Raises:
+        TaskError: If one is.
+    """
+    from morphgen.errors import TaskError
+    from morphgen.rl.config import SIZES
+    from morphgen.rl.variants import constants
+
+    agent = config.policy.agent
+    if args.whole and agent != "se":
+        raise TaskError(f"--whole is for --agent se, not for {agent}")
+    for name in constants(args.set):
+        if name in SIZES and agent not in SIZES[name]:
+            raise TaskError(
+                f"--set {name}: {agent} has no such size; valid for {' and '.join(SIZES[name])}"
+            )
+
+
 def way_of(args: argparse.Namespace) -> Way:
-    """How runs are done."""
+    """How runs are done.
+
+    Raises:
+        TaskError: If there are no workers.
+        MissingDependencyError: If Weights & Biases is asked for and not installed.
+    """
+    from morphgen.rl.recorders import require_wandb
     from morphgen.rl.training import Way
 
+    if args.wandb:
+        require_wandb()
     return Way(args.workers, not args.no_tensorboard, args.wandb)
 
 
@@ -242,7 +287,7 @@ def place(source: Source) -> str:
     """A folder's name for robots."""
     import re
 
-    name = source.name if source.split else f"{source.name}-{source.task}"
+    name = source.name if source.split else f"{Path(source.name).name}-{source.task}"
     if source.obstacles:
         name += "-obstacles"
     if source.side != "train":
@@ -251,14 +296,18 @@ def place(source: Source) -> str:
 
 
 @contextmanager
-def shown() -> Iterator[Shower]:
-    """Bars on stderr while there is one to look at, else some lines."""
+def shown(again: str = "with --resume") -> Iterator[Shower]:
+    """Bars on stderr while there is one to look at, else some lines.
+
+    Args:
+        again: What to say after Ctrl-C.
+    """
     shower = Shower()
     try:
         yield shower
     except KeyboardInterrupt:
         shower.close()
-        print("morphgen: the run goes on from its last checkpoint with --resume", file=sys.stderr)
+        print(f"morphgen: it goes on from its last checkpoint {again}", file=sys.stderr)
         raise
     finally:
         shower.close()

@@ -33,13 +33,14 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def save(path: Path, content: str | bytes) -> None:
-    """``write_atomic`` for a file that the user named.
+    """Write a file that the user named; several processes may at once.
 
     Raises:
-        FormatError: If it cannot be written.
+        FormatError: If it cannot be written; then nothing is left behind.
     """
     try:
-        write_atomic(path, content)
+        with replacing_file(path) as partial:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
@@ -93,8 +94,8 @@ def alone(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        (folder / LOCK).unlink(missing_ok=True)  # before the release: nobody holds it meanwhile
         lock.release()
-        (folder / LOCK).unlink(missing_ok=True)
 
 
 @contextmanager

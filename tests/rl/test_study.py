@@ -148,6 +148,45 @@ def test_a_cell_that_fails_is_told_and_does_not_stop_the_others(tmp_path):
 def test_scores_of_another_evaluation_are_not_mixed_in(whole):
     with pytest.raises(TaskError, match="of another evaluation"):
         read_scores(replace(whole[0], exam=replace(EXAM, episodes=5)))
+    for cell in (whole[0], whole[-1]):
+        with pytest.raises(TaskError, match="of another set of robots"):
+            read_scores(replace(cell, source=replace(cell.source, goal_seed=1)))
+
+
+def test_what_nobody_foresaw_does_not_stop_the_others_either(tmp_path, monkeypatch, capsys):
+    bad, good = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1))[-2:]
+    train = study.train
+
+    def without_memory(folder, config, **options):
+        if config.seed == 0:
+            raise RuntimeError("CUDA out of memory")
+        return train(folder, config, **options)
+
+    monkeypatch.setattr(study, "train", without_memory)
+    outcomes = list(work_here([bad, good], QUIET))
+    assert [each.why for each in outcomes] == ["RuntimeError: CUDA out of memory", ""]
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_curves_go_as_far_as_the_farthest_seed(whole, tmp_path, monkeypatch):
+    drawn = []
+    from matplotlib.axes import Axes
+
+    plot = Axes.plot
+    monkeypatch.setattr(
+        Axes, "plot", lambda self, *a, **k: drawn.append((k["label"], a)) or plot(self, *a, **k)
+    )
+    path = whole[-1].folder / METRICS
+    text = path.read_text()
+    path.write_text(text.splitlines(keepends=True)[0])
+    try:
+        write_tables(tmp_path, results(whole))
+    finally:
+        path.write_text(text)
+    label, (steps, values) = drawn[-1]
+    assert label == "me-mlp (1 of 2 seeds to the end)"
+    assert list(steps) == [32, 64]
+    assert np.isfinite(values).all()
 
 
 def score(side, value, robot="a"):
@@ -181,6 +220,21 @@ def test_rows_are_averages_over_seeds_and_robots(tmp_path):
     assert (test.mean, test.iqm.low, test.iqm.high) == (15, 10, 20)
     line = table_text(found).splitlines()[-1].split("|")
     assert [each.strip() for each in line[4:7]] == ["5.00", "5.00 [5.00, 5.00]", "50%"]
+
+
+def test_robots_of_se_on_the_test_robots_are_drawn_by_themselves(tmp_path):
+    source = other_side(small_source(), "test")
+    cells = [
+        agent_cell(tmp_path, "se@test", small_config(source, agent="se", seed=seed), EXAM)
+        for seed in range(3)
+    ]
+    values = [(0, 10), (10, 0), (0, 10)]
+    found = {
+        cell: {"deterministic": [score("test", a), score("test", b, robot="b")]}
+        for cell, (a, b) in zip(cells, values, strict=True)
+    }
+    (row,) = rows(found)
+    assert (row.groups["test"].iqm.low, row.groups["test"].iqm.high) == (0, 10)
 
 
 def test_what_is_missing_is_shown_as_missing(tmp_path):
@@ -229,7 +283,7 @@ def test_curves_are_of_those_that_learned(whole, tmp_path, monkeypatch):
     finally:
         (tmp_path / "aside").rename(whole[-1].folder / METRICS)
     (se, (steps, values)), (mlp, _) = drawn
-    assert (se, mlp) == ("se", "me-mlp (1 of 2 seeds)")
+    assert (se, mlp) == ("se", "me-mlp (1 of 2 seeds to the end)")
     assert list(steps) == [32, 64]
     assert np.isfinite(values).all()
     with Image.open(tmp_path / CURVES) as image:

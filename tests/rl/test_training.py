@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import morphgen
 from commands import tree
 from morphgen.errors import FormatError, TaskError
 from morphgen.formats.files import alone
@@ -16,6 +17,7 @@ from morphgen.rl import training
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
+from morphgen.rl.sources import robot_source
 from morphgen.rl.training import (
     Way,
     checkpoints,
@@ -174,6 +176,31 @@ def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
         assert equal(weights(part.folder), weights(same.folder))
 
 
+def test_a_run_of_se_with_robots_that_have_no_policy_yet_is_not_taken_for_whole(tmp_path):
+    config = small_config(small_source(), agent="se", transitions=64)
+    parts = train(tmp_path / "run", config, way=QUIET)
+    (parts[0].folder / CHECKPOINT).unlink()
+    says = f"1 of its 2 robots have no policy yet, such as {parts[0].folder.name}"
+    with pytest.raises(TaskError, match=says):
+        list(checkpoints(tmp_path / "run"))
+
+
+def test_a_robot_that_was_changed_since_is_another_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for words in ("base=planar ee=cube", "base=planar ee=plane"):
+        body = replace(morphgen.compose(words), name="own")
+        path = morphgen.write(body, "robots", picture=False)
+        config = small_config(robot_source(str(path), "reach"), transitions=64)
+        if words.endswith("cube"):
+            first = config
+            train(tmp_path / "run", config, way=QUIET)
+    assert config.source.name == str(path.resolve())
+    with pytest.raises(TaskError, match="not the body that it was"):
+        train(tmp_path / "new", first, way=QUIET)
+    with pytest.raises(TaskError, match=r"another run: source\.body"):
+        train(tmp_path / "run", config, resume=True, way=QUIET)
+
+
 def test_an_agent_of_many_robots_and_one_robot_are_one_run(tmp_path):
     assert len(parts_of(tmp_path, small_config(small_source()))) == 1
     assert len(parts_of(tmp_path, small_config(agent="se"))) == 1
@@ -199,8 +226,9 @@ def test_what_cannot_begin_leaves_nothing(tmp_path):
     for wrong, says in (
         (replace(config, envs=0), "an update takes"),
         (small_config(transitions=31), "an update takes 32 transitions"),
-        (replace(config, seed=-1), "--seed -1"),
+        (replace(small_config(small_source()), envs=1), "--envs 1: fewer than the 2 robots"),
         (replace(config, device="tpu"), "unknown device 'tpu'"),
+        (replace(config, device="cudaX"), "unknown device 'cudaX'"),
         (small_config(minibatches=5), "equal minibatches"),
         (replace(config, begin=str(tmp_path / "none.pt")), "no such checkpoint"),
         (replace(config, policy=replace(POLICY, discrete=True), sim="bullet"), "did you mean"),
@@ -210,6 +238,8 @@ def test_what_cannot_begin_leaves_nothing(tmp_path):
     assert tree(tmp_path) == {}
     with pytest.raises(TaskError, match="--workers 0"):
         Way(0)
+    with pytest.raises(TaskError, match="--seed -1"):
+        replace(config, seed=-1)
     require_runnable(config)
 
 
