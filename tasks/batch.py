@@ -17,7 +17,7 @@ from morphgen.tasks.episodes import Push, Reach, State, Verdict, chosen
 from morphgen.tasks.kinematics import ToolPositions
 from morphgen.tasks.observation import LinkTokens, box_tokens, of_links
 from morphgen.tasks.points import PointClouds
-from morphgen.tasks.rewards import Terms, beyond_limits
+from morphgen.tasks.rewards import Terms, added, beyond_limits
 from morphgen.tasks.settings import Setting
 from morphgen.tasks.sim.base import Simulation
 
@@ -122,6 +122,7 @@ class TaskBatch:
         )
         self._numbers = range(first, first + n)
         self._random = _streams(seed, self._numbers)
+        self._of_points = _streams(seed, self._numbers, 0)
         self._reach = Reach(self.settings, self.body, reach, joints)
         self._push = Push(self.settings, self.body, push, joints)
         self._tasks: list[tuple[Reach | Push, torch.Tensor]] = [
@@ -188,6 +189,7 @@ class TaskBatch:
         """
         if seed is not None:
             self._random = _streams(seed, self._numbers)
+            self._of_points = _streams(seed, self._numbers, 0)
         self._begin(torch.arange(self.num_envs, device=self.device))
         if spread:
             passed = [stream.random() for stream in self._random]
@@ -258,8 +260,11 @@ class TaskBatch:
 
     def state_dict(self) -> dict[str, Any]:
         """What the next ``reset`` follows from: the streams of random numbers, and the line."""
-        streams = [stream.bit_generator.state for stream in self._random]
-        return {"random": streams, "line": self._push.line.clone()}
+        states = [
+            [stream.bit_generator.state for stream in streams]
+            for streams in (self._random, self._of_points)
+        ]
+        return {"random": states[0], "points": states[1], "line": self._push.line.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on as a batch of the same environments would; ``reset`` must follow.
@@ -271,8 +276,9 @@ class TaskBatch:
             raise TaskError(
                 f"the state is of {len(state['random'])} environments; there are {self.num_envs}"
             )
-        for stream, saved in zip(self._random, state["random"], strict=True):
-            stream.bit_generator.state = saved
+        for name, streams in (("random", self._random), ("points", self._of_points)):
+            for stream, saved in zip(streams, state[name], strict=True):
+                stream.bit_generator.state = saved
         self._push.line = state["line"].to(self.device)
 
     def close(self) -> None:
@@ -290,7 +296,7 @@ class TaskBatch:
             tool=self._tools(q),
             block=self.simulation.block_pose[:, :3],
             beyond=beyond_limits(q, self._lower, self._upper),
-            acceleration=(qd - self._qd).abs().sum(dim=1) / CONTROL_PERIOD,
+            acceleration=added((qd - self._qd).abs()) / CONTROL_PERIOD,
         )
         self._qd = qd.clone()
         if len(self._tasks) == 1:
@@ -307,7 +313,7 @@ class TaskBatch:
                 starts[rows], blocks[rows] = task.begin(envs[rows], own)
         if self._points is not None:
             for env in envs.tolist():
-                self._points.begin(env, self._random[env])
+                self._points.begin(env, self._of_points[env])
         self.simulation.reset(envs, starts[:, : self._joints].contiguous(), blocks)
         self.targets[envs] = starts
         self.elapsed[envs] = 0
@@ -320,9 +326,15 @@ class TaskBatch:
         return torch.nn.functional.pad(values, (0, more)) if more else values
 
 
-def _streams(seed: int, numbers: Iterable[int]) -> list[np.random.Generator]:
-    """What each environment draws from: by its number, whatever else is in the batch."""
-    own = (np.random.SeedSequence(seed, spawn_key=(number,)) for number in numbers)
+def _streams(seed: int, numbers: Iterable[int], *of: int) -> list[np.random.Generator]:
+    """What each environment draws from: by its number, whatever else is in the batch.
+
+    Args:
+        seed: Of all.
+        numbers: Of the environments.
+        of: What is drawn, if not its episodes.
+    """
+    own = (np.random.SeedSequence(seed, spawn_key=(number, *of)) for number in numbers)
     return [np.random.default_rng(sequence) for sequence in own]
 
 

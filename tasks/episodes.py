@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.tasks.config import PushConfig, ReachConfig
-from morphgen.tasks.rewards import Terms, anybody_score, moved_line, push_terms, reach_terms
+from morphgen.tasks.rewards import (
+    Terms,
+    anybody_score,
+    lengths,
+    moved_line,
+    push_terms,
+    reach_terms,
+)
 from morphgen.tasks.settings import Setting
 
 
@@ -98,7 +105,7 @@ class Reach:
 
     def judge(self, state: State) -> Verdict:
         """Judge all rows as if they reached."""
-        distance = torch.linalg.vector_norm(state.tool - self.goal[:, :3], dim=1)
+        distance = lengths(state.tool - self.goal[:, :3])
         terms = reach_terms(self._config, distance, state.beyond, state.acceleration)
         near = distance < self._config.near
         score = anybody_score(self._config, distance)
@@ -147,7 +154,7 @@ class Push:
         """Judge all rows as if they pushed."""
         to_go = torch.clamp(self.line - state.block[:, 1], min=0)
         success = state.block[:, 1] > self.line
-        approach = torch.linalg.vector_norm(state.tool - state.block, dim=1)
+        approach = lengths(state.tool - state.block)
         terms = push_terms(self._config, to_go, approach, state.beyond, success)
         return Verdict(success, success, to_go, success.float(), terms)
 

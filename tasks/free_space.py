@@ -18,6 +18,7 @@ from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
 from morphgen.model.rotation import Vec3, normalized, to_rpy
 from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.sim.rigid_bodies import ignored_pairs
 
 Array = NDArray[np.float64]
 
@@ -210,7 +211,7 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Ro
         attached.append(
             Joint(_unused(f"to_{name}", joints), "prismatic", world.name, name, limits=(0.0, 0.0))
         )
-    ignored = [*robot.ignore_pairs, *combinations([link.name for link in still], 2)]
+    ignored = [*ignored_pairs(robot), *combinations([link.name for link in still], 2)]
     moved: list[Link] = []
     if scene.block is not None:
         if scene.ground is not None:

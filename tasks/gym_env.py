@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.benchmark.split import Task
+from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
 from morphgen.tasks.actions import ActionKind
@@ -62,6 +63,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         goal_seed: int = 0,
         cache: Path | None = None,
         library: Iterable[Path] = (),
+        max_links: int = MAX_LINKS,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
@@ -79,6 +81,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             goal_seed: Of goals, starts and obstacles.
             cache: Folder of these; by default the user's.
             library: Folders of your own parts.
+            max_links: Links that the tokens of the robot's are numbered up to; more for more.
             render_mode: ``rgb_array`` or None.
             size: Width and height of what is rendered, pixels.
 
@@ -95,6 +98,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             "kind": kind,
             "channels": channels,
             "contacts": self._contacts,
+            "max_links": max_links,
             **_constants(self.task, config),
         }
         self.render_mode, self._size = render_mode, size
@@ -113,7 +117,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         own = self.setting.robot
         self.action_links: tuple[int, ...] = tuple(torch.nonzero(self.batch.mask[0])[:, 0].tolist())
         self.action_joints = tuple(own.joints[link - 1].name for link in self.action_links)
-        self._running = self._closed = False
+        self._running = self._closed = self._was_reset = False
         self._last: dict[str, Any] | None = None
         seen = self._seen(self.batch.observe())
         self.observation_space = cast(
@@ -126,13 +130,12 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     ) -> tuple[NumpyObservation, dict[str, Any]]:
         """Begin an episode; without a seed the next one, and the very first at random."""
         self._require_open()
-        first = self._np_random is None
         super().reset(seed=seed)
-        if seed is None and first:
+        if seed is None and not self._was_reset:
             seed = int(self.np_random.integers(2**63))
         fresh = self._last is not None and seed is None
         seen = self.batch.observe() if fresh else self.batch.reset(seed)
-        self._running, self._last = True, None
+        self._running, self._last, self._was_reset = True, None, True
         return self._seen(seen), {"self_collision": self._contacts.self_collision}
 
     def step(

@@ -20,7 +20,7 @@ from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.robots import robot_of
 from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
 from morphgen.tasks.sim.base import Contacts, Scene, Simulation
-from morphgen.tasks.split_goals import read_goals
+from morphgen.tasks.split_goals import read_goals, shipped_set
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -77,6 +77,9 @@ def make_batch(
         MissingDependencyError: If the simulator is not installed.
         MorphgenError: If a robot cannot be made or read.
     """
+    if isinstance(robots, (str, Path, Robot)):
+        raise TaskError(f"robots {robots!r}: expected a list, [{robots!r}]")
+    _require_enough(num_envs, len(robots))
     folders = tuple(library)
     tasks: list[Task] = _one_each("task", task, robots)
     boxes: list[bool] = _one_each("obstacles", obstacles, robots)
@@ -122,10 +125,18 @@ def make_split_batch(
     """
     folders = tuple(library)
     parts, recipe = default_library(folders), _recipe(goal_seed, options)
-    shipped = read_goals(goals, side) if goals is not None else {}
+    members = split.side(side)
+    _require_enough(num_envs, len(members))
+    shipped = read_goals(goals, side) if goals is not None else None
     settings = [
-        member_setting(member, parts, recipe, cache=cache, shipped=shipped.get(member.name))
-        for member in split.side(side)
+        member_setting(
+            member,
+            parts,
+            recipe,
+            cache=cache,
+            shipped=None if shipped is None else shipped_set(shipped, member.name, goals),
+        )
+        for member in members
     ]
     return batch_of(settings, num_envs, library=folders, **options)
 
@@ -174,6 +185,8 @@ def batch_of(
             f"{num_envs} environments of {len(settings)} robots with {workers} workers: at least "
             "one of each"
         )
+    if seed < 0:
+        raise TaskError(f"seed {seed}: expected 0 or more")
     _require("action kind", kind, ("continuous", "discrete"))
     bodies = bodies_of(
         [setting.robot for setting in settings],
@@ -194,6 +207,12 @@ def batch_of(
         seed=seed,
         first=first,
     )
+
+
+def _require_enough(num_envs: int, robots: int) -> None:
+    """Require an environment for every robot: what has none would silently not be there."""
+    if num_envs < robots:
+        raise TaskError(f"{num_envs} environments for {robots} robots: expected one each at least")
 
 
 def simulator(

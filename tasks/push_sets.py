@@ -120,7 +120,10 @@ def _require(config: PushConfig, seed: int) -> None:
         raise TaskError(
             f"{config.starts} starts with seed {seed}: at least one start, and no negative seed"
         )
-    if not (0 < low <= high < np.inf and config.start < config.line and config.start_depth >= 0):
+    if config.curriculum_steps < 1:
+        raise TaskError(f"a curriculum of {config.curriculum_steps} steps: expected 1 or more")
+    nearest_line = config.line * min(1.0, config.curriculum_start)
+    if not (0 < low <= high < np.inf and config.start < nearest_line and config.start_depth >= 0):
         raise TaskError(
             f"a block of {low:g} to {high:g} that starts {config.start_depth:g} below "
             f"{config.start:g} and is to cross {config.line:g}: sizes are positive, and it starts "

@@ -42,22 +42,34 @@ def _register() -> None:
 
 
 class _Awaited(MetaPathFinder):
-    """Registers right after Gymnasium is imported, and is gone."""
+    """Registers right after Gymnasium is imported, and is gone.
+
+    Until then it stays, for who only asks whether Gymnasium is there has not imported it.
+    """
+
+    def __init__(self) -> None:
+        """Begin to wait."""
+        self._asking = False
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """What would be found anyway, with the registration at the end of its loading."""
-        if fullname != _LIBRARY:
+        if fullname != _LIBRARY or self._asking:
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(fullname)
+        self._asking = True
+        try:
+            spec = find_spec(fullname)
+        finally:
+            self._asking = False
         if spec is None or spec.loader is None:
             return spec
         load = spec.loader.exec_module
 
         def load_and_register(module: ModuleType) -> None:
             load(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
             _register()
 
         spec.loader.exec_module = load_and_register  # type: ignore[method-assign]

@@ -12,9 +12,22 @@ Terms = dict[str, torch.Tensor]
 """Weighted terms by name, each of shape (n,); the reward is their sum."""
 
 
+def added(values: torch.Tensor) -> torch.Tensor:
+    """Sums of rows (n, k), shape (n,), of which no bit depends on padding or on other rows.
+
+    In single precision the order of a sum, and with it the last bit, depends on both.
+    """
+    return values.sum(dim=1, dtype=torch.float64).float()
+
+
+def lengths(vectors: torch.Tensor) -> torch.Tensor:
+    """Euclidean lengths of rows (n, 3), shape (n,); see ``added``."""
+    return vectors.double().square().sum(dim=1).sqrt().float()
+
+
 def beyond_limits(q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
     """How far joints are outside of their limits, all together, shape (n,), rad and m."""
-    return torch.clamp(torch.maximum(q - upper, lower - q), min=0).sum(dim=1)
+    return added(torch.clamp(torch.maximum(q - upper, lower - q), min=0))
 
 
 def reach_terms(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.model import SUFFIX, grammar_names
 from morphgen.grammar.request import SLOTS, parse_words
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Frame, Robot
 
 FILES = (".urdf", ".xacro")
 """What a robot's file may end in."""
@@ -26,7 +27,8 @@ def robot_of(
 ) -> Robot:
     """The robot that a user means.
 
-    What is a bundle's folder, a URDF or a xacro is read. What begins with a word that has an ``=``,
+    What is a bundle's folder, a URDF or a xacro is read; a link that is called ``tool`` is its tool
+    (``morphgen import --tool`` names another). What begins with a word that has an ``=``,
     or with the name of a grammar, are words of ``morphgen compose``. Anything else is parts joined
     by dashes, each of which goes where its kind belongs: ``ur5-plane`` is ``arm=ur5 ee=plane``,
     ``gantry-cube`` is ``base=gantry ee=cube``.
@@ -44,19 +46,29 @@ def robot_of(
     if isinstance(given, Robot):
         return given
     parts = default_library(library)
-    if isinstance(given, Path) or _is_file(given):
-        robot = read_robot(Path(given))
+    if isinstance(given, Path) or is_file(given):
+        robot = _with_tool(read_robot(Path(given)))
     else:
         derivation, name = parse_words(_words(given, parts), parts)
         robot = compose(derivation, parts, name)
     return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 
 
-def _is_file(text: str) -> bool:
+def _with_tool(robot: Robot) -> Robot:
+    """What a URDF calls ``tool`` is a link; here it is the frame that tasks move."""
+    if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
+        return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
+    return robot
+
+
+def is_file(text: str) -> bool:
     """Whether it names a robot on disk; a folder that merely has a grammar's name is none."""
+    path = Path(text)
+    if (path / CARD).is_file() or (text.endswith(FILES) and path.is_file()):
+        return True
     if "=" in text or text.partition(" ")[0].endswith(SUFFIX):
         return False
-    return "/" in text or text.endswith(FILES) or (Path(text) / CARD).is_file()
+    return "/" in text or text.endswith(FILES)
 
 
 def _words(text: str, library: Library) -> list[str]:

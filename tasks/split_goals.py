@@ -76,9 +76,10 @@ def write_goals(home: Path, made: Sequence[Made], recipe: Recipe) -> Path:
     require_all(made)
     folder = home / GOALS
     files = dict(_files(made, recipe))
-    sums = read_sums(home / SUMS)
+    read_sums(home / SUMS)  # refuses a folder that is not built, before anything is locked
     try:
         with alone(home):
+            sums = read_sums(home / SUMS)
             (home / SUMS).unlink()
             for leftover in home.glob(f".{GOALS}.*"):
                 shutil.rmtree(leftover, ignore_errors=True)
@@ -125,6 +126,19 @@ def read_goals(folder: str | Path, side: Side) -> dict[str, Goals]:
     """
     sets = read_split_goals(folder).sets
     return {name: made.goals for (of, name), made in sets.items() if of == side and made.goals}
+
+
+def shipped_set(sets: Mapping[str, Goals], robot: str, folder: Path | None) -> Goals:
+    """The set of a robot among those that a folder ships.
+
+    Raises:
+        BenchmarkError: If there is none: the folder is of another split, or of the other side.
+    """
+    if robot not in sets:
+        raise BenchmarkError(
+            f"{folder}: ships no goal set for robot {robot!r}; it is of another split"
+        )
+    return sets[robot]
 
 
 def read_split_goals(folder: str | Path) -> SplitGoals:

@@ -15,6 +15,7 @@ from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot, sorted_pair
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.rigid_bodies import ignored_pairs
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -85,7 +86,7 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     priority: the block's friction counts whatever it touches, an obstacle's for links, and links
     have 1 on the ground and on each other.
 
-    Which links touch each other is up to ``Robot.ignore_pairs`` alone: MuJoCo's own exception for
+    Which links touch each other is up to ``ignored_pairs`` alone: MuJoCo's own exception for
     neighbours is off. It never tests what stands still against what stands still: the root link
     and those fixed to it do not touch the ground, obstacles or a block without mass.
 
@@ -124,7 +125,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
 
     Joints have no friction of their own: the law of the position control says how they move.
     """
-    robot = _with_own_root(robot)
+    robot = _with_own_root(replace(robot, ignore_pairs=ignored_pairs(robot)))
     bare = replace(
         robot,
         links=tuple(replace(link, visuals=()) for link in robot.links),

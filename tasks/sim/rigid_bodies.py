@@ -10,9 +10,17 @@ import numpy as np
 from morphgen.checks.rigid import rigid_groups
 from morphgen.checks.self_collision import attached_pairs
 from morphgen.model.geometry import IDENTITY, Pose
-from morphgen.model.robot import Inertial, Link, Robot, sorted_pair
+from morphgen.model.robot import Inertial, Link, Pair, Robot, sorted_pair
 
 _Piece = tuple[Pose, Link]
+
+
+def ignored_pairs(robot: Robot) -> tuple[Pair, ...]:
+    """Pairs of links that nothing tests: those the robot ignores, and neighbours across joints.
+
+    Robots that morphgen made ignore neighbours already; one that was read as it stands may not.
+    """
+    return tuple(sorted({*robot.ignore_pairs, *attached_pairs(robot)}))
 
 
 def rigid_bodies(robot: Robot) -> Robot:
@@ -29,7 +37,7 @@ def rigid_bodies(robot: Robot) -> Robot:
         A robot whose ``ignore_pairs`` also name the pairs that no simulator should test: links of
         one rigid part and neighbours across a movable joint.
     """
-    ignored = {*robot.ignore_pairs, *attached_pairs(robot)}
+    ignored = set(ignored_pairs(robot))
     partners = _partners(robot, ignored)
     holder = {robot.root.name: robot.root.name}
     pieces: dict[str, list[_Piece]] = {robot.root.name: [(IDENTITY, robot.root)]}

@@ -13,7 +13,7 @@ from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import BINS, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematics import tool_poses
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.make import batch_of, make_batch
 from morphgen.tasks.points import NOISE
 from morphgen.tasks.settings import reach_setting
 
@@ -162,6 +162,41 @@ def test_an_environment_is_the_same_in_whichever_batch(made):
         a, b = whole.step(action), part.step(action[2:])
         assert torch.equal(a.observation["tokens"][2:], b.observation["tokens"])
         assert torch.equal(a.reward[2:], b.reward)
+
+
+@pytest.mark.parametrize("others", [(), (1,), (1, 2), (0, 0, 0, 0, 0, 0, 0)])
+def test_no_bit_of_a_reward_depends_on_the_rest_of_the_batch(made, others):
+    alone, beside = (made(1 + len(more), robots=(0, *more), seed=7) for more in ((), others))
+    actions = torch.rand(30, 1, alone.bodies.max_links, generator=torch.Generator().manual_seed(0))
+    alone.reset()
+    beside.reset()
+    for action in 2 * actions - 1:
+        a, b = alone.step(action), beside.step(action.expand(1 + len(others), -1))
+        for name, term in a.terms.items():
+            assert torch.equal(term, b.terms[name][:1]), name
+
+
+def test_a_point_cloud_changes_no_episode(made):
+    with_points, without = (
+        made(obstacles=True, seed=2, channels=Channels(points=points)) for points in (5, 0)
+    )
+    for _ in range(3):
+        with_points.reset()
+        without.reset()
+        assert torch.equal(with_points.goal, without.goal)
+        assert torch.equal(with_points.targets, without.targets)
+
+
+def test_what_would_leave_robots_out_is_refused():
+    with pytest.raises(TaskError, match="2 environments for 3 robots"):
+        make_batch("reach", list(WORDS), 2)
+    with pytest.raises(TaskError, match=r"expected a list, \['prims'\]"):
+        make_batch("reach", "prims", 2)
+
+
+def test_a_negative_seed_is_refused(made):
+    with pytest.raises(TaskError, match="seed -1"):
+        made(seed=-1)
 
 
 def test_shares_become_the_nearest_bins_towards_zero():

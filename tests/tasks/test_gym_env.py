@@ -12,7 +12,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
-from morphgen.errors import CompositionError, TaskError
+import morphgen
+from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.tasks import make_batch, registration
 from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import BINS, PushConfig, ReachConfig
@@ -89,6 +90,7 @@ def test_both_checkers_pass(make, name, options):
         "import gymnasium, morphgen",
         "import morphgen, gymnasium",
         "import morphgen.tasks, gymnasium, morphgen",
+        "import importlib.util, morphgen; importlib.util.find_spec('gymnasium'); import gymnasium",
     ],
 )
 def test_the_ids_are_known_in_whichever_order_of_imports(order):
@@ -173,6 +175,22 @@ def test_without_a_seed_episodes_go_on_and_begin_anywhere(make):
     assert again + [tuple(env.reset()[0]["goal"]) for _ in range(7)] == goals
     starts = {tuple(make(registration.REACH).reset()[0]["tokens"].ravel()) for _ in range(6)}
     assert len(starts) > 1
+
+
+def test_asking_for_the_generator_makes_the_first_episode_no_less_random(make):
+    starts = set()
+    for _ in range(6):
+        env = make(registration.REACH)
+        assert env.unwrapped.np_random is not None
+        starts.add(tuple(env.reset()[0]["tokens"].ravel()))
+    assert len(starts) > 1
+
+
+def test_a_robot_of_many_links_needs_more_numbers_for_them(make):
+    body = morphgen.compose("chain beads=7", geometry="primitive")
+    with pytest.raises(MorphgenError, match="max_links 25 or more"):
+        make(registration.REACH, robot=body)
+    assert make(registration.REACH, robot=body, max_links=25).reset(seed=0)
 
 
 def test_the_episodes_are_those_of_a_batch(make, cache):

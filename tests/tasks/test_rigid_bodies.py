@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from morphgen.model.dynamics import mass_matrix
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.robots import robot_of
+from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.sim.rigid_bodies import ignored_pairs, rigid_bodies
 from robots import arm
 from scenes import robot
 
@@ -35,3 +38,11 @@ def test_links_that_ignore_others_are_not_joined():
     joined = rigid_bodies(replace(body, ignore_pairs=()))
     assert "left" not in {link.name for link in joined.links}
     assert joined.mass == pytest.approx(body.mass)
+
+
+def test_neighbours_are_ignored_whoever_reads_the_robot():
+    made = robot_of("arm3-stick")
+    bare = replace(made, ignore_pairs=())
+    assert set(ignored_pairs(bare)) <= set(ignored_pairs(made)) == set(made.ignore_pairs)
+    _, tried = FreeSpace(Scene(bare, ground=-1.0)).draw(20, np.random.default_rng(0))
+    assert tried < 200

@@ -51,6 +51,10 @@ def test_files_are_read(tmp_path, monkeypatch):
     Path("own.urdf").write_text(urdf_text(arm(), str))
     for given in (folder, str(folder), "bundles/arm", "own.urdf", Path("own.urdf")):
         assert robot_of(given).dof == arm().dof
+        assert robot_of(given).frame("tool")
+    Path("lr=3").mkdir()
+    Path("own.urdf").rename("lr=3/own.urdf")
+    assert robot_of("lr=3/own.urdf").dof == arm().dof
 
 
 def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
