@@ -6,6 +6,7 @@ value or a gradient.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -25,6 +26,8 @@ CHANNELS = ("velocity", "previous_action")
 """Numbers of a link that an observation may have beside its token, in order."""
 SMALL = 0.01
 """Scale of the last layer's weights at the start: all actions begin alike, values at zero."""
+KINDS = 64
+"""Of networks and shapes, that a process may compile."""
 
 
 @dataclass(frozen=True)
@@ -284,6 +287,20 @@ def _largest(
     lowest = torch.finfo(features.dtype).min
     top = torch.where(mask[..., None], features, lowest).amax(dim=1, keepdim=True)
     return top, mask.any(dim=1, keepdim=True)
+
+
+def compile_network(network: nn.Module) -> Callable[[Observation], torch.Tensor]:
+    """A network by ``torch.compile``, however many kinds of them a process has compiled before.
+
+    torch gives up after eight kinds and shapes, which four learners of a study are.
+    """
+    from torch._dynamo import config  # takes a second to load
+
+    config.recompile_limit = max(config.recompile_limit, KINDS)
+    compiled: Callable[[Observation], torch.Tensor] = torch.compile(
+        network, fullgraph=True, dynamic=False
+    )
+    return compiled
 
 
 def _network(config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> nn.Module:

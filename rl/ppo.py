@@ -17,7 +17,13 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.gae import gae, next_values
-from morphgen.rl.policies import layout_from, layout_of, make_networks, require_layout
+from morphgen.rl.policies import (
+    compile_network,
+    layout_from,
+    layout_of,
+    make_networks,
+    require_layout,
+)
 from morphgen.rl.report import Numbers, Report, explained_variance, outcome
 from morphgen.rl.symlog import symexp, symlog
 from morphgen.tasks.batch import Observation, TaskBatch
@@ -74,8 +80,6 @@ class Learner:
         """
         if batch.kind != policy.kind:
             raise TaskError(f"the policy's actions are {policy.kind}, the batch's {batch.kind}")
-        if config.compile:
-            torch.compiler.reset()  # else learners of one process soon reach its limit of variants
         self.batch, self.policy, self.config = batch, policy, config
         self.device = torch.device(device)
         self.update, self.updates = 0, config.updates(batch.num_envs)
@@ -196,11 +200,7 @@ class Learner:
         _require_same(checkpoint["policy"], asdict(self.policy))
 
     def _callable(self, network: nn.Module) -> Callable[[Observation], torch.Tensor]:
-        compiled = (
-            torch.compile(network, fullgraph=True, dynamic=False)
-            if self.config.compile
-            else network
-        )
+        compiled = compile_network(network) if self.config.compile else network
 
         def call(observation: Observation) -> torch.Tensor:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bf16):

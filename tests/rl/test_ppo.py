@@ -1,6 +1,7 @@
 """PPO, part by part against known answers, and as a whole against a task that it must solve."""
 
 import copy
+import functools
 import io
 import math
 from dataclasses import asdict, replace
@@ -480,3 +481,12 @@ def test_the_transformer_learns_them_too():
     reports = trained(agent="me-tf", updates=24)
     assert reports[0].success < 0.4
     assert reports[-1].success > 0.9
+
+
+def test_a_process_compiles_learners_of_many_kinds(monkeypatch):
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
+    for agent in ("se", "me-mlp", "me-tf"):
+        for envs in (2, 4, 6):
+            config = PPOConfig(transitions=envs * 8, steps=8, minibatches=2, epochs=1, compile=True)
+            Learner(OnALine(envs), PolicyConfig(agent), config).iterate()
+    torch.compiler.reset()
