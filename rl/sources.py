@@ -33,7 +33,7 @@ class Source:
     side: Side = "train"
     """Of the split."""
     body: str = ""
-    """Hash of the one robot; a split has that of each."""
+    """Hash of the one robot, empty in runs of before it was kept; a split has that of each."""
     only: str | None = None
     """The one member that is meant, if it is not all of the side."""
     goal_seed: int = 0
@@ -148,7 +148,7 @@ def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
         return [_of_member(member, own, recipe) for member in members(source)]
     assert source.task is not None
     robot = robot_of(source.name, library=map(Path, source.library))
-    if robot_hash(robot) != source.body:
+    if source.body not in ("", robot_hash(robot)):
         raise TaskError(f"{source.name}: it is not the body that it was when the run began")
     return [setting_of(robot, source.task, recipe, obstacles=source.obstacles)]
 
