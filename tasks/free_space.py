@@ -47,7 +47,7 @@ class FreeSpace:
     """A scene's robot, ground and obstacles, compiled once and tested at many configurations.
 
     A configuration is free if nothing penetrates (deeper than ``self_collision.PENETRATION``):
-    links each other, but for ``Robot.ignore_pairs``; links the ground, but for the root link and
+    links each other, but for ``ignored_pairs``; links the ground, but for the root link and
     those fixed to it; any link an obstacle. Nor is the point of the tool in an obstacle, also where
     no link is, as between the fingers of a hand. The block, which can be pushed, is an obstacle
     where a pose of it is given, and nowhere else; it may stand on the ground, or in it.

@@ -52,7 +52,7 @@ class Contacts:
     scene: bool = True
     """The robot touches the ground, the block and obstacles."""
     self_collision: bool = True
-    """Links touch each other, but for ``Robot.ignore_pairs``."""
+    """Links touch each other, but for neighbours and ``Robot.ignore_pairs``."""
 
 
 class Simulation(Protocol):

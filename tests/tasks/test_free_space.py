@@ -59,12 +59,19 @@ def test_the_root_and_what_is_fixed_to_it_may_be_in_the_ground():
     assert free(Scene(robot), 0.0) == [True]
 
 
-def test_links_may_not_go_into_each_other_unless_their_pair_is_ignored():
+def test_links_may_not_go_into_each_other_unless_they_are_neighbours_or_their_pair_is_ignored():
     touching = -0.5 + 0.05 + 0.1
     q = (touching - SHALLOW, touching - DEEP)
-    assert free(Scene(lift(), Pose((0.0, 0.0, 0.3))), *q) == [True, False]
-    known = lift(ignore_pairs=(("ball", "plate"),))
-    assert free(Scene(known, Pose((0.0, 0.0, 0.3))), *q) == [True, True]
+    above = Pose((0.0, 0.0, 0.3))
+    assert free(Scene(lift(), above), *q) == [True, True]
+    plate, ball = lift().links
+    carriage = Link("carriage", collisions=(Shape(Sphere(0.1), Pose((5.0, 0.0, 0.0))),))
+    aside = Joint("y", "prismatic", "plate", "carriage", axis=(0, 1, 0), limits=(-1.0, 1.0))
+    rising = replace(lift().joints[0], parent="carriage")
+    far = lift(links=(plate, carriage, ball), joints=(aside, rising), home=(0.0, 0.0))
+    known = replace(far, ignore_pairs=(("ball", "plate"),))
+    for body, expected in ((far, [True, False]), (known, [True, True])):
+        assert FreeSpace(Scene(body, above)).free([[0.0, z] for z in q]).tolist() == expected
 
 
 def test_links_may_not_go_into_obstacles():
