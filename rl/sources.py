@@ -155,10 +155,8 @@ def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
 
 @lru_cache(maxsize=64)
 def _of_member(member: Member, source: Source, recipe: Recipe) -> Setting:
-    shipped = None
-    if source.goals:
-        sets = _shipped(source.goals, source.side)
-        shipped = shipped_set(sets, member.name, Path(source.goals))
+    sets = _shipped(source.goals, source.side) if source.goals else None
+    shipped = shipped_set(sets, member.name, source.goals)
     library = default_library(tuple(map(Path, source.library)))
     return member_setting(member, library, recipe, shipped=shipped)
 

@@ -56,7 +56,10 @@ class Way:
 
         Raises:
             TaskError: If there are no workers.
+            MissingDependencyError: If Weights & Biases is asked for and not installed.
         """
+        if self.wandb:
+            require_wandb()
         if self.workers < 1:
             raise TaskError(f"--workers {self.workers}: expected 1 or more")
 
@@ -121,8 +124,6 @@ def train(
     for part in made:
         require_runnable(part.config)
     require_device(config.device)
-    if way.wandb:
-        require_wandb()
     require_open(folder, config, resume=resume)
     with ExitStack() as held:
         holds = False

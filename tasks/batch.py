@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,8 +121,7 @@ class TaskBatch:
             bodies.action_mask(fingers=False)[self.body],
         )
         self._numbers = range(first, first + n)
-        self._random = _streams(seed, self._numbers)
-        self._of_points = _streams(seed, self._numbers, 0)
+        self._streams = _streams(seed, self._numbers)
         self._reach = Reach(self.settings, self.body, reach, joints)
         self._push = Push(self.settings, self.body, push, joints)
         self._tasks: list[tuple[Reach | Push, torch.Tensor]] = [
@@ -188,11 +187,10 @@ class TaskBatch:
                 share in each environment: learners want episodes that do not end all at once.
         """
         if seed is not None:
-            self._random = _streams(seed, self._numbers)
-            self._of_points = _streams(seed, self._numbers, 0)
+            self._streams = _streams(seed, self._numbers)
         self._begin(torch.arange(self.num_envs, device=self.device))
         if spread:
-            passed = [stream.random() for stream in self._random]
+            passed = [stream.random() for stream in self._streams["random"]]
             shares = torch.tensor(passed, device=self.device)
             self.elapsed = (shares * self.longest).long()
         return self.observe()
@@ -260,23 +258,25 @@ class TaskBatch:
 
     def state_dict(self) -> dict[str, Any]:
         """What the next ``reset`` follows from: the streams of random numbers, and the line."""
-        states = [
-            [stream.bit_generator.state for stream in streams]
-            for streams in (self._random, self._of_points)
-        ]
-        return {"random": states[0], "points": states[1], "line": self._push.line.clone()}
+        states = {
+            name: [stream.bit_generator.state for stream in streams]
+            for name, streams in self._streams.items()
+        }
+        return {**states, "line": self._push.line.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on as a batch of the same environments would; ``reset`` must follow.
 
         Raises:
-            TaskError: If the state is of another number of environments.
+            TaskError: If the state is of another number of environments, or of an older morphgen.
         """
         if len(state["random"]) != self.num_envs:
             raise TaskError(
                 f"the state is of {len(state['random'])} environments; there are {self.num_envs}"
             )
-        for name, streams in (("random", self._random), ("points", self._of_points)):
+        if self._streams.keys() - state.keys():
+            raise TaskError("the state is of an older morphgen: points had no stream of their own")
+        for name, streams in self._streams.items():
             for stream, saved in zip(streams, state[name], strict=True):
                 stream.bit_generator.state = saved
         self._push.line = state["line"].to(self.device)
@@ -309,11 +309,11 @@ class TaskBatch:
         for task, does in self._tasks:
             rows = torch.nonzero(does[envs])[:, 0]
             if len(rows):
-                own = [self._random[i] for i in envs[rows].tolist()]
+                own = [self._streams["random"][i] for i in envs[rows].tolist()]
                 starts[rows], blocks[rows] = task.begin(envs[rows], own)
         if self._points is not None:
             for env in envs.tolist():
-                self._points.begin(env, self._of_points[env])
+                self._points.begin(env, self._streams["points"][env])
         self.simulation.reset(envs, starts[:, : self._joints].contiguous(), blocks)
         self.targets[envs] = starts
         self.elapsed[envs] = 0
@@ -326,16 +326,14 @@ class TaskBatch:
         return torch.nn.functional.pad(values, (0, more)) if more else values
 
 
-def _streams(seed: int, numbers: Iterable[int], *of: int) -> list[np.random.Generator]:
-    """What each environment draws from: by its number, whatever else is in the batch.
+def _streams(seed: int, numbers: Sequence[int]) -> dict[str, list[np.random.Generator]]:
+    """What environments draw episodes and points from: by number, whatever else is in the batch."""
 
-    Args:
-        seed: Of all.
-        numbers: Of the environments.
-        of: What is drawn, if not its episodes.
-    """
-    own = (np.random.SeedSequence(seed, spawn_key=(number, *of)) for number in numbers)
-    return [np.random.default_rng(sequence) for sequence in own]
+    def drawn(*of: int) -> list[np.random.Generator]:
+        own = (np.random.SeedSequence(seed, spawn_key=(number, *of)) for number in numbers)
+        return [np.random.default_rng(sequence) for sequence in own]
+
+    return {"random": drawn(), "points": drawn(0)}
 
 
 def _obstacles(settings: Sequence[Setting], device: torch.device) -> Observation:

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.checks.rigid import rigid_groups
-from morphgen.checks.self_collision import SelfCollision
+from morphgen.checks.self_collision import SelfCollision, ignored_pairs
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
 from morphgen.model.rotation import Vec3, normalized, to_rpy
 from morphgen.tasks.sim.base import Scene
-from morphgen.tasks.sim.rigid_bodies import ignored_pairs
 
 Array = NDArray[np.float64]
 

@@ -134,7 +134,7 @@ def make_split_batch(
             parts,
             recipe,
             cache=cache,
-            shipped=None if shipped is None else shipped_set(shipped, member.name, goals),
+            shipped=shipped_set(shipped, member.name, goals),
         )
         for member in members
     ]

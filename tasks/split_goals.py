@@ -128,12 +128,16 @@ def read_goals(folder: str | Path, side: Side) -> dict[str, Goals]:
     return {name: made.goals for (of, name), made in sets.items() if of == side and made.goals}
 
 
-def shipped_set(sets: Mapping[str, Goals], robot: str, folder: Path | None) -> Goals:
-    """The set of a robot among those that a folder ships.
+def shipped_set(
+    sets: Mapping[str, Goals] | None, robot: str, folder: str | Path | None
+) -> Goals | None:
+    """The set of a robot among those that a folder ships; None if no folder does.
 
     Raises:
         BenchmarkError: If there is none: the folder is of another split, or of the other side.
     """
+    if sets is None:
+        return None
     if robot not in sets:
         raise BenchmarkError(
             f"{folder}: ships no goal set for robot {robot!r}; it is of another split"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from morphgen.checks.joints import is_axis_valid
-from morphgen.checks.self_collision import SelfCollision, attached_pairs
+from morphgen.checks.self_collision import SelfCollision, ignored_pairs
 from morphgen.checks.solids import is_sound
 from morphgen.model.findings import Finding
 from morphgen.model.kinematics import movable_positions
@@ -25,7 +25,7 @@ def check_self_collision(robot: Robot) -> Iterator[Finding]:
     if not placeable or not np.isfinite(movable_positions(robot, robot.home)).all():
         return
     touchable = robot.with_links(map(_sound, robot.links))
-    tested = SelfCollision(touchable, {*robot.ignore_pairs, *attached_pairs(touchable)})
+    tested = SelfCollision(touchable, ignored_pairs(touchable))
     for (a, b), depth in sorted(tested.penetrations([robot.home])[0].items()):
         yield Finding(
             "self-collision",

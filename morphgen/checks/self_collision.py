@@ -207,6 +207,14 @@ def _mostly_penetrating(
     return set(apart)
 
 
+def ignored_pairs(robot: Robot) -> tuple[Pair, ...]:
+    """Pairs of links that nothing tests: those the robot ignores, and neighbours across joints.
+
+    Robots that morphgen made ignore neighbours already; one that was read as it stands may not.
+    """
+    return tuple(sorted({*robot.ignore_pairs, *attached_pairs(robot)}))
+
+
 def attached_pairs(robot: Robot) -> tuple[Pair, ...]:
     """Pairs of links in one rigid body or across one movable joint, sorted.
 

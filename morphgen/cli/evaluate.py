@@ -15,6 +15,7 @@ from morphgen.rl.names import REFERENCES
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
     from morphgen.rl.evaluation import Exam, Score
+    from morphgen.rl.runs import RunConfig
     from morphgen.rl.sources import Source
     from morphgen.rl.trained import Mode
 
@@ -102,10 +103,12 @@ def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
 def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.runs import read_checkpoint
     from morphgen.rl.trained import MODES
-    from morphgen.rl.training import checkpoints
+    from morphgen.rl.training import checkpoints, require_device
 
     require_words(args)
-    for file in checkpoints(Path(args.checkpoint)):
+    require_device(args.device)
+    files = list(checkpoints(Path(args.checkpoint)))
+    for file in files:
         config, learner = read_checkpoint(file)
         if learner["update"] < config.updates:
             print(
@@ -114,19 +117,15 @@ def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
                 file=sys.stderr,
             )
     modes: tuple[Mode, ...] = (args.mode,) if args.mode else MODES
-    return {mode: _policy(args, mode) for mode in modes}
+    return {mode: _policy(args, files, config, mode) for mode in modes}
 
 
-def _policy(args: argparse.Namespace, mode: Mode) -> list[Score]:
+def _policy(
+    args: argparse.Namespace, files: list[Path], config: RunConfig, mode: Mode
+) -> list[Score]:
     from morphgen.rl.evaluation import evaluate_checkpoints, evaluate_run
-    from morphgen.rl.runs import read_checkpoint
-    from morphgen.rl.training import checkpoints, require_device
 
-    require_device(args.device)
-    path = Path(args.checkpoint)
-    files = list(checkpoints(path))
-    config, _ = read_checkpoint(files[0])
-    exam = _exam(args, config)
+    path, exam = Path(args.checkpoint), _exam(args, config)
     if args.words:
         sources = _sources(args)
         found = [
@@ -139,13 +138,11 @@ def _policy(args: argparse.Namespace, mode: Mode) -> list[Score]:
     return [score for scores in found for score in scores]
 
 
-def _exam(args: argparse.Namespace, config: object) -> Exam:
+def _exam(args: argparse.Namespace, config: RunConfig) -> Exam:
     from dataclasses import replace
 
     from morphgen.rl.evaluation import exam_of
-    from morphgen.rl.runs import RunConfig
 
-    assert isinstance(config, RunConfig)
     exam = exam_of(config, _episodes(args), seed=args.seed, workers=args.workers)
     return replace(exam, sim=args.sim) if args.sim else exam
 

@@ -127,9 +127,7 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.rl.runs import CHECKPOINT
     from morphgen.rl.sources import other_side
 
-    source = source_of(args.words, args)
-    if not source.split:
-        source = other_side(source, args.on)
+    source = other_side(source_of(args.words, args), args.on)
     variant = variant_of(args)
     config = config_of(source, variant, args)
     _require_meant(config, args)
@@ -275,11 +273,8 @@ def way_of(args: argparse.Namespace) -> Way:
         TaskError: If there are no workers.
         MissingDependencyError: If Weights & Biases is asked for and not installed.
     """
-    from morphgen.rl.recorders import require_wandb
     from morphgen.rl.training import Way
 
-    if args.wandb:
-        require_wandb()
     return Way(args.workers, not args.no_tensorboard, args.wandb)
 
 

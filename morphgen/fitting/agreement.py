@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from morphgen.checks.self_collision import SelfCollision, attached_pairs
+from morphgen.checks.self_collision import SelfCollision, ignored_pairs
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics, random_configurations
@@ -71,7 +71,7 @@ def agreement(
     Returns:
         How the primitives agree with the meshes, and how the meshes' convex hulls do.
     """
-    ignored = {*meshes.ignore_pairs, *primitives.ignore_pairs, *attached_pairs(meshes)}
+    ignored = {*ignored_pairs(meshes), *primitives.ignore_pairs}
     q = random_configurations(meshes, n, np.random.default_rng(seed))
     truth = np.array(list(_mesh_collisions(meshes, ignored, q)))
     first, second = (

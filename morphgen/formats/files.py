@@ -39,8 +39,7 @@ def save(path: Path, content: str | bytes) -> None:
         FormatError: If it cannot be written; then nothing is left behind.
     """
     try:
-        with replacing_file(path) as partial:
-            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        _replace(path, content)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
@@ -73,6 +72,10 @@ def keep(path: Path, content: str | bytes) -> None:
         OSError: If it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    _replace(path, content)
+
+
+def _replace(path: Path, content: str | bytes) -> None:
     with replacing_file(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
 

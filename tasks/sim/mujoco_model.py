@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.checks.self_collision import ignored_pairs
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot, sorted_pair
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.rigid_bodies import ignored_pairs
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -8,19 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from morphgen.checks.rigid import rigid_groups
-from morphgen.checks.self_collision import attached_pairs
+from morphgen.checks.self_collision import ignored_pairs
 from morphgen.model.geometry import IDENTITY, Pose
-from morphgen.model.robot import Inertial, Link, Pair, Robot, sorted_pair
+from morphgen.model.robot import Inertial, Link, Robot, sorted_pair
 
 _Piece = tuple[Pose, Link]
-
-
-def ignored_pairs(robot: Robot) -> tuple[Pair, ...]:
-    """Pairs of links that nothing tests: those the robot ignores, and neighbours across joints.
-
-    Robots that morphgen made ignore neighbours already; one that was read as it stands may not.
-    """
-    return tuple(sorted({*robot.ignore_pairs, *attached_pairs(robot)}))
 
 
 def rigid_bodies(robot: Robot) -> Robot:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morphgen.checks.self_collision import ignored_pairs
 from morphgen.model.dynamics import mass_matrix
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.robots import robot_of
 from morphgen.tasks.sim.base import Scene
-from morphgen.tasks.sim.rigid_bodies import ignored_pairs, rigid_bodies
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 from robots import arm
 from scenes import robot
 
