@@ -12,9 +12,9 @@ from platformdirs import user_cache_path
 
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import canonical
+from morphgen.fitting.composite import composite
 from morphgen.fitting.dressed import are_primitives, link_shapes
 from morphgen.fitting.stored import (
-    VERSION,
     read_stored,
     shape_data,
     shape_of,
@@ -28,6 +28,8 @@ from morphgen.model.inertia import union_moments
 from morphgen.model.robot import Robot
 from morphgen.model.scaling import scaled_shape
 
+_KEPT = "tokens-3"
+"""Folder in the user's cache; the number rises when the same shapes are given another primitive."""
 NEARLY = 0.95
 """Share of a link's volume from which its largest primitive stands for it; this is the IoU, too."""
 
@@ -37,7 +39,9 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
 
     A link that is a primitive, or nearly is (``NEARLY``), keeps it in its canonical pose; for
     meshes of the library's parts the stored fit is taken; others are fitted, about a second a
-    link, and kept in the user's cache.
+    link, and kept in the user's cache. What is fitted to primitives is the same on every machine
+    (``composite``); of meshes that nothing is stored for the last bits may differ, and with them
+    the fit.
 
     Args:
         robot: The body.
@@ -77,7 +81,7 @@ def _main_primitive(shapes: Sequence[Shape]) -> Shape | None:
 def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
     """The fit of shapes that nothing is stored for; None if they have no volume."""
     factor = shapes_scale(shapes)
-    path = user_cache_path("morphgen") / f"tokens-{VERSION}" / f"{shapes_key(shapes)}.json"
+    path = user_cache_path("morphgen") / _KEPT / f"{shapes_key(shapes)}.json"
     if path.is_file():
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
@@ -94,6 +98,8 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
 
 
 def _fitted(shapes: Sequence[Shape]) -> Shape | None:
+    if are_primitives(shapes):
+        return composite(shapes)
     # The search needs torch, which takes seconds to load.
     from morphgen.fitting.link import FitOptions, fit_shapes
 

@@ -1,0 +1,98 @@
+"""One primitive for several, the same whatever the last bits are."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morphgen.fitting.composite import composite
+from morphgen.fitting.quality import quality
+from morphgen.fitting.solid import solid_of
+from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
+
+SEEDS = range(6)
+
+
+def drawn(seed, noise=0.0):
+    """Two or three primitives that overlap, all at angles."""
+    rng = np.random.default_rng(seed)
+    shapes = []
+    for _ in range(2 + seed % 2):
+        a, b, c = rng.uniform(0.05, 0.2, 3).tolist()
+        geometry = [Box((a, b, c)), Cylinder(a / 2, 2 * b), Sphere(a)][rng.integers(3)]
+        xyz = rng.uniform(-0.08, 0.08, 3)
+        rpy = rng.uniform(-1, 1, 3)
+        xyz, rpy = (each * (1 + noise) for each in (xyz, rpy))
+        shapes.append(Shape(geometry, Pose.from_xyz_rpy(tuple(xyz), tuple(rpy))))
+    return shapes
+
+
+def overlap(shapes, *found):
+    return quality(solid_of(shapes), found, volume_points=2**15).iou
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_primitive_of_the_link_overlaps_more(seed):
+    shapes = drawn(seed)
+    own = max(overlap(shapes, shape) for shape in shapes)
+    assert overlap(shapes, composite(shapes)) > own - 0.01
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_last_bits_change_nothing(seed):
+    found, other = composite(drawn(seed)), composite(drawn(seed, noise=3e-16))
+    assert type(found.geometry) is type(other.geometry)
+    assert other.geometry == found.geometry
+    assert other.T_link_shape.position == found.T_link_shape.position
+    assert other.T_link_shape.quaternion == pytest.approx(found.T_link_shape.quaternion, abs=1e-9)
+
+
+def test_of_two_rails_one_stands_for_the_link():
+    rails = [Shape(Box((1.1, 0.03, 0.03)), Pose((0.0, y, 1.05))) for y in (0.6, -0.6)]
+    assert composite(rails) == rails[0]
+
+
+def test_sides_are_flush_with_those_of_the_link():
+    prongs = [Shape(Box((0.02, 0.01, 0.04)), Pose((0.0, y, 0.02))) for y in (0.02, -0.02)]
+    bridge = Shape(Box((0.02, 0.03, 0.01)), Pose((0.0, 0.0, 0.035)))
+    found = composite([*prongs, bridge])
+    assert found == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
+
+
+def test_a_rod_in_two_parts_is_one_rod():
+    turned = Pose.from_xyz_rpy((0.1, 0.0, 0.0), (0.0, math.pi / 2, 0.0))
+    rod = Shape(Cylinder(0.02, 0.2), turned)
+    found = composite([rod, replace(rod, T_link_shape=replace(turned, position=(0.25, 0.0, 0.0)))])
+    assert found.geometry == Cylinder(0.02, pytest.approx(0.35, abs=1e-5))
+    assert found.T_link_shape.position == pytest.approx((0.175, 0.0, 0.0), abs=1e-5)
+    assert np.abs(found.T_link_shape.matrix[:3, 2]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
+
+
+def test_mirrored_fingers_have_mirrored_primitives():
+    def finger(side):
+        blocks = [((0.022, 0.015, 0.02), (0.0, 0.0185, 0.011), 0.0)]
+        blocks += [((0.0175, 0.007, 0.0235), (0.0, 0.0159, 0.02835), math.pi / 6)]
+        blocks += [((0.0175, 0.0152, 0.0185), (0.0, 0.00758, 0.04525), 0.0)]
+        return [
+            Shape(Box(size), Pose.from_xyz_rpy((x, side * y, z), (side * roll, 0.0, 0.0)))
+            for size, (x, y, z), roll in blocks
+        ]
+
+    left, right = (composite(finger(side)) for side in (1, -1))
+    assert right.geometry.size == pytest.approx(left.geometry.size, abs=3e-4)
+    mirror = np.array([1, -1, 1])
+    assert mirror * right.T_link_shape.position == pytest.approx(
+        left.T_link_shape.position, abs=3e-4
+    )
+    assert overlap(finger(1), left) > 0.6
+
+
+def test_nothing_stands_for_nothing():
+    assert composite([]) is None
+    assert composite([Shape(Box((0.1, 0.1, 0.0)))]) is None
+
+
+def test_other_shapes_are_refused():
+    with pytest.raises(TypeError, match="Capsule"):
+        composite([Shape(Capsule(0.1, 0.2))])
