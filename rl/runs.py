@@ -22,7 +22,7 @@ from morphgen.tasks.make import SimulatorName
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
 FORMAT = 1
-"""Of config and checkpoint."""
+"""Of config and checkpoint; rises when older ones cannot be read any more."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,9 @@ def read_config(folder: Path) -> RunConfig:
     """
     path = folder / CONFIG
     try:
-        return config_from(json.loads(path.read_text(encoding="utf-8")))
+        data = json.loads(path.read_text(encoding="utf-8"))
+        _require_format(path, data)
+        return config_from(data)
     except OSError as error:
         raise TaskError(f"{folder} is no run's folder: it has no {CONFIG}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -165,6 +167,7 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
         raise TaskError(f"{file}: no such checkpoint")
     try:
         data = torch.load(file, map_location="cpu", weights_only=True)
+        _require_format(file, data)
         return config_from(data["run"]), data["learner"]
     except (
         pickle.UnpicklingError,
@@ -177,6 +180,14 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
         AttributeError,
     ) as error:
         raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
+
+
+def _require_format(path: Path, data: Mapping[str, Any]) -> None:
+    if data["format"] != FORMAT:
+        raise TaskError(
+            f"{path} has format {data['format']!r}, and this morphgen reads {FORMAT}: it was "
+            "written by another version"
+        )
 
 
 def _tuples(data: Mapping[str, Any]) -> dict[str, Any]:
