@@ -26,6 +26,9 @@ class PolicyConfig:
     fixed_deviation: bool = False
     """Numbers as actions keep the deviation that they start with (as in the paper's released code,
     by a clamp); otherwise it is learned."""
+    logit_scale: float = 1.0
+    """What the network's numbers for bins are multiplied by (ours): a step of the optimiser moves
+    probabilities by as much more."""
     mask_morphology: bool = False
     """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
     mlp_features: int = 16
@@ -50,6 +53,10 @@ class PolicyConfig:
             raise TaskError(f"agent {self.agent!r}{nearest(self.agent, AGENTS)}")
         if self.fixed_deviation and self.discrete:
             raise TaskError("fixed-deviation: bins have no deviation; it goes with --no-discrete")
+        if not self.logit_scale > 0:
+            raise TaskError(f"logit_scale {self.logit_scale:g}: expected more than 0")
+        if self.logit_scale != 1 and not self.discrete:
+            raise TaskError("logit_scale: numbers as actions have no logits; it goes with bins")
         for each in fields(self):
             if each.type == "int":
                 _at_least(each.name, getattr(self, each.name), 1)

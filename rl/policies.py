@@ -229,7 +229,7 @@ class Actor(nn.Module):
 
     def __init__(self, config: PolicyConfig, layout: Layout) -> None:
         super().__init__()
-        self.discrete = config.discrete
+        self.discrete, self.scale = config.discrete, config.logit_scale
         self.network = _network(config, layout, len(BINS) if config.discrete else 1, True)
         if not config.discrete:
             self.deviation = nn.Parameter(
@@ -238,7 +238,7 @@ class Actor(nn.Module):
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Numbers of ``head``, shape (n, L, 11) for discrete actions, else (n, L, 1), float32."""
-        found: torch.Tensor = self.network(observation).float()
+        found: torch.Tensor = self.scale * self.network(observation).float()
         return torch.where(observation["actions"][..., None], found, 0.0)
 
     def head(self, numbers: torch.Tensor, mask: torch.Tensor) -> Head:

@@ -170,9 +170,8 @@ class Learner:
         """
         self._require_policy(checkpoint)
         here = {**asdict(self.config), "updates": self.updates, "device": self.device.type}
-        _require_same(
-            {**checkpoint["config"], **{k: checkpoint[k] for k in ("updates", "device")}}, here
-        )
+        config = asdict(PPOConfig(**checkpoint["config"]))
+        _require_same({**config, **{k: checkpoint[k] for k in ("updates", "device")}}, here)
         self.batch.load_state_dict(checkpoint["batch"])
         for name, network in self._networks().items():
             network.load_state_dict(checkpoint[name])
@@ -197,7 +196,7 @@ class Learner:
 
     def _require_policy(self, checkpoint: Mapping[str, Any]) -> None:
         require_layout(layout_from(checkpoint["layout"]), self.layout, "the checkpoint")
-        _require_same(checkpoint["policy"], asdict(self.policy))
+        _require_same(asdict(PolicyConfig(**checkpoint["policy"])), asdict(self.policy))
 
     def _callable(self, network: nn.Module) -> Callable[[Observation], torch.Tensor]:
         compiled = compile_network(network) if self.config.compile else network

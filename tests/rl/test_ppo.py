@@ -400,6 +400,15 @@ def test_checkpoints_of_other_runs_are_refused_and_nothing_is_changed():
     assert equal(before, weights(made))
 
 
+def test_checkpoints_from_before_a_constant_have_its_default():
+    made, again = learner(), learner()
+    made.iterate()
+    checkpoint = stored(made.checkpoint())
+    del checkpoint["policy"]["logit_scale"], checkpoint["config"]["target_kl"]
+    again.resume(checkpoint)
+    assert equal(weights(made), weights(again))
+
+
 def test_fine_tuning_begins_with_the_networks_and_nothing_else():
     pre = learner()
     pre.iterate()
