@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,17 @@ from scipy.stats import qmc
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.soft_iou import KINDS, Kind
 from morphgen.model.geometry import Box, Cylinder, Pose, Primitive, Shape, Sphere, volume
+from morphgen.model.rotation import normalized
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 """Of a box: where its sides are, lower and upper along x, then y, then z. Of a cylinder along z:
 centre x, y, radius, lower and upper end. Of a sphere: centre x, y, z, radius. Metres."""
 
-_POINTS = 11
-"""Logarithm to base 2 of the points that are drawn for each primitive."""
+_FEW = 6
+"""Primitives, up to which any two of them are a candidate's start, too."""
+_POINTS, _FEWER_POINTS = 11, 8
+"""Logarithm to base 2 of the points that are drawn for each primitive, if these are few or not."""
 _GRID = 48
 """Parts of a range, between which numbers are tried besides faces and centres."""
 _REFINED = 16
@@ -45,7 +48,7 @@ _CLEAR = 0.005
 _WHOLE = 2**40
 """The link's volume as a whole number."""
 _SAME = 9
-"""Decimals to which the axes of two frames are compared."""
+"""Decimals of axes and quaternions."""
 _MICRO = 6
 """Decimals of lengths."""
 
@@ -73,7 +76,8 @@ class _Frame:
     points: Array
     """Along these axes, shape (3, n)."""
     spans: Array
-    """Lower and upper end of every primitive, of any two, and of all, shape (k, 3, 2)."""
+    """Lower and upper end of every primitive, of any two if they are few, and of all, shape
+    (k, 3, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +127,10 @@ def composite(shapes: Sequence[Shape]) -> Shape | None:
             found[improved.kind] = improved
     if len(frames) > _UPRIGHT:
         found = {kind: _tilted(link, each) for kind, each in found.items()}
-    return canonical(_shape(max(found.values(), key=lambda each: each.overlap)))
+    shape = canonical(_shape(max(found.values(), key=lambda each: each.overlap)))
+    position, quaternion = shape.T_link_shape.position, shape.T_link_shape.quaternion
+    w, x, y, z = (round(value, _SAME) for value in quaternion)
+    return replace(shape, T_link_shape=Pose(position, normalized((w, x, y, z))))
 
 
 def _rotations(solid: Sequence[Shape]) -> list[Array]:
@@ -138,7 +145,8 @@ def _rotations(solid: Sequence[Shape]) -> list[Array]:
 
 def _frame(link: _Link, R_link_frame: Array) -> _Frame:
     each = [_span(shape, R_link_frame) for shape in link.solid]
-    some = [*itertools.combinations(each, 1), *itertools.combinations(each, 2), each]
+    pairs = itertools.combinations(each, 2) if len(each) <= _FEW else ()
+    some = [*itertools.combinations(each, 1), *pairs, each]
     spans = [np.stack([np.min(of, axis=0)[:, 0], np.max(of, axis=0)[:, 1]], axis=1) for of in some]
     return _Frame(link, R_link_frame, _turned(R_link_frame.T, link.points), np.stack(spans))
 
@@ -162,7 +170,8 @@ def _tilted(link: _Link, best: _Found) -> _Found:
 
 
 def _filled(solid: Sequence[Shape]) -> _Link:
-    cube = 2 * qmc.Sobol(3, scramble=False).random_base2(_POINTS).T - 1 + 0.5**_POINTS
+    m = _POINTS if len(solid) <= _FEW else _FEWER_POINTS
+    cube = 2 * qmc.Sobol(3, scramble=False).random_base2(m).T - 1 + 0.5**m
     drawn, shares = [], []
     for shape in solid:
         body = _plain(shape)
@@ -187,7 +196,7 @@ def _starts(frame: _Frame, kind: Kind) -> Iterator[Numbers]:
         if kind == "box":
             yield tuple(span.ravel().tolist())
         elif kind == "cylinder":
-            for radius in {max(half[:2]), min(half[:2])}:
+            for radius in sorted(set(half[:2])):
                 yield x, y, radius, *span[2].tolist()
         else:
             for radius in sorted(set(half)):
