@@ -30,8 +30,9 @@ _BEHIND = (0.1, 0.4, 0.8, 1.3)
 _NEAREST, _QUICKEST = 24, 36
 """Configurations from which each of them is tried: where the tool is near it, and those to which
 the joints get soonest."""
-_LOW, _HIGH = 0.2, 0.7
-"""Heights of the tool that are aimed at, in edges."""
+_LOW, _HIGH = 0.2, 0.45
+"""Heights of the tool that are aimed at, in edges: pushed above its middle, a block with a friction
+of 1 tips over."""
 _KEPT = 14
 """Configurations behind the block to which simple ways are looked for."""
 _POINTS = 12
