@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from morphgen.errors import MissingDependencyError, SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.quiet import quiet
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.level_links import level_links
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 
 try:
@@ -40,8 +38,6 @@ ITERATIONS = 200
 RESIDUAL = 1e-4
 """Sum of squares, of what is left to do of an iteration, at which the solver is done (m/s, rad/s):
 tools are within a tenth of a millimetre of where all iterations bring them, in half of the time."""
-_UPRIGHT = 1e-6
-"""How far the vertical part of an axis may be from 0 or 1 that is horizontal or vertical."""
 _LINKS, _ROOT, _STATIC, _BLOCK = 1, 2, 4, 8
 """Collision groups: what moves of the robot, what is held of it, ground and obstacles, block."""
 
@@ -64,11 +60,6 @@ class BulletScene:
 
     Friction. By default PyBullet limits it along two axes apart, so that a block that slides askew
     stops 30 % too early and turns aside; ``enableConeFriction`` makes it Coulomb's.
-
-    Ground. A link that no joint raises, lowers or tilts, such as the turntable of an arm, never
-    meets the ground harder than at first, and is not tested against it. If it is as near as 2 cm,
-    PyBullet makes a contact that no impulse can serve, and motors farther along the arm, light
-    ones above all, are then tenths of a radian off, with any number of iterations.
 
     Resets. What outlives a change of state are contact points and the pairs, in the order of their
     making, that the broad phase has found; ``saveState`` and ``restoreState`` keep them. Giving
@@ -137,7 +128,8 @@ class BulletScene:
         self.driven = [joints[body.joints[k].name] for k in body.movable]
         self._efforts = [_effort(body, k) / SUBSTEPS for k in body.movable]
         self._held = _held(body)
-        self._level = [links[name] for name in _level(body, self._scene.T_world_root)]
+        level = level_links(body, self._scene.T_world_root)
+        self._level = [link for name, link in links.items() if name in level]
         for name, link in links.items():
             pybullet.changeDynamics(
                 self.robot,
@@ -298,21 +290,6 @@ def _held(body: Robot) -> set[str]:
         if not joint.is_movable and joint.parent in held:
             held.add(joint.child)
     return held
-
-
-def _level(body: Robot, T_world_root: Pose) -> list[str]:
-    """Links that turn about vertical axes and slide along horizontal ones, if they move at all."""
-    T_world_link = T_world_root.matrix @ forward_kinematics(body, np.array(body.home))
-    level = {body.root.name}
-    for k, joint in enumerate(body.joints):
-        if joint.is_movable:
-            upward = abs(float(T_world_link[k + 1, 2, :3] @ np.array(joint.unit_axis)))
-            steady = upward < _UPRIGHT if joint.kind == "prismatic" else upward > 1 - _UPRIGHT
-        else:
-            steady = True
-        if steady and joint.parent in level:
-            level.add(joint.child)
-    return sorted(level)
 
 
 def _effort(body: Robot, k: int) -> float:

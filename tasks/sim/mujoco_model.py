@@ -16,6 +16,7 @@ from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot, sorted_pair
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.level_links import level_links
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,8 +33,9 @@ PASSIVE = 0.2
 IMPEDANCE_RATIO = 10.0
 """How much harder friction is than the normal direction of a contact (MuJoCo's ``impratio``)."""
 
-_BY_LINKS, _BY_SCENE, _BY_BLOCK = 1, 2, 4
-"""Collision bits: links with links; links with the scene; the block with ground and obstacles."""
+_BY_LINKS, _BY_SCENE, _BY_BLOCK, _BY_GROUND = 1, 2, 4, 8
+"""Collision bits: links with links; links with obstacles and block; the block with ground and
+obstacles; links with the ground."""
 _OBSTACLE_PRIORITY, _BLOCK_PRIORITY = 1, 2
 
 
@@ -141,7 +143,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
         spec.joint(actuator.target).damping[0] = PASSIVE * damping
     for geom in spec.geoms:
         geom.contype = _BY_LINKS if contacts.self_collision else 0
-        geom.conaffinity = geom.contype | (_BY_SCENE if contacts.scene else 0)
+        geom.conaffinity = geom.contype | (_BY_SCENE | _BY_GROUND if contacts.scene else 0)
     option = spec.option
     option.timestep = TIMESTEP
     option.gravity = [0.0, 0.0, -GRAVITY]
@@ -177,10 +179,13 @@ def _with_own_root(robot: Robot) -> Robot:
 def _world(scene: Scene, root: str, spec: mujoco.MjSpec) -> World:
     held = spec.body(root)
     held.pos, held.quat = scene.T_world_root.position, scene.T_world_root.quaternion
+    for name in level_links(scene.robot, scene.T_world_root) - {scene.robot.root.name}:
+        for geom in spec.body(name).geoms:
+            geom.conaffinity &= ~_BY_GROUND
     if scene.ground is not None:
         plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
         plane.pos = [0.0, 0.0, scene.ground]
-        plane.contype, plane.conaffinity = _BY_SCENE | _BY_BLOCK, 0
+        plane.contype, plane.conaffinity = _BY_GROUND | _BY_BLOCK, 0
     for obstacle in scene.obstacles:
         geom = _add_box(spec.worldbody, obstacle, _OBSTACLE_PRIORITY)
         geom.pos, geom.quat = obstacle.pose.position, obstacle.pose.quaternion

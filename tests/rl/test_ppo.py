@@ -401,8 +401,7 @@ def test_checkpoints_of_other_runs_are_refused_and_nothing_is_changed():
 
 
 def test_checkpoints_from_before_a_constant_have_its_default():
-    made, again = learner(), learner()
-    made.iterate()
+    made, again = learner(seed=1), learner()
     checkpoint = stored(made.checkpoint())
     del checkpoint["policy"]["logit_scale"], checkpoint["config"]["target_kl"]
     again.resume(checkpoint)

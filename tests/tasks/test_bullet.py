@@ -12,7 +12,7 @@ from morphgen.errors import SimulationError
 from morphgen.model.dynamics import BANDWIDTH, mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, forward_kinematics, frame_pose, movable_positions
-from morphgen.tasks.sim import bullet_batch, bullet_scene
+from morphgen.tasks.sim import bullet_batch
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.bullet import BulletSimulation
 from morphgen.tasks.sim.bullet_scene import FRICTION
@@ -301,48 +301,6 @@ def test_what_is_held_does_not_touch_what_stands(simulate):
     assert touching(simulation) == set()
     loaded = client_of(simulation, 1)
     assert ((loaded.robot, -1), (loaded.block, -1)) in touching(simulation, 1)
-
-
-def test_a_turntable_on_the_ground_does_not_disturb_the_arm(simulate):
-    """The disc of arm3 stands on the ground, to which no joint brings it nearer."""
-    body = robot("arm=arm3 ee=claw")
-    block = Block((0.1, 0.1, 0.1), Pose((0.0, -0.7, 0.05)), mass=0.1)
-    scene = Scene(body, block=block, ground=0.0)
-    simulation = simulate(scene, contacts=Contacts(self_collision=False))
-    alone = simulate(scene, contacts=Contacts(False, False))
-    q = np.array(body.home)
-    target = torch.tensor(q + 0.4 * np.array([1, -1, 1, -1, 1, 0, 0, 0, 0]), dtype=torch.float32)
-    for each in (simulation, alone):
-        reset(each, q)
-        for _ in range(10):
-            each.step(target[None])
-    np.testing.assert_allclose(simulation.q.numpy(), alone.q.numpy(), atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("request_", "roll", "level"),
-    [
-        ("arm=arm3 ee=claw", 0.0, 2),
-        ("arm=arm3 ee=claw", 0.1, 1),
-        ("planar_arm", 0.0, None),
-    ],
-)
-def test_links_are_level_whose_height_no_joint_changes(request_, roll, level):
-    body = robot(request_)
-    found = bullet_scene._level(body, Pose.from_xyz_rpy(rpy=(roll, 0.0, 0.0)))
-    rng = np.random.default_rng(0)
-    T_world_root = Pose.from_xyz_rpy(rpy=(roll, 0.0, 0.0)).matrix
-    T = [
-        T_world_root @ forward_kinematics(body, q)
-        for q in rng.uniform(*bounds(body).T, (9, body.dof))
-    ]
-    steady = {
-        link.name
-        for i, link in enumerate(body.links)
-        if np.ptp([t[i, 2] for t in T], axis=0).max() < 1e-9
-    }
-    assert set(found) == steady
-    assert level is None or len(steady) == level
 
 
 def self_contact(simulate, body, **contacts):
