@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 _DECIMALS = 9
 """Decimals beyond which rotations turn alike far."""
+_QUATERNION_DECIMALS = 9
 _QUARTER_TURNS = np.array(
     [
         turn
@@ -71,3 +72,9 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
     if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
         x, y, z = -x, -y, -z
     return normalized((1 + z, -y, x, 0.0))
+
+
+def rounded(quaternion: Quat) -> Quat:
+    """The same rotation to nine decimals, beyond which fits differ from machine to machine."""
+    w, x, y, z = (round(value, _QUATERNION_DECIMALS) for value in normalized(quaternion))
+    return normalized((w, x, y, z))

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from morphgen.fitting.canonical import canonical
+from morphgen.fitting.canonical import canonical, rounded
 from morphgen.fitting.soft_iou import KINDS, Kind
 from morphgen.model.geometry import Box, Cylinder, Pose, Primitive, Shape, Sphere, volume
-from morphgen.model.rotation import normalized
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
@@ -48,7 +47,7 @@ _CLEAR = 0.005
 _WHOLE = 2**40
 """The link's volume as a whole number."""
 _SAME = 9
-"""Decimals of axes and quaternions."""
+"""Decimals of axes, and of where sides are, that are compared."""
 _MICRO = 6
 """Decimals of lengths."""
 
@@ -126,11 +125,10 @@ def composite(shapes: Sequence[Shape]) -> Shape | None:
         if improved.kind not in found or improved.overlap > found[improved.kind].overlap:
             found[improved.kind] = improved
     if len(frames) > _UPRIGHT:
-        found = {kind: _tilted(link, each) for kind, each in found.items()}
+        found = {kind: _tilted(each) for kind, each in found.items()}
     shape = canonical(_shape(max(found.values(), key=lambda each: each.overlap)))
-    position, quaternion = shape.T_link_shape.position, shape.T_link_shape.quaternion
-    w, x, y, z = (round(value, _SAME) for value in quaternion)
-    return replace(shape, T_link_shape=Pose(position, normalized((w, x, y, z))))
+    pose = shape.T_link_shape
+    return replace(shape, T_link_shape=replace(pose, quaternion=rounded(pose.quaternion)))
 
 
 def _rotations(solid: Sequence[Shape]) -> list[Array]:
@@ -151,7 +149,7 @@ def _frame(link: _Link, R_link_frame: Array) -> _Frame:
     return _Frame(link, R_link_frame, _turned(R_link_frame.T, link.points), np.stack(spans))
 
 
-def _tilted(link: _Link, best: _Found) -> _Found:
+def _tilted(best: _Found) -> _Found:
     """The same, or what overlaps clearly more along axes that are none of the primitives'."""
     for degrees, axis, sign in itertools.product(_TURNS, range(3), (1, -1)):
         angle = sign * math.radians(degrees)
@@ -160,7 +158,7 @@ def _tilted(link: _Link, best: _Found) -> _Found:
         turn[i, i] = turn[j, j] = math.cos(angle)
         turn[j, i], turn[i, j] = math.sin(angle), -math.sin(angle)
         R = _turned(best.frame.R_link_frame, turn)
-        frame = _frame(link, R)
+        frame = _frame(best.frame.link, R)
         middle = _turned(best.frame.R_link_frame, np.array(best.middle)[:, None])
         moved = _turned(R.T, middle)[:, 0] - best.middle
         found = _improved(frame, best.kind, _shifted(best.kind, best.numbers, moved.tolist()))

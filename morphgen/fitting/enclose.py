@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
 from morphgen.fitting.balls import smallest_balls
-from morphgen.fitting.canonical import least_rotation
+from morphgen.fitting.canonical import least_rotation, rounded
 from morphgen.fitting.soft_iou import KINDS, Kind
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
@@ -32,7 +32,6 @@ Array = NDArray[np.float64]
 
 _DECIMALS = 6
 """Of dimensions and positions in metres."""
-_QUATERNION_DECIMALS = 9
 _SLACK = 1e-10
 """How far a dimension may fall short before it is rounded up, metres."""
 _DIRECTIONS = 400
@@ -152,7 +151,7 @@ def _half_sphere(n: int) -> Array:
 
 def _around(kind: Kind, corners: _Corners, points: Array) -> tuple[Box | Cylinder | Sphere, Pose]:
     """The least primitive of one kind, measured after its pose is rounded."""
-    quaternion = _rounded(_quaternion(kind, corners))
+    quaternion = rounded(_quaternion(kind, corners))
     R = Pose(quaternion=quaternion).matrix[:3, :3]
     middle = R @ _middle(kind, points @ R)
     x, y, z = middle.round(_DECIMALS).tolist()
@@ -165,11 +164,6 @@ def _quaternion(kind: Kind, corners: _Corners) -> Quat:
     if kind == "sphere":
         return rotation.IDENTITY
     return least_rotation(kind, _least(_SEARCHES[kind], corners))
-
-
-def _rounded(quaternion: Quat) -> Quat:
-    w, x, y, z = (round(value, _QUATERNION_DECIMALS) for value in rotation.normalized(quaternion))
-    return rotation.normalized((w, x, y, z))
 
 
 def _middle(kind: Kind, points: Array) -> Array:
