@@ -28,7 +28,7 @@ class PolicyConfig:
     by a clamp); otherwise it is learned."""
     logit_scale: float = 1.0
     """What the network's numbers for bins are multiplied by (ours): a step of the optimiser moves
-    probabilities by as much more."""
+    probabilities by as much more. Numbers as actions have no use for it."""
     mask_morphology: bool = False
     """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
     mlp_features: int = 16
@@ -55,8 +55,6 @@ class PolicyConfig:
             raise TaskError("fixed-deviation: bins have no deviation; it goes with --no-discrete")
         if not self.logit_scale > 0:
             raise TaskError(f"logit_scale {self.logit_scale:g}: expected more than 0")
-        if self.logit_scale != 1 and not self.discrete:
-            raise TaskError("logit_scale: numbers as actions have no logits; it goes with bins")
         for each in fields(self):
             if each.type == "int":
                 _at_least(each.name, getattr(self, each.name), 1)

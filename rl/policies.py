@@ -156,6 +156,11 @@ class MLP(nn.Module):
         self.shape = (layout.links, outputs) if per_link else (outputs,)
         self.leave = _last(width, layout.links * outputs if per_link else outputs)
 
+    @property
+    def last(self) -> nn.Linear:
+        """The layer that the numbers come from."""
+        return self.leave
+
     def forward(self, observation: Observation) -> torch.Tensor:
         """Shape (n, L, outputs) or (n, outputs)."""
         x = self.enter(self.entities(observation)[0].flatten(1))
@@ -210,6 +215,13 @@ class Transformer(nn.Module):
             _last(config.decoder, outputs),
         )
 
+    @property
+    def last(self) -> nn.Linear:
+        """The layer that the numbers come from."""
+        layer = self.decode[-1]
+        assert isinstance(layer, nn.Linear)
+        return layer
+
     def forward(self, observation: Observation) -> torch.Tensor:
         """Shape (n, L, outputs) or (n, outputs)."""
         x, mask = self.entities(observation)
@@ -229,8 +241,11 @@ class Actor(nn.Module):
 
     def __init__(self, config: PolicyConfig, layout: Layout) -> None:
         super().__init__()
-        self.discrete, self.scale = config.discrete, config.logit_scale
+        self.discrete = config.discrete
+        self.scale = config.logit_scale if config.discrete else 1.0
         self.network = _network(config, layout, len(BINS) if config.discrete else 1, True)
+        with torch.no_grad():
+            self.network.last.weight.div_(self.scale)
         if not config.discrete:
             self.deviation = nn.Parameter(
                 torch.zeros(layout.links), requires_grad=not config.fixed_deviation
@@ -303,7 +318,9 @@ def compile_network(network: nn.Module) -> Callable[[Observation], torch.Tensor]
     return compiled
 
 
-def _network(config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> nn.Module:
+def _network(
+    config: PolicyConfig, layout: Layout, outputs: int, per_link: bool
+) -> MLP | Transformer:
     made = Transformer if config.agent == "me-tf" else MLP
     return made(config, layout, outputs, per_link)
 

@@ -15,6 +15,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike, NDArray
 
+from morphgen.checks.mujoco_warnings import caught
 from morphgen.checks.rigid import RigidGroup, rigid_groups
 from morphgen.errors import RobotError
 from morphgen.formats.mjcf_elements import (
@@ -34,6 +35,10 @@ MOSTLY = 0.95
 SAMPLES = 128
 """Random configurations that ``ignore_pairs`` draws."""
 _MEMORY = "16M"
+_GAVE_UP = "EPA"
+"""What a warning of MuJoCo's has if the depth of two shapes that overlap was not found."""
+_NUDGES = (0.0, 1e-9, -1e-9, 1e-8, -1e-8)
+"""By how much joints are moved then, rad or m."""
 
 
 class SelfCollision:
@@ -71,7 +76,8 @@ class SelfCollision:
 
         Raises:
             ValueError: If ``q`` has another shape.
-            RobotError: If the contacts of one configuration do not fit into memory.
+            RobotError: If the contacts of one configuration do not fit into memory, or MuJoCo
+                finds no depth of two shapes that overlap.
         """
         return list(self.each(q))
 
@@ -83,10 +89,8 @@ class SelfCollision:
         return (self._test(positions) for positions in movable_positions(self._robot, q))
 
     def _test(self, positions: NDArray[np.float64]) -> dict[Pair, float]:
-        model, data = self._model, self._data
-        data.qpos[self._addresses] = positions
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
+        data = self._data
+        self._collide(positions)
         depths: dict[Pair, float] = {}
         if data.ncon == 0:
             return depths
@@ -102,6 +106,20 @@ class SelfCollision:
                 pair = sorted_pair(links[self._links[a]].name, links[self._links[b]].name)
                 depths[pair] = max(depths.get(pair, 0.0), -distance)
         return depths
+
+    def _collide(self, positions: NDArray[np.float64]) -> None:
+        """Find contacts, a hair beside the configuration if MuJoCo gives up on a pair there."""
+        for nudge in _NUDGES:
+            self._data.qpos[self._addresses] = positions + nudge
+            mujoco.mj_kinematics(self._model, self._data)
+            with caught() as told:
+                mujoco.mj_collision(self._model, self._data)
+            if not any(_GAVE_UP in each for each in told):
+                return
+        raise RobotError(
+            f"robot {self._robot.name!r}: MuJoCo cannot say how deep two of its shapes overlap at "
+            f"movable joint positions {positions.tolist()}: {told[0]}"
+        )
 
 
 @dataclass(frozen=True)

@@ -259,7 +259,10 @@ def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:
     agent = config.policy.agent
     if args.whole and agent != "se":
         raise TaskError(f"--whole is for --agent se, not for {agent}")
-    for name in constants(args.set):
+    changed = constants(args.set)
+    if "logit_scale" in changed and not config.policy.discrete:
+        raise TaskError("--set logit_scale: numbers have no logits; it is for --discrete")
+    for name in changed:
         if name in SIZES and agent not in SIZES[name]:
             raise TaskError(
                 f"--set {name}: {agent} has no such size; valid for {' and '.join(SIZES[name])}"

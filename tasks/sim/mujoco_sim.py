@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 
 import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.checks.mujoco_warnings import caught
 from morphgen.errors import SimulationError
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
@@ -144,8 +144,8 @@ class MujocoSimulation:
         if not np.isfinite(self._targets).all():
             env = int(np.flatnonzero(~np.isfinite(self._targets).all(axis=1))[0])
             raise ValueError(f"{self._where(env)}: a target is not finite")
-        # Environments whose state is not finite are named below.
-        with np.errstate(invalid="ignore", over="ignore"), _unlogged():
+        # Environments whose state is not finite are named below, whatever MuJoCo warns of.
+        with np.errstate(invalid="ignore", over="ignore"), caught():
             self._control.controls(
                 self._targets, *self._state.joints(), self._state.velocities, out=self._controls
             )
@@ -207,18 +207,3 @@ def _drain(work: Iterator[Work]) -> None:
         actuators[:] = controls
         torques[:] = applied
         mujoco.mj_step(model, data, nstep=SUBSTEPS)
-
-
-@contextmanager
-def _unlogged() -> Iterator[None]:
-    """Keep MuJoCo from writing warnings, which it counts too, to a file in the working folder."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_ignore)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
-def _ignore(text: str) -> None:
-    del text

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -208,3 +209,33 @@ def test_a_heap_of_overlapping_links_fits_into_memory():
     robot = slides(*[0.0] * 40)
     (found,) = self_collisions(robot, [robot.home])
     assert len(found) == 40 * 39 // 2
+
+
+def test_where_mujoco_gives_up_a_hair_beside_it_counts(monkeypatch, tmp_path, capfd):
+    monkeypatch.chdir(tmp_path)
+    collide, given_up = mujoco.mj_collision, []
+
+    def give_up(model, data):
+        if len(given_up) < 2:
+            given_up.append(data.qpos[0])
+            mujoco.get_mju_user_warning()("EPA: out of memory for faces on expanding polytope")
+            data.ncon = 0
+        else:
+            collide(model, data)
+
+    monkeypatch.setattr("morphgen.checks.self_collision.mujoco.mj_collision", give_up)
+    (found,) = self_collisions(slides(0.0, 0.08), [[0.0, 0.0]])
+    assert found == {("ball0", "ball1"): pytest.approx(0.02)}
+    assert given_up == [0.0, 1e-9]
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_mujoco_cannot_tell_at_all_is_an_error(monkeypatch):
+    def give_up(model, data):
+        del model, data
+        mujoco.get_mju_user_warning()("EPA: out of memory for faces on expanding polytope")
+
+    monkeypatch.setattr("morphgen.checks.self_collision.mujoco.mj_collision", give_up)
+    with pytest.raises(RobotError, match=r"'slides': MuJoCo cannot say .* \[0\.0, 0\.0\]: EPA"):
+        self_collisions(slides(0.0, 0.08), [[0.0, 0.0]])

@@ -272,14 +272,21 @@ def test_sizes_are_those_of_the_paper():
 
 
 @agents
-def test_logits_are_scaled_and_nothing_else(agent):
+@pytest.mark.parametrize(("discrete", "factor"), [(True, 16), (False, 1)], ids=["bins", "numbers"])
+def test_logits_begin_alike_and_go_farther_with_every_change(agent, discrete, factor):
     seen, layout = observed(), layout_of(observed())
     plain, larger = (
-        make_networks(PolicyConfig(agent=agent, logit_scale=scale), layout, seed=0)
+        make_networks(PolicyConfig(agent, discrete, logit_scale=scale), layout, seed=0)
         for scale in (1.0, 16.0)
     )
-    torch.testing.assert_close(larger[0](seen), 16 * plain[0](seen))
+    torch.testing.assert_close(larger[0](seen), plain[0](seen))
     assert larger[1](seen).equal(plain[1](seen))
+    before = larger[0](seen)
+    with torch.no_grad():
+        larger[0].network.last.bias.add_(0.1)
+    there = seen["actions"][..., None]
+    moved = torch.where(there, 0.1 * factor, 0.0).expand_as(before)
+    torch.testing.assert_close(larger[0](seen) - before, moved)
 
 
 @agents
@@ -357,7 +364,6 @@ def without_obstacles():
         (lambda: PolicyConfig(features=30), "features 30: expected a multiple of heads 4"),
         (lambda: PolicyConfig(mlp_width=0), "mlp_width 0: expected 1 or more"),
         (lambda: PolicyConfig(logit_scale=0.0), "logit_scale 0: expected more than 0"),
-        (lambda: PolicyConfig(discrete=False, logit_scale=2.0), "logit_scale: numbers as actions"),
         (lambda: PPOConfig(steps=0), "steps 0: expected 1 or more"),
         (lambda: PPOConfig(clip=0.0), "clip 0: expected more than 0"),
         (lambda: PPOConfig(learning_rate=math.nan), "learning_rate nan: expected more than 0"),

@@ -1,56 +1,19 @@
 """PPO, part by part against known answers, and as a whole against a task that it must solve."""
 
-import copy
 import functools
-import io
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
+from learners import SMALL, equal, learner, weights
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import KL_FACTOR, Learner, follow, learning_rate, next_share, policy_loss
 from morphgen.rl.report import explained_variance
 from morphgen.rl.symlog import symlog
 from on_a_line import OnALine
-
-SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4, target_kl=0)
-"""Four updates of eight environments."""
-
-
-def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, **changes):
-    batch = batch or OnALine(8, kind="discrete" if discrete else "continuous")
-    policy = PolicyConfig(agent=agent, discrete=discrete)
-    return Learner(batch, policy, replace(SMALL, **changes), seed=seed)
-
-
-def weights(made):
-    networks = {"actor": made.actor, "critic": made.critic, "slow": made.slow}
-    return {
-        f"{name}.{key}": each.clone()
-        for name, network in networks.items()
-        for key, each in network.state_dict().items()
-    }
-
-
-def equal(a, b):
-    return all(a[name].equal(b[name]) for name in a)
-
-
-def untimed(report):
-    """A report without what depends on the machine; repr, as nan is no equal of nan."""
-    timed = ("collect_seconds", "learn_seconds", "steps_per_second")
-    return repr({name: value for name, value in asdict(report).items() if name not in timed})
-
-
-def stored(checkpoint):
-    """What is left of a checkpoint after a file."""
-    file = io.BytesIO()
-    torch.save(checkpoint, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 def test_policy_loss_by_hand():
@@ -320,104 +283,6 @@ def test_the_curriculum_goes_with_the_updates(moves):
     while not made.done:
         made.iterate()
     assert batch.progress == ([0.0, 0.0, 0.25, 0.5, 0.75] if moves else [])
-
-
-@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
-@pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
-def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
-    options = {
-        "agent": agent,
-        "discrete": discrete,
-        "task_reweighting": True,
-        "learning_rate": 3e-3,
-        "target_kl": 1e-3,
-    }
-    went_on = learner(**options)
-    went_on.iterate(), went_on.iterate()
-    checkpoint = stored(went_on.checkpoint())
-    reports = [went_on.iterate(), went_on.iterate()]
-
-    kind = "discrete" if discrete else "continuous"
-    again = learner(OnALine(8, kind=kind, seed=99), seed=77, **options)
-    again.iterate()
-    again.resume(checkpoint)
-    assert not again.done
-    same = [again.iterate(), again.iterate()]
-    assert again.done
-    assert equal(weights(went_on), weights(again))
-    for one, other in zip(reports, same, strict=True):
-        assert untimed(one) == untimed(other)
-    assert went_on.batch.state_dict() == again.batch.state_dict()
-
-
-@pytest.mark.parametrize("part", ["optimiser", "generators", "batch", "slow", "update", "share"])
-def test_a_run_that_forgets_a_part_does_not_equal_one_that_went_on(part):
-    options = {"task_reweighting": True, "learning_rate": 3e-3, "target_kl": 1e-3}
-    went_on = learner(**options)
-    went_on.iterate(), went_on.iterate()
-    checkpoint = stored(went_on.checkpoint())
-    went_on.iterate()
-    again = learner(OnALine(8, seed=99), seed=77, **options)
-    again.iterate()
-    again.resume({**checkpoint, part: again.checkpoint()[part]})
-    again.iterate()
-    assert not equal(weights(went_on), weights(again))
-
-
-def test_a_checkpoint_does_not_change_with_the_learner():
-    made = learner()
-    made.iterate()
-    checkpoint = made.checkpoint()
-    before = copy.deepcopy(checkpoint)
-    made.iterate()
-    again = learner()
-    again.resume(checkpoint)
-    assert all(checkpoint["actor"][k].equal(before["actor"][k]) for k in before["actor"])
-    steps = [each["step"] for each in checkpoint["optimiser"]["state"].values()]
-    assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
-
-
-def test_the_same_seed_gives_the_same_run():
-    runs = [learner(seed=seed) for seed in (1, 1, 2)]
-    for each in runs:
-        each.iterate()
-    assert equal(weights(runs[0]), weights(runs[1]))
-    assert not equal(weights(runs[0]), weights(runs[2]))
-
-
-def test_checkpoints_of_other_runs_are_refused_and_nothing_is_changed():
-    made = learner()
-    before = weights(made)
-    with pytest.raises(TaskError, match=r"another run: gamma 0\.9, here 0\.99$"):
-        made.resume(learner(gamma=0.9).checkpoint())
-    with pytest.raises(TaskError, match="another run: agent me-tf, here me-mlp"):
-        made.resume(learner(agent="me-tf").checkpoint())
-    wider = learner().checkpoint()
-    wider["layout"]["links"] = 30
-    for take in (made.resume, made.adopt):
-        with pytest.raises(TaskError, match="the checkpoint is for other observations: links 30, "):
-            take(wider)
-    assert equal(before, weights(made))
-
-
-def test_checkpoints_from_before_a_constant_have_its_default():
-    made, again = learner(seed=1), learner()
-    checkpoint = stored(made.checkpoint())
-    del checkpoint["policy"]["logit_scale"], checkpoint["config"]["target_kl"]
-    again.resume(checkpoint)
-    assert equal(weights(made), weights(again))
-
-
-def test_fine_tuning_begins_with_the_networks_and_nothing_else():
-    pre = learner()
-    pre.iterate()
-    fine = learner(OnALine(16), gamma=0.9)
-    fine.adopt(stored(pre.checkpoint()))
-    assert equal(weights(pre), weights(fine))
-    assert fine.update == 0
-    assert not fine.optimiser.state
-    fine.iterate()
-    assert not equal(weights(pre), weights(fine))
 
 
 def test_a_batch_of_other_actions_is_refused():

@@ -1,0 +1,46 @@
+"""Small learners on a line, and what there is to compare of them."""
+
+import io
+from dataclasses import asdict, replace
+
+import torch
+
+from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.ppo import Learner
+from on_a_line import OnALine
+
+SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4, target_kl=0)
+"""Four updates of eight environments."""
+
+
+def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, **changes):
+    batch = batch or OnALine(8, kind="discrete" if discrete else "continuous")
+    policy = PolicyConfig(agent=agent, discrete=discrete)
+    return Learner(batch, policy, replace(SMALL, **changes), seed=seed)
+
+
+def weights(made):
+    networks = {"actor": made.actor, "critic": made.critic, "slow": made.slow}
+    return {
+        f"{name}.{key}": each.clone()
+        for name, network in networks.items()
+        for key, each in network.state_dict().items()
+    }
+
+
+def equal(a, b):
+    return all(a[name].equal(b[name]) for name in a)
+
+
+def untimed(report):
+    """A report without what depends on the machine; repr, as nan is no equal of nan."""
+    timed = ("collect_seconds", "learn_seconds", "steps_per_second")
+    return repr({name: value for name, value in asdict(report).items() if name not in timed})
+
+
+def stored(checkpoint):
+    """What is left of a checkpoint after a file."""
+    file = io.BytesIO()
+    torch.save(checkpoint, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
