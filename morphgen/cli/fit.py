@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot import FitReport
     from morphgen.model.robot import Robot
 
+IOU, CONFIGURATIONS = 0.9, 1000
+"""Unless the user says otherwise."""
 HEADERS = (
     "link",
     "primitives",
@@ -58,8 +60,8 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument(
         "--iou",
         type=float,
-        default=0.9,
-        help="take the fewest primitives that reach it (default: 0.9)",
+        default=IOU,
+        help=f"take the fewest primitives that reach it (default: {IOU})",
     )
     parser.add_argument(
         "--enclose", action="store_true", help="hold every point of the link, for safe collisions"
@@ -70,9 +72,10 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument(
         "--configurations",
         type=int,
-        default=1000,
+        default=CONFIGURATIONS,
         metavar="N",
-        help="compare collisions in so many configurations (default: 1000; with --out)",
+        help=f"compare collisions in so many configurations (default: {CONFIGURATIONS}; "
+        "with --out)",
     )
     add_jobs(parser)
     parser.add_argument("--seed", type=int, default=0)
@@ -222,10 +225,21 @@ def _store_all(args: argparse.Namespace) -> int:
     from morphgen.errors import MorphgenError
     from morphgen.fitting.parts import parts_with_meshes, store_parts
 
-    if args.out or args.enclose or args.visual or args.max_primitives is not None:
+    given = {
+        "--out": args.out,
+        "--enclose": args.enclose,
+        "--visual": args.visual,
+        "--no-picture": args.no_picture,
+        "--max-primitives": args.max_primitives is not None,
+        "--iou": args.iou != IOU,
+        "--configurations": args.configurations != CONFIGURATIONS,
+        "--seed": args.seed,
+        "--json": args.json,
+    }
+    if idle := [name for name, value in given.items() if value]:
         raise MorphgenError(
-            "--all stores one primitive and up to four for every part: it takes no --out, "
-            "--enclose, --visual or --max-primitives"
+            "--all stores one primitive and up to four for every part, always the same ones: it "
+            f"takes no {' or '.join(idle)}"
         )
     library = library_of(args)
     parts = parts_with_meshes(library, missing=args.missing)
