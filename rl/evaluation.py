@@ -137,13 +137,13 @@ def evaluate_checkpoints(
         TaskError: If one is no checkpoint, or for other observations.
         MorphgenError: If a robot or simulator cannot be made.
     """
-    acting, kinds = [], set()
+    acting, forms = [], set()
     for path in paths:
         run, learner = read_checkpoint(path)
         acting.append(_policy(learner, mode, exam.seed, device))
-        kinds.add(run.policy.kind)
-    (kind,) = kinds
-    return evaluate(acting, source, exam, kind=kind)
+        forms.add((run.policy.kind, run.max_links))
+    ((kind, max_links),) = forms
+    return evaluate(acting, source, exam, kind=kind, max_links=max_links)
 
 
 def _policy(learner: dict[str, Any], mode: Mode, seed: int, device: str) -> Acting:
@@ -174,6 +174,7 @@ def evaluate(
     *,
     kind: ActionKind,
     tasks: Sequence[Task] = ("reach", "push"),
+    max_links: int | None = None,
 ) -> list[Score]:
     """Scores of the robots of a source, in order; the random controller has the same episodes.
 
@@ -183,6 +184,7 @@ def evaluate(
         exam: How.
         kind: Of their actions.
         tasks: Robots at other tasks are left out.
+        max_links: As of ``batch_of``.
 
     Raises:
         TaskError: If no robot is left.
@@ -195,7 +197,8 @@ def evaluate(
     folders = tuple(map(Path, source.library))
     played: list[list[Episode]] = [[] for _ in settings]
     for one in acting:
-        for all_own, own in zip(played, _played(one, settings, exam, kind, folders), strict=True):
+        found = _played(one, settings, exam, kind, folders, max_links)
+        for all_own, own in zip(played, found, strict=True):
             all_own.extend(own)
     chance = _chance(source, exam, tuple(tasks), settings, folders)
     return [
@@ -229,6 +232,7 @@ def _played(
     exam: Exam,
     kind: ActionKind,
     folders: tuple[Path, ...],
+    max_links: int | None = None,
 ) -> list[list[Episode]]:
     """Episodes by robot."""
     rounds = -(-exam.episodes // AT_ONCE)
@@ -242,6 +246,7 @@ def _played(
         workers=exam.workers,
         reach=exam.reach,
         push=exam.push,
+        max_links=max_links,
         library=folders,
     )
     try:

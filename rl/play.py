@@ -43,13 +43,16 @@ def require_policy(name: str, task: Task) -> None:
         raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
 
 
-def kind_of(name: str) -> ActionKind | None:
-    """What actions a policy has, if it has but one kind: that of a checkpoint.
+def demands(name: str) -> tuple[ActionKind | None, int | None]:
+    """What actions a checkpoint's policy has, and how many links it sees; others take any.
 
     Raises:
         TaskError: If what is there is no checkpoint.
     """
-    return read_checkpoint(Path(name))[0].policy.kind if _is_file(name) else None
+    if not _is_file(name):
+        return None, None
+    run, _ = read_checkpoint(Path(name))
+    return run.policy.kind, run.max_links
 
 
 def controller(name: str, env: TaskEnv, seed: int) -> Controller:

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import FormatError, TaskError
 from morphgen.formats.files import LOCK, partial_of, write_atomic
 from morphgen.rl.config import PolicyConfig, PPOConfig
@@ -43,6 +44,8 @@ class RunConfig:
     whole: bool = False
     """Whether ``se`` has all environments and transitions for each robot of a split (paper); else
     the robots share them, as those of an agent of many robots do."""
+    max_links: int = MAX_LINKS
+    """Links that observations and actions are padded to; no robot may have more."""
     reach: ReachConfig = field(default_factory=ReachConfig)
     push: PushConfig = field(default_factory=PushConfig)
 
@@ -50,10 +53,12 @@ class RunConfig:
         """Check.
 
         Raises:
-            TaskError: If the seed is none.
+            TaskError: If the seed is none, or so many links are too few for any robot.
         """
         if self.seed < 0:
             raise TaskError(f"--seed {self.seed}: expected 0 or more")
+        if self.max_links < 2:
+            raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
 
     @property
     def updates(self) -> int:

@@ -226,6 +226,7 @@ def _learner(part: Part, way: Way) -> Iterator[Learner]:
         workers=way.workers,
         reach=config.reach,
         push=config.push,
+        max_links=config.max_links,
         library=map(Path, config.source.library),
     )
     try:

@@ -63,7 +63,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         goal_seed: int = 0,
         cache: Path | None = None,
         library: Iterable[Path] = (),
-        max_links: int = MAX_LINKS,
+        max_links: int | None = MAX_LINKS,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
@@ -81,7 +81,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             goal_seed: Of goals, starts and obstacles.
             cache: Folder of these; by default the user's.
             library: Folders of your own parts.
-            max_links: Links that the tokens of the robot's are numbered up to; more for more.
+            max_links: Links that observations and actions are padded to; None for what the robot
+                needs, and the paper's at least.
             render_mode: ``rgb_array`` or None.
             size: Width and height of what is rendered, pixels.
 

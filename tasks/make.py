@@ -42,7 +42,7 @@ class BatchOptions(TypedDict, total=False):
     reach: ReachConfig | None
     push: PushConfig | None
     channels: Channels | None
-    max_links: int
+    max_links: int | None
     first: int
 
 
@@ -153,7 +153,7 @@ def batch_of(
     reach: ReachConfig | None = None,
     push: PushConfig | None = None,
     channels: Channels | None = None,
-    max_links: int = MAX_LINKS,
+    max_links: int | None = MAX_LINKS,
     first: int = 0,
     library: Iterable[Path] = (),
 ) -> TaskBatch:
@@ -170,7 +170,8 @@ def batch_of(
         reach: Constants of reach.
         push: Constants of push.
         channels: What is observed besides.
-        max_links: L, links that observations and actions are padded to.
+        max_links: L, links that observations and actions are padded to; None for what the largest
+            robot needs, and the paper's at least.
         first: Number of the first environment, where a batch is made in parts.
         library: Folders of your own parts.
 
@@ -188,8 +189,11 @@ def batch_of(
     if seed < 0:
         raise TaskError(f"seed {seed}: expected 0 or more")
     _require("action kind", kind, ("continuous", "discrete"))
+    robots = [setting.robot for setting in settings]
+    if max_links is None:
+        max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
     bodies = bodies_of(
-        [setting.robot for setting in settings],
+        robots,
         default_library(tuple(library)).folders,
         max_links=max_links,
     )

@@ -16,7 +16,7 @@ from morphgen.errors import MorphgenError
 from morphgen.fitting.dressed import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.rl.names import REFERENCES
-from morphgen.rl.play import controller, kind_of, require_policy
+from morphgen.rl.play import controller, demands, require_policy
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.sources import members
@@ -203,11 +203,13 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
 def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
     read = read_place(place, places)
     body = as_primitives(as_in_library(read, places.library), places.folders)
+    kind, max_links = demands(policy)
     env = {"reach": ReachEnv, "push": PushEnv}[wanted.task](
         body,
         sim=wanted.simulator,
         obstacles=wanted.obstacles,
-        kind=kind_of(policy) or "continuous",
+        kind=kind or "continuous",
+        max_links=max_links,
         library=places.folders,
     )
     try:

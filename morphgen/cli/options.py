@@ -29,6 +29,17 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
 
 
+def add_max_links(parser: argparse.ArgumentParser) -> None:
+    """Let the user choose how many links tokens are made for."""
+    parser.add_argument(
+        "--max-links",
+        type=int,
+        metavar="N",
+        help="the most links that a robot of the study has; indices are divided by one less "
+        "(default: 23)",
+    )
+
+
 def add_jobs(parser: argparse.ArgumentParser) -> None:
     """Let the user choose how many processes work."""
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")

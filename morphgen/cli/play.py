@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from collections import deque
 
     from morphgen.errors import TaskError
-    from morphgen.rl.play import FPS, controller, kind_of, play, require_policy
+    from morphgen.rl.play import FPS, controller, demands, play, require_policy
     from morphgen.tasks.film import require_film, write_film
     from morphgen.tasks.gym_env import PushEnv, ReachEnv
 
@@ -75,11 +75,13 @@ def run(args: argparse.Namespace) -> int:
     require_policy(args.policy, args.task)
     if args.out is not None:
         require_film(args.out)
+    kind, max_links = demands(args.policy)
     env = {"reach": ReachEnv, "push": PushEnv}[args.task](
         " ".join(args.words),
         sim=args.sim,
         obstacles=args.obstacles,
-        kind=args.kind or kind_of(args.policy) or "continuous",
+        kind=args.kind or kind or "continuous",
+        max_links=max_links,
         library=args.library,
         render_mode=None if args.out is None else "rgb_array",
     )

@@ -52,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
         sim=args.sim,
         workers=args.workers,
         obstacles=args.obstacles,
+        max_links=None,
         library=args.library,
     )
     try:

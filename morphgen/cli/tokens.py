@@ -9,7 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import (
+    Subparsers,
+    add_json,
+    add_library,
+    add_max_links,
+    library_of,
+)
 
 if TYPE_CHECKING:
     from morphgen.benchmark.token_layout import Array
@@ -52,13 +58,7 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument(
         "--out", metavar="FILE.npz", type=Path, help="write the tokens to this file"
     )
-    parser.add_argument(
-        "--max-links",
-        type=int,
-        metavar="N",
-        help="the most links that a robot of the study has; indices are divided by one less "
-        "(default: 23)",
-    )
+    add_max_links(parser)
     add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)

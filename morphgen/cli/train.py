@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from morphgen.cli.options import Subparsers, add_library
+from morphgen.cli.options import Subparsers, add_library, add_max_links
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -81,6 +81,7 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
         action="store_true",
         help="se on a split: all steps and environments for each robot, not shares of them",
     )
+    add_max_links(parser)
     parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
     parser.add_argument("--compile", action="store_true", help="networks by torch.compile")
 
@@ -228,6 +229,7 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
     Raises:
         TaskError: If a number is out of its range.
     """
+    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.rl.runs import RunConfig
     from morphgen.rl.sources import tasks_of
     from morphgen.rl.variants import constants, settle
@@ -243,6 +245,7 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
         envs=args.envs,
         device=args.device,
         whole=args.whole and variant.agent == "se",
+        max_links=MAX_LINKS if args.max_links is None else args.max_links,
     )
 
 

@@ -26,6 +26,12 @@ def test_it_prints_rates_and_shares(sim, capsys):
     assert "physics steps a second" in text
 
 
+def test_bodies_of_many_links_are_measured_too(capsys):
+    words = ["speed", "reach", "chain", "beads=7", "--envs", "1", "--seconds", "0.05"]
+    assert main([*words, "--sim", "mujoco"]) == 0
+    assert "reach, chain" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [

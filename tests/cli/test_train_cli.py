@@ -12,7 +12,7 @@ from commands import start, tree
 from morphgen.benchmark.split_file import write_split
 from morphgen.cli import main
 from morphgen.rl.recorders import METRICS, read_metrics
-from morphgen.rl.runs import CHECKPOINT, read_config
+from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.sources import settings_of
 from morphgen.tasks.settings import Recipe
 from morphgen.tasks.split_goals import read_goals
@@ -72,6 +72,24 @@ def test_one_body_is_trained_resumed_evaluated_and_played(run, tmp_path):
     code, out, _ = run("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
     assert code == 0
     assert out.startswith("episode 1: ")
+
+
+def test_bodies_of_many_links_are_for_those_who_ask(run, tmp_path):
+    words = ("train", "chain", "beads=7", "task=reach", "--agent", "me-mlp", *SMALL)
+    words += ("--steps", "32", "--out", "run")
+    code, out, err = run(*words)
+    assert (code, out, tree(tmp_path)) == (2, "", {})
+    assert "has 25 links, more than max_links 23; make max_links 25 or more" in err
+
+    assert run(*words, "--max-links", "26")[0] == 0
+    assert read_checkpoint(Path("run"))[1]["layout"]["links"] == 26
+    code, out, _ = run("eval", "run", "--episodes", "1", "--mode", "deterministic")
+    assert code == 0
+    assert "chain" in out
+    for policy in ("run", "zero"):
+        code, out, err = run("play", "reach", "chain", "beads=7", "--policy", policy)
+        assert (code, err) == (0, "")
+        assert out.startswith("episode 1: ")
 
 
 def test_the_policy_that_is_played_is_the_one_that_was_trained(run):
@@ -258,6 +276,7 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         (("eval", "nothing"), "no checkpoint, and no folder of a run"),
         ((*RUN, "--on", "test"), "is one robot, no split: there is nothing to test on"),
         ((*RUN, "--whole"), "--whole is for --agent se, not for me-mlp"),
+        ((*RUN, "--max-links", "1"), "--max-links 1: expected 2 or more"),
         (
             (*RUN, "--no-discrete", "--set", "logit_scale=8"),
             "--set logit_scale: numbers have no logits; it is for --discrete",

@@ -191,6 +191,9 @@ def test_a_robot_of_many_links_needs_more_numbers_for_them(make):
     with pytest.raises(MorphgenError, match="max_links 25 or more"):
         make(registration.REACH, robot=body)
     assert make(registration.REACH, robot=body, max_links=25).reset(seed=0)
+    for robot, links, numbered in ((body, 25, 25), ("arm3-stick", 7, 23)):
+        seen, _ = make(registration.REACH, robot=robot, max_links=None).reset(seed=0)
+        assert seen["tokens"][:, 0] * (numbered - 1) == pytest.approx(range(links))
 
 
 def test_the_episodes_are_those_of_a_batch(make, cache):
