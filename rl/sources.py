@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from morphgen.benchmark.split import Member, Side, Split, Task, robot_hash
+from morphgen.benchmark import token_layout
+from morphgen.benchmark.split import Member, Side, Split, Task, member_robot, robot_hash
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_reader import parse_split
 from morphgen.errors import BenchmarkError, TaskError, nearest
@@ -130,6 +131,22 @@ def other_side(source: Source, side: Side) -> Source:
     if side == "test":
         raise TaskError(f"{source.name!r} is one robot, no split: there is nothing to test on")
     return source
+
+
+def require_links(source: Source, max_links: int) -> None:
+    """Require that what is trained on one side of a split can be tested on the other.
+
+    Raises:
+        BenchmarkError: If a robot there has more links.
+        MorphgenError: If it cannot be made.
+    """
+    if not source.split:
+        return
+    library = default_library(tuple(map(Path, source.library)))
+    side: Side = "test" if source.side == "train" else "train"
+    for member in members(other_side(source, side)):
+        links = len(member_robot(member, library).links)
+        token_layout.require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
 def settings_of(source: Source, recipe: Recipe) -> list[Setting]:

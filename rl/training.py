@@ -24,7 +24,7 @@ from morphgen.rl.runs import (
     require_open,
     write_checkpoint,
 )
-from morphgen.rl.sources import apart, members, settings_of
+from morphgen.rl.sources import apart, members, require_links, settings_of
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.settings import Recipe
 
@@ -130,6 +130,8 @@ def train(
         for part in made:
             if is_done(part):
                 continue
+            if not holds:
+                require_links(config.source, config.max_links)
             with _learner(part, way) as learner:
                 if not holds:
                     folder.mkdir(parents=True, exist_ok=True)

@@ -11,13 +11,13 @@ import pytest
 
 import morphgen
 from commands import tree
-from morphgen.errors import FormatError, TaskError
+from morphgen.errors import BenchmarkError, FormatError, TaskError
 from morphgen.formats.files import alone
 from morphgen.rl import training
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
-from morphgen.rl.sources import robot_source
+from morphgen.rl.sources import robot_source, split_source
 from morphgen.rl.training import (
     Way,
     checkpoints,
@@ -28,6 +28,7 @@ from morphgen.rl.training import (
 )
 from on_a_line import OnALine
 from small_runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
+from splits import member, split
 
 TIMED = ("collect_seconds", "learn_seconds", "steps_per_second")
 
@@ -241,6 +242,16 @@ def test_what_cannot_begin_leaves_nothing(tmp_path):
     with pytest.raises(TaskError, match="--seed -1"):
         replace(config, seed=-1)
     require_runnable(config)
+
+
+def test_links_are_enough_for_what_it_is_tested_on_before_it_begins(tmp_path):
+    long = split((member("base=planar ee=cube", task="reach"),), (member("chain beads=7"),))
+    config = small_config(split_source(long), transitions=64)
+    with pytest.raises(BenchmarkError, match=r"test robot '.*' has 25 links, more than max_links"):
+        train(tmp_path / "run", config, way=QUIET)
+    assert tree(tmp_path) == {}
+    train(tmp_path / "run", replace(config, max_links=25), way=QUIET)
+    assert read_checkpoint(tmp_path / "run")[1]["layout"]["links"] == 25
 
 
 def test_two_runs_do_not_write_to_one_folder(tmp_path):
