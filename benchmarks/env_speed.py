@@ -3,7 +3,7 @@
     python benchmarks/env_speed.py [--envs 128] [--seconds 4] [--rounds 3] [--json rows.json]
 
 Reach and push of a Panda with its hand and reach of a UR5 with a plate, collision shapes of fitted
-primitives; random actions; steps of 5 ms, four to an action. Rows of a task:
+primitives; random actions, whole episodes; steps of 5 ms, four to an action. Rows of a task:
 
 - raw PyBullet: the same scenes under the same actions, and of that only what is spent within
   `stepSimulation`: as if targets, states, observations and rewards cost nothing. In two processes,
@@ -62,8 +62,8 @@ CASES: tuple[tuple[Task, str, str], ...] = (
 )
 """Task, robot, and the environment of panda-gym that does the same."""
 RAW = "raw PyBullet"
-ACTIONS = 25
-"""Different ones, again and again."""
+EPISODE = 300
+"""Control steps; every one has actions of its own, and every row is of whole episodes."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
         pybullet.stepSimulation = timed
         try:
             end = time.perf_counter() + seconds
-            actions = random_actions(batch, ACTIONS, seed=0)
+            actions = random_actions(batch, EPISODE, seed=0)
             while time.perf_counter() < end:
                 for action in actions:
                     batch.step(action)
@@ -217,12 +217,12 @@ def _peer(name: str, count: int, seconds: float) -> float:
     with closing(vector(make)) as envs:
         envs.reset(seed=0)
         rng = np.random.default_rng(0)
-        actions = rng.uniform(-1, 1, (ACTIONS, *(envs.action_space.shape or ()))).astype(np.float32)
+        actions = rng.uniform(-1, 1, (EPISODE, *(envs.action_space.shape or ()))).astype(np.float32)
         for action in actions:
             envs.step(action)
         start, steps = time.perf_counter(), 0
-        while time.perf_counter() - start < seconds:
-            envs.step(actions[steps % ACTIONS])
+        while steps % EPISODE or time.perf_counter() - start < seconds:
+            envs.step(actions[steps % EPISODE])
             steps += 1
         return steps * count / (time.perf_counter() - start)
 

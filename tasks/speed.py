@@ -52,7 +52,10 @@ def measure(
     own: Sequence[tuple[Any, str]] = (),
     clock: Callable[[], float] = time.perf_counter,
 ) -> Speed:
-    """Step a batch for some time.
+    """Step a batch for some time, under other random actions in every step of an episode.
+
+    Time is rounded up to whole episodes: what contacts cost depends on how long ago they began, and
+    what is faster would otherwise get farther into them.
 
     Args:
         batch: Environments; they are reset first.
@@ -71,18 +74,20 @@ def measure(
         "around the simulator": [(batch.simulation, "step")],
         "simulator": list(own),
     }
-    actions = random_actions(batch, WARM_UP, seed)
+    episode = int(batch.longest.max())
+    actions = random_actions(batch, episode, seed)
     batch.reset()
-    for action in actions:
+    for action in actions[:WARM_UP]:
         batch.step(action)
+    batch.reset()
     steps = 0
     with ExitStack() as stack:
         for part, functions in parts.items():
             for owner, name in functions:
                 stack.enter_context(_timed(owner, name, part, spent, clock))
         start = clock()
-        while clock() - start < seconds:
-            batch.step(actions[steps % len(actions)])
+        while steps % episode or clock() - start < seconds:
+            batch.step(actions[steps % episode])
             steps += 1
         total = clock() - start
     shares = {part: spent.get(part, 0.0) / total for part in parts}

@@ -39,6 +39,7 @@ def test_without_it_all_within_the_simulation_is_one(robot, tmp_path):
     with closing(
         make_batch("reach", [robot], 2, sim="mujoco", reach=CONFIG, cache=tmp_path)
     ) as batch:
-        found = measure(batch, 500, clock=lambda: float(next(ticks)))
+        found = measure(batch, 507, clock=lambda: float(next(ticks)))
+        assert batch.elapsed.tolist() == [0, 0]  # whole episodes
     assert "around the simulator" not in found.shares
     assert found.shares["simulator"] == pytest.approx(found.shares["actions"], rel=0.05)
