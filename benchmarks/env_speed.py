@@ -48,6 +48,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.benchmark.split import Task
+from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.make import SimulatorName, make_batch
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
@@ -62,7 +63,7 @@ CASES: tuple[tuple[Task, str, str], ...] = (
 )
 """Task, robot, and the environment of panda-gym that does the same."""
 RAW = "raw PyBullet"
-EPISODE = 300
+EPISODE = ReachConfig.steps
 """Control steps; every one has actions of its own, and every row is of whole episodes."""
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from morphgen.benchmark import token_layout
 from morphgen.benchmark.split import Member, Side, Split, Task, member_robot, robot_hash
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_reader import parse_split
+from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.tasks.goal_npz import Goals
@@ -146,7 +146,7 @@ def require_links(source: Source, max_links: int) -> None:
     side: Side = "test" if source.side == "train" else "train"
     for member in members(other_side(source, side)):
         links = len(member_robot(member, library).links)
-        token_layout.require_max_links(links, f"{side} robot {member.name!r}", max_links)
+        require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
 def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
