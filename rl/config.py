@@ -26,9 +26,6 @@ class PolicyConfig:
     fixed_deviation: bool = False
     """Numbers as actions keep the deviation that they start with (as in the paper's released code,
     by a clamp); otherwise it is learned."""
-    logit_scale: float = 1.0
-    """What the network's numbers for bins are multiplied by (ours): a step of the optimiser moves
-    probabilities by as much more. Numbers as actions have no use for it."""
     mask_morphology: bool = False
     """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
     mlp_features: int = 16
@@ -42,6 +39,9 @@ class PolicyConfig:
     feedforward: int = 512
     decoder: int = 64
     """Width of the MLP from a link's features to its action, and to the value (ours)."""
+    logit_scale: float = 64.0
+    """What the transformer's numbers for bins are multiplied by (ours): a step of the optimiser
+    moves probabilities by as much more. The MLP learns less with it, and has none."""
 
     def __post_init__(self) -> None:
         """Check.
@@ -72,12 +72,12 @@ class PolicyConfig:
         return self.mask_morphology or self.agent == "se"
 
 
-SIZES: Mapping[str, tuple[AgentName, ...]] = {
+OWNERS: Mapping[str, tuple[AgentName, ...]] = {
     each.name: ("se", "me-mlp") if each.name.startswith("mlp_") else ("me-tf",)
     for each in fields(PolicyConfig)
-    if each.type == "int"
+    if each.type in ("int", "float")
 }
-"""Whose networks have which sizes."""
+"""Whose networks have which numbers."""
 
 
 @dataclass(frozen=True)

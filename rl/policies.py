@@ -242,7 +242,8 @@ class Actor(nn.Module):
     def __init__(self, config: PolicyConfig, layout: Layout) -> None:
         super().__init__()
         self.discrete = config.discrete
-        self.scale = config.logit_scale if config.discrete else 1.0
+        scaled = config.discrete and config.agent == "me-tf"
+        self.scale = config.logit_scale if scaled else 1.0
         self.network = _network(config, layout, len(BINS) if config.discrete else 1, True)
         with torch.no_grad():
             self.network.last.weight.div_(self.scale)

@@ -22,8 +22,9 @@ from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.make import SimulatorName
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
-FORMAT = 1
-"""Of config and checkpoint; rises when older ones cannot be read any more."""
+FORMAT = 2
+"""Of config and checkpoint; rises when older ones cannot be read any more. In 1 every agent had a
+scale of logits, and none by default."""
 
 
 @dataclass(frozen=True)

@@ -256,20 +256,20 @@ def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:
         TaskError: If one is.
     """
     from morphgen.errors import TaskError
-    from morphgen.rl.config import SIZES
+    from morphgen.rl.config import OWNERS
     from morphgen.rl.variants import constants
 
     agent = config.policy.agent
     if args.whole and agent != "se":
         raise TaskError(f"--whole is for --agent se, not for {agent}")
     changed = constants(args.set)
+    for name in changed:
+        if name in OWNERS and agent not in OWNERS[name]:
+            raise TaskError(
+                f"--set {name}: {agent} has none; valid for {' and '.join(OWNERS[name])}"
+            )
     if "logit_scale" in changed and not config.policy.discrete:
         raise TaskError("--set logit_scale: numbers have no logits; it is for --discrete")
-    for name in changed:
-        if name in SIZES and agent not in SIZES[name]:
-            raise TaskError(
-                f"--set {name}: {agent} has no such size; valid for {' and '.join(SIZES[name])}"
-            )
 
 
 def way_of(args: argparse.Namespace) -> Way:

@@ -278,10 +278,11 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         ((*RUN, "--whole"), "--whole is for --agent se, not for me-mlp"),
         ((*RUN, "--max-links", "1"), "--max-links 1: expected 2 or more"),
         (
-            (*RUN, "--no-discrete", "--set", "logit_scale=8"),
+            ("train", "planar-cube", "task=reach", "--no-discrete", "--set", "logit_scale=8"),
             "--set logit_scale: numbers have no logits; it is for --discrete",
         ),
-        ((*RUN, "--set", "features=8"), "--set features: me-mlp has no such size; valid for me-tf"),
+        ((*RUN, "--set", "logit_scale=8"), "--set logit_scale: me-mlp has none; valid for me-tf"),
+        ((*RUN, "--set", "features=8"), "--set features: me-mlp has none; valid for me-tf"),
         ((*RUN, "--set", "mlp_layers=0"), "mlp_layers 0: expected 1 or more"),
         (("train", "interpolation/arm3/reach", "--envs", "9"), "fewer than the 10 robots"),
         (("eval", "ik"), "say on which robots, with --split"),

@@ -85,7 +85,7 @@ def test_what_is_no_run_is_left_alone(tmp_path):
     assert list(tree(tmp_path)) == ["mine", "mine/letter.txt"]
 
 
-@pytest.mark.parametrize("text", ["{}", "[]", "so", '{"format": 1}', '{"source": {"name": "a"}}'])
+@pytest.mark.parametrize("text", ["{}", "[]", "so", '{"format": 2}', '{"source": {"name": "a"}}'])
 def test_a_broken_config_is_refused(tmp_path, text):
     (tmp_path / CONFIG).write_text(text)
     with pytest.raises(TaskError, match="is not the config of a run"):
@@ -107,12 +107,12 @@ def test_a_run_of_another_format_is_refused(tmp_path):
     open_run(tmp_path, small_config(), resume=False)
     write_checkpoint(tmp_path, small_config(), {"update": 3})
     config = tmp_path / CONFIG
-    config.write_text(config.read_text().replace('"format": 1', '"format": 2'))
-    with pytest.raises(TaskError, match=r"config.json has format 2, and this morphgen reads 1"):
+    config.write_text(config.read_text().replace('"format": 2', '"format": 1'))
+    with pytest.raises(TaskError, match=r"config.json has format 1, and this morphgen reads 2"):
         read_config(tmp_path)
     data = torch.load(tmp_path / CHECKPOINT, weights_only=True)
-    torch.save({**data, "format": 2}, tmp_path / CHECKPOINT)
-    with pytest.raises(TaskError, match=r"checkpoint.pt has format 2"):
+    torch.save({**data, "format": 1}, tmp_path / CHECKPOINT)
+    with pytest.raises(TaskError, match=r"checkpoint.pt has format 1"):
         read_checkpoint(tmp_path)
 
 
