@@ -18,12 +18,14 @@ from torch.nn import functional
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.heads import Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
+from morphgen.rl.heads import REST, Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
 from morphgen.tasks.batch import Observation
 from morphgen.tasks.config import BINS
 
 CHANNELS = ("velocity", "previous_action")
 """Numbers of a link that an observation may have beside its token, in order."""
+LINK_ROWS = ("tokens", "links", "actions", *CHANNELS)
+"""Parts of an observation that have a row for each link."""
 SMALL = 0.01
 """Scale of the last layer's weights at the start: all actions begin alike, values at zero."""
 KINDS = 64
@@ -74,6 +76,30 @@ def require_layout(found: Layout, wanted: Layout, what: str) -> None:
     ]
     if wrong:
         raise TaskError(f"{what} is for other observations: {'; '.join(wrong)}")
+
+
+def rows_needed(config: PolicyConfig, observation: Observation) -> int:
+    """How many rows of links networks have to see.
+
+    The transformer needs those up to the last link that some robot has. More would change nothing
+    that it says (proved in its tests), and costs time. An MLP is made for all.
+    """
+    if config.agent != "me-tf":
+        return observation["links"].shape[1]
+    return int(torch.nonzero(observation["links"].any(dim=0)).max()) + 1
+
+
+def with_rows(observation: Observation, rows: int) -> Observation:
+    """The same with the first rows of links alone; tensors (n, L, ...) become (n, rows, ...)."""
+    return {
+        name: each[:, :rows] if name in LINK_ROWS else each for name, each in observation.items()
+    }
+
+
+def with_all_rows(actions: torch.Tensor, links: int) -> torch.Tensor:
+    """Actions (n, rows) as the batch takes them, (n, L); further links rest."""
+    rest = 0 if actions.is_floating_point() else REST
+    return functional.pad(actions, (0, links - actions.shape[1]), value=rest)
 
 
 class Entities(nn.Module):
@@ -202,7 +228,7 @@ class Transformer(nn.Module):
     def __init__(self, config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> None:
         super().__init__()
         features = config.features
-        self.per_link, self.links = per_link, layout.links
+        self.per_link = per_link
         self.entities = Entities(layout, features, config.blind)
         self.index = nn.Parameter(0.02 * torch.randn(layout.links, features))
         self.blocks = nn.ModuleList(
@@ -223,14 +249,15 @@ class Transformer(nn.Module):
         return layer
 
     def forward(self, observation: Observation) -> torch.Tensor:
-        """Shape (n, L, outputs) or (n, outputs)."""
+        """Shape (n, L, outputs) or (n, outputs); L may be less than what it was made for."""
         x, mask = self.entities(observation)
-        x = x + functional.pad(self.index, (0, 0, 0, x.shape[1] - self.links))
+        links = observation["links"].shape[1]
+        x = x + functional.pad(self.index[:links], (0, 0, 0, x.shape[1] - links))
         for block in self.blocks:
             x = block(x, mask)
-        x = x[:, : self.links]
+        x = x[:, :links]
         if not self.per_link:
-            there = mask[:, : self.links, None]
+            there = mask[:, :links, None]
             x = torch.where(there, x, 0.0).sum(dim=1) / there.sum(dim=1)
         found: torch.Tensor = self.decode(x)
         return found
@@ -261,7 +288,8 @@ class Actor(nn.Module):
         """The distribution of actions, from ``forward`` and the links that count (n, L)."""
         if self.discrete:
             return MaskedMultiDiscrete(numbers, mask)
-        return MaskedGaussian(numbers[..., 0], bounded_log_std(self.deviation), mask)
+        deviation = bounded_log_std(self.deviation[: mask.shape[1]])
+        return MaskedGaussian(numbers[..., 0], deviation, mask)
 
     def distribution(self, observation: Observation) -> Head:
         """The distribution of actions."""

@@ -23,6 +23,9 @@ from morphgen.rl.policies import (
     layout_of,
     make_networks,
     require_layout,
+    rows_needed,
+    with_all_rows,
+    with_rows,
 )
 from morphgen.rl.report import Numbers, Report, explained_variance, outcome
 from morphgen.rl.symlog import symexp, symlog
@@ -30,14 +33,13 @@ from morphgen.tasks.batch import Observation, TaskBatch
 
 TOLD = ("reward", "score", "success", "terminated", "truncated")
 """What of every step is kept besides observations and actions."""
-
 KL_FACTOR = 1.2
 """Between the actor's learning rates of two updates, where they follow ``target_kl``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """T steps of n environments, on the learner's device."""
+    """T steps of n environments, on the learner's device; of links the rows that are needed."""
 
     observation: Observation
     """What was acted upon, tensors (T, n, ...)."""
@@ -46,7 +48,7 @@ class Rollout:
     final: Observation
     """Where time ended an episode, its last; tensors (k, ...), in the order of ``nonzero``."""
     actions: torch.Tensor
-    """Shape (T, n, L)."""
+    """Shape (T, n, rows of links)."""
     log_prob: torch.Tensor
     rewards: torch.Tensor
     terminated: torch.Tensor
@@ -88,8 +90,8 @@ class Learner:
         self._bodies = int(batch.body.max()) + 1
         self._observation: Observation | None = None
         self._buffer: Observation = {}
-        self._begin()
-        self.layout = layout_of(self._now())
+        first = self._begin()
+        self.layout, self._rows = layout_of(first), rows_needed(policy, first)
         weights, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
         actor, critic = make_networks(policy, self.layout, weights)
         self.actor, self.critic = actor.to(self.device), critic.to(self.device)
@@ -120,8 +122,7 @@ class Learner:
             SimulationError: If a simulation became unstable.
         """
         began = time.perf_counter()
-        self._begin()
-        rollout, seen = self._collect()
+        rollout, seen = self._collect(self._begin())
         collected = time.perf_counter()
         learned = self._learn(rollout)
         self.update += 1
@@ -208,23 +209,24 @@ class Learner:
 
         return call
 
-    def _begin(self) -> None:
-        """Move the curriculum, and begin episodes if none are under way."""
+    def _begin(self) -> Observation:
+        """Move the curriculum, begin episodes if none are under way; what is seen now."""
         if self.config.curriculum:
             self.batch.advance(self.update / self.updates)
         if self._observation is None:
             self._observation = self.batch.reset(spread=True)
         elif self.config.curriculum:
             self._observation = self.batch.observe()
+        return self._observation
 
-    def _now(self) -> Observation:
-        assert self._observation is not None
-        return {name: each.to(self.device) for name, each in self._observation.items()}
+    def _here(self, observation: Observation) -> Observation:
+        """What networks see of an observation, on their device."""
+        return {k: v.to(self.device) for k, v in with_rows(observation, self._rows).items()}
 
     @torch.no_grad()
-    def _collect(self) -> tuple[Rollout, Numbers]:
+    def _collect(self, first: Observation) -> tuple[Rollout, Numbers]:
         """Act for ``steps`` control steps; returns them, and what the report says of them."""
-        now = self._now()
+        now = self._here(first)
         if not self._buffer:
             self._buffer = {
                 name: each.new_empty(self.config.steps, *each.shape) for name, each in now.items()
@@ -236,20 +238,20 @@ class Learner:
             seen = {name: rows[t] for name, rows in self._buffer.items()}
             head = self.actor.head(self._act(seen), seen["actions"])
             actions = head.sample(self._generators["actions"])
-            step = self.batch.step(actions.to(self.batch.device))
+            step = self.batch.step(with_all_rows(actions, self.layout.links).to(self.batch.device))
             acted.append((actions, head.log_prob(actions)))
             told.append([getattr(step, name) for name in TOLD])
             terms.append({name: each.mean() for name, each in step.terms.items()})
             finals.append({k: v[step.truncated] for k, v in step.final_observation.items()})
             self._observation = step.observation
-            now = self._now()
+            now = self._here(step.observation)
         tallied = dict(zip(TOLD, map(torch.stack, zip(*told, strict=True)), strict=True))
         means = {k: float(torch.stack([each[k] for each in terms]).mean()) for k in terms[0]}
         actions, log_prob = (torch.stack(each) for each in zip(*acted, strict=True))
         rollout = Rollout(
             observation=self._buffer,
             last={name: each.clone() for name, each in now.items()},
-            final={k: torch.cat([each[k] for each in finals]).to(self.device) for k in now},
+            final=self._here({k: torch.cat([each[k] for each in finals]) for k in now}),
             actions=actions,
             log_prob=log_prob,
             rewards=tallied["reward"].to(self.device),

@@ -7,7 +7,15 @@ from typing import Any, Literal
 import torch
 
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.policies import layout_from, layout_of, make_networks, require_layout
+from morphgen.rl.policies import (
+    layout_from,
+    layout_of,
+    make_networks,
+    require_layout,
+    rows_needed,
+    with_all_rows,
+    with_rows,
+)
 from morphgen.tasks.batch import Observation, TaskBatch
 
 Mode = Literal["deterministic", "stochastic"]
@@ -31,7 +39,8 @@ class Policy:
         """
         self._layout = layout_from(checkpoint["layout"])
         self._device = torch.device(device)
-        actor, _ = make_networks(PolicyConfig(**checkpoint["policy"]), self._layout, 0)
+        self._config = PolicyConfig(**checkpoint["policy"])
+        actor, _ = make_networks(self._config, self._layout, 0)
         actor.load_state_dict(checkpoint["actor"])
         self._actor = actor.to(self._device).eval()
         self._likeliest = mode == "deterministic"
@@ -52,8 +61,9 @@ class Policy:
         Raises:
             TaskError: If the batch has other observations than the policy was made for.
         """
-        seen = {name: each.to(self._device) for name, each in task.observe().items()}
+        seen = task.observe()
         self.require(seen)
-        head = self._actor.distribution(seen)
+        needed = with_rows(seen, rows_needed(self._config, seen))
+        head = self._actor.distribution({k: v.to(self._device) for k, v in needed.items()})
         chosen = head.mode() if self._likeliest else head.sample(self._generator)
-        return chosen.to(task.device)
+        return with_all_rows(chosen, self._layout.links).to(task.device)

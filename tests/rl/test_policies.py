@@ -8,7 +8,14 @@ import torch
 from morphgen.benchmark.token_layout import POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.config import AGENTS, PolicyConfig, PPOConfig
-from morphgen.rl.policies import layout_of, make_networks, require_layout
+from morphgen.rl.policies import (
+    layout_of,
+    make_networks,
+    require_layout,
+    rows_needed,
+    with_all_rows,
+    with_rows,
+)
 
 N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
 COUNT = torch.tensor([6, 4, 1, 3])
@@ -161,6 +168,30 @@ def test_the_transformer_does_not_care_how_much_padding_there_is():
     }
     for one, other in zip(outputs(*pair, seen), outputs(*pair, wider), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+@kinds
+def test_the_transformer_says_and_learns_the_same_without_rows_that_no_robot_has(discrete):
+    seen = {name: each[1:] for name, each in observed().items()}
+    rows = rows_needed(PolicyConfig("me-tf"), seen)
+    assert rows == COUNT[1:].max() == LINKS - 2
+    found = []
+    for needed in (seen, with_rows(seen, rows)):
+        actor, critic = networks("me-tf", seen, discrete=discrete)
+        head = actor.distribution(needed)
+        actions = with_all_rows(head.mode(), LINKS)
+        probable = head.log_prob(actions[:, : needed["links"].shape[1]])
+        value = critic(needed)
+        (probable + head.entropy() + value).sum().backward()
+        gradients = [each.grad for each in (*actor.parameters(), *critic.parameters())]
+        found.append([actions, probable, head.entropy(), value, *gradients])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("agent", ["se", "me-mlp"])
+def test_an_mlp_sees_the_rows_that_it_was_made_for(agent):
+    assert rows_needed(PolicyConfig(agent), observed()) == LINKS
 
 
 def test_the_transformer_learns_nothing_of_the_index_of_a_link_that_is_not_there():

@@ -120,7 +120,7 @@ def test_targets_by_hand(slow, logarithmic):
     steps = []
     step = batch.step
     batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
-    rollout, _ = made._collect()
+    rollout, _ = made._collect(made._begin())
     values, advantages, returns = made._targets(rollout)
     after = torch.stack([Answers()(each.final_observation) for each in steps])
     rewards = torch.stack([each.reward for each in steps])
@@ -138,7 +138,7 @@ def test_targets_by_hand(slow, logarithmic):
 def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
     options = {"epochs": 80, "minibatches": 1, "learning_rate": 3e-3, "gradient_clip": 10.0}
     made = learner(symlog=logarithmic, **options)
-    rollout, _ = made._collect()
+    rollout, _ = made._collect(made._begin())
     _, _, returns = made._targets(rollout)
     made._learn(rollout)
     with torch.no_grad():
