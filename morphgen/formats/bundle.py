@@ -111,7 +111,9 @@ def read_bundle(folder: Path) -> Robot:
 def _read_card(folder: Path) -> dict[str, Any]:
     card_path = folder / CARD
     if not card_path.is_file():
-        raise FormatError(f"{folder} is no bundle: it has no {CARD}")
+        light = (folder / URDF).is_file()
+        what = f"; name its {URDF}, or make it again without --light" if light else ""
+        raise FormatError(f"{folder} is no bundle: it has no {CARD}{what}")
     try:
         card = json.loads(card_path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

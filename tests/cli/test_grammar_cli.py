@@ -54,6 +54,16 @@ def test_sample_reads_a_grammar_file(run, mine):
     ]
 
 
+def test_where_a_light_robot_will_not_do_its_urdf_is_named(run, cubes):
+    code, out, err = run("show", cubes / "cubes-000001")
+    assert (code, out) == (2, "")
+    assert err == (
+        "morphgen: set/cubes-000001 is no bundle: it has no card.json; name its robot.urdf, "
+        "or make it again without --light\n"
+    )
+    assert run("show", cubes / "cubes-000001" / "robot.urdf")[0] == 0
+
+
 def test_sample_writes_bundles_with_a_picture_unless_told_otherwise(run):
     assert run("sample", "cubes", "-n", 1, "--out", "a")[0] == 0
     assert run("sample", "cubes", "-n", 1, "--out", "b", "--no-picture")[0] == 0
