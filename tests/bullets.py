@@ -1,0 +1,60 @@
+"""What tests of PyBullet's simulation share: starts, walks, and a look inside."""
+
+import numpy as np
+import pybullet
+import torch
+
+PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
+"""The gantry's plate upright behind the block, off the ground."""
+
+
+def starts(simulation):
+    """Home, or behind the block, for every environment; blocks where the scenes have them."""
+    q = torch.zeros_like(simulation.q)
+    pose = torch.zeros_like(simulation.block_pose)
+    for env, scene in enumerate(simulation.scenes):
+        values = PUSHING if scene.block and scene.robot.name == "prims" else scene.robot.home
+        q[env, : scene.robot.dof] = torch.tensor(values)
+        if scene.block:
+            pose[env] = torch.tensor([*scene.block.pose.position, *scene.block.pose.quaternion])
+    return q, pose
+
+
+def reset(simulation, q=None, pose=None, envs=None):
+    envs = torch.arange(len(simulation.scenes)) if envs is None else envs
+    home, blocks = starts(simulation)
+    q = home[envs] if q is None else torch.as_tensor(q, dtype=torch.float32).reshape(len(envs), -1)
+    pose = blocks[envs] if pose is None else torch.as_tensor(pose, dtype=torch.float32)
+    simulation.reset(envs, q, pose.reshape(len(envs), 7))
+    return q
+
+
+def client_of(simulation, env=0):
+    """The PyBullet client of an environment."""
+    return simulation._own[0]._loaded[env]
+
+
+def state(simulation):
+    parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
+    return torch.cat(parts, dim=1).clone()
+
+
+def wander(simulation, q, steps, seed=0, size=0.03, ahead=0.0):
+    """Targets on a random walk from ``q``, the same for every environment.
+
+    With ``ahead``, the second joint of each, which is the gantry's along y, moves on besides.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    seen = []
+    for _ in range(steps):
+        q = q + size * torch.randn(q.shape[1], generator=generator)
+        q[:, 1] += ahead
+        simulation.step(q)
+        seen.append(state(simulation))
+    return torch.stack(seen)
+
+
+def touching(simulation, env=0):
+    """Pairs of (body, link) in contact after the last step."""
+    points = pybullet.getContactPoints(physicsClientId=client_of(simulation, env).id)
+    return {((p[1], p[3]), (p[2], p[4])) for p in points if p[9] > 0}

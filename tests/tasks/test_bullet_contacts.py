@@ -1,0 +1,145 @@
+"""Contacts in PyBullet: blocks, friction, obstacles, links with each other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+
+from bullets import client_of, reset, touching
+from morphgen.model.geometry import Pose
+from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, Block, Contacts, Scene
+from morphgen.tasks.sim.bullet_scene import FRICTION
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from robots import arm
+from scenes import push_scene, robot
+
+
+def block_scene(friction=1.0, height=0.5, mass=0.1):
+    edge = 0.1
+    block = Block((edge, edge, edge / 2), Pose((0.4, 0.0, height)), mass, friction)
+    return Scene(robot("arm=ur5 ee=plane"), Pose((-1.0, 0.0, 0.3)), block)
+
+
+def test_blocks_fall_and_come_to_rest(simulate):
+    simulation = simulate(block_scene())
+    q = reset(simulation)
+    for _ in range(10):
+        simulation.step(q)
+    t, n = 0.2, 10 * SUBSTEPS
+    fallen = 0.5 * GRAVITY * t**2 * (n + 1) / n
+    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.5 - fallen, abs=1e-5)
+    assert float(simulation.block_velocity[0, 2]) == pytest.approx(-GRAVITY * t, rel=1e-5)
+    for _ in range(100):
+        simulation.step(q)
+    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.025, abs=1e-3)
+    assert float(simulation.block_velocity.abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.6])
+@pytest.mark.parametrize("degrees", [0, 30, 45])
+def test_friction_is_coulombs_with_the_blocks_coefficient(simulate, friction, degrees):
+    simulation = simulate(block_scene(friction, height=0.025))
+    q = reset(simulation)
+    simulation.step(q)
+    before = simulation.block_pose[0, :2].clone()
+    loaded = client_of(simulation)
+    ahead = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    pybullet.resetBaseVelocity(loaded.block, (*0.8 * ahead, 0.0), physicsClientId=loaded.id)
+    for _ in range(60):
+        simulation.step(q)
+    expected = 0.8**2 / (2 * friction * GRAVITY) * ahead
+    moved = (simulation.block_pose[0, :2] - before).numpy()
+    np.testing.assert_allclose(moved, expected, atol=0.05 * np.linalg.norm(expected))
+
+
+def test_robots_have_the_stated_friction(simulate):
+    loaded = client_of(simulate(push_scene()))
+    for link in (-1, *loaded.driven):
+        info = pybullet.getDynamicsInfo(loaded.robot, link, physicsClientId=loaded.id)
+        assert info[1] == FRICTION
+
+
+def test_a_block_without_mass_stays_where_it_is_put(simulate):
+    scene = block_scene(mass=0.0)
+    simulation = simulate(scene)
+    pose = torch.tensor([[0.1, 0.2, 0.7, 1.0, 0.0, 0.0, 0.0]])
+    q = reset(simulation, pose=pose)
+    for _ in range(20):
+        simulation.step(q)
+    assert torch.allclose(simulation.block_pose, pose)
+    assert not simulation.block_velocity.any()
+
+
+def push(simulation, steps=60):
+    q = reset(simulation)
+    for _ in range(steps):
+        q[:, 1] += 0.008
+        simulation.step(q)
+
+
+def test_the_gantry_pushes_the_block(simulate):
+    simulation = simulate(push_scene())
+    push(simulation)
+    plate = float(simulation.q[0, 1]) + 0.005
+    assert float(simulation.block_pose[0, 1]) == pytest.approx(plate + 0.075, abs=0.01)
+    assert float(simulation.block_pose[0, 1]) > 0.2
+
+
+def test_without_contacts_the_plate_passes_through(simulate):
+    simulation = simulate(push_scene(), contacts=Contacts(scene=False))
+    push(simulation)
+    assert float(simulation.q[0, 1]) > 0.2
+    assert float(simulation.block_pose[0, 1]) == pytest.approx(0.0, abs=1e-3)
+    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.075, abs=1e-3)
+
+
+def test_obstacles_stop_the_robot(simulate):
+    wall = Block((1.0, 0.1, 1.0), Pose((0.0, 0.1, 0.5)))
+    simulation = simulate(replace(push_scene(), block=None, obstacles=(wall,)))
+    push(simulation, 80)
+    half_plate = 0.3
+    assert float(simulation.q[0, 1]) == pytest.approx(0.05 - half_plate, abs=0.01)
+
+
+def test_what_is_held_does_not_touch_what_stands(simulate):
+    """The foot of the arm stands in the ground and in a box, and on a block."""
+    box = Block((0.1, 0.1, 0.05), Pose((0.0, 0.0, -0.01)))
+    scene = Scene(robot("arm=ur5 ee=plane"), obstacles=(box,))
+    simulation = simulate(scene, replace(scene, block=replace(box, mass=0.1), obstacles=()))
+    q = reset(simulation)
+    simulation.step(q)
+    assert touching(simulation) == set()
+    loaded = client_of(simulation, 1)
+    assert ((loaded.robot, -1), (loaded.block, -1)) in touching(simulation, 1)
+
+
+def self_contact(simulate, body, **contacts):
+    simulation = simulate(
+        Scene(body, Pose((0.0, 0.0, 2.0)), ground=None), contacts=Contacts(**contacts)
+    )
+    q = reset(simulation, (0.0, 0.0, 0.0, 0.0))
+    simulation.step(q)
+    return touching(simulation)
+
+
+def overlapping():
+    """An arm whose third link lies in its base."""
+    body = arm()
+    joints = list(body.joints)
+    joints[2] = replace(joints[2], T_parent_joint=Pose((0.0, 0.0, -0.4)))
+    return replace(body, joints=tuple(joints))
+
+
+def test_links_touch_each_other_unless_ignored(simulate):
+    body = overlapping()
+    touched = self_contact(simulate, body)
+    assert touched
+    merged = rigid_bodies(body)
+    names = {-1: merged.root.name} | {k: joint.child for k, joint in enumerate(merged.joints)}
+    pairs = {tuple(sorted((names[a], names[b]))) for (_, a), (_, b) in touched}
+    assert ("base", "slider") in pairs or ("slider", "upper") in pairs
+    assert self_contact(simulate, replace(body, ignore_pairs=tuple(sorted(pairs)))) == set()
+    assert self_contact(simulate, body, self_collision=False) == set()
+    assert self_contact(simulate, body, scene=False) == touched

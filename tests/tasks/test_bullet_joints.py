@@ -1,0 +1,107 @@
+"""Joints in PyBullet: where links are, the law of the motors, and their limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+
+from bullets import client_of, reset
+from morphgen.model.dynamics import BANDWIDTH, mass_matrix
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import bounds, forward_kinematics, frame_pose, movable_positions
+from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from robots import arm
+from scenes import push_scene, reach_scene, real_arm_scene, robot
+
+
+@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])
+def test_links_are_where_the_kinematics_put_them(simulate, request_):
+    T = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.2, 0.4, -0.7))
+    body = robot(request_)
+    simulation = simulate(Scene(body, T), contacts=Contacts(False, False))
+    q = np.array(body.home) + 0.1
+    reset(simulation, q)
+    loaded = client_of(simulation)
+    merged = rigid_bodies(body)
+    T_world_link = T.matrix @ forward_kinematics(body, q)
+    for k in merged.movable:
+        name = merged.joints[k].child
+        found = pybullet.getLinkState(
+            loaded.robot,
+            loaded.driven[merged.movable.index(k)],
+            computeForwardKinematics=True,
+            physicsClientId=loaded.id,
+        )
+        expected = T_world_link[body.link_index[name], :3, 3]
+        assert found[4] == pytest.approx(expected, abs=1e-6), name
+
+
+@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims"])
+def test_motors_follow_the_critically_damped_law(simulate, request_):
+    body = robot(request_)
+    free = replace(body, joints=tuple(replace(j, effort=None, velocity=None) for j in body.joints))
+    simulation = simulate(Scene(free, ground=None), contacts=Contacts(False, False))
+    q = np.array(body.home)
+    target = np.clip(q + 0.05 * (np.arange(body.dof) % 3 - 1), *bounds(body).T)
+    reset(simulation, q)
+    v = np.zeros_like(q)
+    for _ in range(50):
+        simulation.step(torch.tensor(target, dtype=torch.float32)[None])
+        for _ in range(SUBSTEPS):
+            v = v + TIMESTEP * (BANDWIDTH**2 * (target - q) - 2 * BANDWIDTH * v)
+            q = q + TIMESTEP * v
+        np.testing.assert_allclose(simulation.q[0].numpy(), q, atol=3e-3)
+    np.testing.assert_allclose(simulation.q[0].numpy(), target, atol=1e-4)
+
+
+@pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
+def test_robots_carry_their_own_weight(simulate, scene):
+    simulation = simulate(scene())
+    q = reset(simulation)
+    for _ in range(300):
+        simulation.step(q)
+    body = simulation.scenes[0].robot
+    tools = frame_pose(body, np.stack([simulation.q[0].numpy(), q[0].numpy()]))[:, :3, 3]
+    assert np.linalg.norm(tools[0] - tools[1]) < 1e-4
+
+
+def test_effort_is_limited(simulate):
+    body = robot("prims")
+    weak = tuple(replace(j, effort=5.0) if j.name == "gantry_x" else j for j in body.joints)
+    body = replace(body, joints=weak)
+    simulation = simulate(Scene(body))
+    q = reset(simulation, body.home)
+    q[0, 0] = 0.5
+    simulation.step(q)
+    acceleration = 5.0 / mass_matrix(body, body.home)[0, 0]
+    expected = acceleration * SUBSTEPS * TIMESTEP
+    assert float(simulation.qd[0, 0]) == pytest.approx(expected, rel=1e-3)
+
+
+def test_velocity_is_limited(simulate):
+    body = robot("prims")
+    simulation = simulate(Scene(body))
+    q = reset(simulation, body.home)
+    q[0, 0] = 0.5
+    fastest = 0.0
+    for _ in range(20):
+        simulation.step(q)
+        fastest = max(fastest, float(simulation.qd[0, 0]))
+    assert fastest == pytest.approx(body.joints[0].velocity, rel=1e-4)
+
+
+def test_mimic_joints_follow_their_leaders(simulate):
+    body = arm()
+    simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0))))
+    q = reset(simulation, body.home)
+    q[0, 3] = 0.035
+    loaded = client_of(simulation)
+    for _ in range(40):
+        simulation.step(q)
+        states = pybullet.getJointStates(loaded.robot, loaded.driven, physicsClientId=loaded.id)
+        expected = movable_positions(body, simulation.q[0].numpy())
+        np.testing.assert_allclose([s[0] for s in states], expected, atol=2e-4)
+    assert float(simulation.q[0, 3]) == pytest.approx(0.035, abs=1e-4)
