@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.references import reference
-from morphgen.rl.rollouts import Controller, Episode
+from morphgen.rl.rollouts import Controller, Episode, episode_score
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.trained import Policy
 from morphgen.tasks.actions import ActionKind
@@ -115,7 +113,7 @@ def play(
             over = terminated or truncated
             if over or len(scores) % STRIDE == 0:
                 yield from _shown(env)
-        score = float(np.mean(scores)) if env.task == "reach" else scores[-1]
+        score = episode_score(env.task == "push", sum(scores), scores[-1], len(scores))
         report(Episode(0, 0, info["success"], info["distance"], score, len(scores)))
 
 

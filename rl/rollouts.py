@@ -31,13 +31,25 @@ class Episode:
     distance: float
     """From success then, metres; see ``Step``."""
     score: float
-    """Reach: the mean of ``anybody_score`` over its steps; push: 1 for success, else 0."""
+    """See ``episode_score``."""
     steps: int
 
     @property
     def seconds(self) -> float:
         """How long it was, simulated."""
         return self.steps * CONTROL_PERIOD
+
+
+def episode_score(pushes: bool, total: float, last: float, steps: int) -> float:
+    """Reach: the mean of ``anybody_score`` over its steps; push: 1 for success, else 0.
+
+    Args:
+        pushes: Whether it was push.
+        total: The sum of its steps' scores.
+        last: The score of its last step.
+        steps: How many there were.
+    """
+    return last if pushes else total / steps
 
 
 def run_episodes(
@@ -74,16 +86,16 @@ def run_episodes(
         over = torch.nonzero(step.terminated | step.truncated)[:, 0]
         if not len(over):
             continue
-        score = torch.where(batch.pushes, step.score, total / steps)
         for env in over.tolist():
             if len(found[env]) < count:
+                numbers = float(total[env]), float(step.score[env]), int(steps[env])
                 found[env].append(
                     Episode(
                         env,
                         bodies[env],
                         bool(step.success[env]),
                         float(step.distance[env]),
-                        float(score[env]),
+                        episode_score(bool(batch.pushes[env]), *numbers),
                         int(steps[env]),
                     )
                 )

@@ -37,6 +37,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
+from morphgen.rl.rollouts import episode_score
 from morphgen.tasks.sim.base import Block
 from morphgen.viewer.places import Places, read_place
 
@@ -98,7 +99,7 @@ class Episode:
 
 
 def score_until(track: Track, task: Task, step: int) -> float | None:
-    """The score of an episode as if it had ended: of reach the mean, of push 1 for success.
+    """The score of an episode as if it had ended, see ``episode_score``.
 
     Args:
         track: What the body did.
@@ -111,7 +112,7 @@ def score_until(track: Track, task: Task, step: int) -> float | None:
     scores = track.score[:step]
     if not scores:
         return None
-    return float(np.mean(scores)) if task == "reach" else scores[-1]
+    return episode_score(task == "push", sum(scores), scores[-1], len(scores))
 
 
 def still(episode: Episode) -> Episode:
