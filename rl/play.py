@@ -9,13 +9,14 @@ from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.references import reference
-from morphgen.rl.rollouts import Controller, Episode, episode_score
+from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.trained import Policy
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import Frame
 from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.rewards import episode_score
 
 STRIDE = 2
 """Control steps between two pictures."""

@@ -10,6 +10,7 @@ import torch
 
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.rewards import episode_score
 
 
 class Controller(Protocol):
@@ -38,18 +39,6 @@ class Episode:
     def seconds(self) -> float:
         """How long it was, simulated."""
         return self.steps * CONTROL_PERIOD
-
-
-def episode_score(pushes: bool, total: float, last: float, steps: int) -> float:
-    """Reach: the mean of ``anybody_score`` over its steps; push: 1 for success, else 0.
-
-    Args:
-        pushes: Whether it was push.
-        total: The sum of its steps' scores.
-        last: The score of its last step.
-        steps: How many there were.
-    """
-    return last if pushes else total / steps
 
 
 def run_episodes(

@@ -79,6 +79,18 @@ def anybody_score(config: ReachConfig, distance: torch.Tensor) -> torch.Tensor:
     return torch.where(distance < config.near, torch.full_like(far, config.score_near), far)
 
 
+def episode_score(pushes: bool, total: float, last: float, steps: int) -> float:
+    """Of reach the mean of ``anybody_score`` over its steps; of push 1 for success, else 0.
+
+    Args:
+        pushes: Whether it was push.
+        total: The sum of its steps' scores.
+        last: The score of its last step.
+        steps: How many there were.
+    """
+    return last if pushes else total / steps
+
+
 def moved_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
     """Where the line is in a curriculum, shape as ``line``.
 

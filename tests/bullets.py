@@ -35,6 +35,7 @@ def client_of(simulation, env=0):
 
 
 def state(simulation):
+    """All that is reported now."""
     parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
     return torch.cat(parts, dim=1).clone()
 

@@ -37,7 +37,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
-from morphgen.rl.rollouts import episode_score
+from morphgen.tasks.rewards import episode_score
 from morphgen.tasks.sim.base import Block
 from morphgen.viewer.places import Places, read_place
 

@@ -24,9 +24,16 @@ from morphgen.benchmark.tokens import (
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
-from morphgen.model.robot import Frame, Link, Robot
+from morphgen.model.robot import Frame, Joint, Link, Robot
 from robots import arm
-from some_tokens import arm_tokens, field_of, hinge, shapes_of
+from some_tokens import arm_tokens, field_of, shapes_of
+
+
+def hinge(kind="revolute", limits=(-1.0, 1.0), **changes):
+    """A body of one joint."""
+    joint = Joint("j", kind, "a", "b", axis=(0, 0, 1), limits=limits, **changes)
+    home = () if kind == "fixed" else (0.0,)
+    return Robot("hinge", (Link("a"), Link("b")), (joint,), home=home)
 
 
 def test_the_fields_are_the_papers_in_order_and_size():

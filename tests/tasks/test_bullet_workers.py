@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from bullets import state
 from commands import heed_ctrl_c
 from morphgen.errors import SimulationError
 from morphgen.tasks.sim import bullet
@@ -38,11 +39,6 @@ def starts(simulation):
         q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
         pose[env] = torch.tensor([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
     return torch.arange(len(q)), q, pose
-
-
-def state(simulation):
-    parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
-    return torch.cat(parts, dim=1).clone()
 
 
 def keep_stepping(simulation, q):
