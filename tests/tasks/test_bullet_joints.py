@@ -11,7 +11,8 @@ from bullets import client_of, reset
 from morphgen.model.dynamics import BANDWIDTH, mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, forward_kinematics, frame_pose, movable_positions
-from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
+from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.bullet_scene import OVERSPEED
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 from robots import arm
 from scenes import push_scene, reach_scene, real_arm_scene, robot
@@ -91,6 +92,47 @@ def test_velocity_is_limited(simulate):
         simulation.step(q)
         fastest = max(fastest, float(simulation.qd[0, 0]))
     assert fastest == pytest.approx(body.joints[0].velocity, rel=1e-4)
+
+
+@pytest.mark.parametrize("pushes", [False, True])
+def test_joints_come_back_to_their_limits(simulate, pushes):
+    """Whatever pushes them past; with and without a block the solver is another."""
+    body = arm()
+    block = Block((0.1, 0.1, 0.1), Pose((3.0, 0.0, 0.05)), 1.0) if pushes else None
+    simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0)), block=block))
+    q = reset(simulation, [1.95, 0.0, 0.0, 0.0])
+    loaded = client_of(simulation)
+    link = loaded.driven[0]
+    farthest = 0.0
+    for _ in range(100):
+        pybullet.applyExternalTorque(
+            loaded.robot,
+            link,
+            [0.0, 200.0, 0.0],
+            pybullet.WORLD_FRAME,
+            physicsClientId=loaded.id,
+        )
+        simulation.step(q)
+        farthest = max(farthest, float(simulation.q[0, 0]))
+    assert farthest > 2.0
+    assert float(simulation.q[0, 0]) == pytest.approx(2.0, abs=1e-3)
+
+
+def test_nothing_throws_a_joint(simulate):
+    """An arm that presses itself and the ground as hard as it can."""
+    body = robot("arm=ur5 ee=plane")
+    simulation = simulate(*[Scene(body)] * 8)
+    corners = torch.randn(8, body.dof, generator=torch.Generator().manual_seed(0)).sign()
+    low, high = (torch.tensor(each, dtype=torch.float32) for each in bounds(body).T)
+    wanted = torch.where(corners > 0, high, low)
+    q = reset(simulation)
+    fastest = max(joint.velocity for joint in body.joints if joint.is_movable)
+    for _ in range(200):
+        before = simulation.q.clone()
+        q = q + (wanted - q).clamp(-0.05, 0.05)
+        simulation.step(q)
+        moved = (simulation.q - before).abs().max()
+        assert float(moved) <= OVERSPEED * fastest * SUBSTEPS * TIMESTEP * (1 + 1e-4)
 
 
 def test_mimic_joints_follow_their_leaders(simulate):
