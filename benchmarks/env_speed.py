@@ -3,7 +3,8 @@
     python benchmarks/env_speed.py [--envs 128] [--seconds 4] [--rounds 3] [--json rows.json]
 
 Reach and push of a Panda with its hand and reach of a UR5 with a plate, collision shapes of fitted
-primitives; random actions, whole episodes; steps of 5 ms, four to an action. Rows of a task:
+primitives; random actions, whole episodes, the same in all rows that are ours; steps of 5 ms, four
+to an action. Rows of a task:
 
 - raw PyBullet: the same scenes under the same actions, and of that only what is spent within
   `stepSimulation`: as if targets, states, observations and rewards cost nothing. In two processes,
@@ -172,7 +173,7 @@ def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
     """Of the calls of ``stepSimulation`` that the same environments make."""
     spent, calls = 0.0, 0
     with closing(make_batch(task, [robot], envs)) as batch:
-        batch.reset()
+        batch.reset(seed=0)
         step = pybullet.stepSimulation
 
         def timed(**client: int) -> None:

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.checks.self_collision import ignored_pairs
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import BANDWIDTH
@@ -17,6 +16,7 @@ from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot, sorted_pair
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -82,7 +82,8 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     in every MJCF of morphgen. MuJoCo's default contact, critically damped in 20 ms, is four steps
     long, which is stable: blocks come to rest. A pyramidal cone would hold more along its edges
     than between them, and friction no harder than the normal direction lets a pushed block creep.
-    What is solved to MuJoCo's default tolerance takes two or three iterations.
+    What is solved to MuJoCo's default tolerance takes two or three iterations. To look for parts
+    that could be solved apart costs more than that saves: a scene has two at most that matter.
 
     MuJoCo takes the larger friction of two geoms of one priority, and otherwise that of the higher
     priority: the block's friction counts whatever it touches, an obstacle's for links, and links
@@ -112,7 +113,7 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
                 specs[id(scene.robot)] = _robot_spec(scene.robot, contacts)
             robot, spec = specs[id(scene.robot)]
             try:
-                models[key] = _world(scene, robot.root.name, spec.copy())
+                models[key] = _world(scene, robot, spec.copy())
             except ValueError as error:
                 reason = " ".join(str(error).split())
                 raise SimulationError(
@@ -123,14 +124,13 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
 
 
 def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]:
-    """The robot, with a root that can be moved, and its spec, without what is only seen.
+    """The robot as ``rigid_bodies``, with a root that can be moved, and its spec.
 
     Joints have no friction of their own: the law of the position control says how they move.
     """
-    robot = _with_own_root(replace(robot, ignore_pairs=ignored_pairs(robot)))
+    robot = _with_own_root(rigid_bodies(robot))
     bare = replace(
         robot,
-        links=tuple(replace(link, visuals=()) for link in robot.links),
         joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints),
     )
     spec = to_spec(bare)
@@ -151,6 +151,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
     option.impratio = IMPEDANCE_RATIO
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return robot, spec
 
 
@@ -176,10 +177,10 @@ def _with_own_root(robot: Robot) -> Robot:
     )
 
 
-def _world(scene: Scene, root: str, spec: mujoco.MjSpec) -> World:
-    held = spec.body(root)
+def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
+    held = spec.body(robot.root.name)
     held.pos, held.quat = scene.T_world_root.position, scene.T_world_root.quaternion
-    for name in level_links(scene.robot, scene.T_world_root) - {scene.robot.root.name}:
+    for name in level_links(robot, scene.T_world_root) - {robot.root.name}:
         for geom in spec.body(name).geoms:
             geom.conaffinity &= ~_BY_GROUND
     if scene.ground is not None:
@@ -192,7 +193,6 @@ def _world(scene: Scene, root: str, spec: mujoco.MjSpec) -> World:
         geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
     body = _add_block(spec, scene.block) if scene.block is not None else None
     model = spec.compile()
-    robot = scene.robot
     joints = {k: model.joint(robot.joints[k].name) for k in robot.movable}
     return World(
         robot,

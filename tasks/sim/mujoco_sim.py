@@ -14,6 +14,7 @@ from morphgen.checks.mujoco_warnings import caught
 from morphgen.errors import SimulationError
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
+from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_state import State
@@ -149,7 +150,8 @@ class MujocoSimulation:
             self._control.controls(
                 self._targets, *self._state.joints(), self._state.velocities, out=self._controls
             )
-            self._advance()
+            with unclocked():
+                self._advance()
             self._state.read()
         fault = self._state.fault()
         if fault is not None:

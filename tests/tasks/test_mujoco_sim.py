@@ -16,6 +16,7 @@ from morphgen.model.kinematics import bounds, movable_positions
 from morphgen.model.robot import Frame
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 from robots import arm
 from scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 
@@ -133,6 +134,14 @@ def test_mimic_joints_follow_and_root_poses_and_orders_are_kept():
     assert data.joint("right").qpos[0] == pytest.approx(-0.03, abs=1e-3)
     assert data.body("base").xpos == pytest.approx(at.position)
     assert model.body("base").dofnum == 0
+
+
+def test_a_model_has_a_body_for_each_rigid_part():
+    scene = real_arm_scene()
+    parts = rigid_bodies(scene.robot).links
+    assert len(parts) < len(scene.robot.links)
+    world = MujocoSimulation([scene])._worlds[0]
+    assert world.model.nbody == 1 + len(parts)
 
 
 def test_a_root_named_world_is_a_link_like_any_other():
