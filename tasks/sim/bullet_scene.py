@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from morphgen.checks.rigid import rigid_groups
 from morphgen.errors import MissingDependencyError, SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.quiet import quiet
@@ -39,7 +41,8 @@ RESIDUAL = 1e-4
 """Sum of squares, of what is left to do of an iteration, at which the solver is done (m/s, rad/s):
 tools are within a tenth of a millimetre of where all iterations bring them, in half of the time."""
 OVERSPEED = 1.5
-"""How fast what happens to a joint can make it, of what the robot's fastest joint may do."""
+"""How fast what happens to a joint can make it, of what the robot's fastest joint may do. A joint
+without a speed limit may be as fast as PyBullet lets it, 100 rad/s or m/s, and then all may."""
 _LINKS, _ROOT, _STATIC, _BLOCK = 1, 2, 4, 8
 """Collision groups: what moves of the robot, what is held of it, ground and obstacles, block."""
 
@@ -137,13 +140,12 @@ class BulletScene:
         links = {body.root.name: -1} | {info[12].decode(): info[0] for info in infos}
         self.driven = [joints[body.joints[k].name] for k in body.movable]
         self._efforts = [_effort(body, k) / SUBSTEPS for k in body.movable]
-        speeds = [body.joints[k].velocity for k in body.movable]
-        known = [speed for speed in speeds if speed]
-        if known and len(known) == len(speeds):
+        fastest = max((body.joints[k].velocity or math.inf for k in body.movable), default=math.inf)
+        if math.isfinite(fastest):
             pybullet.changeDynamics(
-                self.robot, -1, maxJointVelocity=OVERSPEED * max(known), **self._client
+                self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
             )
-        self._held = _held(body)
+        held = {link.name for link in rigid_groups(body)[0].links}
         level = level_links(body, self._scene.T_world_root)
         self._level = [link for name, link in links.items() if name in level]
         for name, link in links.items():
@@ -156,7 +158,7 @@ class BulletScene:
                 jointDamping=0,
                 **self._client,
             )
-            self._assign(self.robot, link, _ROOT if name in self._held else _LINKS)
+            self._assign(self.robot, link, _ROOT if name in held else _LINKS)
         if self._contacts.self_collision:
             for a, b in body.ignore_pairs:
                 pybullet.setCollisionFilterPair(
@@ -297,15 +299,6 @@ def export(robot: Robot, folder: Path) -> tuple[Path, Robot]:
 def _pose(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
     w, x, y, z = pose.quaternion
     return pose.position, (x, y, z, w)
-
-
-def _held(body: Robot) -> set[str]:
-    """The root link and what fixed joints attach to it."""
-    held = {body.root.name}
-    for joint in body.joints:
-        if not joint.is_movable and joint.parent in held:
-            held.add(joint.child)
-    return held
 
 
 def _effort(body: Robot, k: int) -> float:
