@@ -37,8 +37,9 @@ SAMPLES = 128
 _MEMORY = "16M"
 _GAVE_UP = "EPA"
 """What a warning of MuJoCo's has if the depth of two shapes that overlap was not found."""
-_NUDGES = (0.0, 1e-9, -1e-9, 1e-8, -1e-8)
-"""By how much joints are moved then, rad or m."""
+_NUDGES = (0.0, *(sign * 10.0**k for k in range(-9, -4) for sign in (1, -1)))
+"""By how much the first joint is moved then, rad or m, and the last by half of it, lest shapes on
+parallel slides stay as they are: the least that helps, and nothing as far as depths that count."""
 
 
 class SelfCollision:
@@ -63,6 +64,7 @@ class SelfCollision:
         self._addresses = np.array(
             [self._model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable], np.intp
         )
+        self._shares = np.linspace(1.0, 0.5, len(self._addresses))
 
     def penetrations(self, q: ArrayLike) -> list[dict[Pair, float]]:
         """Test configurations.
@@ -110,7 +112,7 @@ class SelfCollision:
     def _collide(self, positions: NDArray[np.float64]) -> None:
         """Find contacts, a hair beside the configuration if MuJoCo gives up on a pair there."""
         for nudge in _NUDGES:
-            self._data.qpos[self._addresses] = positions + nudge
+            self._data.qpos[self._addresses] = positions + nudge * self._shares
             mujoco.mj_kinematics(self._model, self._data)
             with caught() as told:
                 mujoco.mj_collision(self._model, self._data)

@@ -16,7 +16,7 @@ from morphgen.checks.self_collision import (
     self_collisions,
 )
 from morphgen.errors import RobotError
-from morphgen.model.geometry import Box, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
 from robots import arm
@@ -229,6 +229,30 @@ def test_where_mujoco_gives_up_a_hair_beside_it_counts(monkeypatch, tmp_path, ca
     assert given_up == [0.0, 1e-9]
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
+
+
+def test_two_cylinders_that_mujoco_gives_up_on_for_a_ten_millionth():
+    """As two of YuMi's elbows once met, 0.02 mm deep; MuJoCo 4.0 gives up on them."""
+    shapes = (
+        Shape(
+            Cylinder(0.034199, 0.161572),
+            Pose(
+                (0.31944882411177733, 0.09567079536944428, 0.7688523586586223),
+                (-0.2757582120712299, 0.7316501280197765, 0.40646021705745716, 0.4726897403091473),
+            ),
+        ),
+        Shape(
+            Cylinder(0.043299, 0.108354),
+            Pose(
+                (0.45498025657258256, 0.15469648333251212, 0.730485789367942),
+                (0.4797187306749713, 0.6355797011935347, 0.15535838236271107, 0.584612825637595),
+            ),
+        ),
+    )
+    robot = slides(0.0, 0.0)
+    links = [replace(a, collisions=(b,)) for a, b in zip(robot.links[1:], shapes, strict=True)]
+    (found,) = self_collisions(replace(robot, links=(robot.root, *links)), [[0.0, 0.0]])
+    assert found == {}
 
 
 def test_what_mujoco_cannot_tell_at_all_is_an_error(monkeypatch):
