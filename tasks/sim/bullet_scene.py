@@ -60,8 +60,8 @@ class BulletScene:
     joint is a motor with its leader's target.
 
     Solver. Iterations are many because motors of one arm pull against each other. Dantzig's direct
-    method has no such trouble and is two to four times faster, but knows no friction cone; so it
-    is taken where no block slides.
+    method has no such trouble and is faster, but knows no friction cone; so it is taken where no
+    block slides.
 
     Contacts that press links against each other have no solution at times, and what the solver then
     says throws a joint a radian farther in a step; so speeds end at ``OVERSPEED``.
