@@ -6,7 +6,6 @@ value or a gradient.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from torch.nn import functional
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.errors import TaskError
+from morphgen.rl.attention import Block
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.heads import REST, Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
 from morphgen.tasks.batch import Observation
@@ -28,8 +28,6 @@ LINK_ROWS = ("tokens", "links", "actions", *CHANNELS)
 """Parts of an observation that have a row for each link."""
 SMALL = 0.01
 """Scale of the last layer's weights at the start: all actions begin alike, values at zero."""
-KINDS = 64
-"""Of networks and shapes, that a process may compile."""
 
 
 @dataclass(frozen=True)
@@ -196,32 +194,6 @@ class MLP(nn.Module):
         return found.reshape(-1, *self.shape)
 
 
-class Block(nn.Module):
-    """A layer of a transformer, normalised before each half (Xiong et al. 2020)."""
-
-    def __init__(self, features: int, heads: int, feedforward: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm_attention = nn.LayerNorm(features)
-        self.qkv = nn.Linear(features, 3 * features)
-        self.merge = nn.Linear(features, features)
-        self.feedforward = nn.Sequential(
-            nn.LayerNorm(features),
-            nn.Linear(features, feedforward),
-            nn.GELU(),
-            nn.Linear(feedforward, features),
-        )
-
-    def forward(self, x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """Mix x (n, T, features); nobody attends to what is not in the mask (n, T)."""
-        qkv = self.qkv(self.norm_attention(x)).unflatten(2, (3, self.heads, -1))
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None])
-        x = x + self.merge(mixed.transpose(1, 2).flatten(2))
-        found: torch.Tensor = x + self.feedforward(x)
-        return found
-
-
 class Transformer(nn.Module):
     """Entities attend to each other; a small MLP reads each link, or the mean of all links."""
 
@@ -331,20 +303,6 @@ def _largest(
     lowest = torch.finfo(features.dtype).min
     top = torch.where(mask[..., None], features, lowest).amax(dim=1, keepdim=True)
     return top, mask.any(dim=1, keepdim=True)
-
-
-def compile_network(network: nn.Module) -> Callable[[Observation], torch.Tensor]:
-    """A network by ``torch.compile``, however many kinds of them a process has compiled before.
-
-    torch gives up after eight kinds and shapes, which four learners of a study are.
-    """
-    from torch._dynamo import config  # takes a second to load
-
-    config.recompile_limit = max(config.recompile_limit, KINDS)
-    compiled: Callable[[Observation], torch.Tensor] = torch.compile(
-        network, fullgraph=True, dynamic=False
-    )
-    return compiled
 
 
 def _network(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from morphgen.errors import TaskError
+from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.gae import gae, next_values
 from morphgen.rl.policies import (
-    compile_network,
     layout_from,
     layout_of,
     make_networks,
@@ -33,6 +34,9 @@ from morphgen.tasks.batch import Observation, TaskBatch
 
 TOLD = ("reward", "score", "success", "terminated", "truncated")
 """What of every step is kept besides observations and actions."""
+LOSSES = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
+LEARNED = (*LOSSES, "actor_gradient", "critic_gradient")
+"""What is reported of gradient steps; see ``Report``."""
 KL_FACTOR = 1.2
 """Between the actor's learning rates of two updates, where they follow ``target_kl``."""
 
@@ -106,8 +110,10 @@ class Learner:
             name: torch.Generator(self.device).manual_seed(stream)
             for name, stream in zip(("actions", "minibatches", "weights"), streams, strict=True)
         }
-        self._act, self._value = self._callable(self.actor), self._callable(self.critic)
-        self._slow_value = self._callable(self.slow)
+        ready = partial(prepared, device=self.device, bf16=config.bf16, compiled=config.compile)
+        self._act = ready(self.actor)
+        self._value = ready(self.slow if config.slow_critic else self.critic)
+        self._losses = ready(self._objective)
 
     @property
     def done(self) -> bool:
@@ -199,16 +205,6 @@ class Learner:
         require_layout(layout_from(checkpoint["layout"]), self.layout, "the checkpoint")
         _require_same(asdict(PolicyConfig(**checkpoint["policy"])), asdict(self.policy))
 
-    def _callable(self, network: nn.Module) -> Callable[[Observation], torch.Tensor]:
-        compiled = compile_network(network) if self.config.compile else network
-
-        def call(observation: Observation) -> torch.Tensor:
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bf16):
-                found: torch.Tensor = compiled(observation)
-            return found
-
-        return call
-
     def _begin(self) -> Observation:
         """Move the curriculum, begin episodes if none are under way; what is seen now."""
         if self.config.curriculum:
@@ -281,12 +277,12 @@ class Learner:
 
     def _values(self, observation: Observation) -> torch.Tensor:
         """Expected returns by the critic whose word counts, in chunks of one shape, (n,)."""
-        value = self._slow_value if self.config.slow_critic else self._value
         count, found = len(observation["goal"]), []
         for start in range(0, count, self._size):
             rows = torch.arange(start, start + self._size, device=self.device)
             rows = rows.clamp(max=count - 1)
-            found.append(value({name: each[rows] for name, each in observation.items()}))
+            chunk = {name: each[rows] for name, each in observation.items()}
+            found.append(self._value(chunk).clone())
         every = torch.cat([torch.zeros(0, device=self.device), *found])[:count]
         return symexp(every) if self.config.symlog else every
 
@@ -313,39 +309,43 @@ class Learner:
             for rows in order.reshape(-1, self._size):
                 here = {name: each[rows] for name, each in seen.items()}
                 found.append(self._descend(here, {k: v[rows] for k, v in data.items()}))
-        names = found[0].keys()
-        means = {name: float(torch.stack([each[name] for each in found]).mean()) for name in names}
+        means = dict(zip(LEARNED, torch.stack(found).mean(dim=0).tolist(), strict=True))
         self._share = next_share(self.config, self._share, means["kl"])
         explained = float(explained_variance(values, returns))
         return {**means, "explained_variance": explained, "learning_rate": actor["lr"]}
 
-    def _descend(self, seen: Observation, data: Observation) -> dict[str, torch.Tensor]:
-        """One gradient step on a minibatch; actor and critic are clipped apart."""
-        head = self.actor.head(self._act(seen), seen["actions"])
+    def _descend(self, seen: Observation, data: Observation) -> torch.Tensor:
+        """One gradient step on a minibatch, actor and critic clipped apart; ``LEARNED``, (7,)."""
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, told = self._losses(seen, data, self._weights())
+        loss.backward()  # type: ignore[no-untyped-call]
+        clip, nets = self.config.gradient_clip, (self.actor, self.critic)
+        norms = [nn.utils.clip_grad_norm_(net.parameters(), clip) for net in nets]
+        self.optimiser.step()
+        follow(self.slow, self.critic, self.config.slow_decay)
+        return torch.stack([*told, *norms])
+
+    def _objective(
+        self, seen: Observation, data: Observation, weights: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What is to become smaller on a minibatch, shape (), and its ``LOSSES``, (5,).
+
+        Args:
+            seen: Observations, tensors (m, ...).
+            data: What was done and what came of it, tensors (m, ...).
+            weights: How much each robot's transitions count, shape (R,).
+        """
+        head = self.actor.head(self.actor(seen), seen["actions"])
         log_ratio = head.log_prob(data["actions"]) - data["log_prob"]
         policy = policy_loss(log_ratio, data["advantage"], self.config.clip)
         entropy = head.entropy()
-        value = 0.5 * (self._value(seen) - data["goal"]).square()
-        weight = self._weights()[data["body"]]
+        value = 0.5 * (self.critic(seen) - data["goal"]).square()
+        weight = weights[data["body"]]
         loss = (weight * (policy - self.config.entropy * entropy + value)).mean()
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        clip = self.config.gradient_clip
-        actor = nn.utils.clip_grad_norm_(self.actor.parameters(), clip)
-        critic = nn.utils.clip_grad_norm_(self.critic.parameters(), clip)
-        self.optimiser.step()
-        follow(self.slow, self.critic, self.config.slow_decay)
-        with torch.no_grad():
-            ratio = log_ratio.exp()
-            return {
-                "policy_loss": policy.mean(),
-                "value_loss": value.mean(),
-                "entropy": entropy.mean(),
-                "kl": (ratio - 1 - log_ratio).mean(),
-                "clip_fraction": ((ratio - 1).abs() > self.config.clip).float().mean(),
-                "actor_gradient": actor,
-                "critic_gradient": critic,
-            }
+        ratio = log_ratio.exp()
+        clipped = ((ratio - 1).abs() > self.config.clip).float()
+        told = (policy, value, entropy, ratio - 1 - log_ratio, clipped)
+        return loss, torch.stack([each.mean() for each in told]).detach()
 
     def _weights(self) -> torch.Tensor:
         """How much each robot's transitions count, (R,), mean 1.

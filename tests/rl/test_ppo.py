@@ -116,7 +116,7 @@ def test_targets_by_hand(slow, logarithmic):
     made = learner(batch, slow_critic=slow, symlog=logarithmic, lam=0.0, minibatches=4)
     wrong = lambda seen: torch.full_like(seen["line"][:, 0], 99.0)  # noqa: E731
     right = lambda seen: symlog(Answers()(seen)) if logarithmic else Answers()(seen)  # noqa: E731
-    made._slow_value, made._value = (right, wrong) if slow else (wrong, right)
+    made.slow.forward, made.critic.forward = (right, wrong) if slow else (wrong, right)
     steps = []
     step = batch.step
     batch.step = lambda actions: steps.append(step(actions)) or steps[-1]

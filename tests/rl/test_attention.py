@@ -1,0 +1,72 @@
+"""Attention against PyTorch's own, and a layer that sees what its mask shows."""
+
+import math
+
+import pytest
+import torch
+
+from morphgen.rl import attention
+
+N, HEADS, T, FEATURES = 5, 2, 7, 8
+WAYS = {"as here": attention.attend, "as on a GPU": attention.attend_to_few}
+
+
+def some(seed=0):
+    """Queries, keys, values, and a mask that leaves one token at least."""
+    generator = torch.Generator().manual_seed(seed)
+    q, k, v = torch.randn(3, N, HEADS, T, FEATURES, generator=generator)
+    mask = torch.rand(N, T, generator=generator) < 0.5
+    mask[:, 0] = True
+    return q, k, v, mask
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_attention_is_a_weighted_mean_of_the_values_in_the_mask(way):
+    q, k, v, mask = some()
+    found = way(q, k, v, mask)
+    for row in range(N):
+        there = torch.nonzero(mask[row])[:, 0].tolist()
+        for head in range(HEADS):
+            for token in range(T):
+                scores = [float(q[row, head, token] @ k[row, head, i]) for i in there]
+                weights = [math.exp(score / math.sqrt(FEATURES)) for score in scores]
+                total = sum(weights)
+                wanted = sum(
+                    w / total * v[row, head, i] for w, i in zip(weights, there, strict=True)
+                )
+                torch.testing.assert_close(found[row, head, token], wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_both_ways_have_the_same_gradients():
+    *inputs, mask = some()
+    gradients = []
+    for way in WAYS.values():
+        own = [each.clone().requires_grad_() for each in inputs]
+        (way(*own, mask).sin().sum()).backward()
+        gradients.append([each.grad for each in own])
+    for first, second in zip(*gradients, strict=True):
+        torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-5)
+    assert all(each.abs().max() > 0.1 for each in gradients[0])
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_what_the_mask_hides_changes_nothing_and_gets_no_gradient(way):
+    q, k, v, mask = some()
+    hidden = ~mask[:, None, :, None]
+    before = way(q, k, v, mask)
+    k, v = (torch.where(hidden, 1e6, each).requires_grad_() for each in (k, v))
+    after = way(q, k, v, mask)
+    torch.testing.assert_close(after, before)
+    after.square().sum().backward()
+    for each in (k, v):
+        assert torch.where(hidden, each.grad, 0.0).abs().max() == 0
+        assert each.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_bfloat16_stays_bfloat16(way):
+    q, k, v, mask = some()
+    exact = way(q, k, v, mask)
+    rough = way(*(each.bfloat16() for each in (q, k, v)), mask)
+    assert rough.dtype == torch.bfloat16
+    torch.testing.assert_close(rough.float(), exact, rtol=0.05, atol=0.05)
