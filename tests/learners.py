@@ -13,10 +13,10 @@ SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4, targe
 """Four updates of eight environments."""
 
 
-def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, **changes):
+def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, device="cpu", **changes):
     batch = batch or OnALine(8, kind="discrete" if discrete else "continuous")
     policy = PolicyConfig(agent=agent, discrete=discrete)
-    return Learner(batch, policy, replace(SMALL, **changes), seed=seed)
+    return Learner(batch, policy, replace(SMALL, **changes), seed=seed, device=device)
 
 
 def weights(made):

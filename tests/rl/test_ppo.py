@@ -1,6 +1,5 @@
 """PPO, part by part against known answers, and as a whole against a task that it must solve."""
 
-import functools
 import math
 from dataclasses import replace
 
@@ -307,16 +306,6 @@ def test_bfloat16_gives_nearly_the_same_update():
     assert short.entropy == pytest.approx(plain.entropy, rel=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
-def test_compilation_gives_nearly_the_same_update(agent):
-    plain = learner(agent=agent, epochs=1).iterate()
-    compiled = learner(agent=agent, epochs=1, compile=True).iterate()
-    torch.compiler.reset()
-    assert compiled.value_loss == pytest.approx(plain.value_loss, rel=1e-3)
-    assert compiled.actor_gradient == pytest.approx(plain.actor_gradient, rel=1e-2)
-
-
 def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
     """Reports of a run on 32 points that learns fast."""
     batch = OnALine(32, kind="discrete" if discrete else "continuous")
@@ -354,12 +343,3 @@ def test_the_transformer_learns_them_too():
     reports = trained(agent="me-tf", updates=24)
     assert reports[0].success < 0.4
     assert reports[-1].success > 0.9
-
-
-def test_a_process_compiles_learners_of_many_kinds(monkeypatch):
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
-    for agent in ("se", "me-mlp", "me-tf"):
-        for envs in (2, 4, 6):
-            config = PPOConfig(transitions=envs * 8, steps=8, minibatches=2, epochs=1, compile=True)
-            Learner(OnALine(envs), PolicyConfig(agent), config).iterate()
-    torch.compiler.reset()

@@ -1,0 +1,57 @@
+"""What is compiled learns as what is not, on a GPU too."""
+
+import functools
+
+import pytest
+import torch
+
+from learners import learner
+from morphgen.rl.compiled import prepared
+from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.ppo import Learner
+from on_a_line import OnALine
+
+CPU = torch.device("cpu")
+
+
+@pytest.mark.parametrize(("bf16", "kind"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_products_are_in_the_precision_that_is_asked_for(bf16, kind):
+    call = prepared(lambda x: x @ x, CPU, bf16=bf16, compiled=False)
+    found = call(torch.eye(3) / 3)
+    assert found.dtype == kind
+    torch.testing.assert_close(found.float(), torch.eye(3) / 9, rtol=1e-2, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+def test_compilation_gives_nearly_the_same_update(agent):
+    plain = learner(agent=agent, epochs=1).iterate()
+    compiled = learner(agent=agent, epochs=1, compile=True).iterate()
+    torch.compiler.reset()
+    assert compiled.value_loss == pytest.approx(plain.value_loss, rel=1e-3)
+    assert compiled.actor_gradient == pytest.approx(plain.actor_gradient, rel=1e-2)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+def test_graphs_on_a_gpu_learn_the_same_one_learner_after_the_other(agent):
+    for seed in (0, 1):
+        plain, graphs = (
+            learner(agent=agent, seed=seed, device="cuda", compile=compiled)
+            for compiled in (False, True)
+        )
+        for _ in range(3):
+            wanted, found = plain.iterate(), graphs.iterate()
+            assert found.value_loss == pytest.approx(wanted.value_loss, rel=1e-2)
+            assert found.actor_gradient == pytest.approx(wanted.actor_gradient, rel=5e-2)
+            assert found.entropy == pytest.approx(wanted.entropy, rel=1e-2)
+            assert found.reward == pytest.approx(wanted.reward, rel=1e-2)
+
+
+def test_a_process_compiles_learners_of_many_kinds(monkeypatch):
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
+    for agent in ("se", "me-mlp", "me-tf"):
+        for envs in (2, 4, 6):
+            config = PPOConfig(transitions=envs * 8, steps=8, minibatches=2, epochs=1, compile=True)
+            Learner(OnALine(envs), PolicyConfig(agent), config).iterate()
+    torch.compiler.reset()
