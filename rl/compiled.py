@@ -19,9 +19,9 @@ def prepared(
 ) -> Callable[P, T]:
     """A function ready to be called.
 
-    On a GPU what is compiled is a CUDA graph: a gradient step of a small network is a hundred
-    kernels and more, and starting them one by one takes longer than what they do. What a graph
-    returns is overwritten when the next is called; who keeps it copies it.
+    On a GPU what is compiled is a CUDA graph: a gradient step of a small network is hundreds of
+    kernels, and starting them one by one takes longer than what they do. What a graph returns is
+    overwritten when the next is called; who keeps it copies it.
 
     Args:
         function: A network, or what calls networks; its tensors are on the device.

@@ -124,7 +124,7 @@ class PPOConfig:
     bf16: bool = False
     """Networks in bfloat16, by autocast."""
     compile: bool = False
-    """Networks by ``torch.compile``."""
+    """Networks and losses by ``torch.compile``; on a GPU as CUDA graphs."""
 
     def __post_init__(self) -> None:
         """Check.

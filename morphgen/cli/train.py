@@ -83,7 +83,9 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
     )
     add_max_links(parser)
     parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
-    parser.add_argument("--compile", action="store_true", help="networks by torch.compile")
+    parser.add_argument(
+        "--compile", action="store_true", help="networks and losses by torch.compile"
+    )
 
 
 def add_learning(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:

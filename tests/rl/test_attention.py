@@ -30,10 +30,7 @@ def test_attention_is_a_weighted_mean_of_the_values_in_the_mask(way):
             for token in range(T):
                 scores = [float(q[row, head, token] @ k[row, head, i]) for i in there]
                 weights = [math.exp(score / math.sqrt(FEATURES)) for score in scores]
-                total = sum(weights)
-                wanted = sum(
-                    w / total * v[row, head, i] for w, i in zip(weights, there, strict=True)
-                )
+                wanted = torch.tensor(weights) / sum(weights) @ v[row, head, there]
                 torch.testing.assert_close(found[row, head, token], wanted, rtol=1e-4, atol=1e-5)
 
 

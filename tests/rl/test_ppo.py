@@ -62,11 +62,6 @@ def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
     assert divergence[0.01] < 0.02
 
 
-def test_transitions_are_rounded_up_to_whole_updates():
-    assert PPOConfig(transitions=1025, steps=128).updates(4) == 3
-    assert PPOConfig(transitions=1024, steps=128).updates(4) == 2
-
-
 def test_explained_variance_by_hand():
     returns = torch.tensor([[1.0, 2.0], [3.0, 6.0]])
     assert explained_variance(returns, returns) == 1
