@@ -112,11 +112,13 @@ class PPOConfig:
     entropy: float = 0.002
     """Weight of the entropy, which is the sum of that of the joints (ours)."""
     symlog: bool = True
-    """The critic predicts the symlog of returns (paper, after DreamerV3)."""
+    """The critic predicts the symlog of returns (paper, after DreamerV3), that of their mean, by
+    ``matching_loss`` (ours; the squared error of symlogs learns the mean of the symlogs)."""
     slow_critic: bool = True
     """Returns to learn come from a moving average of the critic (paper)."""
-    slow_decay: float = 0.98
-    """Of that average, a gradient step (DreamerV3; the paper gives none)."""
+    slow_decay: float = 0.9
+    """Of that average, a gradient step (ours; the paper gives none). DreamerV3's 0.98 is a lag of
+    an update here, when returns to learn are made of the values of the last but one."""
     task_reweighting: bool = False
     """Robots count with weights drawn anew every gradient step (paper: "random")."""
     curriculum: bool = True

@@ -113,7 +113,7 @@ def evaluate_run(
         path: A checkpoint, or a run's folder.
         side: Of the split.
         exam: How.
-        mode: Whether policies do what is likeliest, or draw.
+        mode: Whether policies act by the mean of their actions, or draw.
         device: Where the networks are.
 
     Raises:

@@ -32,8 +32,8 @@ class MaskedGaussian:
     mask: torch.Tensor
     """Links that count, shape (n, L), bool."""
 
-    def mode(self) -> torch.Tensor:
-        """The likeliest actions, shape (n, L); 0 where no link counts."""
+    def middle(self) -> torch.Tensor:
+        """The mean actions, shape (n, L); 0 where no link counts."""
         return torch.where(self.mask, self.mean, 0.0)
 
     def sample(self, generator: torch.Generator) -> torch.Tensor:
@@ -62,9 +62,15 @@ class MaskedMultiDiscrete:
     mask: torch.Tensor
     """Links that count, shape (n, L), bool."""
 
-    def mode(self) -> torch.Tensor:
-        """The likeliest bins, shape (n, L), int64; ``REST`` where no link counts."""
-        return torch.where(self.mask, self.logits.argmax(dim=-1), REST)
+    def middle(self) -> torch.Tensor:
+        """The bins nearest to the mean actions, shape (n, L), int64; ``REST`` where none counts.
+
+        Bins are in an order, so that they have a mean, and it is as good for them as for numbers:
+        a bin may be the likeliest by little, and far from the others.
+        """
+        shares = torch.tensor(BINS, device=self.logits.device)
+        mean = (self._logs().exp() * shares).sum(dim=-1, keepdim=True)
+        return torch.where(self.mask, (mean - shares).abs().argmin(dim=-1), REST)
 
     def sample(self, generator: torch.Generator) -> torch.Tensor:
         """Drawn bins, shape (n, L), int64; ``REST`` where no link counts."""

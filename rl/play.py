@@ -59,7 +59,7 @@ def controller(name: str, env: TaskEnv, seed: int) -> Controller:
 
     Args:
         name: ``zero``, ``random``, ``ik`` (for reach) or ``scripted`` (for push); or the path of a
-            checkpoint or of a run's folder, whose policy does what is likeliest.
+            checkpoint or of a run's folder, whose policy acts by the mean of its actions.
         env: What it is to act in.
         seed: Of what it draws.
 

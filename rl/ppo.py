@@ -29,7 +29,7 @@ from morphgen.rl.policies import (
     with_rows,
 )
 from morphgen.rl.report import Numbers, Report, explained_variance, outcome
-from morphgen.rl.symlog import symexp, symlog
+from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import Observation, TaskBatch
 
 TOLD = ("reward", "score", "success", "terminated", "truncated")
@@ -298,7 +298,7 @@ class Learner:
             "actions": rollout.actions.flatten(0, 1),
             "log_prob": rollout.log_prob.flatten(),
             "advantage": normal.flatten(),
-            "goal": (symlog(returns) if self.config.symlog else returns).flatten(),
+            "return": returns.flatten(),
             "body": self._body.repeat(self.config.steps),
         }
         found = []
@@ -339,9 +339,9 @@ class Learner:
         log_ratio = head.log_prob(data["actions"]) - data["log_prob"]
         policy = policy_loss(log_ratio, data["advantage"], self.config.clip)
         entropy = head.entropy()
-        value = 0.5 * (self.critic(seen) - data["goal"]).square()
-        weight = weights[data["body"]]
-        loss = (weight * (policy - self.config.entropy * entropy + value)).mean()
+        error = matching_loss if self.config.symlog else half_square
+        value = error(self.critic(seen), data["return"])
+        loss = (weights[data["body"]] * (policy - self.config.entropy * entropy + value)).mean()
         ratio = log_ratio.exp()
         clipped = ((ratio - 1).abs() > self.config.clip).float()
         told = (policy, value, entropy, ratio - 1 - log_ratio, clipped)

@@ -20,7 +20,7 @@ from morphgen.tasks.batch import Observation, TaskBatch
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
-"""A policy does what is likeliest, or draws."""
+"""A policy acts by the mean of its actions, or draws."""
 
 
 class Policy:
@@ -33,7 +33,7 @@ class Policy:
 
         Args:
             checkpoint: What a learner was.
-            mode: Whether it does what is likeliest, or draws.
+            mode: Whether it acts by the mean of its actions, or draws.
             seed: Of what it draws.
             device: Where the network is.
         """
@@ -43,7 +43,7 @@ class Policy:
         actor, _ = make_networks(self._config, self._layout, 0)
         actor.load_state_dict(checkpoint["actor"])
         self._actor = actor.to(self._device).eval()
-        self._likeliest = mode == "deterministic"
+        self._steady = mode == "deterministic"
         self._generator = torch.Generator(self._device).manual_seed(seed)
 
     def require(self, observation: Observation) -> None:
@@ -65,5 +65,5 @@ class Policy:
         self.require(seen)
         needed = with_rows(seen, rows_needed(self._config, seen))
         head = self._actor.distribution({k: v.to(self._device) for k, v in needed.items()})
-        chosen = head.mode() if self._likeliest else head.sample(self._generator)
+        chosen = head.middle() if self._steady else head.sample(self._generator)
         return with_all_rows(chosen, self._layout.links).to(task.device)

@@ -64,7 +64,7 @@ def test_episodes_are_those_of_the_seed():
     assert scores[0][0].distance != scores[2][0].distance
 
 
-def test_the_likeliest_and_drawn_actions_are_each_the_same_again(run):
+def test_mean_and_drawn_actions_are_each_the_same_again(run):
     modes = ("deterministic", "deterministic", "stochastic", "stochastic")
     found = [evaluate_run(run, "train", EXAM, mode) for mode in modes]
     assert found[0] == found[1] != found[2] == found[3]

@@ -1,9 +1,8 @@
-"""Advantages, worked out by hand, and the logarithm of returns."""
+"""Advantages, worked out by hand."""
 
 import torch
 
 from morphgen.rl.gae import gae, next_values
-from morphgen.rl.symlog import symexp, symlog
 
 GAMMA, LAM = 0.9, 0.5
 
@@ -79,22 +78,3 @@ def test_next_values_are_those_of_the_observations_before_new_episodes():
     found = next_values(values, torch.tensor([7.0, 8.0]), cut, torch.tensor([20.0, 50.0, 60.0]))
     assert found.tolist() == [[3.0, 20.0], [5.0, 6.0], [50.0, 60.0]]
     assert values.tolist() == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
-
-
-def test_symexp_is_the_inverse_of_symlog():
-    x = torch.tensor([-5e4, -3.0, -1e-6, 0.0, 1e-6, 0.5, 7.0, 1e5])
-    torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-5, atol=0)
-
-
-def test_symlog_is_odd_near_the_identity_and_logarithmic():
-    torch.testing.assert_close(symlog(torch.tensor(torch.e - 1)), torch.tensor(1.0))
-    x = torch.linspace(0, 9, 10)
-    assert symlog(-x).equal(-symlog(x))
-    small = torch.tensor([1e-4])
-    torch.testing.assert_close(symlog(small), small, rtol=1e-3, atol=0)
-
-
-def test_symlog_has_slope_one_at_zero_on_both_sides():
-    x = torch.tensor([-1e-9, 1e-9], requires_grad=True)
-    symlog(x).sum().backward()
-    torch.testing.assert_close(x.grad, torch.ones(2))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from torch.distributions import Categorical, Independent, Normal
+from torch.nn import functional
 
 from morphgen.rl.heads import (
     HIGH,
@@ -75,18 +76,27 @@ def test_multi_discrete_draws_with_its_probabilities():
     torch.testing.assert_close(shares, logits.softmax(dim=0), atol=0.01, rtol=0)
 
 
-def test_modes_are_the_mean_and_the_likeliest_bin():
+def test_the_middle_is_the_mean_and_the_bin_nearest_to_it():
     head = gaussian()
-    assert head.mode()[MASK].equal(head.mean[MASK])
-    bins = discrete()
-    assert bins.mode()[MASK].equal(bins.logits.argmax(dim=-1)[MASK])
+    assert head.middle()[MASK].equal(head.mean[MASK])
+    shares = {-1 / 16: 0.4, 1 / 2: 0.3, 1 / 4: 0.3}  # mean 0.2, where 1/4 is nearest
+    probabilities = torch.tensor([shares.get(each, 1e-9) for each in BINS])
+    bins = MaskedMultiDiscrete(probabilities.log().expand(*MASK.shape, len(BINS)), MASK)
+    assert set(bins.middle()[MASK].tolist()) == {BINS.index(1 / 4)}
+
+
+@pytest.mark.parametrize("chosen", range(len(BINS)))
+def test_the_middle_of_one_bin_is_that_bin(chosen):
+    logits = 50.0 * functional.one_hot(torch.tensor(chosen), len(BINS)).float()
+    bins = MaskedMultiDiscrete(logits.expand(*MASK.shape, len(BINS)), MASK)
+    assert set(bins.middle()[MASK].tolist()) == {chosen}
 
 
 def test_links_that_do_not_move_rest():
     assert BINS[REST] == 0
-    for actions in (discrete().sample(seeded()), discrete().mode()):
+    for actions in (discrete().sample(seeded()), discrete().middle()):
         assert set(actions[~MASK].tolist()) == {REST}
-    for actions in (gaussian().sample(seeded()), gaussian().mode()):
+    for actions in (gaussian().sample(seeded()), gaussian().middle()):
         assert set(actions[~MASK].tolist()) == {0.0}
 
 

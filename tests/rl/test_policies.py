@@ -91,7 +91,7 @@ def networks(agent="me-tf", seen=None, *, discrete=True, mask_morphology=False, 
 def outputs(actor, critic, seen):
     """Actions, their probability, and values."""
     head = actor.distribution(seen)
-    return head.mode(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
+    return head.middle(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
 
 
 agents = pytest.mark.parametrize("agent", AGENTS)
@@ -179,7 +179,7 @@ def test_the_transformer_says_and_learns_the_same_without_rows_that_no_robot_has
     for needed in (seen, with_rows(seen, rows)):
         actor, critic = networks("me-tf", seen, discrete=discrete)
         head = actor.distribution(needed)
-        actions = with_all_rows(head.mode(), LINKS)
+        actions = with_all_rows(head.middle(), LINKS)
         probable = head.log_prob(actions[:, : needed["links"].shape[1]])
         value = critic(needed)
         (probable + head.entropy() + value).sum().backward()
@@ -333,7 +333,7 @@ def test_all_actions_begin_alike_and_values_near_zero(agent):
     assert (spread - 1 / 11).abs().max() < 0.01
     assert critic(seen).abs().max() < 0.1
     calm, _ = networks(agent, seen, discrete=False, lively=False)
-    assert calm.distribution(seen).mode().abs().max() < 0.1
+    assert calm.distribution(seen).middle().abs().max() < 0.1
 
 
 def test_weights_follow_from_the_seed_and_leave_torchs_own_stream_alone():

@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import replace
+from itertools import product
+from statistics import median
 
 import pytest
 import torch
@@ -49,17 +51,17 @@ def test_the_actors_share_of_the_rate_follows_the_divergence():
 
 def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
     options = {"learning_rate": 5e-3, "transitions": 30 * 64}
-    divergence = {}
-    for target in (0, 0.01):
-        made = learner(**options, target_kl=target)
+    divergence = {0: [], 0.01: []}
+    for target, seed in product(divergence, range(4)):
+        made = learner(**options, target_kl=target, seed=seed)
         first, *_ = (made.iterate() for _ in range(3))
         assert first.kl > 0.1
-        divergence[target] = sum(made.iterate().kl for _ in range(7)) / 7
+        divergence[target] += [made.iterate().kl for _ in range(7)]
         actor, critic = (group["lr"] for group in made.optimiser.param_groups)
         assert critic == pytest.approx(5e-3 * (1 - 9 / 30))
         assert actor <= 0.5 * critic if target else actor == critic
-    assert divergence[0] > 0.03
-    assert divergence[0.01] < 0.02
+    assert median(divergence[0]) > 0.03
+    assert median(divergence[0.01]) < 0.02
 
 
 def test_explained_variance_by_hand():
@@ -90,7 +92,7 @@ def test_the_slow_critic_follows_every_gradient_step():
     assert moved
     for name in moved:
         fast = after[f"critic.{name}"]
-        wanted = 0.98 * before[f"slow.{name}"] + 0.02 * fast
+        wanted = torch.lerp(fast, before[f"slow.{name}"], made.config.slow_decay)
         torch.testing.assert_close(after[f"slow.{name}"], wanted)
     assert not equal({k: v for k, v in before.items() if k.startswith("slow")}, after)
 
