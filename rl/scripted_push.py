@@ -16,7 +16,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.settings import Setting
 
-PLANS = 5
+PLANS = 8
 """Plans of an episode at most."""
 GAIN = 0.2
 """Share of the distance aside of tool and block that is made good in a control step."""
@@ -31,10 +31,12 @@ SETTLE = 15
 """Control steps in which joints may get there."""
 PATIENCE = 40
 """Control steps in which the block has to get on before a new plan is made."""
-PROGRESS = 0.06
+PROGRESS = 0.3
 """How far that is at least, in edges of the block."""
 LOST = 0.7
 """Distance aside of tool and block from which it is lost, in edges of the block."""
+ASTRAY = 1.0
+"""Distance aside of the block from where the push began from which it goes astray, in its edges."""
 UNDERWAY = 10
 """Control steps of a push before which it is not."""
 
@@ -90,7 +92,7 @@ class ScriptedPush:
         state.active[env] = plan is not None
         state.pushing[env] = False
         if plan is not None:
-            state.take(env, plan, float(block[1]))
+            state.take(env, plan, block)
 
 
 @dataclass(eq=False)
@@ -114,6 +116,8 @@ class _State:
     """Control steps since the arm could go on."""
     best: torch.Tensor
     """How far the block had got then, y."""
+    begun: torch.Tensor
+    """Where the block was before the push, x."""
     lead: torch.Tensor
     """How far the commanded tool may be ahead now, metres."""
     rotation: torch.Tensor
@@ -123,12 +127,12 @@ class _State:
     edge: torch.Tensor
     """Of the block, metres."""
 
-    def take(self, env: int, plan: Plan, y: float) -> None:
-        """Begin a plan, the block being at y."""
+    def take(self, env: int, plan: Plan, block: torch.Tensor) -> None:
+        """Begin a plan; the pose of the block is of shape (7,)."""
         self.routes.take(env, plan.way)
         self.rotation[env] = plan.rotation
         self.height[env], self.aside[env], self.gap[env] = plan.height, plan.aside, plan.gap
-        self.best[env], self.lead[env] = y, LEAD
+        self.begun[env], self.best[env], self.lead[env] = block[0], block[1], LEAD
         self.settled[env], self.still[env], self.stuck[env] = 0, 0, 0
 
 
@@ -157,6 +161,7 @@ def _no_state(task: TaskBatch) -> _State:
         still=count(),
         stuck=count(),
         best=zero(),
+        begun=zero(),
         lead=zero(),
         rotation=zero(3, 3),
         height=zero(),
@@ -180,7 +185,8 @@ def _watched(
     off = (tool[:, 0] - block[:, 0] - state.aside).abs()
     lost = (off > LOST * state.edge) & (state.still > UNDERWAY)
     slow = state.still > PATIENCE + state.gap / SPEED
-    return state.active & state.pushing & (slow | lost | (state.stuck > UNDERWAY))
+    astray = (block[:, 0] - state.begun).abs() > ASTRAY * state.edge
+    return state.active & state.pushing & (slow | lost | astray | (state.stuck > UNDERWAY))
 
 
 def _pushed(

@@ -1,8 +1,8 @@
 """Small robots that tests build in code."""
 
-from morphgen.model.geometry import Box, Cylinder, Pose, Shape
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
-from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 
 
 def rod(name: str, length: float = 0.3) -> Link:
@@ -46,3 +46,22 @@ def arm() -> Robot:
     )
     tool = Frame("tool", "slider", Pose.from_xyz_rpy((0.0, 0.0, 0.28), (0.0, 0.3, 0.0)))
     return Robot("arm", links, joints, (tool,), home=(0.4, 0.5, 0.01, 0.02))
+
+
+def finger(mass: float = 2.0) -> Robot:
+    """A ball of 7 mm radius that goes along y and z; at zero its middle is at the origin."""
+
+    def heavy(m: float) -> Inertial:
+        return Inertial(m, (0.0, 0.0, 0.0), (m * 1e-3, 0.0, 0.0, m * 1e-3, 0.0, m * 1e-3))
+
+    links = (
+        Link("base"),
+        Link("carriage", heavy(0.2)),
+        Link("ball", heavy(mass), collisions=(Shape(Sphere(0.007)),)),
+    )
+    slide = {"limits": (-3.0, 3.0), "velocity": 2.0}
+    joints = (
+        Joint("along", "prismatic", "base", "carriage", axis=(0, 1, 0), **slide),
+        Joint("up", "prismatic", "carriage", "ball", axis=(0, 0, 1), **slide),
+    )
+    return Robot("finger", links, joints, home=(0.0, 0.0))

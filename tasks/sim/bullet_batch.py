@@ -16,6 +16,7 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene, export
+from morphgen.tasks.sim.motor_law import MotorForces
 
 MAX_VELOCITY = 1e4
 """Joints and blocks that are faster (rad/s or m/s), or blocks that are so far, have exploded."""
@@ -165,6 +166,8 @@ class BulletBatch:
         self._blocks = [i for i, scene in enumerate(scenes) if scene.block is not None]
         self._block_rows = [self._envs[i] for i in self._blocks]
         self._plan()
+        efforts = [effort for loaded in self._loaded for effort in loaded.efforts]
+        self._forces = MotorForces([scene.robot for scene in scenes], efforts)
 
     def _load(self, i: int) -> BulletScene:
         urdf, body = self._exported[i]
@@ -240,13 +243,18 @@ class BulletBatch:
         for why in self._unstable.values():
             raise SimulationError(why)
         wanted = targets.reshape(-1)[self._source] * self._gain + self._offset
-        mean, last = self._law(wanted)
+        ends, last = self._law(wanted)
+        mean = (ends - self._positions) / (SUBSTEPS * TIMESTEP)
         asked = self._found + (mean - self._found) / _TAKEN
         asked = np.clip(asked, -self._fastest, self._fastest)
         velocities: list[float] = asked.tolist()
+        limits = self._forces.limits(
+            (wanted - self._positions, wanted - ends), (self._velocities, last)
+        )
+        forces: list[float] = (limits / SUBSTEPS).tolist()
         states: list[tuple[float, float]] = []
         for loaded, span in zip(self._loaded, self._spans, strict=True):
-            loaded.step(velocities[span])
+            loaded.step(velocities[span], forces[span])
             states += loaded.joint_states()
         self._steps += 1
         rows = self._rows
@@ -264,7 +272,7 @@ class BulletBatch:
             self._find_unstable()
 
     def _law(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Velocities of a control step: its mean, and that at its end.
+        """Positions and velocities at the end of a control step.
 
         The critically damped law of ``morphgen.model.dynamics``, physics step by physics step, as
         if nothing else moved the joints. What does, an effort or a contact, shows in the velocity
@@ -275,7 +283,7 @@ class BulletBatch:
             v = v + TIMESTEP * BANDWIDTH * (BANDWIDTH * (wanted - q) - 2 * v)
             v = np.clip(v, -self._fastest, self._fastest)
             q = q + TIMESTEP * v
-        return (q - self._positions) / (SUBSTEPS * TIMESTEP), v
+        return q, v
 
     def _find_unstable(self) -> None:
         rows = self._rows

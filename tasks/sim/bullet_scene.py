@@ -53,11 +53,12 @@ class BulletScene:
     Motors. PyBullet's position control, v' = v - kd v + kp e / dt at every physics step, is the
     wanted law only where nothing else moves the joint: the v on the right already has the step's
     gravity and Coriolis acceleration, of which kd takes only a part away. So motors make for a
-    velocity, within the effort, during a control step, and ``BulletBatch`` says which. The robot
-    carries its own weight: the world has no gravity, and the block is pulled by its weight as a
-    force. One call makes all substeps; the motors act anew in each, but PyBullet reckons their
-    impulse limits with the whole call's time, hence efforts are divided by ``SUBSTEPS``. A mimic
-    joint is a motor with its leader's target.
+    velocity during a control step, with no more force than a spring and a damper would have;
+    ``BulletBatch`` says which velocity, ``MotorForces`` how much force. The robot carries its own
+    weight: the world has no gravity, and the block is pulled by its weight as a force. One call
+    makes all substeps; the motors act anew in each, but PyBullet reckons their impulse limits with
+    the whole call's time, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor with
+    its leader's target.
 
     Solver. Iterations are many because motors of one arm pull against each other. Dantzig's direct
     method has no such trouble and is faster, but knows no friction cone; so it is taken where no
@@ -139,7 +140,7 @@ class BulletScene:
         joints = {info[1].decode(): info[0] for info in infos}
         links = {body.root.name: -1} | {info[12].decode(): info[0] for info in infos}
         self.driven = [joints[body.joints[k].name] for k in body.movable]
-        self._efforts = [_effort(body, k) / SUBSTEPS for k in body.movable]
+        self.efforts = [_effort(body, k) for k in body.movable]
         fastest = max((body.joints[k].velocity or math.inf for k in body.movable), default=math.inf)
         if math.isfinite(fastest):
             pybullet.changeDynamics(
@@ -165,7 +166,6 @@ class BulletScene:
                     self.robot, self.robot, links[a], links[b], 0, **self._client
                 )
         self._motors: dict[str, Any] = {
-            "forces": self._efforts,
             "velocityGains": [VELOCITY_GAIN] * len(self.driven),
             **self._client,
         }
@@ -238,14 +238,15 @@ class BulletScene:
         for entry in self._groups:
             pybullet.setCollisionFilterGroupMask(*entry, **self._client)
 
-    def step(self, velocities: list[float]) -> None:
-        """One control step with the velocities of all movable joints."""
+    def step(self, velocities: list[float], forces: list[float]) -> None:
+        """One control step with velocities and largest forces of all movable joints."""
         if velocities:
             pybullet.setJointMotorControlArray(
                 self.robot,
                 self.driven,
                 pybullet.VELOCITY_CONTROL,
                 targetVelocities=velocities,
+                forces=forces,
                 **self._motors,
             )
         if self._weight is not None:

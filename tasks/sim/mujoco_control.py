@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.model.dynamics import BANDWIDTH
-from morphgen.model.robot import Joint
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
+from morphgen.tasks.sim.motor_law import LAG, speed_limit
 from morphgen.tasks.sim.mujoco_gather import Gathered
 from morphgen.tasks.sim.mujoco_model import GAIN, PASSIVE, World
 
@@ -27,10 +27,6 @@ def _mean_acceleration() -> tuple[float, float]:
 
 
 BY_ERROR, BY_VELOCITY = _mean_acceleration()
-LAG = 2 / BANDWIDTH + TIMESTEP * SUBSTEPS
-"""Seconds by which a joint is behind a target that moves steadily, at most, in steps."""
-FASTEST_TURN, FASTEST_SLIDE = 10.0, 1.0
-"""Speed limit of a joint that has none, rad/s and m/s: the benchmark's largest steps at 50 Hz."""
 
 
 class PositionControl:
@@ -82,7 +78,7 @@ class PositionControl:
             self._products.append((world.model, one, force, acceleration))
             self._compliance[i, : world.robot.dof] = 1 / world.model.actuator_gainprm[:, 0]
             self._farthest[i, : world.robot.dof] = [
-                LAG * _speed(world.robot.joints[k]) for k in world.robot.independent
+                LAG * speed_limit(world.robot.joints[k]) for k in world.robot.independent
             ]
             matrix, _ = world.robot.mimic_map
             rows, columns = np.nonzero(matrix)
@@ -126,7 +122,3 @@ class PositionControl:
         """Let go of the environments' data."""
         self._products = []
         self._bias, self._weight = Gathered(()), Gathered(())
-
-
-def _speed(joint: Joint) -> float:
-    return joint.velocity or (FASTEST_SLIDE if joint.kind == "prismatic" else FASTEST_TURN)

@@ -119,9 +119,12 @@ def self_contact(simulate, body, **contacts):
     simulation = simulate(
         Scene(body, Pose((0.0, 0.0, 2.0)), ground=None), contacts=Contacts(**contacts)
     )
-    q = reset(simulation, (0.0, 0.0, 0.0, 0.0))
-    simulation.step(q)
-    return touching(simulation)
+    reset(simulation, (0.0, 0.0, 0.0, 0.0))
+    # Not after a step, in which what overlaps gives way.
+    client = client_of(simulation).id
+    pybullet.performCollisionDetection(physicsClientId=client)
+    points = pybullet.getContactPoints(physicsClientId=client)
+    return {((p[1], p[3]), (p[2], p[4])) for p in points if p[8] < 0}
 
 
 def overlapping():
