@@ -20,9 +20,13 @@ FASTEST_TURN, FASTEST_SLIDE = 10.0, 1.0
 SLACK = 0.2
 """Share of the spring's and the damper's force, added up, that a motor may pull beside their sum:
 inertia is another where the robot is not at home, and turning about several axes takes some."""
-HARDNESS = 1 / (1 - 2 * BANDWIDTH * TIMESTEP)
-"""Force of a joint that is held, of what its stiffness and error give: that of MuJoCo's actuators,
-which have this gain because they integrate damping implicitly."""
+GAIN = 1 / (1 - 2 * BANDWIDTH * TIMESTEP)
+"""What the gains of the law are multiplied by in MuJoCo, and so the force of what is held in all.
+
+MuJoCo integrates damping implicitly, v' = (v + dt s e) / (1 + dt d) at unit inertia. With
+s = ``GAIN`` omega^2 and d = ``GAIN`` 2 omega this is v' = v + dt (omega^2 e - 2 omega v), as in
+other simulators.
+"""
 
 
 def speed_limit(joint: Joint) -> float:
@@ -36,7 +40,7 @@ class MotorForces:
     A motor that makes for a velocity does so with all its effort, as if it were rigid. The law of
     ``morphgen.model.dynamics`` is a spring and a damper; so a motor may pull as hard as these do
     with the joint-space inertia M at home, the sum over joints k of |M_jk a_k|, where
-    a_k = omega^2 e_k - 2 omega v_k is what the law wants, with ``SLACK`` and ``HARDNESS``. What
+    a_k = omega^2 e_k - 2 omega v_k is what the law wants, with ``SLACK`` and ``GAIN``. What
     moves freely needs no more.
     """
 
@@ -59,7 +63,7 @@ class MotorForces:
             if id(robot) not in known:
                 known[id(robot)] = _inertia(robot)
             start, end = len(farthest), len(farthest) + len(robot.movable)
-            self._pull[: robot.dof, start:end] = HARDNESS * known[id(robot)]
+            self._pull[: robot.dof, start:end] = GAIN * known[id(robot)]
             self._row[: robot.dof, start:end] = [
                 [start + robot.movable.index(k)] for k in robot.independent
             ]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
-from morphgen.tasks.sim.motor_law import LAG, speed_limit
+from morphgen.tasks.sim.motor_law import GAIN, LAG, speed_limit
 from morphgen.tasks.sim.mujoco_gather import Gathered
-from morphgen.tasks.sim.mujoco_model import GAIN, PASSIVE, World
+from morphgen.tasks.sim.mujoco_model import PASSIVE, World
 
 Array = NDArray[np.float64]
 

@@ -11,23 +11,16 @@ from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf import to_spec
-from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot, sorted_pair
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
+from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-GAIN = 1 / (1 - 2 * BANDWIDTH * TIMESTEP)
-"""What the gains of the law are multiplied by.
-
-MuJoCo integrates damping implicitly, v' = (v + dt s e) / (1 + dt d) at unit inertia. With
-s = ``GAIN`` omega^2 and d = ``GAIN`` 2 omega this is v' = v + dt (omega^2 e - 2 omega v), as in
-other simulators.
-"""
 PASSIVE = 0.2
 """Share of the damping that the joints have, and not the actuators; see ``PositionControl``."""
 IMPEDANCE_RATIO = 100.0

@@ -9,7 +9,7 @@ from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
 from morphgen.tasks.sim.motor_law import (
     FASTEST_SLIDE,
     FASTEST_TURN,
-    HARDNESS,
+    GAIN,
     LAG,
     SLACK,
     MotorForces,
@@ -30,7 +30,7 @@ def limits(body, error, velocity=0.0, effort=PLENTY):
 
 def test_a_held_slide_pulls_as_its_stiffness_says():
     (along, up) = limits(finger(2.0), 0.01)
-    spring = (1 + SLACK) * HARDNESS * BANDWIDTH**2 * 0.01
+    spring = (1 + SLACK) * GAIN * BANDWIDTH**2 * 0.01
     assert along == pytest.approx(spring * 2.2)
     assert up == pytest.approx(spring * 2.0)
 
@@ -40,7 +40,7 @@ def test_joints_of_an_arm_pull_each_other():
     error = np.linspace(0.01, -0.02, body.dof)
     inertia = np.abs(mass_matrix(body, body.home))
     inertia += np.diag([each.armature for each in actuation(body)])
-    wanted = (1 + SLACK) * HARDNESS * inertia @ (BANDWIDTH**2 * np.abs(error))
+    wanted = (1 + SLACK) * GAIN * inertia @ (BANDWIDTH**2 * np.abs(error))
     np.testing.assert_allclose(limits(body, error), wanted, rtol=1e-12)
 
 
@@ -60,7 +60,7 @@ def test_at_rest_nothing_pulls_and_no_more_than_the_effort_ever():
 def test_a_motor_that_lags_as_much_as_its_speed_says_has_slack_alone():
     speed = 0.3
     (along, _) = limits(finger(2.0), 2 * speed / BANDWIDTH, speed)
-    assert along == pytest.approx(SLACK * HARDNESS * 2.2 * 4 * BANDWIDTH * speed)
+    assert along == pytest.approx(SLACK * GAIN * 2.2 * 4 * BANDWIDTH * speed)
 
 
 def test_what_is_far_behind_pulls_no_harder_than_its_speed_limit_needs():

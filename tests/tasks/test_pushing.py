@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
-from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Scene
-from morphgen.tasks.sim.motor_law import HARDNESS
+from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.sim.base import GRAVITY, Block, Scene
+from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 from robots import finger
 
@@ -14,8 +16,6 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 from morphgen.tasks.sim.bullet import BulletSimulation
 
 EDGE = 0.08
-OMEGA = 30.0
-PERIOD = TIMESTEP * SUBSTEPS
 
 
 @pytest.fixture(params=[BulletSimulation, MujocoSimulation])
@@ -32,8 +32,8 @@ def pushed(simulator, block_mass, speed, way, finger_mass=2.0, height=0.3):
         pose = torch.tensor([[0.0, 0.0, EDGE / 2, 1.0, 0.0, 0.0, 0.0]])
         simulation.reset(torch.tensor([0]), q, pose)
         rows = []
-        for _ in range(round((way + 0.004) / speed / PERIOD)):
-            q[:, 0] += speed * PERIOD
+        for _ in range(round((way + 0.004) / speed / CONTROL_PERIOD)):
+            q[:, 0] += speed * CONTROL_PERIOD
             simulation.step(q)
             _, _, z, _, x, y, _ = simulation.block_pose[0].tolist()
             tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
@@ -47,8 +47,8 @@ def pushed(simulator, block_mass, speed, way, finger_mass=2.0, height=0.3):
 def test_a_finger_gives_way_as_its_stiffness_says(simulator, block_mass, finger_mass):
     speed = 0.02
     rows, _ = pushed(simulator, block_mass, speed, 0.06, finger_mass)
-    load = block_mass * GRAVITY / (HARDNESS * OMEGA**2 * (finger_mass + 0.2))
-    free = 2 * speed / OMEGA
+    load = block_mass * GRAVITY / (GAIN * BANDWIDTH**2 * (finger_mass + 0.2))
+    free = 2 * speed / BANDWIDTH
     lag = rows[len(rows) // 2 :, 0].mean()
     assert lag == pytest.approx(free + load, rel=0.35)
 
