@@ -17,21 +17,26 @@ STRETCH = 12.0
 """Longest piece of a tree, in control steps."""
 LEAST = 1.0
 """Shortest, likewise."""
-GROWN = 12
-"""Times that a tree grows for every configuration that is taken from it."""
 SHORTCUTS = 60
 """Random pairs of points on a way between which a straight one is tried."""
 
 
-class _Tree:
+class Tree:
     """Configurations, each with the one it was reached from."""
 
     def __init__(self, roots: Array, step: Array) -> None:
+        """Begin.
+
+        Args:
+            roots: Those that are reached from nowhere, shape (n, dof).
+            step: As of ``connected``.
+        """
         self._step = step
         self.nodes = [*roots]
         self.parents = [-1] * len(roots)
 
     def nearest(self, q: Array) -> int:
+        """The configuration from which another, shape (dof,), takes the fewest control steps."""
         apart = np.abs(np.array(self.nodes) - q) / self._step
         return int(apart.max(axis=1).argmin())
 
@@ -81,7 +86,7 @@ def connected(
     """
     if not len(ends):
         return None
-    here, there = _Tree(start[None], step), _Tree(ends, step)
+    here, there = Tree(start[None], step), Tree(ends, step)
     growing, other = here, there
     for _ in range(ROUNDS):
         drawn = rng.uniform(bounds[:, 0], bounds[:, 1])
@@ -91,7 +96,7 @@ def connected(
             if met is not None:
                 a, b = growing.back(new), other.back(met)
                 way = [*a[::-1], *b[1:]] if growing is here else [*b[::-1], *a[1:]]
-                return tuple(_shortened(way, free_part, rng))
+                return tuple(shortened(way, free_part, rng))
         growing, other = other, growing
     return None
 
@@ -102,20 +107,20 @@ def explored(
     step: Array,
     free_part: FreePart,
     rng: np.random.Generator,
-    count: int,
-) -> Array:
-    """Configurations to which free ways lead from a start, shape (count, dof).
+    times: int,
+) -> Tree:
+    """Configurations to which free ways lead from a start.
 
-    Arguments as of ``connected``. They are drawn from a tree, maybe more than once.
+    Arguments as of ``connected``; the tree grows so many times, or tries to.
     """
-    tree = _Tree(start[None], step)
-    for _ in range(GROWN * count):
+    tree = Tree(start[None], step)
+    for _ in range(times):
         drawn = rng.uniform(bounds[:, 0], bounds[:, 1])
         tree.grow(tree.nearest(drawn), drawn, free_part)
-    return np.array(tree.nodes)[rng.integers(len(tree.nodes), size=count)]
+    return tree
 
 
-def _meet(tree: _Tree, q: Array, free_part: FreePart) -> int | None:
+def _meet(tree: Tree, q: Array, free_part: FreePart) -> int | None:
     """Grow a tree until it gets to a configuration, if it does."""
     near: int | None = tree.nearest(q)
     while near is not None and not np.array_equal(tree.nodes[near], q):
@@ -123,8 +128,8 @@ def _meet(tree: _Tree, q: Array, free_part: FreePart) -> int | None:
     return near
 
 
-def _shortened(way: list[Array], free_part: FreePart, rng: np.random.Generator) -> list[Array]:
-    """The same way with straight lines across its corners."""
+def shortened(way: list[Array], free_part: FreePart, rng: np.random.Generator) -> list[Array]:
+    """The same way with straight lines across its corners, as far as they are free."""
     for _ in range(SHORTCUTS):
         if len(way) < 3:
             break

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 
 from morphgen.model.kinematics import bounds
 from morphgen.model.robot import Robot
-from morphgen.rl.connect import connected, explored
+from morphgen.rl.connect import Tree, connected, explored, shortened
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
 
 Array = NDArray[np.float64]
 
+GROWN = 12
+"""Times that a tree grows for every configuration that is drawn from it."""
 STOPS = 12
 """Free configurations by way of which an end may be reached, besides home."""
 ATTEMPTS = 4
@@ -127,24 +130,56 @@ class FreeWays:
         self, start: Array, ends: Array, *, block: Array | None = None, attempt: int = 0
     ) -> Way | None:
         """Any free way to one of several ends; see ``connected``. Arguments as of ``find``."""
-
-        def free_part(a: Array, b: Array) -> float:
-            return self._free_part(a, b, block)
-
+        free_part = partial(self._free_part, block=block)
         rng = np.random.default_rng([self._seed, attempt])
         found = connected(start, ends, self._within(start), self._step, free_part, rng)
         if found is None:
             return None
         return Way(found[1:], int(np.abs(ends - found[-1]).max(axis=1).argmin()))
 
-    def reached(self, start: Array, count: int, *, attempt: int = 0) -> Array:
-        """Configurations to which free ways lead without the block, shape (count, dof)."""
-
-        def free_part(a: Array, b: Array) -> float:
-            return self._free_part(a, b, None)
-
+    def explored(
+        self, start: Array, times: int, *, block: Array | None = None, attempt: int = 0
+    ) -> Tree:
+        """A tree of configurations to which free ways lead, grown so many times."""
+        free_part, within = partial(self._free_part, block=block), self._within(start)
         rng = np.random.default_rng([self._seed, attempt])
-        return explored(start, self._within(start), self._step, free_part, rng, count)
+        return explored(start, within, self._step, free_part, rng, times)
+
+    def reached(self, start: Array, count: int, *, attempt: int = 0) -> Array:
+        """Configurations to which free ways lead without the block, shape (count, dof).
+
+        They are drawn from a tree, maybe more than once.
+        """
+        nodes = np.array(self.explored(start, GROWN * count, attempt=attempt).nodes)
+        return nodes[np.random.default_rng([self._seed, attempt]).integers(len(nodes), size=count)]
+
+    def find_along(
+        self, tree: Tree, ends: Array, *, vias: Array, costs: Array, block: Array
+    ) -> Way | None:
+        """A free way along a tree to the first of several ends that has one.
+
+        Arguments as of ``find``. Ends that cost less come first, how far they are from the tree
+        counted, by way of a configuration of the tree each, and of the end's via if need be.
+        """
+        near = [tree.nearest(end) for end in ends]
+        far = self.steps(np.array([tree.nodes[i] for i in near]), ends) if near else costs
+        free_part = partial(self._free_part, block=block)
+        for i in np.argsort(costs + far, kind="stable").tolist():
+            for last in ((ends[i],), (vias[i], ends[i])):
+                legs = [tree.nodes[near[i]], *last]
+                # From the end: there the room is least.
+                if all(
+                    free_part(b, a) == 1 for a, b in zip(legs[-2::-1], legs[:0:-1], strict=True)
+                ):
+                    way = [*tree.back(near[i])[::-1], *last]
+                    rng = np.random.default_rng([self._seed, i])
+                    return Way(tuple(shortened(way, free_part, rng)[1:]), i)
+        return None
+
+    def length(self, start: Array, way: Way) -> float:
+        """Control steps that a way takes from a start, shape (dof,)."""
+        points = np.array([start, *way.points])
+        return float(self.steps(points[:-1], points[1:]).sum())
 
     def _within(self, start: Array) -> Array:
         """Bounds of the joints; those that do not move are where they are."""
@@ -163,10 +198,8 @@ class FreeWays:
             lasts = ((end,),) if vias is None else ((end,), (vias[i], end))
             for before in ((), *((stop,) for stop in stops)):
                 for last in lasts:
-                    points = (*before, *last)
-                    legs = np.diff(np.array([start, *points]), axis=0)
-                    steps = (np.abs(legs) / self._step).max(axis=1).sum()
-                    yield float(steps + (0.0 if costs is None else costs[i])), Way(points, i)
+                    way = Way((*before, *last), i)
+                    yield self.length(start, way) + (0.0 if costs is None else costs[i]), way
 
     def _free_part(self, start: Array, end: Array, block: Array | None) -> float:
         """Which part of the straight way between two configurations is free, from the start."""

@@ -13,12 +13,15 @@ Array = NDArray[np.float64]
 
 NEARER = np.arange(0.05, 2.0, 0.1)
 """How far the block is moved to the robot to see where they touch, in its edges."""
+HALVINGS = 5
+"""Times that what is between two of these is halved."""
 ASIDE = np.array([-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0])
 """How far aside, to see how broadly they do, in its edges."""
-HALF = 0.5
-"""How far it is lowered and raised to see which of its halves is touched first, in its edges."""
+LOWERED, RAISED = -0.5, 0.15
+"""Shifts up with which only what is below the block's middle touches it, and with which what is at
+its upper edge does too, in its edges."""
 FIRM = 0.1
-"""How far it is pressed against the robot for that, in its edges."""
+"""How far it is pressed against the robot to see how broadly they touch, in its edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +36,10 @@ class Poised:
     """How far aside the block has to be for the touch to be on its middle, shape (n,), metres."""
     width: Array
     """Share of the shifts ``ASIDE`` at which the block is still touched, shape (n,)."""
-    roof: Array
-    """How much earlier the block's upper half is touched than its lower, 0 to 1, in its edges: a
-    robot that leans over the block presses it to the ground. Shape (n,)."""
+    over: Array
+    """How much earlier the robot touches what is above the block's middle, or just above the block,
+    than what is below, 0 to 1, in its edges. What leans over a block presses it to the ground, or
+    tips it over. Shape (n,)."""
 
     def taken(self, rows: NDArray[np.intp]) -> Poised:
         """Some of the rows."""
@@ -51,23 +55,19 @@ def poised(space: FreeSpace, q: Array, block: Array, edge: float) -> Poised:
         block: Pose of the block, shape (7,).
         edge: Of the block, metres.
     """
-    gap = _gaps(space, q, block, edge, 0.0)
+    gap = _gaps(space, q, block, edge, np.zeros((len(q), 1)), 0.0)
     some = np.isfinite(gap)
     q, gap = q[some], gap[some]
-    farthest = NEARER[-1] * edge
-    lower, upper = (
-        np.minimum(_gaps(space, q, block, edge, dz * edge), farthest) for dz in (-HALF, HALF)
-    )
     nearer = (gap + FIRM * edge)[:, None]
     broad = touches(space, q, block, ASIDE * edge, -nearer)
     count = np.maximum(broad.sum(axis=1), 1)
-    return Poised(
-        q,
-        gap,
-        middle=(broad * ASIDE).sum(axis=1) / count * edge,
-        width=count / len(ASIDE),
-        roof=np.clip((lower - upper) / edge, 0.0, 1.0),
+    middle = (broad * ASIDE).sum(axis=1) / count * edge
+    below, above = (
+        np.minimum(_gaps(space, q, block, edge, middle[:, None], dz * edge), NEARER[-1] * edge)
+        for dz in (LOWERED, RAISED)
     )
+    over = np.clip((below - above) / edge, 0.0, 1.0)
+    return Poised(q, gap, middle, count / len(ASIDE), over)
 
 
 def touches(
@@ -95,8 +95,23 @@ def touches(
     return ~free.reshape(n, k)
 
 
-def _gaps(space: FreeSpace, q: Array, block: Array, edge: float, raised: float) -> Array:
-    """How far the block comes nearer until it is touched, (n,), metres; infinite if never."""
+def _gaps(
+    space: FreeSpace, q: Array, block: Array, edge: float, aside: Array, raised: float
+) -> Array:
+    """How far the block comes nearer until it is touched, (n,), metres; infinite if never.
+
+    It is shifted aside, shape (n, 1), and raised, metres.
+    """
     shifts = NEARER * edge
-    touched = touches(space, q, block, np.zeros(1), -shifts, raised)
-    return np.where(touched.any(axis=1), shifts[touched.argmax(axis=1)], np.inf)
+    touched = touches(space, q, block, aside, -shifts, raised)
+    at = touched.argmax(axis=1)
+    far = np.where(touched.any(axis=1), shifts[at], np.inf)
+    some = np.isfinite(far)
+    q, aside, most = q[some], aside[some], far[some]
+    least = np.where(at[some] > 0, shifts[at[some] - 1], 0.0)
+    for _ in range(HALVINGS):
+        between = (least + most) / 2
+        hit = touches(space, q, block, aside, -between[:, None], raised)[:, 0]
+        least, most = np.where(hit, least, between), np.where(hit, between, most)
+    far[some] = most
+    return far

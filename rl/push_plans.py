@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from morphgen.model.dynamics import actuation
 from morphgen.model.kinematics import frame_jacobian
 from morphgen.rl.cartesian import OneTool
-from morphgen.rl.free_ways import FreeWays
+from morphgen.rl.free_ways import FreeWays, Way
 from morphgen.rl.push_contacts import Poised, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
@@ -46,10 +46,50 @@ _LIFT = 1.4
 _PARTING = 0.15, 8
 """Way of the tool in a step away from the block, in edges, and how many steps there may be."""
 _AWAY = ((0.0, -1.0, 0.0), (0.0, -0.7, 0.7), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
-_UNFINISHED, _NARROW, _ROOF = 400.0, 120.0, 150.0
-"""Control steps that it is worth to get all the way, on a broad front, and not from above."""
+_UNFINISHED, _NARROW = 400.0, 120.0
+"""Control steps that it is worth to get all the way, and on a broad front."""
+_OVER, _MOST = 3000.0, 0.1
+"""Control steps that an edge is worth by which the robot leans over the block, and edges from which
+more of it is no worse."""
 _SOFT = 3000.0
 """Control steps that a metre is worth by which the tool gives way to the block's friction."""
+_DEAR, _GROWN = 350.0, 1500
+"""Control steps that a plan takes, or is worth, from which a tree is grown for others, and how many
+times it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Configurations behind the block from which a push begins, a row each."""
+
+    q: Array
+    """Shape (n, dof)."""
+    lifted: Array
+    """The same with the tool above, shape (n, dof)."""
+    position: Array
+    """Of the tool, shape (n, 3), metres."""
+    rotation: Array
+    """Of the tool, shape (n, 3, 3)."""
+    aside: Array
+    """x of the tool less x of the block when it pushes, shape (n,), metres."""
+    gap: Array
+    """How far the tool goes until it touches, shape (n,), metres."""
+    cost: Array
+    """What a push from there takes and what it is worth, in control steps, shape (n,)."""
+
+    def taken(self, rows: NDArray[np.intp]) -> _Ends:
+        """Some of the rows."""
+        return _Ends(*(getattr(self, each.name)[rows] for each in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A way to one of some ends."""
+
+    ends: _Ends
+    way: Way
+    cost: float
+    """Of the way and of what comes after it, control steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,52 +152,99 @@ class PushPlanner:
         Returns:
             The plan that takes the least time, or gets farthest; None if there is none.
         """
-        found = poised(self._space, self._behind(q, block), block, self._edge)
+        start = self._parted(q, block)
+        found = self._by_stops(start, q, block, attempt)
+        if found is None or found.cost > _DEAR:
+            other = self._along_a_tree(start, block, attempt)
+            if found is None or (other and other.cost < found.cost):
+                found = other
+        if found is None:
+            return None
+        ends, i, points = found.ends, found.way.end, found.way.points
+        return Plan(
+            way=points if start is q else (start, *points),
+            rotation=torch.from_numpy(ends.rotation[i]).float(),
+            height=float(ends.position[i, 2]),
+            aside=float(ends.aside[i]),
+            gap=float(ends.gap[i]),
+        )
+
+    def _by_stops(self, start: Array, q: Array, block: Array, attempt: int) -> _Found | None:
+        """The cheapest simple way to the ends that are known."""
+        ends = self._judged(self._behind(q, block), block)
+        order = np.argsort(ends.cost + self._ways.steps(q, ends.q), kind="stable")
+        ends = ends.taken(order[:_KEPT])
+        way = self._ways.find(
+            start, ends.q, vias=ends.lifted, costs=ends.cost, block=block, attempt=attempt
+        )
+        return None if way is None else self._found(start, ends, way)
+
+    def _along_a_tree(self, start: Array, block: Array, attempt: int) -> _Found | None:
+        """A way to ends near configurations that the robot gets to from where it is.
+
+        Others may be out of its reach: links that are in each other's way divide what is free.
+        """
+        tree = self._ways.explored(start, _GROWN, block=block, attempt=attempt)
+        nodes = np.array(tree.nodes)
+        tools, _ = self._tool.poses(nodes)
+        none = np.zeros(0, dtype=np.intp)
+        behind = self._free_behind(*self._near_behind(nodes, tools, block, none), block)
+        ends = self._judged(behind, block)
+        way = self._ways.find_along(tree, ends.q, vias=ends.lifted, costs=ends.cost, block=block)
+        return None if way is None else self._found(start, ends, way)
+
+    def _found(self, start: Array, ends: _Ends, way: Way) -> _Found:
+        cost = float(ends.cost[way.end]) + self._ways.length(start, way)
+        return _Found(ends, way, cost)
+
+    def _judged(self, q: Array, block: Array) -> _Ends:
+        """From which configurations behind the block a push begins, and what it costs."""
+        found = poised(self._space, q, block, self._edge)
         position, rotation = self._tool.poses(found.q)
         aside = position[:, 0] - block[0] - found.middle
         share = self._tried_out(found, position, rotation, aside, block)
-        cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width) + _ROOF * found.roof
-        cost += found.gap / SPEED + _SOFT * self._given_way(found.q)
-        best = np.argsort(cost + self._ways.steps(q, found.q), kind="stable")
-        best = best[share[best] > 0]
-        first = best[:_KEPT]
-        start = self._parted(q, block)
-        vias = self._lifted(found.q[first], position[first], rotation[first])
-        way = self._ways.find(
-            start, found.q[first], vias=vias, costs=cost[first], block=block, attempt=attempt
-        ) or self._ways.find_round_about(start, found.q[best], block=block, attempt=attempt)
-        if way is None:
-            return None
-        i = best[way.end]
-        return Plan(
-            way=way.points if start is q else (start, *way.points),
-            rotation=torch.from_numpy(rotation[i]).float(),
-            height=float(position[i, 2]),
-            aside=float(aside[i]),
-            gap=float(found.gap[i]),
-        )
+        cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width)
+        cost += _OVER * np.minimum(found.over, _MOST) + found.gap / SPEED
+        cost += _SOFT * self._given_way(found.q)
+        lifted = self._lifted(found.q, position, rotation)
+        ends = _Ends(found.q, lifted, position, rotation, aside, found.gap, cost)
+        return ends.taken(np.flatnonzero(share > 0))
 
     def _behind(self, q: Array, block: Array) -> Array:
         """Free configurations with the tool behind the block, shape (n, dof)."""
+        bank = self._ways.unwound(q, self._bank)
+        quick = np.argsort(self._ways.steps(q, bank), kind="stable")[:_QUICKEST]
+        start, goal = self._near_behind(bank, self._tools, block, quick)
+        start[::2, self._others] = q[self._others]
+        start[1::2, self._others] = np.array(self._robot.home)[self._others]
+        return self._ways.unwound(q, self._free_behind(start, goal, block))
+
+    def _near_behind(
+        self, q: Array, tools: Array, block: Array, more: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        """Configurations with the tool near places behind the block, and those places.
+
+        Taken from all (n, dof), whose tools are at (n, 3), and more of them for each place.
+        """
         edge = self._edge
         yaw = 2 * np.arctan2(block[6], block[3])
         hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
-        bank = self._ways.unwound(q, self._bank)
-        quick = np.argsort(self._ways.steps(q, bank), kind="stable")[:_QUICKEST]
         goals, starts = [], []
         for distance in _BEHIND:
             place = np.array([block[0], hindmost - distance * edge])
-            apart = np.linalg.norm(self._tools[:, :2] - place, axis=1)
-            near = np.concatenate([np.argsort(apart, kind="stable")[:_NEAREST], quick])
-            height = np.clip(self._tools[near, 2] - self._ground, _LOW * edge, _HIGH * edge)
+            apart = np.linalg.norm(tools[:, :2] - place, axis=1)
+            apart += np.maximum(tools[:, 2] - self._ground - edge, 0)
+            near = np.concatenate([np.argsort(apart, kind="stable")[:_NEAREST], more])
+            height = np.clip(tools[near, 2] - self._ground, _LOW * edge, _HIGH * edge)
             goals.append(np.column_stack([np.tile(place, (len(near), 1)), self._ground + height]))
-            starts.append(bank[near])
-        start, goal = np.concatenate(starts), np.concatenate(goals)
-        start[::2, self._others] = q[self._others]
-        start[1::2, self._others] = np.array(self._robot.home)[self._others]
+            starts.append(q[near])
+        return np.concatenate(starts), np.concatenate(goals)
+
+    def _free_behind(self, start: Array, goal: Array, block: Array) -> Array:
+        """Configurations that are free with the tool at goals (n, 3), near others (n, dof)."""
         found, error = bring_tool(self._robot, start, goal)
-        there = (np.abs(error[:, :2]) < _REACHED * edge).all(axis=1)
-        found = self._ways.unwound(q, found[there & (np.abs(error[:, 2]) < edge / 2)])
+        there = (np.abs(error[:, :2]) < _REACHED * self._edge).all(axis=1)
+        found = found[there & (np.abs(error[:, 2]) < self._edge / 2)]
         return found[self._space.free(found, np.tile(block, (len(found), 1)))]
 
     def _given_way(self, q: Array) -> Array:

@@ -113,7 +113,8 @@ def test_what_is_explored_is_on_this_side_of_a_wall():
 def test_a_tree_that_cannot_grow_is_its_start():
     bounds, rng = np.array([[0.0, 1.0]]), np.random.default_rng(0)
     found = explored(np.array([0.5]), bounds, np.array([0.1]), lambda a, b: 0.0, rng, 3)
-    assert found.tolist() == [[0.5]] * 3
+    assert np.array(found.nodes).tolist() == [[0.5]]
+    assert found.back(0) == [0.5]
 
 
 def test_tools_are_brought_to_their_goals_and_fingers_are_left_alone(made):

@@ -209,11 +209,11 @@ def test_contacts_are_where_the_block_would_be_touched():
 
     low = found(0.2)
     assert low.q.tolist() == q[:2].tolist()
-    assert low.gap == pytest.approx(0.2, abs=0.04)
+    assert low.gap == pytest.approx(0.2, abs=0.002)
     assert low.middle == pytest.approx([0.0, 0.1], abs=0.05)
     assert low.width == pytest.approx(0.5, abs=0.12)
-    assert low.roof.max() == 0
-    assert found(0.35).roof.min() > 0.5
+    assert low.over.max() == 0
+    assert found(0.35).over.min() > 0.5
 
 
 def test_ways_go_round_what_is_in_between():
