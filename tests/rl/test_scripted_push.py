@@ -1,11 +1,14 @@
 """The scripted push: it plans where nothing is in its way, and blocks get across."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
+from morphgen.benchmark.split_file import read_split
+from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import bounds, forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
@@ -19,7 +22,7 @@ from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematics import tool_frames
 from morphgen.tasks.make import make_batch
-from morphgen.tasks.settings import push_setting, reach_setting
+from morphgen.tasks.settings import member_setting, push_setting, reach_setting
 from morphgen.tasks.sim.base import Block, Scene
 from scenes import robot
 
@@ -216,6 +219,19 @@ def test_contacts_are_where_the_block_would_be_touched():
     assert found(0.35).over.min() > 0.5
 
 
+@pytest.mark.parametrize(("ahead", "over"), [(0.01, 0.025), (0.002, 0.005), (-0.01, 0.0)])
+def test_a_brim_that_is_ahead_leans_over_the_block_by_as_much(ahead, over):
+    """A box that touches the block below its middle, and a brim at its upper edge."""
+    foot = Shape(Box((0.2, 0.1, 0.1)))
+    brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
+    wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
+    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    found = poised(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
+    assert found.over[0] == pytest.approx(over, abs=0.0035)
+
+
 def test_ways_go_round_what_is_in_between():
     wall = Block((0.2, 2.0, 0.4), Pose((0.0, -1.0, 0.2)))
     scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=(wall,))
@@ -295,3 +311,46 @@ def test_a_way_round_about_is_found_where_no_simple_one_is():
     assert all((a == b).all() for a, b in zip(found.points, again.points, strict=True))
     assert ways.find_round_about(start, ends[:1], block=block) is None
     assert ways.find_round_about(start, ends[:0], block=block) is None
+
+
+def test_ends_are_got_to_along_a_tree_if_it_grows_there():
+    """Of two ends the cheaper is behind a wall without a gap."""
+    walls = (
+        Block((0.1, 4.5, 0.4), Pose((0.5, 0.0, 0.2))),
+        Block((0.1, 1.0, 0.4), Pose((-0.3, 0.0, 0.2))),
+    )
+    scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls)
+    space = FreeSpace(scene)
+    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
+    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
+    start, ends = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [-1.0, 0.0]])
+    tree = ways.explored(start, 400, block=block)
+    assert max(q[0] for q in tree.nodes) < 0.5
+    costs = np.array([0.0, 500.0])
+    found = ways.find_along(tree, ends, vias=ends, costs=costs, block=block)
+    assert found.end == 1
+    assert found.points[-1].tolist() == [-1.0, 0.0]
+    for a, b in pairwise((start, *found.points)):
+        assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).mean() > 0.95
+    assert ways.length(start, found) >= 50
+    assert ways.find_along(tree, ends[:1], vias=ends, costs=costs[:1], block=block) is None
+    none = np.zeros((0, 2))
+    assert ways.find_along(tree, none, vias=none, costs=np.zeros(0), block=block) is None
+
+
+@pytest.mark.slow
+def test_arms_in_each_others_way_push_below_the_middle(tmp_path):
+    """Starts of YuMi from which no simple way leads behind the block."""
+    members = read_split("extrapolation/arms/push").train
+    member = next(each for each in members if each.name == "yumi")
+    setting = member_setting(replace(member, obstacles=False), default_library(()), cache=tmp_path)
+    bodies = bodies_of([setting.robot])
+    planner = PushPlanner(setting, bodies, 0, np.random.default_rng(0))
+    space, edge = FreeSpace(setting.scene), setting.pushes.block.size[0]
+    over = []
+    for i in (3, 4, 29, 31, 36, 39):
+        plan = planner.plan(setting.pushes.q[i], setting.pushes.blocks[i])
+        if plan is not None:
+            block = setting.pushes.blocks[i]
+            over += poised(space, plan.way[-1][None], block, edge).over.tolist()
+    assert (np.array(over) < 0.05).sum() >= 5
