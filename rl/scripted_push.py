@@ -35,7 +35,7 @@ PROGRESS = 0.3
 """How far that is at least, in edges of the block."""
 LOST = 0.7
 """Distance aside of tool and block from which it is lost, in edges of the block."""
-ASTRAY = 1.0
+ASTRAY = 2.0
 """Distance aside of the block from where the push began from which it goes astray, in its edges."""
 UNDERWAY = 10
 """Control steps of a push before which it is not."""
