@@ -13,6 +13,7 @@ from morphgen.rl.free_ways import Routes, shares_to
 from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.settings import Setting
 
@@ -31,8 +32,8 @@ SETTLE = 15
 """Control steps in which joints may get there."""
 PATIENCE = 40
 """Control steps in which the block has to get on before a new plan is made."""
-PROGRESS = 0.3
-"""How far that is at least, in edges of the block."""
+PROGRESS = MOVES * PATIENCE * CONTROL_PERIOD
+"""How far that is at least, metres."""
 LOST = 0.7
 """Distance aside of tool and block from which it is lost, in edges of the block."""
 ASTRAY = 2.0
@@ -179,7 +180,7 @@ def _watched(
     state.settled = torch.where(final, state.settled + 1, state.settled)
     arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
     state.pushing = state.pushing | (final & (arrived | (state.settled > SETTLE)))
-    ahead = block[:, 1] > state.best + PROGRESS * state.edge
+    ahead = block[:, 1] > state.best + PROGRESS
     state.best = torch.where(ahead, block[:, 1], state.best)
     state.still = torch.where(ahead | ~state.pushing, 0, state.still + 1)
     off = (tool[:, 0] - block[:, 0] - state.aside).abs()
