@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from morphgen.model.kinematics import bounds
 from morphgen.model.robot import Robot
-from morphgen.rl.connect import Tree, connected, explored, shortened
+from morphgen.rl.connect import FreePart, Tree, connected, explored, shortened
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
@@ -107,12 +107,12 @@ class FreeWays:
         Returns:
             None if no way is free.
         """
-        known: dict[bytes, bool] = {}
+        known: dict[bytes, float] = {}
 
-        def free(a: Array, b: Array) -> bool:
+        def free_part(a: Array, b: Array) -> float:
             key = a.tobytes() + b.tobytes()
             if key not in known:
-                known[key] = self._free_part(a, b, block) == 1
+                known[key] = self._free_part(a, b, block)
             return known[key]
 
         first = STOPS * (attempt % ATTEMPTS)
@@ -120,17 +120,13 @@ class FreeWays:
         stops = [np.where(self._moves, stop, start) for stop in drawn]
         ways = self._ways(start, ends, vias, stops, costs)
         for _, way in sorted(ways, key=lambda each: each[0]):
-            points = (start, *way.points)
-            # From the end: there the room is least.
-            if all(free(a, b) for a, b in zip(points[:0:-1], points[-2::-1], strict=True)):
+            if _all_free((start, *way.points), free_part):
                 return way
         return None
 
-    def find_round_about(
-        self, start: Array, ends: Array, *, block: Array | None = None, attempt: int = 0
-    ) -> Way | None:
+    def find_round_about(self, start: Array, ends: Array, *, attempt: int = 0) -> Way | None:
         """Any free way to one of several ends; see ``connected``. Arguments as of ``find``."""
-        free_part = partial(self._free_part, block=block)
+        free_part = partial(self._free_part, block=None)
         rng = np.random.default_rng([self._seed, attempt])
         found = connected(start, ends, self._within(start), self._step, free_part, rng)
         if found is None:
@@ -166,11 +162,7 @@ class FreeWays:
         free_part = partial(self._free_part, block=block)
         for i in np.argsort(costs + far, kind="stable").tolist():
             for last in ((ends[i],), (vias[i], ends[i])):
-                legs = [tree.nodes[near[i]], *last]
-                # From the end: there the room is least.
-                if all(
-                    free_part(b, a) == 1 for a, b in zip(legs[-2::-1], legs[:0:-1], strict=True)
-                ):
+                if _all_free((tree.nodes[near[i]], *last), free_part):
                     way = [*tree.back(near[i])[::-1], *last]
                     rng = np.random.default_rng([self._seed, i])
                     return Way(tuple(shortened(way, free_part, rng)[1:]), i)
@@ -207,6 +199,11 @@ class FreeWays:
         way = start + np.linspace(0, 1, parts)[:, None] * (end - start)
         free = self._space.free(way, None if block is None else np.tile(block, (parts, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (parts - 1)
+
+
+def _all_free(points: Sequence[Array], free_part: FreePart) -> bool:
+    """Whether straight lines through configurations are free; from the end, where room is least."""
+    return all(free_part(b, a) == 1 for a, b in zip(points[-2::-1], points[:0:-1], strict=True))
 
 
 def whole_turns(robot: Robot) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +40,6 @@ class Poised:
     """How much earlier the robot touches what is above the block's middle, or just above the block,
     than what is below, 0 to 1, in its edges. What leans over a block presses it to the ground, or
     tips it over. Shape (n,)."""
-
-    def taken(self, rows: NDArray[np.intp]) -> Poised:
-        """Some of the rows."""
-        return Poised(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
 def poised(space: FreeSpace, q: Array, block: Array, edge: float) -> Poised:

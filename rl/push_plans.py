@@ -64,8 +64,6 @@ class _Ends:
 
     q: Array
     """Shape (n, dof)."""
-    lifted: Array
-    """The same with the tool above, shape (n, dof)."""
     position: Array
     """Of the tool, shape (n, 3), metres."""
     rotation: Array
@@ -175,7 +173,7 @@ class PushPlanner:
         order = np.argsort(ends.cost + self._ways.steps(q, ends.q), kind="stable")
         ends = ends.taken(order[:_KEPT])
         way = self._ways.find(
-            start, ends.q, vias=ends.lifted, costs=ends.cost, block=block, attempt=attempt
+            start, ends.q, vias=self._lifted(ends), costs=ends.cost, block=block, attempt=attempt
         )
         return None if way is None else self._found(start, ends, way)
 
@@ -190,7 +188,9 @@ class PushPlanner:
         none = np.zeros(0, dtype=np.intp)
         behind = self._free_behind(*self._near_behind(nodes, tools, block, none), block)
         ends = self._judged(behind, block)
-        way = self._ways.find_along(tree, ends.q, vias=ends.lifted, costs=ends.cost, block=block)
+        way = self._ways.find_along(
+            tree, ends.q, vias=self._lifted(ends), costs=ends.cost, block=block
+        )
         return None if way is None else self._found(start, ends, way)
 
     def _found(self, start: Array, ends: _Ends, way: Way) -> _Found:
@@ -206,8 +206,7 @@ class PushPlanner:
         cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width)
         cost += _OVER * np.minimum(found.over, _MOST) + found.gap / SPEED
         cost += _SOFT * self._given_way(found.q)
-        lifted = self._lifted(found.q, position, rotation)
-        ends = _Ends(found.q, lifted, position, rotation, aside, found.gap, cost)
+        ends = _Ends(found.q, position, rotation, aside, found.gap, cost)
         return ends.taken(np.flatnonzero(share > 0))
 
     def _behind(self, q: Array, block: Array) -> Array:
@@ -279,12 +278,12 @@ class PushPlanner:
         begun = share * through > found.gap + 0.1 * edge
         return np.where(begun, share, 0.0)
 
-    def _lifted(self, ends: Array, position: Array, rotation: Array) -> Array:
+    def _lifted(self, ends: _Ends) -> Array:
         """Configurations with the tool above, or as high as it gets, shape (n, dof)."""
-        goal, q = position.copy(), ends
+        goal, q = ends.position.copy(), ends.q
         for _ in range(5):
             goal[:, 2] += _LIFT * self._edge / 5
-            q = self._tool.brought(q, goal, rotation, 3)
+            q = self._tool.brought(q, goal, ends.rotation, 3)
         return q
 
     def _parted(self, q: Array, block: Array) -> Array:

@@ -300,17 +300,16 @@ def test_a_way_round_about_is_found_where_no_simple_one_is():
     scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls)
     space = FreeSpace(scene)
     ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
-    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
     start, ends = np.array([0.2, 0.0]), np.array([[0.5, 0.0], [1.0, 0.0]])
-    found = ways.find_round_about(start, ends, block=block)
+    found = ways.find_round_about(start, ends)
     assert found.end == 1
     assert found.points[-1].tolist() == [1.0, 0.0]
     for a, b in pairwise((start, *found.points)):
         assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).all()
-    again = ways.find_round_about(start, ends, block=block)
+    again = ways.find_round_about(start, ends)
     assert all((a == b).all() for a, b in zip(found.points, again.points, strict=True))
-    assert ways.find_round_about(start, ends[:1], block=block) is None
-    assert ways.find_round_about(start, ends[:0], block=block) is None
+    assert ways.find_round_about(start, ends[:1]) is None
+    assert ways.find_round_about(start, ends[:0]) is None
 
 
 def test_ends_are_got_to_along_a_tree_if_it_grows_there():
