@@ -19,6 +19,8 @@ from morphgen.tasks.free_space import FreeSpace
 
 Array = NDArray[np.float64]
 
+ALONG = 6
+"""Free ways along a tree that are compared."""
 GROWN = 12
 """Times that a tree grows for every configuration that is drawn from it."""
 STOPS = 12
@@ -152,21 +154,27 @@ class FreeWays:
     def find_along(
         self, tree: Tree, ends: Array, *, vias: Array, costs: Array, block: Array
     ) -> Way | None:
-        """A free way along a tree to the first of several ends that has one.
+        """A free way along a tree to one of several ends.
 
         Arguments as of ``find``. Ends that cost less come first, how far they are from the tree
-        counted, by way of a configuration of the tree each, and of the end's via if need be.
+        counted, by way of a configuration of the tree each, and of the end's via if need be; of
+        the first ``ALONG`` ways that are free it is the one that costs least.
         """
         near = [tree.nearest(end) for end in ends]
         far = self.steps(np.array([tree.nodes[i] for i in near]), ends) if near else costs
         free_part = partial(self._free_part, block=block)
+        found: list[tuple[float, Way]] = []
         for i in np.argsort(costs + far, kind="stable").tolist():
+            if len(found) == ALONG:
+                break
             for last in ((ends[i],), (vias[i], ends[i])):
                 if _all_free((tree.nodes[near[i]], *last), free_part):
-                    way = [*tree.back(near[i])[::-1], *last]
+                    points = [*tree.back(near[i])[::-1], *last]
                     rng = np.random.default_rng([self._seed, i])
-                    return Way(tuple(shortened(way, free_part, rng)[1:]), i)
-        return None
+                    way = Way(tuple(shortened(points, free_part, rng)[1:]), i)
+                    found.append((costs[i] + self.length(points[0], way), way))
+                    break
+        return min(found, key=lambda each: each[0])[1] if found else None
 
     def length(self, start: Array, way: Way) -> float:
         """Control steps that a way takes from a start, shape (dof,)."""

@@ -51,19 +51,35 @@ def poised(space: FreeSpace, q: Array, block: Array, edge: float) -> Poised:
         block: Pose of the block, shape (7,).
         edge: Of the block, metres.
     """
-    gap = _gaps(space, q, block, edge, np.zeros((len(q), 1)), 0.0)
+    gap = _gaps(space, q, np.tile(block, (len(q), 1)), edge, 0.0)
     some = np.isfinite(gap)
     q, gap = q[some], gap[some]
     nearer = (gap + FIRM * edge)[:, None]
     broad = touches(space, q, block, ASIDE * edge, -nearer)
     count = np.maximum(broad.sum(axis=1), 1)
     middle = (broad * ASIDE).sum(axis=1) / count * edge
+    blocks = np.tile(block, (len(q), 1))
+    blocks[:, 0] += middle
+    return Poised(q, gap, middle, count / len(ASIDE), leaning(space, q, blocks, edge))
+
+
+def leaning(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
+    """How far configurations lean over the block that they touch if they go along y.
+
+    Args:
+        space: What is free, with the block.
+        q: Configurations free of it, shape (n, dof).
+        blocks: Its pose, one for each, shape (n, 7).
+        edge: Of the block, metres.
+
+    Returns:
+        ``Poised.over``, shape (n,).
+    """
     below, above = (
-        np.minimum(_gaps(space, q, block, edge, middle[:, None], dz * edge), NEARER[-1] * edge)
+        np.minimum(_gaps(space, q, blocks, edge, dz * edge), NEARER[-1] * edge)
         for dz in (LOWERED, RAISED)
     )
-    over = np.clip((below - above) / edge, 0.0, 1.0)
-    return Poised(q, gap, middle, count / len(ASIDE), over)
+    return np.clip((below - above) / edge, 0.0, 1.0)
 
 
 def touches(
@@ -74,7 +90,7 @@ def touches(
     Args:
         space: What is free, with the block.
         q: Shape (n, dof).
-        block: Pose of the block, shape (7,).
+        block: Pose of the block, shape (7,), or one for each, (n, 7).
         dx: Shifts along x, shape (n, k) or one that broadcasts to it, metres.
         dy: Shifts along y, likewise.
         dz: Shift along z.
@@ -83,7 +99,7 @@ def touches(
         Shape (n, k).
     """
     n, k = len(q), max(dx.shape[-1], dy.shape[-1])
-    blocks = np.tile(block, (n, k, 1))
+    blocks = np.broadcast_to(block.reshape(-1, 1, 7), (n, k, 7)).copy()
     blocks[..., 0] += dx
     blocks[..., 1] += dy
     blocks[..., 2] += dz
@@ -91,23 +107,18 @@ def touches(
     return ~free.reshape(n, k)
 
 
-def _gaps(
-    space: FreeSpace, q: Array, block: Array, edge: float, aside: Array, raised: float
-) -> Array:
-    """How far the block comes nearer until it is touched, (n,), metres; infinite if never.
-
-    It is shifted aside, shape (n, 1), and raised, metres.
-    """
-    shifts = NEARER * edge
-    touched = touches(space, q, block, aside, -shifts, raised)
+def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, raised: float) -> Array:
+    """How far blocks (n, 7) come nearer until they are touched, (n,), metres; infinite if never."""
+    shifts, none = NEARER * edge, np.zeros(1)
+    touched = touches(space, q, blocks, none, -shifts, raised)
     at = touched.argmax(axis=1)
     far = np.where(touched.any(axis=1), shifts[at], np.inf)
     some = np.isfinite(far)
-    q, aside, most = q[some], aside[some], far[some]
+    q, blocks, most = q[some], blocks[some], far[some]
     least = np.where(at[some] > 0, shifts[at[some] - 1], 0.0)
     for _ in range(HALVINGS):
         between = (least + most) / 2
-        hit = touches(space, q, block, aside, -between[:, None], raised)[:, 0]
+        hit = touches(space, q, blocks, none, -between[:, None], raised)[:, 0]
         least, most = np.where(hit, least, between), np.where(hit, between, most)
     far[some] = most
     return far

@@ -12,7 +12,7 @@ from morphgen.model.dynamics import actuation
 from morphgen.model.kinematics import frame_jacobian
 from morphgen.rl.cartesian import OneTool
 from morphgen.rl.free_ways import FreeWays, Way
-from morphgen.rl.push_contacts import Poised, poised, touches
+from morphgen.rl.push_contacts import Poised, leaning, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.inverse_kinematics import bring_tool
@@ -33,10 +33,10 @@ the joints get soonest."""
 _LOW, _HIGH = 0.2, 0.45
 """Heights of the tool that are aimed at, in edges: pushed above its middle, a block with a friction
 of 1 tips over."""
-_KEPT = 14
+_KEPT = 24
 """Configurations behind the block to which simple ways are looked for."""
-_POINTS = 12
-"""Of a push, at which it is tried out."""
+_POINTS, _LOOKED = 12, 3
+"""Of a push, at which it is tried out, and every how many of them it is looked how far it leans."""
 _REACHED = 0.02
 """Distance from a point that counts as there, in edges."""
 _TOLERANCE = (0.3, 0.4)
@@ -202,9 +202,9 @@ class PushPlanner:
         found = poised(self._space, q, block, self._edge)
         position, rotation = self._tool.poses(found.q)
         aside = position[:, 0] - block[0] - found.middle
-        share = self._tried_out(found, position, rotation, aside, block)
+        share, over = self._tried_out(found, position, rotation, aside, block)
         cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width)
-        cost += _OVER * np.minimum(found.over, _MOST) + found.gap / SPEED
+        cost += _OVER * np.minimum(over, _MOST) + found.gap / SPEED
         cost += _SOFT * self._given_way(found.q)
         ends = _Ends(found.q, position, rotation, aside, found.gap, cost)
         return ends.taken(np.flatnonzero(share > 0))
@@ -253,8 +253,8 @@ class PushPlanner:
 
     def _tried_out(
         self, found: Poised, position: Array, rotation: Array, aside: Array, block: Array
-    ) -> Array:
-        """Which share of the push configurations get through, shape (n,).
+    ) -> tuple[Array, Array]:
+        """Which share of the push configurations get through, and how far they lean over, (n,).
 
         The tool is taken along its way as it will be; where the block then is, it is to be near,
         and not in the way.
@@ -262,6 +262,7 @@ class PushPlanner:
         edge, q = self._edge, found.q
         through = found.gap + self._line - block[1] + 0.1 * edge
         good, share = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
+        over = found.over.copy()
         for i in range(1, _POINTS + 1):
             ahead = through * i / _POINTS
             goal = position.copy()
@@ -275,8 +276,13 @@ class PushPlanner:
             near, far = touches(self._space, q, block, np.zeros(1), shifts).T
             good &= (near & ~far) | (ahead < found.gap)
             share[good] = i / _POINTS
+            if i % _LOOKED == 0:
+                at = np.flatnonzero(good)
+                blocks = np.tile(block, (len(at), 1))
+                blocks[:, 1] += moved[at, 0] + _TOLERANCE[1] * edge
+                over[at] = np.maximum(over[at], leaning(self._space, q[at], blocks, edge))
         begun = share * through > found.gap + 0.1 * edge
-        return np.where(begun, share, 0.0)
+        return np.where(begun, share, 0.0), over
 
     def _lifted(self, ends: _Ends) -> Array:
         """Configurations with the tool above, or as high as it gets, shape (n, dof)."""

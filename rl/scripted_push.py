@@ -36,7 +36,7 @@ PROGRESS = MOVES * PATIENCE * CONTROL_PERIOD
 """How far that is at least, metres."""
 LOST = 0.7
 """Distance aside of tool and block from which it is lost, in edges of the block."""
-ASTRAY = 2.0
+ASTRAY = 1.5
 """Distance aside of the block from where the push began from which it goes astray, in its edges."""
 UNDERWAY = 10
 """Control steps of a push before which it is not."""

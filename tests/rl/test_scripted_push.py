@@ -12,9 +12,10 @@ from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import bounds, forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.rl import push_plans
 from morphgen.rl.cartesian import OneTool, towards
 from morphgen.rl.free_ways import FreeWays, whole_turns
-from morphgen.rl.push_contacts import poised
+from morphgen.rl.push_contacts import leaning, poised
 from morphgen.rl.push_plans import PushPlanner
 from morphgen.rl.scripted_push import PLANS, ScriptedPush
 from morphgen.tasks.bodies import bodies_of
@@ -142,6 +143,26 @@ def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
         assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
 
 
+def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
+    """Configurations near the first plan's last one are said to, on the way of the push."""
+    setting = push_setting(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
+    planner = PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
+    q, block = setting.pushes.q[0], setting.pushes.blocks[0]
+    first = planner.plan(q, block).way[-1]
+
+    def near(configurations):
+        return np.abs(configurations - first).max(axis=-1) < 1.0
+
+    def said(space, configurations, blocks, edge):
+        assert blocks.shape == (len(configurations), 7)
+        assert (blocks[:, 1] > block[1]).all()
+        return near(configurations).astype(float)
+
+    monkeypatch.setattr(push_plans, "leaning", said)
+    assert near(first)
+    assert not near(planner.plan(q, block).way[-1])
+
+
 def test_a_setting_of_another_task_is_refused(tmp_path):
     setting = reach_setting(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
@@ -230,6 +251,11 @@ def test_a_brim_that_is_ahead_leans_over_the_block_by_as_much(ahead, over):
     found = poised(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
     assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
     assert found.over[0] == pytest.approx(over, abs=0.0035)
+
+    beyond = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
+    each = leaning(FreeSpace(scene), np.array([[0.0, -0.5]] * 2), beyond, 0.4)
+    assert each[0] == found.over[0]
+    assert each[1] == 0
 
 
 def test_ways_go_round_what_is_in_between():
@@ -335,6 +361,19 @@ def test_ends_are_got_to_along_a_tree_if_it_grows_there():
     assert ways.find_along(tree, ends[:1], vias=ends, costs=costs[:1], block=block) is None
     none = np.zeros((0, 2))
     assert ways.find_along(tree, none, vias=none, costs=np.zeros(0), block=block) is None
+
+
+def test_of_the_ways_along_a_tree_it_is_the_one_that_costs_least():
+    """Not the one to the end that costs least itself, which is far."""
+    space = FreeSpace(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1))))
+    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
+    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
+    tree = ways.explored(np.array([0.0, 0.0]), 400, block=block)
+    ends, costs = np.array([[1.8, 1.8], [0.3, 0.0]]), np.array([0.0, 40.0])
+    found = ways.find_along(tree, ends, vias=ends, costs=costs, block=block)
+    assert found.end == 1
+    found = ways.find_along(tree, ends, vias=ends, costs=3 * costs, block=block)
+    assert found.end == 0
 
 
 @pytest.mark.slow
