@@ -79,7 +79,7 @@ def leaning(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
         np.minimum(_gaps(space, q, blocks, edge, dz * edge), NEARER[-1] * edge)
         for dz in (LOWERED, RAISED)
     )
-    return np.clip((below - above) / edge, 0.0, 1.0)
+    return np.asarray(np.clip((below - above) / edge, 0.0, 1.0))
 
 
 def touches(
