@@ -29,6 +29,8 @@ ATTEMPTS = 4
 """Times that these are others."""
 STRIDE = 0.05
 """Largest change of a joint between configurations of a way that are tested, rad or m."""
+LATE, TOO_LATE = 20.0, 400.0
+"""Control steps that one is worth by which a way is late, and that it is worth at most."""
 LEGS = 24
 """Of a way that is followed, at most."""
 NEAR = 1.01 * min(share for share in BINS if share > 0)
@@ -43,6 +45,21 @@ class Way:
     """Configurations to go through in straight lines, the end among them, each (dof,)."""
     end: int
     """Which of the ends it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Price:
+    """What ways to several ends are worth, in control steps."""
+
+    after: Array
+    """What it is worth to go on from each end, shape (n,)."""
+    left: Array
+    """In how many a way has to be at each end, shape (n,)."""
+
+    def of(self, steps: Array | float, ends: int | slice = slice(None)) -> Array:
+        """Of ways that take so many control steps, to all ends, shape (n,), or to one, ()."""
+        late = np.maximum(steps - self.left[ends], 0)
+        return steps + self.after[ends] + np.minimum(LATE * late, TOO_LATE)
 
 
 class FreeWays:
@@ -92,7 +109,7 @@ class FreeWays:
         ends: Array,
         *,
         vias: Array | None = None,
-        costs: Array | None = None,
+        price: Price | None = None,
         block: Array | None = None,
         attempt: int = 0,
     ) -> Way | None:
@@ -102,7 +119,7 @@ class FreeWays:
             start: Where it begins, shape (dof,).
             ends: Where it may end, shape (n, dof).
             vias: By way of which each end may also be reached, shape (n, dof).
-            costs: What it costs to go on from each end, in control steps, shape (n,).
+            price: What ways are worth; by default the control steps that they take.
             block: Where the block is, shape (7,); nowhere without.
             attempt: Which stops there are: others for the next ``ATTEMPTS`` numbers.
 
@@ -120,7 +137,8 @@ class FreeWays:
         first = STOPS * (attempt % ATTEMPTS)
         drawn = self.unwound(start, np.array([self._home, *self._stops[first : first + STOPS]]))
         stops = [np.where(self._moves, stop, start) for stop in drawn]
-        ways = self._ways(start, ends, vias, stops, costs)
+        price = price or Price(np.zeros(len(ends)), np.full(len(ends), np.inf))
+        ways = self._ways(start, ends, vias, stops, price)
         for _, way in sorted(ways, key=lambda each: each[0]):
             if _all_free((start, *way.points), free_part):
                 return way
@@ -152,7 +170,7 @@ class FreeWays:
         return nodes[np.random.default_rng([self._seed, attempt]).integers(len(nodes), size=count)]
 
     def find_along(
-        self, tree: Tree, ends: Array, *, vias: Array, costs: Array, block: Array
+        self, tree: Tree, ends: Array, *, vias: Array, price: Price, block: Array
     ) -> Way | None:
         """A free way along a tree to one of several ends.
 
@@ -161,10 +179,10 @@ class FreeWays:
         the first ``ALONG`` ways that are free it is the one that costs least.
         """
         near = [tree.nearest(end) for end in ends]
-        far = self.steps(np.array([tree.nodes[i] for i in near]), ends) if near else costs
+        far = self.steps(np.array([tree.nodes[i] for i in near]), ends) if near else price.after
         free_part = partial(self._free_part, block=block)
         found: list[tuple[float, Way]] = []
-        for i in np.argsort(costs + far, kind="stable").tolist():
+        for i in np.argsort(price.after + far, kind="stable").tolist():
             if len(found) == ALONG:
                 break
             for last in ((ends[i],), (vias[i], ends[i])):
@@ -172,7 +190,7 @@ class FreeWays:
                     points = [*tree.back(near[i])[::-1], *last]
                     rng = np.random.default_rng([self._seed, i])
                     way = Way(tuple(shortened(points, free_part, rng)[1:]), i)
-                    found.append((costs[i] + self.length(points[0], way), way))
+                    found.append((float(price.of(self.length(points[0], way), i)), way))
                     break
         return min(found, key=lambda each: each[0])[1] if found else None
 
@@ -191,7 +209,7 @@ class FreeWays:
         ends: Array,
         vias: Array | None,
         stops: Sequence[Array],
-        costs: Array | None,
+        price: Price,
     ) -> Iterator[tuple[float, Way]]:
         """All ways there may be, with what they cost."""
         for i, end in enumerate(ends):
@@ -199,7 +217,7 @@ class FreeWays:
             for before in ((), *((stop,) for stop in stops)):
                 for last in lasts:
                     way = Way((*before, *last), i)
-                    yield self.length(start, way) + (0.0 if costs is None else costs[i]), way
+                    yield float(price.of(self.length(start, way), i)), way
 
     def _free_part(self, start: Array, end: Array, block: Array | None) -> float:
         """Which part of the straight way between two configurations is free, from the start."""

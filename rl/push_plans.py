@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from morphgen.model.dynamics import actuation
 from morphgen.model.kinematics import frame_jacobian
 from morphgen.rl.cartesian import OneTool
-from morphgen.rl.free_ways import FreeWays, Way
+from morphgen.rl.free_ways import FreeWays, Price, Way
 from morphgen.rl.push_contacts import Poised, leaning, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
@@ -53,6 +53,8 @@ _OVER, _MOST = 3000.0, 0.1
 more of it is no worse."""
 _SOFT = 3000.0
 """Control steps that a metre is worth by which the tool gives way to the block's friction."""
+_SETTLED = 25
+"""Control steps that a push takes besides those of its way, until arm and block are at speed."""
 _DEAR, _GROWN = 350.0, 1500
 """Control steps that a plan takes, or is worth, from which a tree is grown for others, and how many
 times it is."""
@@ -73,7 +75,13 @@ class _Ends:
     gap: Array
     """How far the tool goes until it touches, shape (n,), metres."""
     cost: Array
-    """What a push from there takes and what it is worth, in control steps, shape (n,)."""
+    """What a push from there is worth, in control steps, shape (n,)."""
+    steps: Array
+    """Control steps that it takes, shape (n,)."""
+
+    def price(self, left: float) -> Price:
+        """Of ways to them, if the push is to be over in so many control steps."""
+        return Price(self.cost, left - self.steps)
 
     def taken(self, rows: NDArray[np.intp]) -> _Ends:
         """Some of the rows."""
@@ -139,21 +147,22 @@ class PushPlanner:
         high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
         self._bank, self._tools = free_within(self._space, low, high, rng)
 
-    def plan(self, q: Array, block: Array, attempt: int = 0) -> Plan | None:
+    def plan(self, q: Array, block: Array, attempt: int = 0, left: float = np.inf) -> Plan | None:
         """Look for a way to push.
 
         Args:
             q: Where the joints are, shape (dof,).
             block: Pose of the block, shape (7,).
             attempt: How many plans were made before; each goes by way of other configurations.
+            left: Control steps until the episode ends. Plans that take longer come last.
 
         Returns:
             The plan that takes the least time, or gets farthest; None if there is none.
         """
         start = self._parted(q, block)
-        found = self._by_stops(start, q, block, attempt)
+        found = self._by_stops(start, q, block, attempt, left)
         if found is None or found.cost > _DEAR:
-            other = self._along_a_tree(start, block, attempt)
+            other = self._along_a_tree(start, block, attempt, left)
             if found is None or (other and other.cost < found.cost):
                 found = other
         if found is None:
@@ -167,17 +176,22 @@ class PushPlanner:
             gap=float(ends.gap[i]),
         )
 
-    def _by_stops(self, start: Array, q: Array, block: Array, attempt: int) -> _Found | None:
+    def free(self, q: Array) -> NDArray[np.bool_]:
+        """Whether configurations (n, dof) are free of all but the block, shape (n,)."""
+        return self._space.free(q)
+
+    def _by_stops(
+        self, start: Array, q: Array, block: Array, attempt: int, left: float
+    ) -> _Found | None:
         """The cheapest simple way to the ends that are known."""
         ends = self._judged(self._behind(q, block), block)
-        order = np.argsort(ends.cost + self._ways.steps(q, ends.q), kind="stable")
+        order = np.argsort(ends.price(left).of(self._ways.steps(q, ends.q)), kind="stable")
         ends = ends.taken(order[:_KEPT])
-        way = self._ways.find(
-            start, ends.q, vias=self._lifted(ends), costs=ends.cost, block=block, attempt=attempt
-        )
-        return None if way is None else self._found(start, ends, way)
+        price, vias = ends.price(left), self._lifted(ends)
+        way = self._ways.find(start, ends.q, vias=vias, price=price, block=block, attempt=attempt)
+        return None if way is None else self._found(start, ends, way, price)
 
-    def _along_a_tree(self, start: Array, block: Array, attempt: int) -> _Found | None:
+    def _along_a_tree(self, start: Array, block: Array, attempt: int, left: float) -> _Found | None:
         """A way to ends near configurations that the robot gets to from where it is.
 
         Others may be out of its reach: links that are in each other's way divide what is free.
@@ -188,14 +202,12 @@ class PushPlanner:
         none = np.zeros(0, dtype=np.intp)
         behind = self._free_behind(*self._near_behind(nodes, tools, block, none), block)
         ends = self._judged(behind, block)
-        way = self._ways.find_along(
-            tree, ends.q, vias=self._lifted(ends), costs=ends.cost, block=block
-        )
-        return None if way is None else self._found(start, ends, way)
+        price, vias = ends.price(left), self._lifted(ends)
+        way = self._ways.find_along(tree, ends.q, vias=vias, price=price, block=block)
+        return None if way is None else self._found(start, ends, way, price)
 
-    def _found(self, start: Array, ends: _Ends, way: Way) -> _Found:
-        cost = float(ends.cost[way.end]) + self._ways.length(start, way)
-        return _Found(ends, way, cost)
+    def _found(self, start: Array, ends: _Ends, way: Way, price: Price) -> _Found:
+        return _Found(ends, way, float(price.of(self._ways.length(start, way), way.end)))
 
     def _judged(self, q: Array, block: Array) -> _Ends:
         """From which configurations behind the block a push begins, and what it costs."""
@@ -206,7 +218,8 @@ class PushPlanner:
         cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width)
         cost += _OVER * np.minimum(over, _MOST) + found.gap / SPEED
         cost += _SOFT * self._given_way(found.q)
-        ends = _Ends(found.q, position, rotation, aside, found.gap, cost)
+        steps = (found.gap + self._line - block[1]) / SPEED + _SETTLED
+        ends = _Ends(found.q, position, rotation, aside, found.gap, cost, steps)
         return ends.taken(np.flatnonzero(share > 0))
 
     def _behind(self, q: Array, block: Array) -> Array:

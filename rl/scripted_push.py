@@ -40,13 +40,17 @@ ASTRAY = 1.5
 """Distance aside of the block from where the push began from which it goes astray, in its edges."""
 UNDERWAY = 10
 """Control steps of a push before which it is not."""
+RISE = 0.003
+"""How much higher the tool goes in a control step in which the arm would be in the ground, or in
+whatever else is in its way, metres. Where a block goes aside, it soon is."""
 
 
 class ScriptedPush:
     """Gets behind the block, pushes it along y, and plans again where that fails.
 
     The plan (``PushPlanner``) is made of collision tests and kinematics alone; the push is closed
-    loop: the tool goes along y, its height and rotation held, and follows the block aside.
+    loop: the tool goes along y, its rotation held, and its height where there is room, and follows
+    the block aside.
     Environments that do not push stand still.
     """
 
@@ -76,10 +80,21 @@ class ScriptedPush:
         failed = _watched(state, task, block, tool) | (task.pushes & ~state.active)
         for env in torch.nonzero(new | (failed & (state.plans < PLANS)))[:, 0].tolist():
             self._plan(state, task, env, block[env])
+        state.height += torch.where(self._blocked(state, task), RISE, 0.0)
         pushed = _pushed(state, task, block, tool)
         wanted = torch.where(state.pushing[:, None], pushed, state.routes.wanted)
         wanted = torch.where(state.active[:, None], wanted, task.targets)
         return actions_of(shares_to(task, wanted), task.kind)
+
+    def _blocked(self, state: _State, task: TaskBatch) -> torch.Tensor:
+        """Whether arms that push are to be where something is in their way, shape (n,), bool."""
+        found = torch.zeros_like(state.active)
+        for index, planner in self._planners.items():
+            rows = torch.nonzero(state.active & state.pushing & (task.body == index))[:, 0]
+            dof = task.settings[index].robot.dof
+            q = task.targets[rows, :dof].double().cpu().numpy()
+            found[rows] = ~torch.from_numpy(planner.free(q)).to(found.device)
+        return found
 
     def _plan(self, state: _State, task: TaskBatch, env: int, block: torch.Tensor) -> None:
         index = int(task.body[env])
@@ -88,7 +103,8 @@ class ScriptedPush:
             self._planners[index] = PushPlanner(task.settings[index], task.bodies, index, rng)
         q = task.targets[env, : task.settings[index].robot.dof].double().cpu().numpy()
         attempt = int(state.plans[env])
-        plan = self._planners[index].plan(q, block.double().cpu().numpy(), attempt)
+        left = int(task.longest[env] - task.elapsed[env])
+        plan = self._planners[index].plan(q, block.double().cpu().numpy(), attempt, left)
         state.plans[env] += 1
         state.active[env] = plan is not None
         state.pushing[env] = False

@@ -14,19 +14,20 @@ from morphgen.model.kinematics import bounds, forward_kinematics, random_configu
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.rl import push_plans
 from morphgen.rl.cartesian import OneTool, towards
-from morphgen.rl.free_ways import FreeWays, whole_turns
+from morphgen.rl.free_ways import FreeWays, Price, whole_turns
 from morphgen.rl.push_contacts import leaning, poised
 from morphgen.rl.push_plans import PushPlanner
-from morphgen.rl.scripted_push import PLANS, ScriptedPush
+from morphgen.rl.scripted_push import PLANS, RISE, ScriptedPush
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.kinematics import tool_frames
+from morphgen.tasks.kinematics import tool_frames, tool_positions
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.settings import member_setting, push_setting, reach_setting
 from morphgen.tasks.sim.base import Block, Scene
 from scenes import robot
 
+NO_HURRY = np.array([np.inf, np.inf])
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)
 
@@ -125,6 +126,30 @@ def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
     task.close()
     assert 2 <= len(made) <= PLANS
     assert not np.allclose(made[0][1], made[1][1])
+    left = [args[3] for args in made]
+    assert left[0] == PUSH.steps
+    assert left == sorted(left, reverse=True)
+    assert left[1] <= PUSH.steps - 59
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_a_tool_whose_arm_gets_into_something_rises(free, tmp_path, monkeypatch):
+    def said(self, q):
+        assert q.ndim == 2
+        return np.full(len(q), free)
+
+    monkeypatch.setattr(PushPlanner, "free", said)
+    task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
+    task.reset()
+    heights = []
+    while len(heights) < 12:
+        acting = controller.act(task)
+        if controller._state.pushing[0]:
+            heights.append(float(tool_positions(task.bodies.chain, task.body, task.targets)[0, 2]))
+        assert not task.step(acting).terminated.any()
+    task.close()
+    rise = 0.0 if free else RISE
+    assert np.diff(heights[1:]) == pytest.approx(rise, abs=RISE / 3)
 
 
 def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
@@ -351,16 +376,18 @@ def test_ends_are_got_to_along_a_tree_if_it_grows_there():
     start, ends = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [-1.0, 0.0]])
     tree = ways.explored(start, 400, block=block)
     assert max(q[0] for q in tree.nodes) < 0.5
-    costs = np.array([0.0, 500.0])
-    found = ways.find_along(tree, ends, vias=ends, costs=costs, block=block)
+    price = Price(np.array([0.0, 500.0]), NO_HURRY)
+    found = ways.find_along(tree, ends, vias=ends, price=price, block=block)
     assert found.end == 1
     assert found.points[-1].tolist() == [-1.0, 0.0]
     for a, b in pairwise((start, *found.points)):
         assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).mean() > 0.95
     assert ways.length(start, found) >= 50
-    assert ways.find_along(tree, ends[:1], vias=ends, costs=costs[:1], block=block) is None
+    one = Price(np.zeros(1), NO_HURRY[:1])
+    assert ways.find_along(tree, ends[:1], vias=ends, price=one, block=block) is None
     none = np.zeros((0, 2))
-    assert ways.find_along(tree, none, vias=none, costs=np.zeros(0), block=block) is None
+    nothing = Price(np.zeros(0), np.zeros(0))
+    assert ways.find_along(tree, none, vias=none, price=nothing, block=block) is None
 
 
 def test_of_the_ways_along_a_tree_it_is_the_one_that_costs_least():
@@ -370,10 +397,29 @@ def test_of_the_ways_along_a_tree_it_is_the_one_that_costs_least():
     block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
     tree = ways.explored(np.array([0.0, 0.0]), 400, block=block)
     ends, costs = np.array([[1.8, 1.8], [0.3, 0.0]]), np.array([0.0, 40.0])
-    found = ways.find_along(tree, ends, vias=ends, costs=costs, block=block)
-    assert found.end == 1
-    found = ways.find_along(tree, ends, vias=ends, costs=3 * costs, block=block)
-    assert found.end == 0
+
+    def end(costs, left):
+        return ways.find_along(tree, ends, vias=ends, price=Price(costs, left), block=block).end
+
+    assert end(costs, NO_HURRY) == 1
+    assert end(3 * costs, NO_HURRY) == 0
+    assert end(3 * costs, np.array([70.0, 70.0])) == 1, "the other is too far for what is left"
+
+
+def test_ways_that_take_longer_than_there_is_time_come_last():
+    space = FreeSpace(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1))))
+    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
+    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
+    start, ends = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [0.3, 0.0]])
+
+    def end(left):
+        price = Price(np.array([0.0, 100.0]), np.array(left))
+        return ways.find(start, ends, price=price, block=block).end
+
+    assert end([np.inf, np.inf]) == 0
+    assert end([51.0, 0.0]) == 0
+    assert end([40.0, 40.0]) == 1
+    assert end([-30.0, -30.0]) == 0, "both are far too late"
 
 
 @pytest.mark.slow
