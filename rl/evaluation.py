@@ -285,8 +285,15 @@ def _score(
 
 
 def exam_of(config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1) -> Exam:
-    """An evaluation in the simulator and with the tasks of a run."""
-    return Exam(episodes, config.sim, seed, workers, config.reach, config.push)
+    """An evaluation in the simulator and with the tasks of a run, but for how many goals it had."""
+    return Exam(
+        episodes,
+        config.sim,
+        seed,
+        workers,
+        replace(config.reach, goals=ReachConfig().goals),
+        replace(config.push, starts=PushConfig().starts),
+    )
 
 
 def as_data(scores: Sequence[Score]) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from morphgen.rl.sources import Source
     from morphgen.rl.training import Part, Show, Way
     from morphgen.rl.variants import Variant
+    from morphgen.tasks.config import PushConfig, ReachConfig
 
 SWITCHES = {
     "symlog": "the critic predicts the symlog of returns (default: on)",
@@ -75,6 +76,13 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
     parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
     parser.add_argument(
         "--goal-seed", type=int, help="of all goals (default: as shipped with the split, else 0)"
+    )
+    parser.add_argument(
+        "--train-goals",
+        type=count,
+        metavar="N",
+        help="goals of reach, and starts of push, of each robot in training; evaluations have 100 "
+        "(default: 100, as in the paper)",
     )
     parser.add_argument(
         "--whole",
@@ -238,6 +246,7 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
 
     changes = {**constants(args.set), "bf16": args.bf16, "compile": args.compile}
     policy, ppo = settle(variant, tasks_of(source), changes, args.steps)
+    reach, push = _tasks(source, args.train_goals)
     return RunConfig(
         source,
         policy,
@@ -248,7 +257,30 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
         device=args.device,
         whole=args.whole and variant.agent == "se",
         max_links=MAX_LINKS if args.max_links is None else args.max_links,
+        reach=reach,
+        push=push,
     )
+
+
+def _tasks(source: Source, goals: int | None) -> tuple[ReachConfig, PushConfig]:
+    """Tasks with so many goals, and starts, of each robot; by default as many as in evaluations.
+
+    Raises:
+        TaskError: If they are too few, or the split brings goals of its own.
+    """
+    from morphgen.errors import TaskError
+    from morphgen.tasks.config import PushConfig, ReachConfig
+
+    if goals is None:
+        return ReachConfig(), PushConfig()
+    if goals < 2:
+        raise TaskError(f"--train-goals {goals}: expected 2 or more")
+    if source.goals:
+        raise TaskError(
+            f"--train-goals {goals}: {source.goals} brings the goals to train on; name the split "
+            f"itself, {source.name}, to have others"
+        )
+    return ReachConfig(goals=goals), PushConfig(starts=goals)
 
 
 def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:

@@ -137,7 +137,31 @@ def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_y
 
     code, _, err = run(*words, "--out", "b", "--goal-seed", "4")
     assert (code, "the goals in " in err, "are of seed 5" in err) == (2, True, True)
+    code, _, err = run(*words, "--out", "b", "--train-goals", "300")
+    assert (code, "--train-goals 300" in err, str(home.resolve()) in err) == (2, True, True)
     assert not Path("b").exists()
+
+
+def test_training_may_have_more_goals_than_evaluations(run):
+    """Which have the same, whatever the training had."""
+    found = []
+    for name, more in (("a", ()), ("b", ("--train-goals", "150"))):
+        assert run(*RUN, "--steps", "32", "--no-tensorboard", "--out", name, *more)[0] == 0
+        config = read_config(Path(name))
+        (setting,) = settings_of(config.source, Recipe(reach=config.reach))
+        found.append(len(setting.goals.q))
+        assert config.push.starts == found[-1]
+    assert found == [100, 150]
+    _, out, _ = run("eval", "b", "--episodes", "1", "--json")
+    _, chance, _ = run("eval", "a", "--episodes", "1", "--json")
+    randoms = [
+        {each["random"] for own in json.loads(one).values() for each in own}
+        for one in (out, chance)
+    ]
+    assert randoms[0] == randoms[1]
+    code, _, err = run(*RUN, "--train-goals", "1", "--out", "c")
+    assert (code, "--train-goals 1: expected 2 or more" in err) == (2, True)
+    assert not Path("c").exists()
 
 
 def test_every_switch_is_a_flag(run, tmp_path):
