@@ -32,7 +32,7 @@ STRIDE = 0.05
 LATE, TOO_LATE = 20.0, 400.0
 """Control steps that one is worth by which a way is late, and that it is worth at most."""
 LEGS = 24
-"""Of a way that is followed, at most."""
+"""Of a way for which there is room before there is one with more."""
 NEAR = 1.01 * min(share for share in BINS if share > 0)
 """Part of a joint's step that is left where a leg ends: discrete actions get no nearer."""
 
@@ -251,9 +251,13 @@ class Routes:
 
     def take(self, env: int, points: Sequence[Array]) -> None:
         """Begin a way through configurations, each (dof,)."""
-        for i, q in enumerate(points[:LEGS]):
+        more = len(points) - self._points.shape[1]
+        if more > 0:
+            last = self._points[:, -1:].repeat(1, more, 1)
+            self._points = torch.cat([self._points, last], dim=1)
+        for i, q in enumerate(points):
             self._points[env, i, : len(q)] = torch.from_numpy(q)
-        self._leg[env], self._last[env] = 0, len(points[:LEGS]) - 1
+        self._leg[env], self._last[env] = 0, len(points) - 1
 
     @property
     def wanted(self) -> torch.Tensor:

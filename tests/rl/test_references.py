@@ -62,12 +62,16 @@ def test_a_robot_gets_past_a_stop(made, kind):
     assert ((batch.targets[0] - torch.from_numpy(end)).abs() <= step / 16 + 1e-6).all()
 
 
-def test_a_way_has_no_more_legs_than_are_followed(made):
-    batch = made("prims", 1)
+def test_all_legs_of_a_way_are_followed_however_many(made):
+    batch = made("prims", 2)
     routes = Routes(batch)
-    start = batch.targets[0].numpy().astype(np.float64)
-    routes.take(0, [start] * (LEGS + 3))
-    assert [bool(routes.go_on()) for _ in range(LEGS)] == [False] * (LEGS - 1) + [True]
+    starts = batch.targets.numpy().astype(np.float64)
+    other = starts[1] + 0.1
+    routes.take(1, [starts[1], other])
+    routes.take(0, [starts[0]] * (LEGS + 3))
+    finals = torch.stack([routes.go_on() for _ in range(LEGS + 3)])
+    assert finals[:, 0].tolist() == [False] * (LEGS + 2) + [True]
+    assert routes.wanted[1].numpy() == pytest.approx(other, abs=1e-6)
 
 
 def ball_on_slides():
