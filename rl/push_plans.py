@@ -157,8 +157,11 @@ class PushPlanner:
             left: Control steps until the episode ends. Plans that take longer come last.
 
         Returns:
-            The plan that takes the least time, or gets farthest; None if there is none.
+            The plan that takes the least time, or gets farthest; None if there is none, or no
+            block gets as far in the time that is left.
         """
+        if left < (self._line - block[1]) / SPEED:
+            return None
         start = self._parted(q, block)
         found = self._by_stops(start, q, block, attempt, left)
         if found is None or found.cost > _DEAR:

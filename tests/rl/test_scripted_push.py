@@ -16,7 +16,7 @@ from morphgen.rl import push_plans
 from morphgen.rl.cartesian import OneTool, towards
 from morphgen.rl.free_ways import FreeWays, Price, whole_turns
 from morphgen.rl.push_contacts import leaning, poised
-from morphgen.rl.push_plans import PushPlanner
+from morphgen.rl.push_plans import SPEED, PushPlanner
 from morphgen.rl.scripted_push import PLANS, RISE, ScriptedPush
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.config import PushConfig, ReachConfig
@@ -166,6 +166,9 @@ def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
         assert position[1] < block[1] - setting.pushes.block.size[1] / 2
         assert position[2] == pytest.approx(plan.height)
         assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
+    across = (setting.pushes.line - block[1]) / SPEED
+    assert planner.plan(q, block, left=across + 1) is not None
+    assert planner.plan(q, block, left=across - 1) is None
 
 
 def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
