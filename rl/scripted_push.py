@@ -50,8 +50,7 @@ class ScriptedPush:
 
     The plan (``PushPlanner``) is made of collision tests and kinematics alone; the push is closed
     loop: the tool goes along y, its rotation held, and its height where there is room, and follows
-    the block aside.
-    Environments that do not push stand still.
+    the block aside. Environments that do not push stand still.
     """
 
     def __init__(self, seed: int) -> None:

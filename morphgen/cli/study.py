@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library
-from morphgen.cli.train import add_training, count, shown, way_of
+from morphgen.cli.progress import shown
+from morphgen.cli.train import add_training, count, way_of
 
 if TYPE_CHECKING:
     from morphgen.rl.study import Cell

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library, add_max_links
+from morphgen.cli.progress import shown
 
 if TYPE_CHECKING:
-    from tqdm import tqdm
-
-    from morphgen.rl.report import Report
     from morphgen.rl.runs import RunConfig
     from morphgen.rl.sources import Source
-    from morphgen.rl.training import Part, Show, Way
+    from morphgen.rl.training import Part, Way
     from morphgen.rl.variants import Variant
     from morphgen.tasks.config import PushConfig, ReachConfig
 
@@ -328,78 +323,3 @@ def place(source: Source) -> str:
     if source.side != "train":
         name += f"-{source.side}"
     return re.sub(r"[^\w./-]+", "-", name).strip("/.")
-
-
-@contextmanager
-def shown(again: str = "with --resume") -> Iterator[Shower]:
-    """Bars on stderr while there is one to look at, else some lines.
-
-    Args:
-        again: What to say after Ctrl-C.
-    """
-    shower = Shower()
-    try:
-        yield shower
-    except KeyboardInterrupt:
-        shower.close()
-        print(f"morphgen: it goes on from its last checkpoint {again}", file=sys.stderr)
-        raise
-    finally:
-        shower.close()
-
-
-class Shower:
-    """Shows how a run goes."""
-
-    def __init__(self) -> None:
-        self._bar: tqdm[NoReturn] | None = None
-
-    def __call__(self, part: Part) -> Show:
-        """Begin with a part."""
-        self.close()
-        name = part.config.source.only or part.config.source.name
-        if not sys.stderr.isatty():
-            return lambda report, updates: _print(name, report, updates)
-        from tqdm import tqdm
-
-        total = part.config.updates * part.config.ppo.steps * part.config.envs
-        self._bar = tqdm(
-            total=total,
-            desc=name,
-            unit="step",
-            unit_scale=True,
-            file=sys.stderr,
-            dynamic_ncols=True,
-        )
-        return self._show
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-    def _show(self, report: Report, updates: int) -> None:
-        assert self._bar is not None
-        if self._bar.n == 0:
-            self._bar.initial = report.transitions - report.transitions // report.update
-            self._bar.n = self._bar.initial
-        self._bar.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
-        self._bar.update(report.transitions - self._bar.n)
-
-
-def _print(name: str, report: Report, updates: int) -> None:
-    if report.update % max(updates // 20, 1) and report.update < updates:
-        return
-    left = (updates - report.update) * report.transitions / report.update / report.steps_per_second
-    print(
-        f"{name}: update {report.update} of {updates}, {report.transitions:,} steps, "
-        f"score {report.score:.2f}, success {_success(report)}, "
-        f"{report.steps_per_second:,.0f} steps/s, {left / 60:.1f} min left",
-        file=sys.stderr,
-        flush=True,
-    )
-
-
-def _success(report: Report) -> str:
-    return f"{report.success:.0%}" if report.episodes else "unknown"
