@@ -3,7 +3,8 @@
 from functools import cache
 
 import morphgen
-from morphgen.model.geometry import Pose
+from morphgen.model.geometry import Pose, Shape, Sphere
+from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks.sim.base import Block, Scene
 
 
@@ -39,3 +40,13 @@ def push_scene(mass=0.1, friction=1.0):
 def mixed_scenes():
     """One of each: three bodies, with and without a block."""
     return [reach_scene(), push_scene(), real_arm_scene()]
+
+
+def ball(height):
+    """A ball of 0.1 m on slides along x and y."""
+    base, cart, last = Link("base"), Link("cart"), Link("ball", collisions=(Shape(Sphere(0.1)),))
+    joints = (
+        Joint("x", "prismatic", "base", "cart", Pose((0, 0, height)), (1, 0, 0), (-2.0, 2.0)),
+        Joint("y", "prismatic", "cart", "ball", Pose(), (0, 1, 0), (-2.0, 2.0)),
+    )
+    return Robot("ball", (base, cart, last), joints, (Frame("tool", "ball"),), (0.0, 0.0))
