@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.model.kinematics import bounds
-from morphgen.model.robot import Robot
+from morphgen.model.kinematics import bounds, unwound
 from morphgen.rl.connect import FreePart, Tree, connected, explored, shortened
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
@@ -84,24 +83,12 @@ class FreeWays:
         robot = space.scene.robot
         self._moves = np.ones(robot.dof, dtype=np.bool_) if moves is None else moves
         self._home, self._bounds = np.array(robot.home), bounds(robot)
-        self._turns = whole_turns(robot)
         self._seed = int(rng.integers(2**63))
         self._stops, _ = space.draw(STOPS * ATTEMPTS, rng)
 
     def steps(self, start: Array, ends: Array) -> Array:
         """Control steps that straight ways to ends (..., dof) take, shape (...,)."""
         return np.asarray((np.abs(ends - start) / self._step).max(axis=-1))
-
-    def unwound(self, start: Array, ends: Array) -> Array:
-        """The same poses as of configurations (..., dof), with joints turned as little as may be.
-
-        Joints that may turn more than once around are turned back by whole turns to where they are
-        nearest to the start (dof,).
-        """
-        lower, upper = self._bounds.T
-        turns = np.round((start - ends) / (2 * np.pi)) * self._turns
-        least, most = ((bound - ends) / (2 * np.pi) for bound in (lower, upper))
-        return np.asarray(ends + 2 * np.pi * np.clip(turns, np.ceil(least), np.floor(most)))
 
     def find(
         self,
@@ -135,7 +122,8 @@ class FreeWays:
             return known[key]
 
         first = STOPS * (attempt % ATTEMPTS)
-        drawn = self.unwound(start, np.array([self._home, *self._stops[first : first + STOPS]]))
+        drawn = np.array([self._home, *self._stops[first : first + STOPS]])
+        drawn = unwound(self._space.scene.robot, start, drawn)
         stops = [np.where(self._moves, stop, start) for stop in drawn]
         price = price or Price(np.zeros(len(ends)), np.full(len(ends), np.inf))
         ways = self._ways(start, ends, vias, stops, price)
@@ -230,13 +218,6 @@ class FreeWays:
 def _all_free(points: Sequence[Array], free_part: FreePart) -> bool:
     """Whether straight lines through configurations are free; from the end, where room is least."""
     return all(free_part(b, a) == 1 for a, b in zip(points[-2::-1], points[:0:-1], strict=True))
-
-
-def whole_turns(robot: Robot) -> NDArray[np.bool_]:
-    """Joints that are as they were after a whole turn, shape (dof,): no other joint follows one."""
-    followed = (robot.mimic_map[0] != 0).sum(axis=0) > 1
-    kinds = np.array([robot.joints[k].kind for k in robot.independent])
-    return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~followed)
 
 
 class Routes:

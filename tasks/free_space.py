@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -121,7 +121,12 @@ class FreeSpace:
         hits = [[name in row for name in self._obstacles] for row in rows]
         return np.array(hits, dtype=np.bool_).reshape(len(rows), len(self._obstacles))
 
-    def draw(self, n: int, rng: np.random.Generator) -> tuple[Array, int]:
+    def draw(
+        self,
+        n: int,
+        rng: np.random.Generator,
+        counts: Callable[[Array], bool] = lambda q: True,
+    ) -> tuple[Array, int]:
         """Draw free configurations, uniformly within the joint limits.
 
         The first few of many are the same as few; ``rng`` is left anywhere.
@@ -129,10 +134,11 @@ class FreeSpace:
         Args:
             n: How many.
             rng: Where they come from.
+            counts: Whether a free one, shape (dof,), counts; the others are drawn again.
 
         Returns:
-            The free ones in the order in which they were drawn, shape (n, dof), and how many were
-            tested until then.
+            The free ones that count in the order in which they were drawn, shape (n, dof), and how
+            many were tested until then.
 
         Raises:
             BenchmarkError: If fewer are found in ``TRIES`` times n.
@@ -148,7 +154,7 @@ class FreeSpace:
             for row, found in zip(q, self._each(q), strict=True):
                 tried += 1
                 collisions.update(found.keys())
-                if not found:
+                if not found and counts(row):
                     kept.append(row)
                     if len(kept) == n:
                         break

@@ -24,6 +24,7 @@ from morphgen.formats.mjcf import to_spec
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose, movable_positions
 from morphgen.model.robot import TOOL, Robot
+from morphgen.tasks.barriers import barriers, beyond
 from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import draw_obstacles
@@ -32,7 +33,7 @@ from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
 
-FORMAT = 2
+FORMAT = 3
 """Of a stored set; a change of how sets are drawn needs another."""
 EXACT = 1e-6
 """Largest deviation of a goal from its witness's tool, metres and of a quaternion."""
@@ -46,14 +47,14 @@ class GoalSet:
     key: str
     """Hash of all that the set follows from: 64 hexadecimal digits."""
     q: Array
-    """Witnesses: free configurations, shape (G, dof), rad or m."""
+    """Witnesses: free configurations, none beyond a barrier, shape (G, dof), rad or m."""
     poses: Array
     """Of the tool at them in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0, shape (G, 7)."""
     obstacles: tuple[Block, ...]
     tried: int
     """Random configurations that were tested."""
     accepted: int
-    """How many of these are free: G."""
+    """How many of these are such: G."""
     seed: int
 
 
@@ -70,8 +71,9 @@ def goal_set(
     """A robot's goal set: one that came with a split, or from the cache, or made and kept there.
 
     Configurations are drawn uniformly within the joint limits; what collides, with the ground and
-    obstacles too, is drawn again. The same body, pairs to ignore, seed, ground, goals and obstacles
-    give the same set, whatever the robot is called; fewer goals are the first of more.
+    obstacles too, is drawn again, and so is what the robot's own links part from the rest (see
+    ``barriers``). The same body, pairs to ignore, seed, ground, goals and obstacles give the same
+    set, whatever the robot is called; fewer goals are the first of more.
 
     Args:
         robot: The body, with a tool.
@@ -98,7 +100,7 @@ def goal_set(
     if shipped is not None:
         require_own(shipped, key, robot.name)
         return shipped
-    folder = user_cache_path("morphgen") / "goals-2" if cache is None else cache
+    folder = user_cache_path("morphgen") / "goals-3" if cache is None else cache
     make = partial(_made, robot, body, config, obstacles, seed, ground)
     return cached(GoalSet, folder / f"{key}.npz", robot.name, make)
 
@@ -119,7 +121,10 @@ def _made(
         count, size = config.obstacles, config.obstacle_size
         placed = draw_obstacles(robot, count, size, of_obstacles, ground=ground)
     space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
-    q, tried = space.draw(config.goals, of_goals)
+    parted = barriers(robot)
+    q, tried = space.draw(
+        config.goals, of_goals, lambda each: not beyond(robot, parted, each).any()
+    )
     poses = _vectors(frame_pose(robot, q, TOOL))
     return GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
 
@@ -135,8 +140,8 @@ def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
         scene: Where it stands, and among which obstacles.
 
     Returns:
-        What is wrong, a line each: a witness out of limits or in collision, or whose tool is not
-        at the goal; a set of another robot or other obstacles.
+        What is wrong, a line each: a witness out of limits, in collision or beyond a barrier, or
+        whose tool is not at the goal; a set of another robot or other obstacles.
 
     Raises:
         FormatError: If MJCF cannot express the robot.
@@ -154,6 +159,11 @@ def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
     usable = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
     free = FreeSpace(replace(scene, robot=robot)).free(goals.q[usable])
     wrong += [f"goal {i}: its witness is in collision" for i in usable[~free].tolist()]
+    parted = barriers(robot)
+    for i in usable[free].tolist():
+        for k in np.flatnonzero(beyond(robot, parted, goals.q[i])).tolist():
+            a, b = parted[k].pairs[0]
+            wrong.append(f"goal {i}: {a!r} and {b!r} touch on all ways to most others")
     tools = _vectors(tools_in_mujoco(robot, goals.q[usable]))
     for i, tool in zip(usable.tolist(), tools, strict=True):
         away, turned = _deviation(goals.poses[i], tool)

@@ -24,6 +24,32 @@ def random_configurations(robot: Robot, n: int, rng: np.random.Generator) -> Arr
     return rng.uniform(limits[:, 0], limits[:, 1], size=(n, robot.dof))
 
 
+def whole_turns(robot: Robot) -> NDArray[np.bool_]:
+    """Joints that are as they were after a whole turn, shape (dof,): no other joint follows one."""
+    followed = (robot.mimic_map[0] != 0).sum(axis=0) > 1
+    kinds = np.array([robot.joints[k].kind for k in robot.independent])
+    return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~followed)
+
+
+def unwound(robot: Robot, start: ArrayLike, q: ArrayLike) -> Array:
+    """The same poses of all links, with joints turned as little as may be.
+
+    Args:
+        robot: The body.
+        start: From where, shape (dof,), rad or m.
+        q: Configurations, shape (..., dof).
+
+    Returns:
+        Of the shape of ``q``: joints that may turn more than once around are turned back by whole
+        turns to where they are nearest to the start within their bounds.
+    """
+    start, q = np.asarray(start, dtype=np.float64), np.asarray(q, dtype=np.float64)
+    lower, upper = bounds(robot).T
+    turns = np.round((start - q) / (2 * np.pi)) * whole_turns(robot)
+    least, most = ((bound - q) / (2 * np.pi) for bound in (lower, upper))
+    return np.asarray(q + 2 * np.pi * np.clip(turns, np.ceil(least), np.floor(most)))
+
+
 def movable_positions(robot: Robot, q: ArrayLike) -> Array:
     """Positions of all movable joints, mimic joints following their leaders.
 

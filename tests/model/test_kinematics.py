@@ -15,6 +15,8 @@ from morphgen.model.kinematics import (
     movable_positions,
     random_configurations,
     reach,
+    unwound,
+    whole_turns,
 )
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from robots import arm
@@ -104,3 +106,27 @@ def test_jacobians_are_derivatives_of_poses(words):
     one, of_one = frame_jacobian(robot, q[1])
     assert (one == T[1]).all()
     assert of_one == pytest.approx(jacobian[1])
+
+
+def test_unwound_configurations_are_those_that_turn_least():
+    body = compose("arm=ur5 ee=plane")
+    rng = np.random.default_rng(0)
+    start, ends = rng.uniform(-6, 6, 6), random_configurations(body, 200, rng)
+    found = unwound(body, start, ends)
+    assert forward_kinematics(body, found) == pytest.approx(forward_kinematics(body, ends))
+    lower, upper = bounds(body).T
+    assert (lower <= found).all()
+    assert (found <= upper).all()
+    apart = np.abs(found - start)
+    assert (apart <= np.abs(ends - start) + 1e-9).all()
+    others = [found + turn for turn in (-2 * np.pi, 2 * np.pi)]
+    nearer = [
+        (np.abs(each - start) < apart - 1e-9) & (lower <= each) & (each <= upper) for each in others
+    ]
+    assert not np.any(nearer)
+    assert (apart < np.abs(ends - start) - 6).any()
+
+
+def test_a_joint_that_another_follows_is_not_turned_back():
+    turns = whole_turns(compose("arm=panda ee=panda_hand"))
+    assert turns.tolist() == [True] * 7 + [False]

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, forward_kinematics, random_configurations
-from morphgen.rl.free_ways import FreeWays, Price, whole_turns
+from morphgen.rl.free_ways import FreeWays, Price
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
-from scenes import ball, robot
+from scenes import ball
 
 NO_HURRY = np.array([np.inf, np.inf])
 UR5, PANDA = "arm=ur5 ee=plane", "arm=panda ee=panda_hand"
@@ -38,31 +37,6 @@ def test_ways_go_round_what_is_in_between():
     on_the_end = np.array([-0.5, 0.5, 0.1, 1.0, 0.0, 0.0, 0.0])
     assert ways.find(start, ends[1:], block=on_the_end) is None
     assert ways.find(start, ends[1:]).points[-1].tolist() == ends[1].tolist()
-
-
-def test_ends_are_those_that_turn_least():
-    body = robot(UR5)
-    ways = FreeWays(FreeSpace(Scene(body)), np.full(6, 0.1), np.random.default_rng(0))
-    rng = np.random.default_rng(0)
-    start, ends = rng.uniform(-6, 6, 6), random_configurations(body, 200, rng)
-    found = ways.unwound(start, ends)
-    assert forward_kinematics(body, found) == pytest.approx(forward_kinematics(body, ends))
-    lower, upper = bounds(body).T
-    assert (lower <= found).all()
-    assert (found <= upper).all()
-    apart = np.abs(found - start)
-    assert (apart <= np.abs(ends - start) + 1e-9).all()
-    others = [found + turn for turn in (-2 * np.pi, 2 * np.pi)]
-    nearer = [
-        (np.abs(each - start) < apart - 1e-9) & (lower <= each) & (each <= upper) for each in others
-    ]
-    assert not np.any(nearer)
-    assert (apart < np.abs(ends - start) - 6).any()
-
-
-def test_a_joint_that_another_follows_is_not_turned_back():
-    turns = whole_turns(robot(PANDA))
-    assert turns.tolist() == [True] * 7 + [False]
 
 
 def test_a_way_round_about_is_found_where_no_simple_one_is():

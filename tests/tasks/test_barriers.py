@@ -1,0 +1,111 @@
+"""Links that part what a robot can get to, and goals that are on the larger side."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.robot import Link
+from morphgen.tasks.barriers import barriers, beyond
+from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.goals import certify, goal_set
+from morphgen.tasks.sim.base import Scene
+from scenes import ball, robot
+
+ACROSS = ((0.5, 0.0), (0.1, 6.0))
+GAP = (((0.5, -1.2), (0.1, 2.0)), ((0.5, 1.2), (0.1, 2.0)))
+HERE, THERE = np.array([-1.5, 1.0]), np.array([1.5, 1.0])
+
+
+def walled(*walls):
+    """A ball on slides, among walls: (x, y) of their middles and edges.
+
+    The cart has a shape, far above, lest ball and base are neighbours, which may touch.
+    """
+    shapes = tuple(Shape(Box((*edges, 0.4)), Pose((*middle, 0.2))) for middle, edges in walls)
+    above = Shape(Sphere(0.01), Pose((0.0, 0.0, 5.0)))
+    links = [Link("base", collisions=shapes), Link("cart", collisions=(above,))]
+    return ball(0.2).with_links(links)
+
+
+def hinged(kind, *walls):
+    """The same with a hinge for the first slide, so that the ball goes round the middle."""
+    body = walled(*walls)
+    first, second = body.joints
+    limits = None if kind == "continuous" else (-2 * math.pi, 2 * math.pi)
+    turning = replace(first, kind=kind, axis=(0.0, 0.0, 1.0), limits=limits)
+    sliding = replace(second, axis=(1.0, 0.0, 0.0), limits=(0.6, 1.2))
+    return replace(body, joints=(turning, sliding), home=(0.0, 0.9))
+
+
+def test_a_wall_across_parts_what_is_behind_it():
+    body = walled(ACROSS)
+    (found,) = barriers(body)
+    assert found.pairs == (("ball", "base"),)
+    assert found.joints == (0, 1)
+    assert beyond(body, [found], THERE).tolist() == [True]
+    assert beyond(body, [found], HERE).tolist() == [False]
+    for x, far in ((0.34, False), (0.66, True)):
+        assert FreeSpace(Scene(body)).free([[x, 0.0]])[0]
+        assert beyond(body, [found], np.array([x, 0.0]))[0] == far
+
+
+@pytest.mark.parametrize("walls", [(), GAP])
+def test_what_can_be_gone_round_parts_nothing(walls):
+    assert barriers(walled(*walls)) == ()
+
+
+def test_a_joint_without_end_goes_on_at_the_other():
+    """A wall on one side is no barrier to what goes round, two are; limits make one enough."""
+    left, right = ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0))
+    assert barriers(hinged("continuous", left)) == ()
+    body = hinged("continuous", left, right)
+    found = barriers(body)
+    assert beyond(body, found, np.array([math.pi - 0.1, 0.9])).all()
+    assert beyond(body, found, np.array([0.1 - math.pi, 0.9])).all()
+    assert not beyond(body, found, np.array([0.5, 0.9])).any()
+
+
+def test_whole_turns_part_nothing():
+    """A wall in the way of a hinge that turns twice: where it is counts, not how often round."""
+    body = hinged("revolute", ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0)))
+    found = barriers(body)
+    for turns in (-1, 0):
+        assert not beyond(body, found, np.array([0.5 + 2 * math.pi * turns, 0.9])).any()
+    assert beyond(body, found, np.array([math.pi, 0.9])).all()
+
+
+@pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"])
+def test_robots_as_they_are_have_none(words):
+    assert barriers(robot(words)) == ()
+
+
+def test_goals_are_on_the_larger_side(tmp_path):
+    body = walled(ACROSS)
+    both, _ = FreeSpace(Scene(body)).draw(40, np.random.default_rng(0))
+    assert 5 < (both[:, 0] > 0.5).sum() < 35
+    goals = goal_set(body, ReachConfig(goals=40), obstacles=False, seed=0, cache=tmp_path)
+    assert (goals.q[:, 0] < 0.5).all()
+    assert goals.accepted == 40 < goals.tried
+    few = goal_set(body, ReachConfig(goals=7), obstacles=False, seed=0, cache=tmp_path)
+    assert (few.q == goals.q[:7]).all()
+    assert certify(goals, body, Scene(body)) == []
+
+
+def test_a_certificate_notices_what_is_beyond(tmp_path):
+    goals = goal_set(ball(0.2), ReachConfig(goals=12), obstacles=False, seed=0, cache=tmp_path)
+    body = walled(ACROSS)
+    lines = certify(goals, body, Scene(body))
+    there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]
+    assert there
+    said = "'ball' and 'base' touch on all ways to most others"
+    assert [line for line in lines if "touch" in line] == [f"goal {i}: {said}" for i in there]
+
+
+def test_joints_that_do_not_move_the_tool_part_nothing():
+    body = walled(ACROSS)
+    (frame,) = body.frames
+    assert barriers(replace(body, frames=(replace(frame, link="cart"),))) == ()
