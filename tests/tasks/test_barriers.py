@@ -15,7 +15,7 @@ from morphgen.tasks.goals import certify, goal_set
 from morphgen.tasks.sim.base import Scene
 from scenes import ball, robot
 
-ACROSS = ((0.5, 0.0), (0.1, 6.0))
+ACROSS = ((0.5, 0.0), (0.12, 6.0))
 GAP = (((0.5, -1.2), (0.1, 2.0)), ((0.5, 1.2), (0.1, 2.0)))
 HERE, THERE = np.array([-1.5, 1.0]), np.array([1.5, 1.0])
 
@@ -48,7 +48,7 @@ def test_a_wall_across_parts_what_is_behind_it():
     assert found.joints == (0, 1)
     assert beyond(body, [found], THERE).tolist() == [True]
     assert beyond(body, [found], HERE).tolist() == [False]
-    for x, far in ((0.34, False), (0.66, True)):
+    for x, far in ((0.33, False), (0.67, True)):
         assert FreeSpace(Scene(body)).free([[x, 0.0]])[0]
         assert beyond(body, [found], np.array([x, 0.0]))[0] == far
 
