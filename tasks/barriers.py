@@ -9,7 +9,7 @@ is not found.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from morphgen.checks.self_collision import SelfCollision, ignored_pairs
-from morphgen.model.kinematics import bounds, random_configurations, whole_turns
+from morphgen.model.kinematics import bounds, moved_by, random_configurations, whole_turns
 from morphgen.model.robot import TOOL, Pair, Robot
 
 Array = NDArray[np.float64]
@@ -47,6 +47,8 @@ class Barrier:
     """Where it ends."""
     main: NDArray[np.bool_]
     """Cells of the largest part, an axis for each of the joints."""
+    turns: tuple[float, ...]
+    """After how much each of the joints is as it was, rad; 0 if it never is."""
 
 
 def barriers(robot: Robot) -> tuple[Barrier, ...]:
@@ -67,23 +69,24 @@ def barriers(robot: Robot) -> tuple[Barrier, ...]:
     between: dict[tuple[int, ...], list[Pair]] = defaultdict(list)
     for pair in sorted(pair for pair, count in times.items() if count >= OFTEN * SAMPLES):
         between[_between(robot, *pair)].append(pair)
-    of_tool = {*_moved_by(robot, robot.joints_to(robot.frame(TOOL).link))}
+    of_tool = {*moved_by(robot, robot.joints_to(robot.frame(TOOL).link))}
     planes = [(k, pairs) for k, pairs in between.items() if 0 < len(k) <= 2 and {*k} <= of_tool]
     found = [_barrier(robot, tested, k, pairs) for k, pairs in planes]
     return tuple(each for each in found if each is not None)
 
 
-def beyond(robot: Robot, found: Sequence[Barrier], q: Array) -> NDArray[np.bool_]:
+def beyond(found: Sequence[Barrier], q: Array) -> NDArray[np.bool_]:
     """Which barriers a free configuration, shape (dof,), is beyond; shape (number of these,)."""
-    turns = np.where(whole_turns(robot), 2 * np.pi, 0.0)
-    return np.array([_is_beyond(each, turns, q) for each in found], dtype=np.bool_)
+    return np.array([_is_beyond(each, q) for each in found], dtype=np.bool_)
 
 
-def _is_beyond(barrier: Barrier, turns: Array, q: Array) -> bool:
+def _is_beyond(barrier: Barrier, q: Array) -> bool:
     """Whether it is, however often the joints are turned around within their bounds."""
-    own, count = [*barrier.joints], np.array(barrier.main.shape)
-    for times in product(*((-2, -1, 0, 1, 2) if turn else (0,) for turn in turns[own].tolist())):
-        share = (q[own] + times * turns[own] - barrier.lower) / (barrier.upper - barrier.lower)
+    own, count = q[[*barrier.joints]], np.array(barrier.main.shape)
+    for times in product(*((-2, -1, 0, 1, 2) if turn else (0,) for turn in barrier.turns)):
+        share = (own + np.multiply(times, barrier.turns) - barrier.lower) / (
+            barrier.upper - barrier.lower
+        )
         if ((share >= 0) & (share <= 1)).all():
             cell = np.minimum((share * count).astype(int), count - 1)
             if barrier.main[tuple(cell.tolist())]:
@@ -93,14 +96,7 @@ def _is_beyond(barrier: Barrier, turns: Array, q: Array) -> bool:
 
 def _between(robot: Robot, a: str, b: str) -> tuple[int, ...]:
     """Independent joints that move one of two links against the other."""
-    return _moved_by(robot, {*robot.joints_to(a)} ^ {*robot.joints_to(b)})
-
-
-def _moved_by(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
-    """Independent joints that are among some, or that these follow."""
-    matrix, _ = robot.mimic_map
-    rows = [i for i, k in enumerate(robot.movable) if k in joints]
-    return tuple(np.flatnonzero((matrix[rows] != 0).any(axis=0)).tolist())
+    return moved_by(robot, {*robot.joints_to(a)} ^ {*robot.joints_to(b)})
 
 
 def _barrier(
@@ -122,7 +118,9 @@ def _barrier(
         return None
     largest = int(np.bincount(parts[parts > 0]).argmax())
     nearest = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
-    return Barrier(tuple(pairs), joints, lower, upper, parts[tuple(nearest)] == largest)
+    turns = np.where(whole_turns(robot)[columns], 2 * np.pi, 0.0)
+    main = parts[tuple(nearest)] == largest
+    return Barrier(tuple(pairs), joints, lower, upper, main, tuple(turns.tolist()))
 
 
 def _parts(free: NDArray[np.bool_], endless: Sequence[bool]) -> NDArray[np.int64]:

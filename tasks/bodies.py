@@ -14,7 +14,7 @@ from morphgen.benchmark.token_layout import POSITION
 from morphgen.benchmark.tokens import MAX_LINKS, padded, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.model.kinematics import bounds
+from morphgen.model.kinematics import bounds, moved_by
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
 
@@ -215,6 +215,7 @@ def _chain(robot: Robot, joints: int) -> dict[str, np.ndarray]:
     T = np.eye(4)
     origins, axes, slides, gains, offsets = [], [], [], [], []
     moves_tool = np.zeros(joints, dtype=bool)
+    moves_tool[[*moved_by(robot, robot.joints_to(frame.link))]] = True
     for k in robot.joints_to(frame.link):
         joint = robot.joints[k]
         T = T @ joint.T_parent_joint.matrix
@@ -222,7 +223,6 @@ def _chain(robot: Robot, joints: int) -> dict[str, np.ndarray]:
             continue
         gain = np.zeros(joints)
         gain[: robot.dof] = matrix[row_of[k]]
-        moves_tool |= gain != 0
         origins.append(T)
         axes.append(joint.unit_axis)
         slides.append(joint.kind == "prismatic")

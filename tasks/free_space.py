@@ -146,10 +146,10 @@ class FreeSpace:
         """
         kept: list[Array] = []
         collisions: Counter[Pair] = Counter()
-        tried = 0
+        tried = passed = 0
         while len(kept) < n:
             if tried >= n * TRIES:
-                raise self._too_few(len(kept), n, tried, collisions)
+                raise self._too_few(len(kept), passed, n, tried, collisions)
             q = random_configurations(self.scene.robot, _CHUNK, rng)[: n * TRIES - tried]
             for row, found in zip(q, self._each(q), strict=True):
                 tried += 1
@@ -158,15 +158,20 @@ class FreeSpace:
                     kept.append(row)
                     if len(kept) == n:
                         break
+                elif not found:
+                    passed += 1
         return np.array(kept).reshape(n, self.scene.robot.dof), tried
 
-    def _too_few(self, found: int, n: int, tried: int, collisions: Counter[Pair]) -> BenchmarkError:
+    def _too_few(
+        self, found: int, passed: int, n: int, tried: int, collisions: Counter[Pair]
+    ) -> BenchmarkError:
         ((a, b), times), *_ = collisions.most_common(1)
+        more = f" and {passed:,} more are, but cut off by links that touch" if passed else ""
         return BenchmarkError(
             f"robot {self.scene.robot.name!r}: only {found} of {tried:,} random configurations are "
-            f"free of collisions (acceptance rate {found / tried:.2g}), {n} are needed; most often "
-            f"{a!r} and {b!r} collide, in {times / tried:.0%}: lift the robot off the ground, by a "
-            "base or its place in the world, or narrow the limits of its joints"
+            f"free of collisions{more} (acceptance rate {found / tried:.2g}), {n} are needed; "
+            f"most often {a!r} and {b!r} collide, in {times / tried:.0%}: lift the robot off the "
+            "ground, by a base or its place in the world, or narrow the limits of its joints"
         )
 
     def _each(self, q: ArrayLike, blocks: ArrayLike | None = None) -> Iterator[dict[Pair, float]]:

@@ -122,9 +122,7 @@ def _made(
         placed = draw_obstacles(robot, count, size, of_obstacles, ground=ground)
     space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
     parted = barriers(robot)
-    q, tried = space.draw(
-        config.goals, of_goals, lambda each: not beyond(robot, parted, each).any()
-    )
+    q, tried = space.draw(config.goals, of_goals, lambda each: not beyond(parted, each).any())
     poses = _vectors(frame_pose(robot, q, TOOL))
     return GoalSet(robot.name, key, q, poses, placed, tried, len(q), seed)
 
@@ -161,7 +159,7 @@ def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
     wrong += [f"goal {i}: its witness is in collision" for i in usable[~free].tolist()]
     parted = barriers(robot)
     for i in usable[free].tolist():
-        for k in np.flatnonzero(beyond(robot, parted, goals.q[i])).tolist():
+        for k in np.flatnonzero(beyond(parted, goals.q[i])).tolist():
             a, b = parted[k].pairs[0]
             wrong.append(f"goal {i}: {a!r} and {b!r} touch on all ways to most others")
     tools = _vectors(tools_in_mujoco(robot, goals.q[usable]))

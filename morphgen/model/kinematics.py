@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,6 +24,13 @@ def random_configurations(robot: Robot, n: int, rng: np.random.Generator) -> Arr
     """Configurations drawn uniformly between the bounds, shape (n, dof)."""
     limits = bounds(robot)
     return rng.uniform(limits[:, 0], limits[:, 1], size=(n, robot.dof))
+
+
+def moved_by(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
+    """Independent joints, 0 to dof - 1, that are among some of all joints, or that these follow."""
+    matrix, _ = robot.mimic_map
+    rows = [i for i, k in enumerate(robot.movable) if k in joints]
+    return tuple(np.flatnonzero((matrix[rows] != 0).any(axis=0)).tolist())
 
 
 def whole_turns(robot: Robot) -> NDArray[np.bool_]:

@@ -1,12 +1,15 @@
 """Links that part what a robot can get to, and goals that are on the larger side."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Link
 from morphgen.tasks.barriers import barriers, beyond
 from morphgen.tasks.config import ReachConfig
@@ -46,11 +49,11 @@ def test_a_wall_across_parts_what_is_behind_it():
     (found,) = barriers(body)
     assert found.pairs == (("ball", "base"),)
     assert found.joints == (0, 1)
-    assert beyond(body, [found], THERE).tolist() == [True]
-    assert beyond(body, [found], HERE).tolist() == [False]
+    assert beyond([found], THERE).tolist() == [True]
+    assert beyond([found], HERE).tolist() == [False]
     for x, far in ((0.33, False), (0.67, True)):
         assert FreeSpace(Scene(body)).free([[x, 0.0]])[0]
-        assert beyond(body, [found], np.array([x, 0.0]))[0] == far
+        assert beyond([found], np.array([x, 0.0]))[0] == far
 
 
 @pytest.mark.parametrize("walls", [(), GAP])
@@ -64,9 +67,9 @@ def test_a_joint_without_end_goes_on_at_the_other():
     assert barriers(hinged("continuous", left)) == ()
     body = hinged("continuous", left, right)
     found = barriers(body)
-    assert beyond(body, found, np.array([math.pi - 0.1, 0.9])).all()
-    assert beyond(body, found, np.array([0.1 - math.pi, 0.9])).all()
-    assert not beyond(body, found, np.array([0.5, 0.9])).any()
+    assert beyond(found, np.array([math.pi - 0.1, 0.9])).all()
+    assert beyond(found, np.array([0.1 - math.pi, 0.9])).all()
+    assert not beyond(found, np.array([0.5, 0.9])).any()
 
 
 def test_whole_turns_part_nothing():
@@ -74,8 +77,8 @@ def test_whole_turns_part_nothing():
     body = hinged("revolute", ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0)))
     found = barriers(body)
     for turns in (-1, 0):
-        assert not beyond(body, found, np.array([0.5 + 2 * math.pi * turns, 0.9])).any()
-    assert beyond(body, found, np.array([math.pi, 0.9])).all()
+        assert not beyond(found, np.array([0.5 + 2 * math.pi * turns, 0.9])).any()
+    assert beyond(found, np.array([math.pi, 0.9])).all()
 
 
 @pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"])
@@ -93,6 +96,17 @@ def test_goals_are_on_the_larger_side(tmp_path):
     few = goal_set(body, ReachConfig(goals=7), obstacles=False, seed=0, cache=tmp_path)
     assert (few.q == goals.q[:7]).all()
     assert certify(goals, body, Scene(body)) == []
+
+
+def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
+    space = FreeSpace(Scene(walled(ACROSS)))
+    with pytest.raises(BenchmarkError) as caught:
+        space.draw(1, np.random.default_rng(0), lambda q: False)
+    said = re.search(
+        r"only 0 of 1,000 .* free of collisions and (\d+) more are, but cut", str(caught.value)
+    )
+    q = random_configurations(space.scene.robot, 1000, np.random.default_rng(0))
+    assert int(said[1]) == space.free(q).sum() > 100
 
 
 def test_a_certificate_notices_what_is_beyond(tmp_path):
