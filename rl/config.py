@@ -28,6 +28,8 @@ class PolicyConfig:
     by a clamp); otherwise it is learned."""
     mask_morphology: bool = False
     """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
+    tool_position: bool = False
+    """See where the tool is, too (ours; the paper's policies have to work it out)."""
     mlp_features: int = 16
     """Of a token in the MLP."""
     mlp_width: int = 192

@@ -17,11 +17,10 @@ from morphgen.rl.intervals import mean_interval
 from morphgen.rl.names import REFERENCES
 from morphgen.rl.references import Random, reference
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
-from morphgen.rl.runs import RunConfig, read_checkpoint
+from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
 from morphgen.rl.sources import Source, other_side, settings_of
 from morphgen.rl.trained import Mode, Policy
 from morphgen.rl.training import checkpoints
-from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.make import SimulatorName, batch_of
@@ -137,13 +136,13 @@ def evaluate_checkpoints(
         TaskError: If one is no checkpoint, or for other observations.
         MorphgenError: If a robot or simulator cannot be made.
     """
-    acting, forms = [], set()
+    acting, interfaces = [], set()
     for path in paths:
         run, learner = read_checkpoint(path)
         acting.append(_policy(learner, mode, exam.seed, device))
-        forms.add((run.policy.kind, run.max_links))
-    ((kind, max_links),) = forms
-    return evaluate(acting, source, exam, kind=kind, max_links=max_links)
+        interfaces.add(run.interface)
+    (wanted,) = interfaces
+    return evaluate(acting, source, exam, wanted)
 
 
 def _policy(learner: dict[str, Any], mode: Mode, seed: int, device: str) -> Acting:
@@ -164,17 +163,16 @@ def evaluate_reference(name: str, source: Source, exam: Exam) -> list[Score]:
     def acting(batch: TaskBatch) -> Controller:
         return reference(name, batch, exam.seed)
 
-    return evaluate([acting], source, exam, kind="continuous", tasks=REFERENCES[name])
+    return evaluate([acting], source, exam, Interface(), tasks=REFERENCES[name])
 
 
 def evaluate(
     acting: Sequence[Acting],
     source: Source,
     exam: Exam,
+    wanted: Interface,
     *,
-    kind: ActionKind,
     tasks: Sequence[Task] = ("reach", "push"),
-    max_links: int | None = None,
 ) -> list[Score]:
     """Scores of the robots of a source, in order; the random controller has the same episodes.
 
@@ -182,9 +180,8 @@ def evaluate(
         acting: What acts: each in episodes of its own, which all count.
         source: The robots.
         exam: How.
-        kind: Of their actions.
+        wanted: What those that act see and do.
         tasks: Robots at other tasks are left out.
-        max_links: As of ``batch_of``.
 
     Raises:
         TaskError: If no robot is left.
@@ -197,7 +194,7 @@ def evaluate(
     folders = tuple(map(Path, source.library))
     played: list[list[Episode]] = [[] for _ in settings]
     for one in acting:
-        found = _played(one, settings, exam, kind, folders, max_links)
+        found = _played(one, settings, exam, wanted, folders)
         for all_own, own in zip(played, found, strict=True):
             all_own.extend(own)
     chance = _chance(source, exam, tuple(tasks), settings, folders)
@@ -220,9 +217,7 @@ def _chance(
     """Episodes of the random controller; played once in a process."""
     key = (source, replace(exam, workers=1), tasks)
     if key not in _known:
-        _known[key] = _played(
-            lambda batch: Random(exam.seed), settings, exam, "continuous", folders
-        )
+        _known[key] = _played(lambda batch: Random(exam.seed), settings, exam, Interface(), folders)
     return _known[key]
 
 
@@ -230,9 +225,8 @@ def _played(
     acting: Acting,
     settings: Sequence[Setting],
     exam: Exam,
-    kind: ActionKind,
+    wanted: Interface,
     folders: tuple[Path, ...],
-    max_links: int | None = None,
 ) -> list[list[Episode]]:
     """Episodes by robot."""
     rounds = -(-exam.episodes // AT_ONCE)
@@ -242,11 +236,12 @@ def _played(
         each * len(settings),
         sim=exam.sim,
         seed=int(np.random.SeedSequence([SALT, exam.seed]).generate_state(1)[0]),
-        kind=kind,
+        kind=wanted.kind,
+        channels=wanted.channels,
         workers=exam.workers,
         reach=exam.reach,
         push=exam.push,
-        max_links=max_links,
+        max_links=wanted.max_links,
         library=folders,
     )
     try:

@@ -10,9 +10,8 @@ from morphgen.errors import TaskError, nearest
 from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.references import reference
 from morphgen.rl.rollouts import Controller, Episode
-from morphgen.rl.runs import read_checkpoint
+from morphgen.rl.runs import Interface, read_checkpoint
 from morphgen.rl.trained import Policy
-from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import Frame
 from morphgen.tasks.gym_env import TaskEnv
@@ -42,16 +41,16 @@ def require_policy(name: str, task: Task) -> None:
         raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
 
 
-def demands(name: str) -> tuple[ActionKind | None, int | None]:
-    """What actions a checkpoint's policy has, and how many links it sees; others take any.
+def demands(name: str) -> Interface:
+    """What a checkpoint's policy sees and does; other controllers take any environment.
 
     Raises:
         TaskError: If what is there is no checkpoint.
     """
     if not _is_file(name):
-        return None, None
+        return Interface()
     run, _ = read_checkpoint(Path(name))
-    return run.policy.kind, run.max_links
+    return run.interface
 
 
 def controller(name: str, env: TaskEnv, seed: int) -> Controller:

@@ -44,6 +44,8 @@ class Layout:
     """Points of the cloud, P; 0 for no cloud."""
     channels: tuple[str, ...]
     """Those of ``CHANNELS`` that there are."""
+    tool: bool = False
+    """Whether the tool's position is seen."""
 
 
 def layout_of(observation: Observation) -> Layout:
@@ -54,6 +56,7 @@ def layout_of(observation: Observation) -> Layout:
         obstacles=observation["obstacles"].shape[1],
         points=observation["points"].shape[1] if "points" in observation else 0,
         channels=tuple(name for name in CHANNELS if name in observation),
+        tool="tool" in observation,
     )
 
 
@@ -106,6 +109,9 @@ class Entities(nn.Module):
     The code of a joint position has frequencies so high that a step of the joint is many periods:
     noise to a network that has not learned anything yet. Weights of a frequency begin in inverse
     proportion to it, so that the first policy is smooth.
+
+    The tool's position is beside the goal and beside the object, in one vector with it: how far it
+    is to go is then a difference of a vector's own numbers.
     """
 
     def __init__(self, layout: Layout, features: int, blind: bool) -> None:
@@ -113,7 +119,9 @@ class Entities(nn.Module):
         self.seen = POSITION.columns if blind else slice(0, layout.token)
         """Columns of the tokens that count."""
         link = self.seen.stop - self.seen.start + len(layout.channels)
-        sizes = {"links": link, "goal": 7, "object": 13, "line": 1}
+        self.tool = layout.tool
+        tool = 3 * layout.tool
+        sizes = {"links": link, "goal": 7 + tool, "object": 13 + tool, "line": 1}
         if layout.obstacles:
             sizes["obstacles"] = 13
         self.cloud: nn.Module | None = None
@@ -150,11 +158,12 @@ class Entities(nn.Module):
         """Values (n, k, size) and masks (n, k) of each kind."""
         extra = [seen[name][..., None] for name in self.channels]
         links = torch.cat([seen["tokens"][..., self.seen], *extra], dim=-1)
+        tool = [seen["tool"]] if self.tool else []
         reach, push = seen["goal_mask"][:, None], seen["object_mask"][:, None]
         entries = {
             "links": (links, seen["links"]),
-            "goal": (seen["goal"][:, None], reach),
-            "object": (seen["object"][:, None], push),
+            "goal": (torch.cat([seen["goal"], *tool], dim=-1)[:, None], reach),
+            "object": (torch.cat([seen["object"], *tool], dim=-1)[:, None], push),
             "line": (seen["line"][:, None], push),
         }
         if "obstacles" in self.project:
@@ -282,7 +291,15 @@ class Critic(nn.Module):
 
 
 def make_networks(config: PolicyConfig, layout: Layout, seed: int) -> tuple[Actor, Critic]:
-    """An actor and a critic on the CPU; the same seed gives the same weights."""
+    """An actor and a critic on the CPU; the same seed gives the same weights.
+
+    Raises:
+        TaskError: If they are to see the tool's position and the observations lack it, or the
+            other way round.
+    """
+    if config.tool_position != layout.tool:
+        shown = "show" if layout.tool else "do not show"
+        raise TaskError(f"tool_position {config.tool_position}: the environments {shown} it")
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(
             int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> 1)

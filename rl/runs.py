@@ -18,6 +18,8 @@ from morphgen.errors import FormatError, TaskError
 from morphgen.formats.files import LOCK, partial_of, write_atomic
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.sources import Source
+from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.make import SimulatorName
 
@@ -25,6 +27,16 @@ CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
 FORMAT = 2
 """Of config and checkpoint; rises when older ones cannot be read any more. In 1 every agent had a
 scale of logits, and none by default."""
+
+
+@dataclass(frozen=True)
+class Interface:
+    """What policies see and do; environments for them are made so."""
+
+    kind: ActionKind = "continuous"
+    max_links: int | None = None
+    """Links that observations and actions are padded to, as ``batch_of`` has it."""
+    channels: Channels = field(default_factory=Channels)
 
 
 @dataclass(frozen=True)
@@ -65,6 +77,12 @@ class RunConfig:
     def updates(self) -> int:
         """How many there will be."""
         return self.ppo.updates(self.envs)
+
+    @property
+    def interface(self) -> Interface:
+        """Of its policy."""
+        channels = Channels(tool=self.policy.tool_position)
+        return Interface(self.policy.kind, self.max_links, channels)
 
 
 def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:

@@ -217,18 +217,19 @@ def updates_between(config: RunConfig) -> int:
 @contextmanager
 def _learner(part: Part, way: Way) -> Iterator[Learner]:
     """The learner of a part, as far as it got."""
-    config = part.config
+    config, wanted = part.config, part.config.interface
     settings = settings_of(config.source, Recipe(reach=config.reach, push=config.push))
     batch = batch_of(
         settings,
         config.envs,
         sim=config.sim,
         seed=config.seed,
-        kind=config.policy.kind,
+        kind=wanted.kind,
+        channels=wanted.channels,
         workers=way.workers,
         reach=config.reach,
         push=config.push,
-        max_links=config.max_links,
+        max_links=wanted.max_links,
         library=map(Path, config.source.library),
     )
     try:

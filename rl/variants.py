@@ -11,7 +11,7 @@ from morphgen.benchmark.split import Side, Task
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.config import AGENTS, AgentName, PolicyConfig, PPOConfig
 
-OF_POLICY = ("discrete", "fixed-deviation", "mask-morphology")
+OF_POLICY = ("discrete", "fixed-deviation", "mask-morphology", "tool-position")
 OF_PPO = ("symlog", "slow-critic", "task-reweighting", "curriculum")
 SWITCHES = (*OF_PPO, *OF_POLICY)
 ABLATION = (

@@ -25,7 +25,7 @@ Observation = dict[str, torch.Tensor]
 """``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``goal`` (n, 7) and ``goal_mask``
 (n,) bool for reach; ``object`` (n, 13), ``object_mask`` (n,) bool and ``line`` (n, 1) for push;
 ``obstacles`` (n, O, 13) and ``obstacle_mask`` (n, O) bool. If asked for, ``velocity`` (n, L),
-``previous_action`` (n, L), ``points`` (n, P, 3) and ``point_mask`` (n, P) bool."""
+``previous_action`` (n, L), ``tool`` (n, 3), ``points`` (n, P, 3) and ``point_mask`` (n, P) bool."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Channels:
     """Velocities of the links' independent joints, rad/s or m/s."""
     previous_action: bool = False
     """The action before, as shares of the joints' steps."""
+    tool: bool = False
+    """Where the tool is in the world, metres."""
     points: int = 0
     """Points of a point cloud of block and obstacles."""
 
@@ -244,6 +246,8 @@ class TaskBatch:
             seen["velocity"] = of_links(self.bodies, self.body, qd)
         if self._channels.previous_action:
             seen["previous_action"] = self._shares.clone()
+        if self._channels.tool:
+            seen["tool"] = self._tools(self.q)
         if self._points is not None:
             seen["points"] = self._points(self.simulation.block_pose)
         return seen

@@ -203,13 +203,14 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
 def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
     read = read_place(place, places)
     body = as_primitives(as_in_library(read, places.library), places.folders)
-    kind, max_links = demands(policy)
+    seen = demands(policy)
     env = {"reach": ReachEnv, "push": PushEnv}[wanted.task](
         body,
         sim=wanted.simulator,
         obstacles=wanted.obstacles,
-        kind=kind or "continuous",
-        max_links=max_links,
+        kind=seen.kind,
+        channels=seen.channels,
+        max_links=seen.max_links,
         library=places.folders,
     )
     try:

@@ -75,13 +75,14 @@ def run(args: argparse.Namespace) -> int:
     require_policy(args.policy, args.task)
     if args.out is not None:
         require_film(args.out)
-    kind, max_links = demands(args.policy)
+    wanted = demands(args.policy)
     env = {"reach": ReachEnv, "push": PushEnv}[args.task](
         " ".join(args.words),
         sim=args.sim,
         obstacles=args.obstacles,
-        kind=args.kind or kind or "continuous",
-        max_links=max_links,
+        kind=args.kind or wanted.kind,
+        channels=wanted.channels,
+        max_links=wanted.max_links,
         library=args.library,
         render_mode=None if args.out is None else "rgb_array",
     )

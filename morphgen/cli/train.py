@@ -25,6 +25,7 @@ SWITCHES = {
     "curriculum": "the line of push moves (default: on)",
     "fixed-deviation": "numbers as actions keep their first deviation (default: off)",
     "mask-morphology": "hide the robot's body from the agent (default: off)",
+    "tool-position": "show the agent where its tool is (default: off)",
 }
 
 

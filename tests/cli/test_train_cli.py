@@ -92,6 +92,18 @@ def test_bodies_of_many_links_are_for_those_who_ask(run, tmp_path):
         assert out.startswith("episode 1: ")
 
 
+def test_a_policy_that_sees_its_tool_is_scored_and_played_where_it_is_shown(run):
+    words = (*RUN, "--steps", "32", "--no-tensorboard", "--out", "run")
+    assert run(*words, "--tool-position")[0] == 0
+    assert read_checkpoint(Path("run"))[1]["layout"]["tool"]
+    code, _, err = run(*words, "--resume")
+    assert (code, "tool_position" in err) == (2, True)
+    code, out, _ = run("eval", "run", "--episodes", "1", "--mode", "deterministic")
+    assert (code, "planar-cube" in out) == (0, True)
+    code, out, _ = run("play", "reach", "planar-cube", "--policy", "run", "--sim", "mujoco")
+    assert (code, out[:11]) == (0, "episode 1: ")
+
+
 def test_the_policy_that_is_played_is_the_one_that_was_trained(run):
     outs = []
     for seed in (0, 1):
@@ -166,17 +178,18 @@ def test_training_may_have_more_goals_than_evaluations(run):
 
 def test_every_switch_is_a_flag(run, tmp_path):
     off = ("--no-symlog", "--no-slow-critic", "--no-discrete", "--no-curriculum")
-    on = ("--task-reweighting", "--fixed-deviation", "--mask-morphology")
+    on = ("--task-reweighting", "--fixed-deviation", "--mask-morphology", "--tool-position")
     flags = (*off, *on, "--no-tensorboard")
     code, out, _ = run(*RUN, "--steps", "32", *flags)
     label = "me-mlp-symlog-slow-critic+task-reweighting-curriculum-discrete"
-    label += "+fixed-deviation+mask-morphology"
+    label += "+fixed-deviation+mask-morphology+tool-position"
     assert (code, out) == (0, f"runs/planar-cube-reach/{label}/seed0/{CHECKPOINT}\n")
     config = read_config(tmp_path / out.strip().removesuffix(f"/{CHECKPOINT}"))
     ppo, policy = config.ppo, config.policy
     assert (ppo.symlog, ppo.slow_critic, ppo.task_reweighting, ppo.curriculum) == (0, 0, 1, 0)
     assert (policy.discrete, policy.mask_morphology, policy.mlp_width) == (False, True, 8)
     assert policy.fixed_deviation
+    assert policy.tool_position
     code, _, err = run(*RUN, "--steps", "32", "--fixed-deviation", "--out", "bins")
     assert (code, "fixed-deviation: bins have no deviation" in err) == (2, True)
     assert not Path("bins").exists()

@@ -57,7 +57,7 @@ def observed(seed=0, *, extras=True):
     }
     if extras:
         found["velocity"], found["previous_action"] = normal(N, LINKS), normal(N, LINKS)
-        found["points"] = normal(N, POINTS, 3)
+        found["points"], found["tool"] = normal(N, POINTS, 3), normal(N, 3)
         found["point_mask"] = torch.tensor([True, True, False, True])[:, None].repeat(1, POINTS)
         found["point_mask"][0, 5:] = False
     return found
@@ -65,7 +65,7 @@ def observed(seed=0, *, extras=True):
 
 def mask_of(seen, name):
     """Where numbers of an entry are there, of the entry's shape."""
-    mask = seen[MASKS[name]]
+    mask = seen[MASKS[name]] if name in MASKS else torch.ones(N).bool()
     return mask.reshape(mask.shape + (1,) * (seen[name].dim() - mask.dim())).expand_as(seen[name])
 
 
@@ -77,10 +77,15 @@ def filled(seen, value):
 
 def networks(agent="me-tf", seen=None, *, discrete=True, mask_morphology=False, lively=True):
     """An actor and a critic; ``lively`` ones are as if they had learned. Logits are not scaled."""
+    layout = layout_of(seen or observed())
     config = PolicyConfig(
-        agent=agent, discrete=discrete, mask_morphology=mask_morphology, logit_scale=1.0
+        agent=agent,
+        discrete=discrete,
+        mask_morphology=mask_morphology,
+        tool_position=layout.tool,
+        logit_scale=1.0,
     )
-    actor, critic = make_networks(config, layout_of(seen or observed()), seed=0)
+    actor, critic = make_networks(config, layout, seed=0)
     if lively:
         generator = torch.Generator().manual_seed(1)
         for each in (*actor.parameters(), *critic.parameters()):
@@ -282,7 +287,9 @@ def test_se_sees_no_morphology_and_is_the_mlp_otherwise():
 
 
 @agents
-@pytest.mark.parametrize("name", ["tokens", "goal", "object", "line", "obstacles", "points"])
+@pytest.mark.parametrize(
+    "name", ["tokens", "goal", "object", "line", "tool", "obstacles", "points"]
+)
 def test_all_that_is_there_counts(agent, name):
     seen = observed()
     actor, critic = networks(agent, seen)
@@ -312,7 +319,9 @@ def test_logits_begin_alike_and_those_of_the_transformer_go_farther_with_every_c
     factor = 16 if discrete and agent == "me-tf" else 1
     seen, layout = observed(), layout_of(observed())
     plain, larger = (
-        make_networks(PolicyConfig(agent, discrete, logit_scale=scale), layout, seed=0)
+        make_networks(
+            PolicyConfig(agent, discrete, tool_position=True, logit_scale=scale), layout, 0
+        )
         for scale in (1.0, 16.0)
     )
     torch.testing.assert_close(larger[0](seen), plain[0](seen))
@@ -337,7 +346,7 @@ def test_all_actions_begin_alike_and_values_near_zero(agent):
 
 
 def test_weights_follow_from_the_seed_and_leave_torchs_own_stream_alone():
-    config, layout = PolicyConfig(), layout_of(observed())
+    config, layout = PolicyConfig(tool_position=True), layout_of(observed())
     before = torch.random.get_rng_state()
     first, again, other = (make_networks(config, layout, seed)[0] for seed in (3, 3, 4))
     assert torch.random.get_rng_state().equal(before)
@@ -383,10 +392,23 @@ def test_bfloat16_is_close_and_masks_hold_there_too(agent, garbage):
 
 def test_weights_for_other_observations_are_refused_with_the_difference():
     here = layout_of(observed())
-    words = r"a\.pt is for other .*: obstacles 0, here 3; points 0, here 8; channels \(\), here"
+    words = (
+        r"a\.pt is for other .*: obstacles 0, here 3; points 0, here 8; channels \(\), here .*; "
+        "tool False, here True"
+    )
     with pytest.raises(TaskError, match=words):
         require_layout(layout_of(without_obstacles()), here, "a.pt")
     require_layout(here, layout_of(observed(5)), "a.pt")
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_policy_sees_the_tool_if_it_is_to_and_only_then(shown):
+    layout = layout_of(observed(extras=shown))
+    assert layout.tool == shown
+    make_networks(PolicyConfig(tool_position=shown), layout, 0)
+    words = "tool_position True: .* do not show it" if not shown else "False: .*ments show it"
+    with pytest.raises(TaskError, match=words):
+        make_networks(PolicyConfig(tool_position=not shown), layout, 0)
 
 
 def without_obstacles():

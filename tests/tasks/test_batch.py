@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 import morphgen
 from morphgen.errors import TaskError
+from morphgen.model.kinematics import frame_pose
+from morphgen.model.robot import TOOL
 from morphgen.rl.references import InverseKinematics, Random, Zero
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import Channels
@@ -60,7 +63,7 @@ def run(batch, controller, steps):
 
 
 def test_observations_have_the_shapes_they_claim(made):
-    channels = Channels(velocity=True, previous_action=True, points=50)
+    channels = Channels(velocity=True, previous_action=True, tool=True, points=50)
     batch = made(obstacles=True, channels=channels)
     seen = batch.reset()
     n, links = 3, batch.bodies.max_links
@@ -77,6 +80,7 @@ def test_observations_have_the_shapes_they_claim(made):
         "obstacle_mask": (n, CONFIG.obstacles),
         "velocity": (n, links),
         "previous_action": (n, links),
+        "tool": (n, 3),
         "points": (n, 50, 3),
         "point_mask": (n, 50),
     }
@@ -243,6 +247,26 @@ def test_velocities_and_actions_are_those_of_the_links(made):
     assert torch.equal(seen["previous_action"] != 0, batch.mask)
     assert ((seen["velocity"] != 0) <= (batch.bodies.joint_of_link[batch.body] >= 0)).all()
     assert (seen["velocity"].abs().amax(dim=1) > 0.01).all()
+
+
+def test_the_tool_is_where_the_joints_bring_it(made):
+    batch = made(channels=Channels(tool=True))
+    batch.reset()
+    for _ in range(5):
+        step = batch.step(torch.ones(batch.mask.shape))
+    for env, each in enumerate(batch.settings):
+        q = batch.q[env, : each.robot.dof].double().numpy()
+        expected = frame_pose(each.robot, q[None], TOOL)[0, :3, 3]
+        assert step.observation["tool"][env].tolist() == pytest.approx(expected, abs=1e-5)
+        assert np.linalg.norm(expected - each.goals.poses[0, :3]) > 0.01
+
+
+def test_the_tool_is_at_the_goal_where_the_witness_is(made):
+    batch = made(channels=Channels(tool=True))
+    batch.reset()
+    envs = torch.arange(3)
+    batch.simulation.reset(envs, batch.witness, batch.simulation.block_pose)
+    torch.testing.assert_close(batch.observe()["tool"], batch.goal[:, :3], rtol=0, atol=1e-5)
 
 
 def test_points_are_on_the_obstacles(made):

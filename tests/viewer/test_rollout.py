@@ -1,6 +1,7 @@
 """Episodes of playback are those of ``morphgen play``, and come back from their files."""
 
 import json
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -13,6 +14,7 @@ from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
 from morphgen.rl import runs
 from morphgen.rl.play import controller, play
+from morphgen.rl.training import train
 from morphgen.tasks.gym_env import ReachEnv
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, still
@@ -22,6 +24,7 @@ from morphgen.viewer.play_files import recording, setting_of
 from morphgen.viewer.play_scene import GAP, area, places_in_grid
 from morphgen.viewer.rollout import Recorded, Rollout, Wanted, simulators
 from robots import arm
+from small_runs import QUIET, small_config
 
 CUBE = "words:base=planar ee=cube"
 
@@ -162,6 +165,16 @@ def test_one_that_cannot_play_does_not_keep_the_others_from_it(places, cache):
     assert list(rollout.faults) == ["robots/none"]
     assert "no such file" in rollout.faults["robots/none"]
     assert [track.place for track in rollout.episode.tracks] == ["robots/one"]
+    rollout.close()
+
+
+def test_a_policy_that_sees_its_tool_is_shown_it(root, places, cache):
+    config = small_config(transitions=32)
+    config = replace(config, policy=replace(config.policy, tool_position=True))
+    train(root / "run", config, way=QUIET)
+    rollout = Rollout(Wanted("reach", (CUBE,), "run"), places)
+    assert rollout.faults == {}
+    assert rollout.advance()
     rollout.close()
 
 
