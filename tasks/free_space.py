@@ -10,11 +10,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.checks.rigid import rigid_groups
 from morphgen.checks.self_collision import SelfCollision, ignored_pairs
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
+from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
 from morphgen.model.rotation import Vec3, normalized, to_rpy
 from morphgen.tasks.sim.base import Scene

@@ -108,3 +108,14 @@ def test_the_front_door_loads_nothing_heavy(statement):
 def test_reading_manifests_loads_no_simulator():
     loaded = modules_after("import morphgen.grammar.library")
     assert loaded.isdisjoint(SIMULATORS_AND_MESHES)
+
+
+def test_processes_of_pybullet_load_little_else():
+    loaded = modules_after("import morphgen.tasks.sim.bullet_workers")
+    assert "pybullet" in loaded
+    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "scipy", "lxml"} - {"pybullet"})
+
+
+@pytest.mark.parametrize("module", ["benchmark.export", "fitting.token_shapes", "tasks.goals"])
+def test_splits_and_goals_wait_for_no_torch(module):
+    assert "torch" not in modules_after(f"import morphgen.{module}")

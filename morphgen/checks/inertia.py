@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morphgen.checks.rigid import RigidGroup, rigid_groups
 from morphgen.checks.solids import body_shapes, solid_of
 from morphgen.model.findings import Finding
 from morphgen.model.inertia import bounding_box
+from morphgen.model.rigid import RigidGroup, rigid_groups
 from morphgen.model.robot import Inertial, Link, Robot
 
 DEFAULT_DENSITY = 1000.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from morphgen.checks.rigid import rigid_groups
 from morphgen.checks.solids import is_scale_valid
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Mesh
+from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import Robot
 
 PYBULLET_LINKS = 127

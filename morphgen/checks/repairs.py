@@ -22,9 +22,9 @@ from morphgen.checks.joints import (
     reachable,
 )
 from morphgen.checks.names import named, safe_names
-from morphgen.checks.rigid import rigid_groups
 from morphgen.checks.solids import solid_of
 from morphgen.model.inertia import with_inertia
+from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,

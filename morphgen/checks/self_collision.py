@@ -16,7 +16,6 @@ from lxml import etree
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.checks.mujoco_warnings import caught
-from morphgen.checks.rigid import RigidGroup, rigid_groups
 from morphgen.errors import RobotError
 from morphgen.formats.mjcf_elements import (
     Meshes,
@@ -26,6 +25,7 @@ from morphgen.formats.mjcf_elements import (
 )
 from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
 from morphgen.model.kinematics import movable_positions, random_configurations
+from morphgen.model.rigid import RigidGroup, rigid_groups
 from morphgen.model.robot import Pair, Robot, sorted_pair
 
 PENETRATION = 1e-4

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from morphgen.fitting.kinds import Kind
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, Quat, normalized
-
-if TYPE_CHECKING:
-    from morphgen.fitting.soft_iou import Kind
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from morphgen.fitting.canonical import canonical, rounded
-from morphgen.fitting.soft_iou import KINDS, Kind
+from morphgen.fitting.kinds import KINDS, Kind
 from morphgen.model.geometry import Box, Cylinder, Pose, Primitive, Shape, Sphere, volume
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from morphgen.errors import FitError
 from morphgen.fitting.balls import smallest_balls
 from morphgen.fitting.canonical import least_rotation, rounded
-from morphgen.fitting.soft_iou import KINDS, Kind
+from morphgen.fitting.kinds import KINDS, Kind
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
 from morphgen.model.mesh import is_flat

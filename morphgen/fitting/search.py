@@ -17,7 +17,8 @@ from scipy.stats import qmc
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
-from morphgen.fitting.soft_iou import KINDS, Array, Candidates, ascend, overlaps
+from morphgen.fitting.kinds import KINDS
+from morphgen.fitting.soft_iou import Array, Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import normalized

@@ -9,15 +9,12 @@ each, are moved at once.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Kind = Literal["box", "cylinder", "sphere"]
-KINDS: tuple[Kind, ...] = ("box", "cylinder", "sphere")
 
 _BUNCH = 96
 """Primitives times thousand points that are evaluated together; bounds memory."""
@@ -28,7 +25,7 @@ class Candidates:
     """``n`` guesses of ``k`` primitives each; arrays are (n, k, ...)."""
 
     kinds: NDArray[np.int64]
-    """Index into ``KINDS``, shape (n, k)."""
+    """Index into ``kinds.KINDS``, shape (n, k)."""
     centres: Array
     """Shape (n, k, 3)."""
     quaternions: Array

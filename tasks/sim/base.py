@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
-
-import torch
+from typing import TYPE_CHECKING, Protocol
 
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
+
+if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
+    import torch
 
 TIMESTEP = 0.005
 """Physics step, seconds: 200 Hz, as the benchmark has it."""

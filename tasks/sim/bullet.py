@@ -13,7 +13,8 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.tasks.sim.base import Contacts, Scene
-from morphgen.tasks.sim.bullet_batch import BulletBatch, RowTensors, export_robots, most_joints
+from morphgen.tasks.sim.bullet_batch import BulletBatch, most_joints
+from morphgen.tasks.sim.bullet_files import export_robots
 from morphgen.tasks.sim.bullet_workers import (
     STEP,
     Share,
@@ -25,6 +26,7 @@ from morphgen.tasks.sim.bullet_workers import (
     send,
     start,
 )
+from morphgen.tasks.sim.row_tensors import RowTensors
 
 _BASE_LOAD = 5
 """What a step costs without joints, in joints."""

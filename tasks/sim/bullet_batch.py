@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.errors import SimulationError
@@ -15,7 +14,7 @@ from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
-from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene, export
+from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene
 from morphgen.tasks.sim.motor_law import MotorForces
 
 MAX_VELOCITY = 1e4
@@ -41,86 +40,6 @@ class Rows:
     """Shape (n, 7)."""
     block_velocity: Float32
     """Shape (n, 6)."""
-
-
-class RowTensors:
-    """The half of ``Simulation`` that reports, from rows in this machine's memory."""
-
-    def __init__(self, scenes: Sequence[Scene], rows: Rows) -> None:
-        """Wrap the rows of ``scenes`` without a copy."""
-        self.scenes = tuple(scenes)
-        self.device = torch.device("cpu")
-        self._q, self._qd = torch.from_numpy(rows.q), torch.from_numpy(rows.qd)
-        self._block_pose = torch.from_numpy(rows.block_pose)
-        self._block_velocity = torch.from_numpy(rows.block_velocity)
-        dofs = np.array([scene.robot.dof for scene in scenes], np.int64)
-        self._used = np.arange(rows.q.shape[1]) < dofs[:, None]
-        self._with_block = np.array([scene.block is not None for scene in scenes], bool)
-
-    @property
-    def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J), rad or m."""
-        return self._q
-
-    @property
-    def qd(self) -> torch.Tensor:
-        """Their velocities, shape (n, J)."""
-        return self._qd
-
-    @property
-    def block_pose(self) -> torch.Tensor:
-        """Poses of the blocks, (x, y, z, qw, qx, qy, qz), shape (n, 7); zeros if none."""
-        return self._block_pose
-
-    @property
-    def block_velocity(self) -> torch.Tensor:
-        """Linear and angular velocities of the blocks, shape (n, 6); zeros if none."""
-        return self._block_velocity
-
-    def _checked_targets(self, targets: torch.Tensor) -> Float32:
-        """Targets of ``step``, contiguous.
-
-        Raises:
-            ValueError: If the shape is wrong, or a target is not finite; padding may be anything.
-        """
-        found = np.ascontiguousarray(targets.numpy(), np.float32)
-        if found.shape != self._used.shape:
-            raise ValueError(f"targets have shape {found.shape}, not {self._used.shape}")
-        wrong = self._used & ~np.isfinite(found)
-        if wrong.any():
-            env = int(wrong.any(axis=1).argmax())
-            name = self.scenes[env].robot.name
-            raise ValueError(f"environment {env} ({name!r}): targets {found[env].tolist()}")
-        return found
-
-    def _checked_state(
-        self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor
-    ) -> tuple[NDArray[np.int64], Float32, Float32]:
-        """Arguments of ``reset``.
-
-        Raises:
-            ValueError: If a shape is wrong, an environment does not exist, or a position that
-                matters is not finite.
-        """
-        n, joints = self._used.shape
-        chosen, positions, poses = envs.numpy(), q.numpy(), block_pose.numpy()
-        if positions.shape != (len(chosen), joints) or poses.shape != (len(chosen), 7):
-            raise ValueError(
-                f"reset of {len(chosen)} environments with q of shape {positions.shape} and "
-                f"blocks of shape {poses.shape}; they need ({len(chosen)}, {joints}) and (.., 7)"
-            )
-        if ((chosen < 0) | (chosen >= n)).any():
-            raise ValueError(f"reset of environments {chosen.tolist()}; there are {n}")
-        wrong = (self._used[chosen] & ~np.isfinite(positions)).any(axis=1)
-        wrong |= self._with_block[chosen] & ~np.isfinite(poses).all(axis=1)
-        if wrong.any():
-            k = int(wrong.argmax())
-            env = int(chosen[k])
-            raise ValueError(
-                f"environment {env} ({self.scenes[env].robot.name!r}): reset to "
-                f"q {positions[k].tolist()}, block {poses[k].tolist()}"
-            )
-        return chosen, positions, poses
 
 
 _TAKEN_AT_END = 1 - (1 - VELOCITY_GAIN) ** SUBSTEPS
@@ -315,21 +234,3 @@ def _sane(values: ArrayLike, largest: float) -> bool:
 def most_joints(scenes: Sequence[Scene]) -> int:
     """J, the largest number of independent joints."""
     return max((scene.robot.dof for scene in scenes), default=0)
-
-
-def export_robots(scenes: Sequence[Scene], folder: Path) -> list[Exported]:
-    """Write every robot that the scenes hold, once, for ``BulletBatch``.
-
-    Returns:
-        What each scene loads.
-
-    Raises:
-        FormatError: If a robot cannot be written.
-        MeshError: If a collision mesh cannot be read.
-    """
-    written: dict[int, Exported] = {}
-    for scene in scenes:
-        key = id(scene.robot)
-        if key not in written:
-            written[key] = export(scene.robot, folder / f"robot{len(written)}")
-    return [written[id(scene.robot)] for scene in scenes]

@@ -7,15 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from morphgen.checks.rigid import rigid_groups
 from morphgen.errors import MissingDependencyError, SimulationError
-from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.quiet import quiet
 from morphgen.model.geometry import Pose
+from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 
 try:
     with quiet():
@@ -86,7 +84,7 @@ class BulletScene:
 
         Args:
             scene: What to load.
-            urdf: The file of ``body``, as ``export`` writes it.
+            urdf: The file of ``body``, as ``export_robots`` writes it.
             body: The scene's robot as ``rigid_bodies``.
             contacts: What may touch what.
 
@@ -281,20 +279,6 @@ class BulletScene:
         if self.id >= 0:
             pybullet.disconnect(**self._client)
             self.id = -1
-
-
-def export(robot: Robot, folder: Path) -> tuple[Path, Robot]:
-    """Write what ``BulletScene`` loads.
-
-    Returns:
-        The URDF and the robot in it, as ``rigid_bodies``.
-
-    Raises:
-        FormatError: If a robot cannot be written.
-        MeshError: If a collision mesh cannot be read.
-    """
-    body = rigid_bodies(robot)
-    return write_bundle(body, folder, picture=False) / URDF, body
 
 
 def _pose(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:

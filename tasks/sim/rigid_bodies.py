@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from morphgen.checks.rigid import rigid_groups
 from morphgen.checks.self_collision import ignored_pairs
 from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import Inertial, Link, Robot, sorted_pair
 
 _Piece = tuple[Pose, Link]

@@ -9,7 +9,7 @@ import torch
 
 from bullets import PUSHING, client_of, reset, starts, state, touching, wander
 from morphgen.errors import SimulationError
-from morphgen.tasks.sim import bullet_batch
+from morphgen.tasks.sim import bullet_files
 from morphgen.tasks.sim.bullet import BulletSimulation
 from scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 
@@ -120,10 +120,13 @@ def test_a_reset_reports_the_state(simulate):
 
 def test_a_robot_is_written_once(simulate, monkeypatch):
     written = []
-    original = bullet_batch.export
-    monkeypatch.setattr(
-        bullet_batch, "export", lambda *args: (written.append(args), original(*args))[1]
-    )
+    original = bullet_files.write_bundle
+
+    def counted(body, *args, **options):
+        written.append(body)
+        return original(body, *args, **options)
+
+    monkeypatch.setattr(bullet_files, "write_bundle", counted)
     simulate(*mixed_scenes(), *mixed_scenes())
     assert len(written) == 3
 
