@@ -10,9 +10,10 @@ import trimesh
 
 from morphgen.errors import FitError
 from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
+from morphgen.fitting.kinds import KINDS
 from morphgen.fitting.quality import quality
 from morphgen.fitting.search import DIGITS, best_several, best_single, sampled
-from morphgen.fitting.soft_iou import KINDS, covered, overlaps
+from morphgen.fitting.soft_iou import covered, overlaps
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, dimensions
 

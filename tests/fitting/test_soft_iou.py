@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from morphgen.fitting.soft_iou import KINDS, Candidates, ascend, overlaps
+from morphgen.fitting.kinds import KINDS
+from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 
 BOX, CYLINDER, SPHERE = (KINDS.index(kind) for kind in ("box", "cylinder", "sphere"))
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
