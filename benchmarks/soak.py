@@ -4,8 +4,9 @@
 
 Steps the robots that a split trains on, among obstacles, whatever the split says of them. Every
 observation and reward is tested. Resident memory of this process and of its workers is told after
-a tenth of the time and at the end; the exit code is 1 if something was not finite, if memory grew
-by more than a twentieth in between, or if a worker outlived the batch.
+a tenth of the time and at the end; the exit code is 1 if something was not finite, if a simulation
+became unstable, if memory grew by more than a twentieth in between, or if a worker outlived the
+batch.
 """
 
 from __future__ import annotations
@@ -48,19 +49,20 @@ def main() -> int:
     with closing(
         make_batch(tasks, bodies, args.envs, sim=args.sim, workers=args.workers, obstacles=True)
     ) as batch:
-        steps, early, late, lost = _run(batch, 60 * args.minutes)
+        steps, early, late, lost, unstable = _run(batch, 60 * args.minutes)
     left = [process.pid for process in multiprocessing.active_children()]
     print(f"{steps:,} steps of {args.envs} environments in {args.minutes:g} minutes, {args.sim}")
     print(f"memory after a tenth: {early / 2**20:,.0f} MB; at the end: {late / 2**20:,.0f} MB")
     print(f"steps with something that is not finite: {lost}; processes left behind: {len(left)}")
-    return int(lost > 0 or late > GROWTH * early or bool(left))
+    print(f"episodes whose simulation became unstable: {unstable}")
+    return int(lost > 0 or unstable > 0 or late > GROWTH * early or bool(left))
 
 
-def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int]:
-    """Steps, memory after a tenth and at the end, and how many steps were not finite."""
+def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int, int]:
+    """Steps, memory after a tenth and at the end, steps not finite, and episodes unstable."""
     actions = random_actions(batch, 1000, seed=0)
     batch.reset()
-    steps = lost = early = 0
+    steps = lost = early = unstable = 0
     start = time.monotonic()
     with tqdm(total=round(seconds), unit="s") as bar:
         while (elapsed := time.monotonic() - start) < seconds:
@@ -68,9 +70,10 @@ def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int]:
                 early = _memory()
             step = batch.step(actions[steps % len(actions)])
             lost += not _is_finite(step)
+            unstable += int(step.unstable.sum())
             steps += 1
             bar.update(int(elapsed) - bar.n)
-    return steps, early, _memory(), lost
+    return steps, early, _memory(), lost, unstable
 
 
 def _is_finite(step: Step) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 _LISTED = 24
 
@@ -42,6 +42,27 @@ class TaskError(MorphgenError):
 
 class SimulationError(MorphgenError):
     """A simulator that cannot hold a scene, became unstable or died."""
+
+
+class UnstableError(SimulationError):
+    """Environments whose numbers mean nothing any more, until they are reset; all others are well.
+
+    Its text is the reason of the first.
+    """
+
+    def __init__(self, reasons: Mapping[int, str]) -> None:
+        """Name them, at least one, each by its number and with what is wrong."""
+        super().__init__(dict(sorted(reasons.items())))
+
+    @property
+    def reasons(self) -> dict[int, str]:
+        """What is wrong, by environment."""
+        found: dict[int, str] = self.args[0]
+        return found
+
+    def __str__(self) -> str:
+        """One line."""
+        return next(iter(self.reasons.values()))
 
 
 class GrammarError(MorphgenError):

@@ -87,6 +87,8 @@ class Score:
     """From success at the end, metres, mean."""
     relative_distance: float
     """Reach: the same over the robot's reach; nan for push."""
+    unstable: int = 0
+    """How many episodes ended because their simulation became unstable."""
 
 
 def episodes_for(steps: int, longest: int) -> int:
@@ -276,6 +278,7 @@ def _score(
         random_success=float(np.mean([episode.success for episode in chance])),
         distance=distance,
         relative_distance=distance / reach(setting.robot) if reaches else math.nan,
+        unstable=sum(episode.unstable for episode in own),
     )
 
 

@@ -98,7 +98,7 @@ def play(
         Pictures, ``FPS`` a second of simulated time, with the first and last moment of an episode.
 
     Raises:
-        SimulationError: If the simulation becomes unstable.
+        SimulationError: If the simulator fails.
     """
     links = list(env.action_links)
     for number in range(episodes):
@@ -114,7 +114,8 @@ def play(
             if over or len(scores) % STRIDE == 0:
                 yield from _shown(env)
         score = episode_score(env.task == "push", sum(scores), scores[-1], len(scores))
-        report(Episode(0, 0, info["success"], info["distance"], score, len(scores)))
+        facts = info["success"], info["distance"], score, len(scores), info["unstable"]
+        report(Episode(0, 0, *facts))
 
 
 def _is_file(policy: str) -> bool:

@@ -32,7 +32,7 @@ from morphgen.rl.report import Numbers, Report, explained_variance, outcome
 from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import Observation, TaskBatch
 
-TOLD = ("reward", "score", "success", "terminated", "truncated")
+TOLD = ("reward", "score", "success", "terminated", "truncated", "unstable")
 """What of every step is kept besides observations and actions."""
 LOSSES = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
 LEARNED = (*LOSSES, "actor_gradient", "critic_gradient")
@@ -125,7 +125,7 @@ class Learner:
 
         Raises:
             TaskError: If a number is no longer finite.
-            SimulationError: If a simulation became unstable.
+            SimulationError: If the simulator failed.
         """
         began = time.perf_counter()
         rollout, seen = self._collect(self._begin())

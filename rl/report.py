@@ -27,6 +27,8 @@ class Report:
     """Share of the episodes that ended here; nan if none did."""
     episodes: int
     """How many ended here."""
+    unstable: int
+    """How many of them because their simulation became unstable."""
     terms: dict[str, float]
     """Of the reward."""
     policy_loss: float
@@ -69,6 +71,7 @@ def outcome(tallied: dict[str, torch.Tensor], body: torch.Tensor, bodies: int) -
         "scores": tuple(scores.tolist()),
         "success": float(tallied["success"][over].float().mean()),
         "episodes": int(over.sum()),
+        "unstable": int(tallied["unstable"].sum()),
     }
 
 

@@ -34,6 +34,8 @@ class Episode:
     score: float
     """See ``episode_score``."""
     steps: int
+    unstable: bool
+    """Whether it ended because the simulation became unstable; see ``Step``."""
 
     @property
     def seconds(self) -> float:
@@ -59,7 +61,7 @@ def run_episodes(
         By environment, and then in their order.
 
     Raises:
-        SimulationError: If a simulation becomes unstable.
+        SimulationError: If the simulator fails.
     """
     batch.reset()
     n = batch.num_envs
@@ -86,6 +88,7 @@ def run_episodes(
                         float(step.distance[env]),
                         episode_score(bool(batch.pushes[env]), *numbers),
                         int(steps[env]),
+                        bool(step.unstable[env]),
                     )
                 )
                 done += 1

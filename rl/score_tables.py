@@ -33,7 +33,7 @@ def score_table(found: Scores, style: str = "simple") -> str:
 
 
 def summary(found: Scores) -> str:
-    """Mean scores of each side and task, a line a mode."""
+    """Mean scores of each side and task, a line a mode, and how many episodes were cut short."""
     lines = []
     for mode, scores in found.items():
         groups = dict.fromkeys((each.side, each.task) for each in scores)
@@ -43,6 +43,9 @@ def summary(found: Scores) -> str:
             score = np.mean([each.score for each in own])
             success = np.mean([each.success for each in own])
             means.append(f"{SIDES[side]} {task} {score:.2f}, success {success:.0%}")
+        unstable = sum(each.unstable for each in scores)
+        if unstable:
+            means.append(f"{unstable} episodes ended because their simulation became unstable")
         lines.append(f"{mode}: " + "; ".join(means))
     return "\n".join(lines)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, UnstableError
 from morphgen.tasks.actions import ActionKind, Targets, shares_of
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
@@ -53,7 +53,10 @@ class Step:
     terminated: torch.Tensor
     """Whether the task ended the episode, shape (n,), bool."""
     truncated: torch.Tensor
-    """Whether time did, shape (n,), bool."""
+    """Whether time did, or physics (see ``unstable``), shape (n,), bool."""
+    unstable: torch.Tensor
+    """Whether its simulation became unstable, shape (n,), bool; the step is then as if robot and
+    block had stopped where they were before."""
     final_observation: Observation
     """After the action, whatever followed: to bootstrap from where time ran out."""
     success: torch.Tensor
@@ -205,13 +208,13 @@ class TaskBatch:
 
         Raises:
             TaskError: If the actions are none.
-            SimulationError: If a simulation became unstable.
+            SimulationError: If the simulator failed.
         """
         self._act(actions)
-        self.simulation.step(self.targets[:, : self._joints].contiguous())
+        unstable = self._move()
         self.elapsed += 1
         verdict = self._judge()
-        truncated = (self.elapsed >= self.longest) & ~verdict.terminated
+        truncated = ((self.elapsed >= self.longest) | unstable) & ~verdict.terminated
         final = self.observe()
         q, block_pose = self.q.clone(), self.simulation.block_pose.clone()
         over = torch.nonzero(truncated | verdict.terminated)[:, 0]
@@ -222,6 +225,7 @@ class TaskBatch:
             reward=torch.stack(list(verdict.terms.values())).sum(dim=0),
             terminated=verdict.terminated,
             truncated=truncated,
+            unstable=unstable,
             final_observation=final,
             success=verdict.success,
             distance=verdict.distance,
@@ -293,6 +297,19 @@ class TaskBatch:
         shape = (self.num_envs, self.bodies.max_links)
         self._shares = shares_of(actions, self.kind, shape, self.device) * self.mask
         self.targets = self._moved(self.targets, self._shares)
+
+    def _move(self) -> torch.Tensor:
+        """Let physics go on; what became unstable is put back to where it was, (n,) bool."""
+        unstable = torch.zeros_like(self.pushes)
+        q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
+        try:
+            self.simulation.step(self.targets[:, : self._joints].contiguous())
+        except UnstableError as error:
+            envs = torch.tensor(list(error.reasons), device=self.device)
+            unstable[envs] = True
+            self.simulation.reset(envs, q[envs], block[envs])
+            self._qd[envs] = 0
+        return unstable
 
     def _judge(self) -> Verdict:
         q, qd = self.q, self._widened(self.simulation.qd)

@@ -146,7 +146,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
 
         Raises:
             TaskError: If the action is none, or no episode is running.
-            SimulationError: If the simulation became unstable.
+            SimulationError: If the simulator failed.
         """
         self._require_open()
         if not self._running:
@@ -211,6 +211,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             "success": bool(step.success[0]),
             "distance": float(step.distance[0]),
             "score": float(step.score[0]),
+            "unstable": bool(step.unstable[0]),
             "terms": {name: float(term[0]) for name, term in step.terms.items()},
             "self_collision": self._contacts.self_collision,
         }

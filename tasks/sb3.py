@@ -60,6 +60,7 @@ class SB3Vector(VecEnv):
             infos[env]["terminal_observation"] = facts["final_obs"][env]
             infos[env]["TimeLimit.truncated"] = bool(truncated[env])
             infos[env]["is_success"] = bool(facts["success"][env])
+            infos[env]["unstable"] = bool(facts["unstable"][env])
         return seen, reward, over, infos
 
     def close(self) -> None:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from morphgen.tasks.sb3 import SB3Vector
 
 Array = NDArray[Any]
+_TOLD = ("success", "distance", "score", "unstable")
+"""What of a ``Step`` is in ``infos``, besides the terms."""
 
 
 class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
@@ -35,8 +37,9 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
     Where an episode ends, the next begins in the same step (``AutoresetMode.SAME_STEP``):
     ``infos["final_obs"]`` is then an array of observations, and of None where none ended, and
     ``infos["final_info"]`` has the facts of the last step. Every step has ``success``,
-    ``distance``, ``score`` and ``terms`` (see ``Step``), each with its mask, such as ``_success``:
-    the environments whose episode goes on, or in ``final_info`` those whose episode ended.
+    ``distance``, ``score``, ``unstable`` and ``terms`` (see ``Step``), each with its mask, such as
+    ``_success``: the environments whose episode goes on, or in ``final_info`` those whose episode
+    ended.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -68,7 +71,7 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
 
         Raises:
             TaskError: If the actions are none.
-            SimulationError: If a simulation became unstable.
+            SimulationError: If the simulator failed.
         """
         self._require_open()
         step = self.batch.step(torch.from_numpy(np.array(actions)))
@@ -135,8 +138,8 @@ def _vector(
 
 def _facts(step: Step, where: Array) -> dict[str, Any]:
     """What is known of a step, each with the mask of the environments that it is known of."""
-    facts = {"success": step.success, "distance": step.distance, "score": step.score}
-    found = _masked({name: _numpy(values) for name, values in facts.items()}, where)
+    facts = {name: _numpy(getattr(step, name)) for name in _TOLD}
+    found = _masked(facts, where)
     terms = _masked({name: _numpy(values) for name, values in step.terms.items()}, where)
     return found | {"terms": terms, "_terms": where.copy()}
 

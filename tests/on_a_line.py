@@ -50,6 +50,7 @@ class OnALine:
             reward=terms["distance"] + terms["near"],
             terminated=terminated,
             truncated=truncated,
+            unstable=torch.zeros_like(truncated),
             final_observation=final,
             success=near,
             distance=distance,

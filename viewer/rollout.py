@@ -249,6 +249,8 @@ def _step(player: _Player) -> None:
     track.success.append(bool(step.success[0]))
     track.q.append(_numbers(step.q[0, : track.robot.dof]))
     player.running = not bool(step.terminated[0] | step.truncated[0])
+    if step.unstable[0]:
+        track.fault = "the simulation became unstable"
 
 
 def _numbers(values: torch.Tensor) -> Array:

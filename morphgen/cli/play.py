@@ -111,6 +111,6 @@ class _Report:
         print(
             f"episode {self._number}: {'success' if episode.success else 'failure'}, "
             f"{episode.distance:.3f} m from the {self._from}, score {episode.score:.2f}, "
-            f"{episode.seconds:.2f} s",
+            f"{episode.seconds:.2f} s{', the simulation became unstable' * episode.unstable}",
             flush=True,
         )

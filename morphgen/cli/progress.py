@@ -70,9 +70,13 @@ class Shower:
             self._bar.n = self._bar.initial
         self._bar.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
         self._bar.update(report.transitions - self._bar.n)
+        if report.unstable:
+            self._bar.write(_unstable(self._bar.desc, report), file=sys.stderr)
 
 
 def _print(name: str, report: Report, updates: int) -> None:
+    if report.unstable:
+        print(_unstable(name, report), file=sys.stderr, flush=True)
     if report.update % max(updates // 20, 1) and report.update < updates:
         return
     left = (updates - report.update) * report.transitions / report.update / report.steps_per_second
@@ -82,6 +86,13 @@ def _print(name: str, report: Report, updates: int) -> None:
         f"{report.steps_per_second:,.0f} steps/s, {left / 60:.1f} min left",
         file=sys.stderr,
         flush=True,
+    )
+
+
+def _unstable(name: str, report: Report) -> str:
+    return (
+        f"{name}: update {report.update}: {report.unstable} of {report.episodes} episodes ended "
+        "because their simulation became unstable"
     )
 
 

@@ -102,7 +102,9 @@ class Simulation(Protocol):
             targets: Target positions of the independent joints, shape (n, J).
 
         Raises:
-            SimulationError: If a simulation became unstable, or a worker died; it names which.
+            UnstableError: If simulations became unstable; it names them, and each must be reset
+                before the next step. All others have moved.
+            SimulationError: If a worker died, or MuJoCo has no memory for an environment.
         """
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from morphgen.errors import SimulationError
+from morphgen.errors import SimulationError, UnstableError
 from morphgen.tasks.sim.base import Contacts, Scene
 from morphgen.tasks.sim.bullet_batch import BulletBatch, most_joints
 from morphgen.tasks.sim.bullet_files import export_robots
@@ -119,8 +119,9 @@ class BulletSimulation(RowTensors):
 
         Raises:
             ValueError: If the shape is wrong, or a target is not finite.
-            SimulationError: If an environment became unstable, the simulation is closed, or a
-                worker died; in the last case it is closed thereby.
+            UnstableError: If environments became unstable.
+            SimulationError: If the simulation is closed, or a worker died; in the last case it is
+                closed thereby.
         """
         self._require_open()
         self._targets[:] = self._checked_targets(targets)
@@ -155,7 +156,7 @@ class BulletSimulation(RowTensors):
             self.close()
             raise
         if failures:
-            raise failures[0]
+            raise _as_one(failures)
 
 
 def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
@@ -172,6 +173,16 @@ def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
         shares[lightest].append(env)
         loads[lightest] += weights[env]
     return [sorted(share) for share in shares]
+
+
+def _as_one(failures: Sequence[Exception]) -> Exception:
+    """What processes found unstable is one error, if nothing else failed."""
+    reasons: dict[int, str] = {}
+    for failure in failures:
+        if not isinstance(failure, UnstableError):
+            return failure
+        reasons |= failure.reasons
+    return UnstableError(reasons)
 
 
 def _free(

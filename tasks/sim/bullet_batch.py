@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.errors import SimulationError
+from morphgen.errors import UnstableError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
@@ -135,7 +135,7 @@ class BulletBatch:
             i = self._index[env]
             scene = self._scenes[i]
             positions = positions[: scene.robot.dof]
-            if self._unstable.pop(i, None) is not None:
+            if self._unstable.pop(env, None) is not None:
                 self._loaded[i].close()
                 self._loaded[i] = self._load(i)
             loaded, span = self._loaded[i], self._spans[i]
@@ -156,11 +156,10 @@ class BulletBatch:
             targets: Of all environments, shape (n, J), contiguous and finite.
 
         Raises:
-            SimulationError: If an environment is unstable: not finite, or beyond
-                ``MAX_VELOCITY``. All have stepped; this one must be reset before the next step.
+            UnstableError: If environments are unstable: not finite, or beyond ``MAX_VELOCITY``.
+                All have stepped; these must be reset before the next step.
         """
-        for why in self._unstable.values():
-            raise SimulationError(why)
+        self._require_stable()
         wanted = targets.reshape(-1)[self._source] * self._gain + self._offset
         ends, last = self._law(wanted)
         mean = (ends - self._positions) / (SUBSTEPS * TIMESTEP)
@@ -189,6 +188,7 @@ class BulletBatch:
             rows.block_velocity[self._block_rows] = blocks[:, 7:]
         if not (_sane(q, MAX_POSITION) and _sane(qd, MAX_VELOCITY) and _sane(blocks, MAX_VELOCITY)):
             self._find_unstable()
+            self._require_stable()
 
     def _law(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions and velocities at the end of a control step.
@@ -211,11 +211,14 @@ class BulletBatch:
             velocity = rows.block_velocity[env]
             joints = _sane(q, MAX_POSITION) and _sane(qd, MAX_VELOCITY)
             if not (joints and _sane(pose, MAX_VELOCITY) and _sane(velocity, MAX_VELOCITY)):
-                self._unstable[i] = (
+                self._unstable[env] = (
                     f"{self._name(i)} became unstable in step {self._steps[i]} after its reset: "
                     f"q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
                 )
-        raise SimulationError(next(iter(self._unstable.values())))
+
+    def _require_stable(self) -> None:
+        if self._unstable:
+            raise UnstableError(self._unstable)
 
     def _name(self, i: int) -> str:
         return f"environment {self._envs[i]} ({self._scenes[i].robot.name!r})"

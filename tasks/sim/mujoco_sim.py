@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.checks.mujoco_warnings import caught
-from morphgen.errors import SimulationError
+from morphgen.errors import SimulationError, UnstableError
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
-from morphgen.tasks.sim.mujoco_state import State
+from morphgen.tasks.sim.mujoco_state import MAX_SPEED, State
 
 Array = NDArray[np.float64]
 Work = tuple[mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
@@ -134,8 +134,9 @@ class MujocoSimulation:
 
         Raises:
             ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
-            SimulationError: If a simulation became unstable; then all have moved. It names the
-                first such environment, which remains so until it is reset.
+            UnstableError: If environments became unstable; all have moved, and these remain so
+                until they are reset.
+            SimulationError: If the contacts of one do not fit into MuJoCo's memory; all have moved.
         """
         self._require_open()
         if targets.shape != self._targets.shape:
@@ -153,9 +154,13 @@ class MujocoSimulation:
             with unclocked():
                 self._advance()
             self._state.read()
-        fault = self._state.fault()
-        if fault is not None:
-            raise SimulationError(f"{self._where(fault[0])}: {fault[1]}")
+        full, unstable = self._state.faults()
+        if full:
+            where = self._where(full[0])
+            raise SimulationError(f"{where}: its contacts do not fit into MuJoCo's memory")
+        if unstable:
+            why = f"unstable: a velocity is not finite or beyond {MAX_SPEED:g}"
+            raise UnstableError({env: f"{self._where(env)}: {why}" for env in unstable})
 
     def close(self) -> None:
         """Free everything; a second time does nothing."""

@@ -77,18 +77,22 @@ class State:
             spin[:] = _rotated(quaternion, spin)
             self.block_velocity.numpy()[:] = velocity
 
-    def fault(self) -> tuple[int, str] | None:
-        """The first environment whose numbers mean nothing any more, and what it has."""
+    def faults(self) -> tuple[list[int], list[int]]:
+        """Environments whose numbers mean nothing any more.
+
+        Returns:
+            Those whose contacts do not fit into MuJoCo's memory, and the others: they have a
+            velocity that is not finite, or beyond ``MAX_SPEED``.
+        """
         warnings = np.array(self._warnings)
         speeds = np.abs(self._velocities.flat)
         if speeds.max() <= MAX_SPEED and not warnings.any():
-            return None
+            return [], []
         begin = self._velocities.begin
         slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
-        env = int(np.flatnonzero(~np.array(slow) | warnings.any(axis=1))[0])
-        if warnings[env, _FULL].any():
-            return env, "its contacts do not fit into MuJoCo's memory"
-        return env, f"unstable: a velocity is not finite or beyond {MAX_SPEED:g}"
+        full = warnings[:, _FULL].any(axis=1)
+        unstable = (~np.array(slow) | warnings.any(axis=1)) & ~full
+        return np.flatnonzero(full).tolist(), np.flatnonzero(unstable).tolist()
 
     def forget(self) -> None:
         """Let go of the environments' data."""

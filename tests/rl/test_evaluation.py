@@ -153,6 +153,10 @@ def test_tables_hold_every_robot_and_mode(run, tmp_path):
     assert "MT reach" in summary(found)
     mean = np.mean([each.score for each in found["deterministic"]])
     assert f"{mean:.2f}" in summary(found).splitlines()[0]
+    assert "unstable" not in summary(found)
+    lost = [replace(found["deterministic"][0], unstable=2), *found["deterministic"][1:]]
+    last = "2 episodes ended because their simulation became unstable"
+    assert summary({"deterministic": lost}).endswith(last)
     for suffix in (".csv", ".json", ".md"):
         write_scores(tmp_path / f"table{suffix}", found)
     stored = json.loads((tmp_path / "table.json").read_text())

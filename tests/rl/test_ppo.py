@@ -12,7 +12,7 @@ from learners import SMALL, equal, learner, weights
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import KL_FACTOR, Learner, follow, learning_rate, next_share, policy_loss
-from morphgen.rl.report import explained_variance
+from morphgen.rl.report import explained_variance, outcome
 from morphgen.rl.symlog import symlog
 from on_a_line import OnALine
 
@@ -71,6 +71,23 @@ def test_explained_variance_by_hand():
     assert explained_variance(0.5 * returns, returns) == pytest.approx(0.75)
     assert explained_variance(-returns, returns) == pytest.approx(-3)
     assert explained_variance(returns, torch.ones(2, 2)) == 0
+
+
+def test_the_outcome_of_a_rollout_by_hand():
+    true, false = True, False
+    tallied = {
+        "reward": torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]),
+        "score": torch.tensor([[0.0, 1.0, 2.0], [4.0, 3.0, 2.0]]),
+        "success": torch.tensor([[true, true, false], [false, false, true]]),
+        "terminated": torch.tensor([[true, false, false], [false, false, false]]),
+        "truncated": torch.tensor([[false, false, true], [false, true, true]]),
+        "unstable": torch.tensor([[false, false, true], [false, false, false]]),
+    }
+    found = outcome(tallied, torch.tensor([1, 0, 1]), 3)
+    assert (found["reward"], found["score"]) == (3.5, 2.0)
+    assert found["scores"][:2] == (2.0, 2.0)
+    assert math.isnan(found["scores"][2])
+    assert (found["success"], found["episodes"], found["unstable"]) == (0.5, 4, 1)
 
 
 def test_a_moving_average_by_hand():

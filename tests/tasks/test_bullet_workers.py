@@ -16,7 +16,7 @@ import torch
 
 from bullets import state
 from commands import heed_ctrl_c
-from morphgen.errors import SimulationError
+from morphgen.errors import SimulationError, UnstableError
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.sim.bullet import BulletSimulation, divide
@@ -111,19 +111,23 @@ def test_wrong_arguments_leave_the_workers_at_work(workers):
     assert workers.q[0, : workers.scenes[0].robot.dof].any()
 
 
-@pytest.mark.parametrize("heavy", [0, 1], ids=["here", "in a worker"])
-def test_errors_are_raised_wherever_they_are_and_the_others_step(heavy):
+@pytest.mark.parametrize("heavy", [{0}, {1}, {0, 1}], ids=["here", "in a worker", "both"])
+def test_what_is_unstable_is_named_wherever_it_is_and_the_others_step(heavy):
     """The weight of such a block is not finite."""
-    scenes = [push_scene(), push_scene()]
-    scenes[heavy] = Scene(push_scene().robot, block=Block((0.1, 0.1, 0.1), mass=1e308))
+    scenes = [push_scene() for _ in range(4)]
+    for env in heavy:
+        scenes[env] = Scene(push_scene().robot, block=Block((0.1, 0.1, 0.1), mass=1e308))
     with closing(BulletSimulation(scenes, processes=2)) as simulation:
+        assert [worker.envs.tolist() for worker in simulation._workers] == [[1, 3]]
         envs, q, pose = starts(simulation)
         simulation.reset(envs, q, pose)
-        before = state(simulation)[1 - heavy]
-        message = rf"environment {heavy} \('prims'\) became unstable"
-        with pytest.raises(SimulationError, match=message):
+        others = sorted({0, 1, 2, 3} - heavy)
+        before = state(simulation)[others]
+        message = rf"environment {min(heavy)} \('prims'\) became unstable"
+        with pytest.raises(UnstableError, match=message) as found:
             simulation.step(q)
-        assert not torch.equal(state(simulation)[1 - heavy], before)
+        assert found.value.reasons.keys() == heavy
+        assert (state(simulation)[others] != before).any(dim=1).all()
         simulation.reset(envs, q, pose)
         assert torch.isfinite(state(simulation)).all()
 

@@ -224,7 +224,7 @@ def test_an_episode_ends_by_itself_and_is_seen_to_its_end(make):
         seen, _, terminated, truncated, info = env.step(np.ones(5, dtype=np.float32))
         assert (terminated, truncated) == (False, k == STEPS - 1)
     assert np.abs(seen["velocity"]).max() > 0
-    assert set(info) == {"success", "distance", "score", "terms", "self_collision"}
+    assert set(info) == {"success", "distance", "score", "unstable", "terms", "self_collision"}
     assert info["terms"]["distance"] == pytest.approx(-info["distance"])
     with pytest.raises(TaskError, match="no episode is running; call reset"):
         env.step(np.ones(5, dtype=np.float32))

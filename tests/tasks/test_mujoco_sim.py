@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from morphgen.checks.self_collision import attached_pairs
-from morphgen.errors import SimulationError
+from morphgen.errors import SimulationError, UnstableError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, movable_positions
@@ -295,14 +295,15 @@ def test_what_explodes_is_named_and_can_be_reset(tmp_path, monkeypatch):
     sim.step(home[0])
     sim._data[1].qvel[0] = math.nan
     name = sim.scenes[1].robot.name
-    with pytest.raises(SimulationError, match=rf"environment 1 \(robot '{name}', 2 steps"):
+    with pytest.raises(UnstableError, match=rf"environment 1 \(robot '{name}', 2 steps"):
         sim.step(home[0])
     assert sim.q[[0, 2]].isfinite().all()
     put_back(sim, [1], home)
     sim.step(home[0])
-    sim._data[2].qvel[:] = 1e6
-    with pytest.raises(SimulationError, match=r"environment 2 .*beyond 10000"):
+    sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
+    with pytest.raises(UnstableError, match=r"environment 0 .*beyond 10000") as found:
         sim.step(home[0])
+    assert list(found.value.reasons) == [0, 2]
     assert list(Path(tmp_path).iterdir()) == []
 
 

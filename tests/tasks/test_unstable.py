@@ -1,0 +1,129 @@
+"""A simulation that explodes ends one episode, whatever the simulator, and nothing else."""
+
+import math
+
+import pytest
+import torch
+
+from morphgen.rl.references import Random
+from morphgen.rl.rollouts import run_episodes
+from morphgen.tasks.batch import Channels
+from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.make import batch_of
+from morphgen.tasks.robots import robot_of
+from morphgen.tasks.settings import push_setting, reach_setting
+
+pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+import pybullet
+
+from bullets import client_of
+
+REACH, PUSH = ReachConfig(goals=5), PushConfig(starts=5)
+CHANNELS = Channels(velocity=True, previous_action=True, tool=True)
+ENVS = 4
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    """A robot that reaches and one that pushes."""
+    cache = tmp_path_factory.mktemp("goals")
+    chosen = {"obstacles": False, "seed": 0, "cache": cache}
+    reaching = reach_setting(robot_of("arm3-stick"), REACH, **chosen)
+    return [reaching, push_setting(robot_of("prims"), PUSH, **chosen)]
+
+
+@pytest.fixture(params=["pybullet", "mujoco"])
+def made(request, settings):
+    """Batches whose even environments reach and whose odd ones push."""
+    opened = []
+
+    def make():
+        options = {"reach": REACH, "push": PUSH, "channels": CHANNELS, "seed": 1}
+        opened.append(batch_of(settings, ENVS, sim=request.param, **options))
+        assert opened[-1].pushes.tolist() == [False, True, False, True]
+        return opened[-1]
+
+    yield make
+    for batch in opened:
+        batch.close()
+
+
+def break_physics(batch, env):
+    """Leave a velocity that is no number."""
+    if hasattr(batch.simulation, "_data"):
+        batch.simulation._data[env].qvel[0] = math.nan
+        return
+    loaded = client_of(batch.simulation, env)
+    pybullet.resetJointState(loaded.robot, loaded.driven[0], math.nan, physicsClientId=loaded.id)
+
+
+def numbers(step):
+    """All that a step says of each environment."""
+    told = {**step.terms, "reward": step.reward, "score": step.score, "distance": step.distance}
+    seen = {f"next {name}": each for name, each in step.observation.items()}
+    final = {f"final {name}": each for name, each in step.final_observation.items()}
+    return {**told, **seen, **final, "q": step.q, "block": step.block_pose}
+
+
+@pytest.mark.parametrize("lost", [[0], [1], [0, 1, 2, 3]], ids=["reach", "push", "all"])
+def test_it_is_put_back_its_episode_ends_and_the_others_go_on(made, lost):
+    batch, whole = made(), made()
+    batch.reset()
+    whole.reset()
+    chance = Random(0)
+    for _ in range(5):
+        actions = chance.act(batch)
+        before = batch.step(actions)
+        whole.step(actions)
+    for env in lost:
+        break_physics(batch, env)
+    actions = chance.act(batch)
+    found, other = batch.step(actions), whole.step(actions)
+    kept = [env for env in range(ENVS) if env not in lost]
+    assert found.unstable.tolist() == [env in lost for env in range(ENVS)]
+    assert torch.equal(found.truncated, found.unstable)
+    assert not found.terminated.any()
+    for name, each in numbers(found).items():
+        assert each.isfinite().all(), name
+        assert torch.equal(each[kept], numbers(other)[name][kept]), name
+    assert torch.equal(found.q[lost], before.q[lost])
+    torch.testing.assert_close(found.block_pose[lost], before.block_pose[lost])
+    assert not found.final_observation["velocity"][lost].any()
+    assert not batch.elapsed[lost].any()
+    assert (batch.elapsed[kept] == 6).all()
+    found, other = batch.step(actions), whole.step(actions)
+    assert not found.unstable.any()
+    for name, each in numbers(found).items():
+        assert each.isfinite().all(), name
+        assert torch.equal(each[kept], numbers(other)[name][kept]), name
+
+
+def test_the_episode_that_follows_is_the_one_that_would_have(made):
+    batch, whole = made(), made()
+    batch.reset()
+    whole.reset()
+    assert torch.equal(batch.goal, whole.goal)
+    break_physics(batch, 0)
+    step = batch.step(Random(0).act(batch))
+    whole.reset()
+    assert step.unstable.tolist() == [True, False, False, False]
+    assert torch.equal(batch.goal[0], whole.goal[0])
+    assert torch.equal(batch.targets[0], whole.targets[0])
+
+
+def test_episodes_say_so(made):
+    class Breaks(Random):
+        acted = 0
+
+        def act(self, task):
+            self.acted += 1
+            if self.acted == 10:
+                break_physics(task, 0)
+            return super().act(task)
+
+    batch = made()
+    first, second, *others = run_episodes(batch, Breaks(0), 2)
+    assert (first.env, first.unstable, first.steps) == (0, True, 10)
+    assert (second.env, second.unstable, second.steps) == (0, False, REACH.steps)
+    assert not any(each.unstable for each in others)
+    assert len(others) == 2 * ENVS - 2
