@@ -7,6 +7,8 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
+from morphgen.errors import TaskError
+
 KINDS = 64
 """Of functions and shapes, that a process may compile."""
 
@@ -44,10 +46,21 @@ def prepared(
 def _compiled(function: Callable[P, T], graphs: bool) -> Callable[P, T]:
     """By ``torch.compile``, however many kinds of functions a process has compiled before.
 
-    torch gives up after eight kinds and shapes, which four learners of a study are.
+    torch gives up after eight kinds and shapes, which four learners of a study are. Calls raise
+    TaskError where torch cannot compile, such as without a compiler of C++ on a CPU.
     """
     from torch._dynamo import config  # takes a second to load
+    from torch._dynamo.exc import TorchDynamoException
 
     config.recompile_limit = max(config.recompile_limit, KINDS)
     mode = "reduce-overhead" if graphs else None
-    return torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
+    compiled = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return compiled(*args, **kwargs)
+        except TorchDynamoException as error:
+            why = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            raise TaskError(f"--compile: torch cannot compile here: {why}") from error
+
+    return call

@@ -18,7 +18,7 @@ from morphgen.rl.names import REFERENCES
 from morphgen.rl.references import Random, reference
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
-from morphgen.rl.sources import Source, other_side, settings_of
+from morphgen.rl.sources import Source, members, other_side, settings_of
 from morphgen.rl.trained import Mode, Policy
 from morphgen.rl.training import checkpoints
 from morphgen.tasks.batch import TaskBatch
@@ -30,6 +30,8 @@ STEPS = 10_000
 """Control steps of an evaluation, a robot (paper)."""
 AT_ONCE = 34
 """Environments of a robot at most: with these, 10,000 steps are one episode in each."""
+AT_MOST: dict[SimulatorName, int] = {"pybullet": 128, "mujoco": 1024}
+"""Environments of all robots at once, if these are fewer: one of PyBullet takes 36 MB."""
 SALT = 0x5C0_4E5
 """So that an evaluation's episodes are not those of the training with the same seed."""
 
@@ -55,10 +57,10 @@ class Exam:
         Raises:
             TaskError: If there is no episode, or the seed is none.
         """
-        if self.episodes < 1 or self.seed < 0:
+        if self.episodes < 1 or not 0 <= self.seed < 2**63:
             raise TaskError(
-                f"{self.episodes} episodes, seed {self.seed}: at least one episode, and no "
-                "negative seed"
+                f"{self.episodes} episodes, seed {self.seed}: at least one episode, and a seed "
+                "from 0 to 2^63 - 1"
             )
 
 
@@ -107,9 +109,6 @@ def evaluate_run(
 ) -> list[Score]:
     """Evaluate what was trained on the robots of a side of its split, or on its one robot.
 
-    Policies of single robots, of ``se``, are each evaluated on their own robot, and all of them on
-    every robot of another side, where their episodes count alike.
-
     Args:
         path: A checkpoint, or a run's folder.
         side: Of the split.
@@ -121,23 +120,45 @@ def evaluate_run(
         TaskError: If there is no checkpoint, or no such side.
     """
     files = list(checkpoints(path))
-    sources = [read_checkpoint(file)[0].source for file in files]
-    if all(source.only for source in sources) and sources[0].side == side:
-        pairs = zip(files, sources, strict=True)
-        own = (evaluate_checkpoints([file], one, exam, mode, device=device) for file, one in pairs)
-        return [score for scores in own for score in scores]
-    return evaluate_checkpoints(files, other_side(sources[0], side), exam, mode, device=device)
+    source = other_side(read_checkpoint(files[0])[0].source, side)
+    return evaluate_checkpoints(files, source, exam, mode, device=device)
 
 
 def evaluate_checkpoints(
     paths: Sequence[Path], source: Source, exam: Exam, mode: Mode, *, device: str = "cpu"
 ) -> list[Score]:
-    """Evaluate trained policies, the episodes of all together.
+    """Evaluate the trained policies of a run.
+
+    Policies of single robots, of ``se``, are each evaluated on their own robot, if ``source`` is
+    the robots that they were trained on, and all of them on every robot of another, where their
+    episodes count alike.
 
     Raises:
         TaskError: If one is no checkpoint, or for other observations.
         MorphgenError: If a robot or simulator cannot be made.
     """
+    sources = [read_checkpoint(path)[0].source for path in paths]
+    if all(own.only for own in sources) and _of_same(sources[0], source):
+        alone = (replace(source, only=own.only) for own in sources)
+        found = (
+            _evaluate_together([path], own, exam, mode, device)
+            for path, own in zip(paths, alone, strict=True)
+        )
+        return [score for scores in found for score in scores]
+    return _evaluate_together(paths, source, exam, mode, device)
+
+
+def _of_same(one: Source, whole: Source) -> bool:
+    """Whether a robot is of the robots of a split's side, all of which are meant."""
+    if not whole.split or whole.only is not None or one.side != whole.side:
+        return False
+    return members(replace(one, only=None)) == members(whole)
+
+
+def _evaluate_together(
+    paths: Sequence[Path], source: Source, exam: Exam, mode: Mode, device: str
+) -> list[Score]:
+    """The episodes of all policies count together."""
     acting, interfaces = [], set()
     for path in paths:
         run, learner = read_checkpoint(path)
@@ -230,12 +251,35 @@ def _played(
     wanted: Interface,
     folders: tuple[Path, ...],
 ) -> list[list[Episode]]:
-    """Episodes by robot."""
+    """Episodes by robot, in as many batches as it takes; what acts is made for the first."""
     rounds = -(-exam.episodes // AT_ONCE)
     each = -(-exam.episodes // rounds)
-    batch = batch_of(
+    most = max(AT_MOST[exam.sim] // len(settings), 1)
+    found: list[list[Episode]] = [[] for _ in settings]
+    controller: Controller | None = None
+    for begin in range(0, each, most):
+        batch = _batch(range(begin, min(begin + most, each)), settings, exam, wanted, folders)
+        try:
+            controller = controller or acting(batch)
+            for episode in run_episodes(batch, controller, rounds):
+                found[episode.body].append(episode)
+        finally:
+            batch.close()
+    return found
+
+
+def _batch(
+    own: range,
+    settings: Sequence[Setting],
+    exam: Exam,
+    wanted: Interface,
+    folders: tuple[Path, ...],
+) -> TaskBatch:
+    """Some of the environments of each robot."""
+    return batch_of(
         settings,
-        each * len(settings),
+        len(own) * len(settings),
+        first=own.start * len(settings),
         sim=exam.sim,
         seed=int(np.random.SeedSequence([SALT, exam.seed]).generate_state(1)[0]),
         kind=wanted.kind,
@@ -246,13 +290,6 @@ def _played(
         max_links=wanted.max_links,
         library=folders,
     )
-    try:
-        found: list[list[Episode]] = [[] for _ in settings]
-        for episode in run_episodes(batch, acting(batch), rounds):
-            found[episode.body].append(episode)
-    finally:
-        batch.close()
-    return found
 
 
 def _score(

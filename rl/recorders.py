@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
-from morphgen.errors import MissingDependencyError
+from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.formats.files import write_atomic
 from morphgen.rl.report import Report
 from morphgen.rl.runs import RunConfig
@@ -35,12 +35,23 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """Reports of a run, an update each, oldest first; none if it has none yet.
 
     A last line that a killed run left unfinished does not count.
+
+    Raises:
+        FormatError: If a line is no report.
     """
     path = folder / METRICS
     if not path.is_file():
         return []
     lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    return [json.loads(line) for line in lines]
+    found = []
+    for number, line in enumerate(lines, 1):
+        try:
+            report = json.loads(line)
+            report["update"], report["transitions"], report["score"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise FormatError(f"{path}, line {number}: not the report of an update") from error
+        found.append(report)
+    return found
 
 
 class Metrics:
@@ -98,15 +109,20 @@ class WeightsAndBiases:
 
         Raises:
             MissingDependencyError: If wandb is not installed.
+            TaskError: If it refuses, such as where nobody is logged in.
         """
-        self._run = require_wandb().init(
-            project="morphgen",
-            name=str(folder),
-            id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
-            resume="allow",
-            dir=folder,
-            config=asdict(config),
-        )
+        wandb = require_wandb()
+        try:
+            self._run = wandb.init(
+                project="morphgen",
+                name=str(folder),
+                id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
+                resume="allow",
+                dir=folder,
+                config=asdict(config),
+            )
+        except wandb.errors.Error as error:
+            raise TaskError(f"--wandb: {error}") from error
 
     def record(self, report: Report) -> None:
         """Send scalars, by update."""

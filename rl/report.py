@@ -33,7 +33,7 @@ class Report:
     """Of the reward."""
     policy_loss: float
     value_loss: float
-    """Half the squared error, of symlogs if the critic predicts these."""
+    """Half the squared error, or ``matching_loss`` if the critic predicts symlogs."""
     entropy: float
     """Of a robot's action, nats."""
     kl: float

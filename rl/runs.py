@@ -17,7 +17,7 @@ from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import FormatError, TaskError
 from morphgen.formats.files import LOCK, partial_of, write_atomic
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.sources import Source
+from morphgen.rl.sources import Source, most_obstacles
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import PushConfig, ReachConfig
@@ -81,12 +81,15 @@ class RunConfig:
     @property
     def interface(self) -> Interface:
         """Of its policy."""
-        channels = Channels(tool=self.policy.tool_position)
+        obstacles = most_obstacles(self.source, self.reach.obstacles, self.push.obstacles)
+        channels = Channels(tool=self.policy.tool_position, obstacles=obstacles)
         return Interface(self.policy.kind, self.max_links, channels)
 
 
 def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
     """Make a run's folder, or make sure that the one that is there is of this run.
+
+    A run that has no checkpoint yet has nothing to go on from, and may become another.
 
     Raises:
         TaskError: As ``require_open``.
@@ -94,7 +97,7 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
     """
     require_open(folder, config, resume=resume)
     path = folder / CONFIG
-    if path.is_file():
+    if _has_learned(folder):
         return
     data = {"format": FORMAT, "morphgen": version("morphgen"), **asdict(config)}
     try:
@@ -111,16 +114,23 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
         TaskError: If it is there and is not to be resumed, or is of another run or none.
     """
     path = folder / CONFIG
-    if path.is_file():
+    if _has_learned(folder):
         if not resume:
             raise TaskError(f"{folder} has a run: say --resume to go on, or another --out")
         _require_same(folder, read_config(folder), config)
+    elif path.is_file():
+        read_config(folder)
     elif folder.is_dir():
         own = (LOCK, partial_of(path).name)
         if any(each.name not in own for each in folder.iterdir()):
             raise TaskError(f"{folder} is there and is no run's folder: name another with --out")
-    elif folder.exists():
+    elif folder.is_file():
         raise TaskError(f"{folder} is a file: name a folder with --out")
+
+
+def _has_learned(folder: Path) -> bool:
+    """Whether it is a run's folder, and has a checkpoint, or one of its robots has."""
+    return (folder / CONFIG).is_file() and next(folder.rglob(CHECKPOINT), None) is not None
 
 
 def read_config(folder: Path) -> RunConfig:
@@ -220,6 +230,8 @@ def _tuples(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _require_same(folder: Path, stored: RunConfig, asked: RunConfig) -> None:
     theirs, ours = _flat(asdict(stored)), _flat(asdict(asked))
+    for each in (theirs, ours):  # which GPU it is makes no other run
+        each["device"] = each["device"].partition(":")[0]
     wrong = [
         f"{name} {_short(theirs[name])}, not {_short(ours[name])}"
         for name in ours

@@ -20,6 +20,7 @@ from morphgen.rl.evaluation import Score, as_data
 SIDES = {"train": "MT", "test": "ZS"}
 """What the paper calls the mean score of a side: multi-task and zero-shot."""
 HEADERS = ("robot", "side", "task", "mode", "score", "95%", "success", "raw", "random", "distance")
+UNSTABLE = "episodes that ended because their simulation became unstable"
 SUFFIXES = (".csv", ".json", ".md")
 
 Scores = Mapping[str, Sequence[Score]]
@@ -45,7 +46,7 @@ def summary(found: Scores) -> str:
             means.append(f"{SIDES[side]} {task} {score:.2f}, success {success:.0%}")
         unstable = sum(each.unstable for each in scores)
         if unstable:
-            means.append(f"{unstable} episodes ended because their simulation became unstable")
+            means.append(f"{UNSTABLE}: {unstable}")
         lines.append(f"{mode}: " + "; ".join(means))
     return "\n".join(lines)
 
@@ -57,7 +58,9 @@ def require_table(path: Path) -> None:
         TaskError: If not.
     """
     if path.suffix not in SUFFIXES:
-        raise TaskError(f"{path}: a table's name ends in{nearest(path.suffix, SUFFIXES)}")
+        raise TaskError(
+            f"{path}: no name of a table ends in {path.suffix!r}{nearest(path.suffix, SUFFIXES)}"
+        )
     if not path.parent.is_dir():
         raise TaskError(f"{path}: there is no folder {path.parent}")
 

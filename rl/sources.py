@@ -133,6 +133,23 @@ def other_side(source: Source, side: Side) -> Source:
     return source
 
 
+@lru_cache(maxsize=64)
+def most_obstacles(source: Source, reach: int, push: int) -> int:
+    """How many obstacles the one robot has, or at most a robot of the split, on whichever side.
+
+    Args:
+        source: Of the robot or split.
+        reach: How many there are where robots reach among obstacles.
+        push: The same where they push.
+    """
+    each = {"reach": reach, "push": push}
+    if source.task is not None:
+        return each[source.task] if source.obstacles else 0
+    sides: tuple[Side, ...] = ("train", "test")
+    both = (member for side in sides for member in members(other_side(source, side)))
+    return max((each[member.task] for member in both if member.obstacles), default=0)
+
+
 def require_links(source: Source, max_links: int) -> None:
     """Require that what is trained on one side of a split can be tested on the other.
 

@@ -19,6 +19,7 @@ from morphgen.formats.files import save
 from morphgen.rl.evaluation import Score, as_data
 from morphgen.rl.intervals import Interval, iqm_interval
 from morphgen.rl.recorders import read_metrics
+from morphgen.rl.score_tables import UNSTABLE
 from morphgen.rl.study import Cell, as_record
 from morphgen.rl.training import parts_of
 
@@ -50,6 +51,17 @@ class Group:
 
 
 @dataclass(frozen=True)
+class Curve:
+    """A run in training, by update."""
+
+    steps: list[float]
+    """Transitions."""
+    scores: list[float]
+    whole: bool
+    """Whether it came to its end."""
+
+
+@dataclass(frozen=True)
 class Row:
     """An agent on the robots of a split that are at one task."""
 
@@ -64,6 +76,8 @@ class Row:
     """Sides that there are scores of."""
     sides: tuple[Side, ...]
     """Sides that it is, or would be, evaluated on."""
+    unstable: int = 0
+    """How many of its episodes ended because their simulation became unstable."""
 
 
 def rows(results: Results) -> list[Row]:
@@ -84,7 +98,15 @@ def rows(results: Results) -> list[Row]:
             for mode in modes:
                 groups = _groups(there, task, mode)
                 seeds = tuple(cell.seed for cell in there)
-                found.append(Row(split, task, agent, mode, seeds, missing, groups, first.sides))
+                lost = sum(
+                    each.unstable
+                    for scores in there.values()
+                    for each in scores[mode]
+                    if each.task == task
+                )
+                found.append(
+                    Row(split, task, agent, mode, seeds, missing, groups, first.sides, lost)
+                )
     return found
 
 
@@ -114,6 +136,11 @@ def table_text(made: Sequence[Row]) -> str:
             title = split if len(tasks) == 1 else f"{split}: {task}"
             table = tabulate(lines, HEADERS, tablefmt="github", disable_numparse=True)
             parts.append(f"## {title}\n\n{table}\n")
+            parts += [
+                f"{row.agent} {row.mode}: {UNSTABLE}: {row.unstable}\n"
+                for row in own
+                if row.unstable and row.task == task
+            ]
     return "\n".join(parts)
 
 
@@ -133,11 +160,11 @@ def curves(results: Results) -> bytes:
             if not found:
                 panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
                 continue
-            steps = max((steps for steps, _ in found), key=len)
+            steps = max((curve.steps for curve in found), key=len)
             values = np.full((len(found), len(steps)), np.nan)
-            for row, (_, value) in zip(values, found, strict=True):
-                row[: len(value)] = value
-            done = sum(len(value) == len(steps) for _, value in found)
+            for row, curve in zip(values, found, strict=True):
+                row[: len(curve.scores)] = curve.scores
+            done = sum(curve.whole for curve in found)
             note = "" if done == len(own) else f" ({done} of {len(own)} seeds to the end)"
             (line,) = panel.plot(steps, np.nanmean(values, axis=0), label=agent + note)
             panel.fill_between(
@@ -154,15 +181,17 @@ def curves(results: Results) -> bytes:
     return content.getvalue()
 
 
-def _curve(cell: Cell) -> tuple[list[float], list[float]] | None:
-    """Transitions, and the mean score of a run's parts, by update; None if nothing was learned."""
+def _curve(cell: Cell) -> Curve | None:
+    """How the parts of a run learned, in the mean; None if nothing was learned."""
     assert cell.config is not None
-    parts = [read_metrics(part.folder) for part in parts_of(cell.folder, cell.config)]
+    runs = parts_of(cell.folder, cell.config)
+    parts = [read_metrics(part.folder) for part in runs]
     length = min(map(len, parts))
     if not length:
         return None
     steps = [sum(part[i]["transitions"] for part in parts) for i in range(length)]
-    return steps, [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
+    scores = [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
+    return Curve(steps, scores, all(length == run.config.updates for run in runs))
 
 
 def _groups(

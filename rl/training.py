@@ -76,7 +76,12 @@ def parts_of(folder: Path, config: RunConfig) -> list[Part]:
     """The runs that a run is made of: itself, or for ``se`` on a split one for each robot.
 
     Each of these has a seed of its own, and its share of environments and transitions, rounded up.
+
+    Raises:
+        TaskError: If there are no environments.
     """
+    if config.envs < 1:
+        raise TaskError(f"--envs {config.envs}: expected 1 or more")
     if config.policy.agent != "se" or not config.source.split or config.source.only:
         return [Part(folder, config)]
     alone = list(apart(config.source))
@@ -155,9 +160,10 @@ def require_runnable(config: RunConfig) -> None:
             f"--envs {config.envs}: fewer than the {robots} robots, each of which has one"
         )
     one = config.ppo.steps * config.envs
-    if config.envs < 1 or config.ppo.transitions < one:
+    if config.ppo.transitions < one:
+        share = f", the share of {config.source.only}" if config.source.only else ""
         raise TaskError(
-            f"--steps {config.ppo.transitions} with --envs {config.envs}: an update takes "
+            f"--steps {config.ppo.transitions} with --envs {config.envs}{share}: an update takes "
             f"{one:,} transitions ({config.ppo.steps} steps of every environment)"
         )
     config.ppo.minibatch(config.envs)

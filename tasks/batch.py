@@ -40,6 +40,8 @@ class Channels:
     """Where the tool is in the world, metres."""
     points: int = 0
     """Points of a point cloud of block and obstacles."""
+    obstacles: int = 0
+    """Rows for obstacles, if more than there are: for policies that meet more elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +153,7 @@ class TaskBatch:
             "actions": self.mask,
             "goal_mask": ~self.pushes,
             "object_mask": self.pushes,
-            **_obstacles(own, device),
+            **_obstacles(own, channels.obstacles, device),
         }
         self._points: PointClouds | None = None
         if channels.points:
@@ -357,9 +359,9 @@ def _streams(seed: int, numbers: Sequence[int]) -> dict[str, list[np.random.Gene
     return {"random": drawn(), "points": drawn(0)}
 
 
-def _obstacles(settings: Sequence[Setting], device: torch.device) -> Observation:
+def _obstacles(settings: Sequence[Setting], least: int, device: torch.device) -> Observation:
     """Tokens of every environment's obstacles, (n, O, 13), and which there are, (n, O)."""
-    most = max(len(each.scene.obstacles) for each in settings)
+    most = max(least, *(len(each.scene.obstacles) for each in settings))
     pose, size = torch.zeros(len(settings), most, 7), torch.zeros(len(settings), most, 3)
     mask = torch.zeros(len(settings), most, dtype=torch.bool)
     for i, each in enumerate(settings):

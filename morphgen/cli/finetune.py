@@ -12,6 +12,9 @@ from morphgen.cli.train import add_learning, require_words, trained
 if TYPE_CHECKING:
     from morphgen.rl.runs import RunConfig
 
+INHERITED = {"bf16": "networks in bfloat16", "compile": "networks and losses by torch.compile"}
+"""Switches that are as in the checkpoint's run."""
+
 
 def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
@@ -45,6 +48,19 @@ def add_parser(commands: Subparsers) -> None:
         "--out", metavar="DIR", type=Path, help="default: finetuned/SIDE-seedN in the run's folder"
     )
     parser.add_argument("--resume", action="store_true", help="go on with the run that is there")
+    for name, meaning in INHERITED.items():
+        parser.add_argument(
+            f"--{name}",
+            action=argparse.BooleanOptionalAction,
+            default=None,
+            help=f"{meaning} (default: as the checkpoint's run)",
+        )
+    parser.add_argument(
+        "--curriculum",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="push: bring the line to its place again (default: it is there from the start)",
+    )
     add_learning(parser, steps=30_000, envs=16)
     add_library(parser)
     parser.set_defaults(run=run)
@@ -84,10 +100,13 @@ def _config(file: Path, args: argparse.Namespace) -> RunConfig:
     fixed = set(changes) - {field.name for field in fields(PPOConfig)}
     if fixed:
         raise TaskError(f"--set {min(fixed)}: the networks are those of the checkpoint")
+    asked = {name: getattr(args, name) for name in INHERITED}
+    changes |= {name: value for name, value in asked.items() if value is not None}
+    changes |= {"transitions": args.steps, "curriculum": args.curriculum}
     return replace(
         began,
         source=source,
-        ppo=replace(began.ppo, **changes, transitions=args.steps),
+        ppo=replace(began.ppo, **changes),
         seed=args.seed,
         sim=args.sim or began.sim,
         envs=args.envs,

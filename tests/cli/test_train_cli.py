@@ -129,6 +129,12 @@ def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_ya
     tuned = read_config(Path("a/finetuned/test-seed0"))
     assert (tuned.source.side, tuned.ppo.transitions, tuned.ppo.steps) == ("test", 32, 8)
     assert tuned.begin.endswith(f"a/{CHECKPOINT}")
+    assert read_config(Path("a")).ppo.curriculum
+    assert not tuned.ppo.curriculum
+    words = ("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard", "--out", "b")
+    assert run(*words, "--curriculum", "--bf16")[0] == 0
+    other = read_config(Path("b")).ppo
+    assert (other.curriculum, other.bf16, other.compile) == (True, True, False)
     code, _, err = run("finetune", "a", "--steps", "32", "--envs", "4")
     assert code == 2
     assert "say --resume" in err

@@ -4,8 +4,10 @@ import functools
 
 import pytest
 import torch
+from torch._dynamo.exc import TorchDynamoException
 
 from learners import learner
+from morphgen.errors import TaskError
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
@@ -20,6 +22,19 @@ def test_products_are_in_the_precision_that_is_asked_for(bf16, kind):
     found = call(torch.eye(3) / 3)
     assert found.dtype == kind
     torch.testing.assert_close(found.float(), torch.eye(3) / 9, rtol=1e-2, atol=0)
+
+
+def test_what_cannot_be_compiled_is_said_in_one_line(monkeypatch):
+    def without(function, **options):
+        def call(*args):
+            raise TorchDynamoException("no compiler\nand a long story")
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", without)
+    call = prepared(torch.exp, CPU, bf16=False, compiled=True)
+    with pytest.raises(TaskError, match=r"^--compile: torch cannot compile here: no compiler$"):
+        call(torch.zeros(1))
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morphgen.errors import TaskError
+from morphgen.rl import evaluation
 from morphgen.rl.evaluation import (
     Exam,
     as_data,
@@ -17,12 +18,14 @@ from morphgen.rl.evaluation import (
     evaluate_run,
     exam_of,
 )
-from morphgen.rl.runs import CHECKPOINT, read_checkpoint, write_checkpoint
+from morphgen.rl.runs import read_checkpoint, write_checkpoint
 from morphgen.rl.score_tables import score_table, summary, write_scores
-from morphgen.rl.sources import other_side, robot_source
-from morphgen.rl.training import parts_of, train
+from morphgen.rl.sources import other_side, robot_source, split_source
+from morphgen.rl.training import checkpoints, parts_of, train
 from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.make import batch_of
 from small_runs import EXAM, QUIET, small_config, small_source
+from splits import member, split
 
 pytestmark = pytest.mark.slow
 
@@ -83,6 +86,29 @@ def test_more_episodes_than_environments_are_rounds():
     assert score.steps == 36 * 300
 
 
+def test_robots_that_do_not_fit_at_once_have_the_same_episodes(run, monkeypatch):
+    exam = replace(EXAM, episodes=5)
+    source = other_side(small_source(), "train")
+    whole = evaluate_run(run, "train", exam, "deterministic")
+    still = evaluate_reference("zero", source, exam)
+    made = []
+
+    def noted(settings, num_envs, **options):
+        made.append((options["first"], num_envs))
+        return batch_of(settings, num_envs, **options)
+
+    monkeypatch.setattr(evaluation, "batch_of", noted)
+    monkeypatch.setattr(evaluation, "AT_MOST", {"mujoco": 4})
+    evaluation._known.clear()
+    parts = evaluate_run(run, "train", exam, "deterministic")
+    assert made[:3] == [(0, 4), (4, 4), (8, 2)]
+    assert [each.raw for each in parts] == pytest.approx([each.raw for each in whole])
+    assert [each.distance for each in parts] == pytest.approx([each.distance for each in whole])
+    assert [each.raw for each in evaluate_reference("zero", source, exam)] == pytest.approx(
+        [each.raw for each in still]
+    )
+
+
 def test_ten_thousand_steps_are_34_episodes():
     assert episodes_for(10_000, 300) == 34
     assert episodes_for(1, 300) == 1
@@ -114,7 +140,12 @@ def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
     assert [each.episodes for each in own] == [2, 2]
     (test,) = evaluate_run(tmp_path, "test", EXAM, "deterministic")
     assert (test.side, test.episodes) == ("test", 4)
-    files = [part.folder / CHECKPOINT for part in parts_of(tmp_path, config)]
+    files = list(checkpoints(tmp_path))
+    assert evaluate_checkpoints(files, small_source(), EXAM, "deterministic") == own
+    others = replace(small_source(), goal_seed=1)
+    again = evaluate_checkpoints(files, others, EXAM, "deterministic")
+    assert [(each.robot, each.episodes) for each in again] == [(e.robot, 2) for e in own]
+    assert [each.score for each in again] != [each.score for each in own]
     source = other_side(small_source(), "test")
     alone = [evaluate_checkpoints([file], source, EXAM, "deterministic")[0] for file in files]
     assert test.score == pytest.approx(np.mean([each.score for each in alone]))
@@ -130,6 +161,25 @@ def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_
     evaluate_run(tmp_path, "test", EXAM, "deterministic")
 
 
+@pytest.mark.parametrize("agent", ["me-mlp", "se"])
+def test_obstacles_may_be_on_one_side_or_around_one_robot_alone(agent, tmp_path):
+    def made(words, obstacles):
+        return member(words, task="reach", obstacles=obstacles)
+
+    for place, (cube, other, test) in {
+        "one": (False, True, False),
+        "test": (False, False, True),
+    }.items():
+        own = made("base=planar ee=cube", cube), made("base=gantry ee=cube", other)
+        source = split_source(split(own, (made("base=gantry ee=plane", test),)))
+        config, folder = small_config(source, agent=agent, transitions=64), tmp_path / place
+        train(folder, config, way=QUIET)
+        for part in parts_of(folder, config):
+            assert read_checkpoint(part.folder)[1]["layout"]["obstacles"] == 3
+        for side, count in (("train", 2), ("test", 1)):
+            assert len(evaluate_run(folder, side, EXAM, "deterministic")) == count
+
+
 def test_one_robot_has_no_other_side(tmp_path):
     train(tmp_path, small_config(transitions=32), way=QUIET)
     assert len(evaluate_run(tmp_path, "train", EXAM, "deterministic")) == 1
@@ -142,6 +192,8 @@ def test_an_evaluation_is_in_the_simulator_and_task_of_the_run(run):
     assert exam_of(config, 3) == Exam(3, "mujoco")
     with pytest.raises(TaskError, match="0 episodes"):
         Exam(episodes=0)
+    with pytest.raises(TaskError, match="a seed from 0 to"):
+        Exam(seed=2**63)
 
 
 def test_tables_hold_every_robot_and_mode(run, tmp_path):
@@ -155,7 +207,7 @@ def test_tables_hold_every_robot_and_mode(run, tmp_path):
     assert f"{mean:.2f}" in summary(found).splitlines()[0]
     assert "unstable" not in summary(found)
     lost = [replace(found["deterministic"][0], unstable=2), *found["deterministic"][1:]]
-    last = "2 episodes ended because their simulation became unstable"
+    last = "episodes that ended because their simulation became unstable: 2"
     assert summary({"deterministic": lost}).endswith(last)
     for suffix in (".csv", ".json", ".md"):
         write_scores(tmp_path / f"table{suffix}", found)

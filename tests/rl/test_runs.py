@@ -5,12 +5,13 @@ import math
 import pickle
 import sys
 from dataclasses import asdict, fields, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from commands import tree
-from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.rl.recorders import (
     METRICS,
     Metrics,
@@ -30,6 +31,7 @@ from morphgen.rl.runs import (
     write_checkpoint,
 )
 from morphgen.rl.sources import robot_source
+from morphgen.rl.training import ROBOTS
 from small_runs import small_config, small_source
 
 
@@ -64,6 +66,7 @@ def test_a_config_is_saved_whole(tmp_path):
 def test_a_run_is_only_continued_on_purpose_and_as_it_was(tmp_path):
     folder, config = tmp_path / "runs" / "one", small_config()
     open_run(folder, config, resume=True)
+    write_checkpoint(folder, config, {"update": 1})
     before = tree(tmp_path)
     with pytest.raises(TaskError, match="has a run: say --resume"):
         open_run(folder, config, resume=False)
@@ -74,6 +77,36 @@ def test_a_run_is_only_continued_on_purpose_and_as_it_was(tmp_path):
     with pytest.raises(TaskError, match=r"source\.name planar-cube, not mine/small"):
         open_run(folder, small_config(small_source()), resume=True)
     assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_run_that_has_no_checkpoint_yet_may_become_another(tmp_path, resume):
+    first, other = small_config(), small_config(small_source(), agent="se")
+    open_run(tmp_path, first, resume=False)
+    open_run(tmp_path / ROBOTS / "a", first, resume=False)
+    open_run(tmp_path, other, resume=resume)
+    assert read_config(tmp_path) == other
+    write_checkpoint(tmp_path / ROBOTS / "a", first, {"update": 1})
+    with pytest.raises(TaskError, match="has a run: say --resume"):
+        open_run(tmp_path, first, resume=False)
+
+
+def test_which_gpu_it_was_makes_no_other_run(tmp_path):
+    config = replace(small_config(), device="cuda:0")
+    open_run(tmp_path, config, resume=False)
+    write_checkpoint(tmp_path, config, {"update": 1})
+    for device in ("cuda", "cuda:1"):
+        open_run(tmp_path, replace(config, device=device), resume=True)
+    with pytest.raises(TaskError, match="another run: device cuda, not cpu"):
+        open_run(tmp_path, replace(config, device="cpu"), resume=True)
+
+
+def test_the_config_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / CONFIG).write_text('{"model": "mine"}')
+    for resume in (True, False):
+        with pytest.raises(TaskError, match="is not the config of a run"):
+            open_run(tmp_path, small_config(), resume=resume)
+    assert tree(tmp_path) == {CONFIG: b'{"model": "mine"}'}
 
 
 def test_what_is_no_run_is_left_alone(tmp_path):
@@ -192,6 +225,40 @@ def test_what_is_not_installed_is_asked_for(tmp_path, monkeypatch):
         assert len(kept) == 1
 
 
+class UsageError(Exception):
+    """As that of wandb where nobody is logged in."""
+
+
+wandb_errors = SimpleNamespace(Error=UsageError)
+
+
+def test_what_weights_and_biases_says_is_one_line(tmp_path, monkeypatch):
+    class Wandb:
+        errors = wandb_errors
+
+        @staticmethod
+        def init(**options):
+            raise UsageError("api_key not configured (no-tty)")
+
+    monkeypatch.setitem(sys.modules, "wandb", Wandb)
+    with (
+        pytest.raises(TaskError, match="--wandb: api_key not configured"),
+        recording(tmp_path, small_config(), 0, tensorboard=False, wandb=True),
+    ):
+        pass
+
+
+def test_a_report_that_is_none_is_named(tmp_path):
+    with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=False) as kept:
+        kept[0].record(report(1))
+        kept[0].record(report(2))
+    path = tmp_path / METRICS
+    for broken in ("\0\0\0", "[]", "{}"):
+        path.write_text(path.read_text().splitlines()[0] + f"\n{broken}\n")
+        with pytest.raises(FormatError, match=r"metrics\.jsonl, line 2: not the report"):
+            read_metrics(tmp_path)
+
+
 def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
     sent = []
 
@@ -203,6 +270,8 @@ def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
             sent.append("finished")
 
     class Wandb:
+        errors = wandb_errors
+
         @staticmethod
         def init(**options):
             assert options["resume"] == "allow"

@@ -18,6 +18,7 @@ from morphgen.rl import study
 from morphgen.rl.evaluation import Score
 from morphgen.rl.recorders import METRICS
 from morphgen.rl.runs import CHECKPOINT
+from morphgen.rl.score_tables import UNSTABLE
 from morphgen.rl.sources import members, other_side
 from morphgen.rl.study import (
     SCORES,
@@ -220,6 +221,16 @@ def test_rows_are_averages_over_seeds_and_robots(tmp_path):
     assert (test.mean, test.iqm.low, test.iqm.high) == (15, 10, 20)
     line = table_text(found).splitlines()[-1].split("|")
     assert [each.strip() for each in line[4:7]] == ["5.00", "5.00 [5.00, 5.00]", "50%"]
+
+
+def test_a_table_says_how_many_episodes_became_unstable(tmp_path):
+    cells = cells_in(tmp_path, ("me-mlp",))[3:]
+    found = by_hand(cells, [(1, 3, 10), (2, 6, 20)])
+    assert "unstable" not in table_text(rows(found))
+    for scores in found.values():
+        scores["deterministic"][0] = replace(scores["deterministic"][0], unstable=2)
+    last = table_text(rows(found)).splitlines()[-1]
+    assert last == f"me-mlp deterministic: {UNSTABLE}: 4"
 
 
 def test_robots_of_se_on_the_test_robots_are_drawn_by_themselves(tmp_path):
