@@ -85,6 +85,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
     from dataclasses import replace
 
     from morphgen.cli.train import config_of, source_of
+    from morphgen.errors import TaskError
     from morphgen.rl.evaluation import Exam, episodes_for
     from morphgen.rl.sources import other_side
     from morphgen.rl.study import agent_cell, matched_budget, reference_cells
@@ -92,6 +93,8 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.variants import parse_agents
     from morphgen.tasks.config import ReachConfig
 
+    if args.gpus is not None and args.ray is None:
+        raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     if args.ray is None and not args.report:
         require_device(args.device)
     exam = Exam(episodes_for(args.eval_steps, ReachConfig().steps), args.sim)

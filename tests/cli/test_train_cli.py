@@ -340,6 +340,8 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         (("eval", "scripted", "--split", "planar-cube", "task=reach"), "no robot is there to push"),
         (("finetune", "nothing"), "no checkpoint"),
         (("study", "nothing"), "unknown split 'nothing'"),
+        (("study", "interpolation/arm3/reach", "--gpus", "1"), "--gpus 1 goes with --ray"),
+        (("eval", "random", "--seed", str(2**63), "--split", "nothing"), "unknown split"),
         (("study", "interpolation/arm3/reach", "--seeds", "2..x"), "--seeds 2..x"),
         (("study", "interpolation/arm3/reach", "--agents", "se,se"), "is there twice"),
         (("study", "interpolation/arm3/reach", "--agents", "me-tf@test"), "only se"),
