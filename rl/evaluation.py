@@ -137,15 +137,15 @@ def evaluate_checkpoints(
         TaskError: If one is no checkpoint, or for other observations.
         MorphgenError: If a robot or simulator cannot be made.
     """
-    sources = [read_checkpoint(path)[0].source for path in paths]
+    trained = [read_checkpoint(path) for path in paths]
+    sources = [run.source for run, _ in trained]
     if all(own.only for own in sources) and _of_same(sources[0], source):
-        alone = (replace(source, only=own.only) for own in sources)
         found = (
-            _evaluate_together([path], own, exam, mode, device)
-            for path, own in zip(paths, alone, strict=True)
+            _evaluate_together([one], replace(source, only=own.only), exam, mode, device)
+            for one, own in zip(trained, sources, strict=True)
         )
         return [score for scores in found for score in scores]
-    return _evaluate_together(paths, source, exam, mode, device)
+    return _evaluate_together(trained, source, exam, mode, device)
 
 
 def _of_same(one: Source, whole: Source) -> bool:
@@ -156,15 +156,15 @@ def _of_same(one: Source, whole: Source) -> bool:
 
 
 def _evaluate_together(
-    paths: Sequence[Path], source: Source, exam: Exam, mode: Mode, device: str
+    trained: Sequence[tuple[RunConfig, dict[str, Any]]],
+    source: Source,
+    exam: Exam,
+    mode: Mode,
+    device: str,
 ) -> list[Score]:
     """The episodes of all policies count together."""
-    acting, interfaces = [], set()
-    for path in paths:
-        run, learner = read_checkpoint(path)
-        acting.append(_policy(learner, mode, exam.seed, device))
-        interfaces.add(run.interface)
-    (wanted,) = interfaces
+    acting = [_policy(learner, mode, exam.seed, device) for _, learner in trained]
+    (wanted,) = {run.interface for run, _ in trained}
     return evaluate(acting, source, exam, wanted)
 
 

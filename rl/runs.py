@@ -66,10 +66,13 @@ class RunConfig:
         """Check.
 
         Raises:
-            TaskError: If the seed is none, or so many links are too few for any robot.
+            TaskError: If the seed is none, there is no environment, or so many links are too few
+                for any robot.
         """
         if self.seed < 0:
             raise TaskError(f"--seed {self.seed}: expected 0 or more")
+        if self.envs < 1:
+            raise TaskError(f"--envs {self.envs}: expected 1 or more")
         if self.max_links < 2:
             raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
 
@@ -124,7 +127,7 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
         own = (LOCK, partial_of(path).name)
         if any(each.name not in own for each in folder.iterdir()):
             raise TaskError(f"{folder} is there and is no run's folder: name another with --out")
-    elif folder.is_file():
+    elif folder.exists():
         raise TaskError(f"{folder} is a file: name a folder with --out")
 
 

@@ -76,12 +76,7 @@ def parts_of(folder: Path, config: RunConfig) -> list[Part]:
     """The runs that a run is made of: itself, or for ``se`` on a split one for each robot.
 
     Each of these has a seed of its own, and its share of environments and transitions, rounded up.
-
-    Raises:
-        TaskError: If there are no environments.
     """
-    if config.envs < 1:
-        raise TaskError(f"--envs {config.envs}: expected 1 or more")
     if config.policy.agent != "se" or not config.source.split or config.source.only:
         return [Part(folder, config)]
     alone = list(apart(config.source))

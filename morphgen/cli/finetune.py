@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library
-from morphgen.cli.train import add_learning, require_words, trained
+from morphgen.cli.train import OF_NETWORKS, add_learning, require_words, trained
 
 if TYPE_CHECKING:
     from morphgen.rl.runs import RunConfig
-
-INHERITED = {"bf16": "networks in bfloat16", "compile": "networks and losses by torch.compile"}
-"""Switches that are as in the checkpoint's run."""
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -48,7 +45,7 @@ def add_parser(commands: Subparsers) -> None:
         "--out", metavar="DIR", type=Path, help="default: finetuned/SIDE-seedN in the run's folder"
     )
     parser.add_argument("--resume", action="store_true", help="go on with the run that is there")
-    for name, meaning in INHERITED.items():
+    for name, meaning in OF_NETWORKS.items():
         parser.add_argument(
             f"--{name}",
             action=argparse.BooleanOptionalAction,
@@ -100,7 +97,7 @@ def _config(file: Path, args: argparse.Namespace) -> RunConfig:
     fixed = set(changes) - {field.name for field in fields(PPOConfig)}
     if fixed:
         raise TaskError(f"--set {min(fixed)}: the networks are those of the checkpoint")
-    asked = {name: getattr(args, name) for name in INHERITED}
+    asked = {name: getattr(args, name) for name in OF_NETWORKS}
     changes |= {name: value for name, value in asked.items() if value is not None}
     changes |= {"transitions": args.steps, "curriculum": args.curriculum}
     return replace(

@@ -27,6 +27,11 @@ SWITCHES = {
     "mask-morphology": "hide the robot's body from the agent (default: off)",
     "tool-position": "show the agent where its tool is (default: off)",
 }
+OF_NETWORKS = {
+    "bf16": "networks in bfloat16",
+    "compile": "networks and losses by torch.compile",
+}
+"""Switches of how networks are computed."""
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -86,10 +91,8 @@ def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) ->
         help="se on a split: all steps and environments for each robot, not shares of them",
     )
     add_max_links(parser)
-    parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
-    parser.add_argument(
-        "--compile", action="store_true", help="networks and losses by torch.compile"
-    )
+    for name, meaning in OF_NETWORKS.items():
+        parser.add_argument(f"--{name}", action="store_true", help=meaning)
 
 
 def add_learning(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:

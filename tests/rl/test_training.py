@@ -224,8 +224,9 @@ def test_fine_tuning_begins_with_the_networks_of_a_checkpoint(tmp_path):
 
 def test_what_cannot_begin_leaves_nothing(tmp_path):
     config = small_config()
+    with pytest.raises(TaskError, match="--envs 0: expected 1 or more"):
+        replace(config, envs=0)
     for wrong, says in (
-        (replace(config, envs=0), "--envs 0: expected 1 or more"),
         (small_config(transitions=31), "an update takes 32 transitions"),
         (replace(small_config(small_source()), envs=1), "--envs 1: fewer than the 2 robots"),
         (small_config(small_source(), agent="se", transitions=30), "the share of "),
