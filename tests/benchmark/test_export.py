@@ -246,7 +246,7 @@ def test_a_robot_of_another_version_is_made_again(tmp_path, whole, made):
 
 
 def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path):
-    cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(60)]
+    cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(30)]
     made = split(cubes, ["base=planar ee=plane"])
     write_split(made, tmp_path / "some.yaml")
     words = ("split", "build", tmp_path / "some.yaml", "--out", tmp_path / "killed", "--jobs", 2)

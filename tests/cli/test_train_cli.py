@@ -214,7 +214,7 @@ def test_references_are_evaluated_beside(run, split_yaml):
 
 
 def test_ctrl_c_leaves_a_run_that_goes_on(run, tmp_path, cache):
-    words = (*RUN, "--steps", 32 * 2000, "--no-tensorboard")
+    words = (*RUN, "--steps", 32 * 300, "--no-tensorboard")
     process = start(*words, "--out", "cut", XDG_CACHE_HOME=str(cache))
     try:
         while not (tmp_path / "cut" / CHECKPOINT).is_file():

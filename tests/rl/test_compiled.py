@@ -63,6 +63,7 @@ def test_graphs_on_a_gpu_learn_the_same_one_learner_after_the_other(agent):
             assert found.reward == pytest.approx(wanted.reward, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_process_compiles_learners_of_many_kinds(monkeypatch):
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
     for agent in ("se", "me-mlp", "me-tf"):
