@@ -26,7 +26,10 @@ def shown(again: str = "with --resume") -> Iterator[Shower]:
         yield shower
     except KeyboardInterrupt:
         shower.close()
-        print(f"morphgen: it goes on from its last checkpoint, if it has one, {again}", file=sys.stderr)
+        print(
+            f"morphgen: it goes on from its last checkpoint, if it has one, {again}",
+            file=sys.stderr,
+        )
         raise
     finally:
         shower.close()
