@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,19 @@ SALT = 0x5C0_4E5
 
 Acting = Callable[[TaskBatch], Controller]
 """What acts in a batch."""
+Tell = Callable[[float, int], None]
+"""Told how many episodes are over, parts of them included, and how many there are."""
+Count = Callable[[str], Tell]
+"""Called with the name of an evaluation that begins; what it returns, with how far it is."""
+
+
+def silent(done: float, total: int) -> None:
+    """Tell nobody."""
+
+
+def uncounted(name: str) -> Tell:
+    """Tell nobody of any evaluation."""
+    return silent
 
 
 @dataclass(frozen=True)
@@ -105,7 +119,7 @@ def episodes_for(steps: int, longest: int) -> int:
 
 
 def evaluate_run(
-    path: Path, side: Side, exam: Exam, mode: Mode, *, device: str = "cpu"
+    path: Path, side: Side, exam: Exam, mode: Mode, *, device: str = "cpu", tell: Tell = silent
 ) -> list[Score]:
     """Evaluate what was trained on the robots of a side of its split, or on its one robot.
 
@@ -115,17 +129,24 @@ def evaluate_run(
         exam: How.
         mode: Whether policies act by the mean of their actions, or draw.
         device: Where the networks are.
+        tell: Told how far it is; for ``se`` robot by robot.
 
     Raises:
         TaskError: If there is no checkpoint, or no such side.
     """
     files = list(checkpoints(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
-    return evaluate_checkpoints(files, source, exam, mode, device=device)
+    return evaluate_checkpoints(files, source, exam, mode, device=device, tell=tell)
 
 
 def evaluate_checkpoints(
-    paths: Sequence[Path], source: Source, exam: Exam, mode: Mode, *, device: str = "cpu"
+    paths: Sequence[Path],
+    source: Source,
+    exam: Exam,
+    mode: Mode,
+    *,
+    device: str = "cpu",
+    tell: Tell = silent,
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
 
@@ -141,11 +162,11 @@ def evaluate_checkpoints(
     sources = [run.source for run, _ in trained]
     if all(own.only for own in sources) and _of_same(sources[0], source):
         found = (
-            _evaluate_together([one], replace(source, only=own.only), exam, mode, device)
+            _evaluate_together([one], replace(source, only=own.only), exam, mode, device, tell)
             for one, own in zip(trained, sources, strict=True)
         )
         return [score for scores in found for score in scores]
-    return _evaluate_together(trained, source, exam, mode, device)
+    return _evaluate_together(trained, source, exam, mode, device, tell)
 
 
 def _of_same(one: Source, whole: Source) -> bool:
@@ -161,18 +182,21 @@ def _evaluate_together(
     exam: Exam,
     mode: Mode,
     device: str,
+    tell: Tell,
 ) -> list[Score]:
     """The episodes of all policies count together."""
     acting = [_policy(learner, mode, exam.seed, device) for _, learner in trained]
     (wanted,) = {run.interface for run, _ in trained}
-    return evaluate(acting, source, exam, wanted)
+    return evaluate(acting, source, exam, wanted, tell=tell)
 
 
 def _policy(learner: dict[str, Any], mode: Mode, seed: int, device: str) -> Acting:
     return lambda batch: Policy(learner, mode, seed, device)
 
 
-def evaluate_reference(name: str, source: Source, exam: Exam) -> list[Score]:
+def evaluate_reference(
+    name: str, source: Source, exam: Exam, *, tell: Tell = silent
+) -> list[Score]:
     """Evaluate a controller that learns nothing; see ``REFERENCES``.
 
     Its actions are continuous. Robots at a task that it is not for are left out.
@@ -186,7 +210,7 @@ def evaluate_reference(name: str, source: Source, exam: Exam) -> list[Score]:
     def acting(batch: TaskBatch) -> Controller:
         return reference(name, batch, exam.seed)
 
-    return evaluate([acting], source, exam, Interface(), tasks=REFERENCES[name])
+    return evaluate([acting], source, exam, Interface(), tasks=REFERENCES[name], tell=tell)
 
 
 def evaluate(
@@ -196,6 +220,7 @@ def evaluate(
     wanted: Interface,
     *,
     tasks: Sequence[Task] = ("reach", "push"),
+    tell: Tell = silent,
 ) -> list[Score]:
     """Scores of the robots of a source, in order; the random controller has the same episodes.
 
@@ -205,6 +230,7 @@ def evaluate(
         exam: How.
         wanted: What those that act see and do.
         tasks: Robots at other tasks are left out.
+        tell: Told how far those that act are, and not the random controller.
 
     Raises:
         TaskError: If no robot is left.
@@ -216,8 +242,8 @@ def evaluate(
         raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
     folders = tuple(map(Path, source.library))
     played: list[list[Episode]] = [[] for _ in settings]
-    for one in acting:
-        found = _played(one, settings, exam, wanted, folders)
+    for i, one in enumerate(acting):
+        found = _played(one, settings, exam, wanted, folders, partial(_of, i, len(acting), tell))
         for all_own, own in zip(played, found, strict=True):
             all_own.extend(own)
     chance = _chance(source, exam, tuple(tasks), settings, folders)
@@ -250,6 +276,7 @@ def _played(
     exam: Exam,
     wanted: Interface,
     folders: tuple[Path, ...],
+    tell: Tell = silent,
 ) -> list[list[Episode]]:
     """Episodes by robot, in as many batches as it takes; what acts is made for the first."""
     rounds = -(-exam.episodes // AT_ONCE)
@@ -257,15 +284,28 @@ def _played(
     most = max(AT_MOST[exam.sim] // len(settings), 1)
     found: list[list[Episode]] = [[] for _ in settings]
     controller: Controller | None = None
+    whole = each * rounds * len(settings)
     for begin in range(0, each, most):
+        before = begin * rounds * len(settings)
         batch = _batch(range(begin, min(begin + most, each)), settings, exam, wanted, folders)
         try:
             controller = controller or acting(batch)
-            for episode in run_episodes(batch, controller, rounds):
+            now = partial(_in, before, whole, tell)
+            for episode in run_episodes(batch, controller, rounds, now):
                 found[episode.body].append(episode)
         finally:
             batch.close()
     return found
+
+
+def _in(before: int, whole: int, tell: Tell, done: float) -> None:
+    """Tell of all batches, when so many episodes of one are over."""
+    tell(before + done, whole)
+
+
+def _of(before: int, parts: int, tell: Tell, done: float, own: int) -> None:
+    """Tell of all parts, each of as many episodes, when so many are over."""
+    tell(before * own + done, parts * own)
 
 
 def _batch(

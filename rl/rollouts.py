@@ -47,7 +47,7 @@ def run_episodes(
     batch: TaskBatch,
     controller: Controller,
     count: int,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> list[Episode]:
     """The first episodes of every environment, as many of each.
 
@@ -55,7 +55,7 @@ def run_episodes(
         batch: Environments; they are reset first.
         controller: What acts.
         count: Episodes of each environment.
-        progress: Told how many episodes are over, at the end of any.
+        progress: Told after every step how many episodes are over, parts of them included.
 
     Returns:
         By environment, and then in their order.
@@ -70,13 +70,13 @@ def run_episodes(
     total = torch.zeros(n, device=batch.device)
     steps = torch.zeros(n, dtype=torch.int64, device=batch.device)
     done = 0
+    left = torch.full_like(steps, count)
     while done < n * count:
         step = batch.step(controller.act(batch))
         total += step.score
         steps += 1
         over = torch.nonzero(step.terminated | step.truncated)[:, 0]
-        if not len(over):
-            continue
+        left[over] -= 1
         for env in over.tolist():
             if len(found[env]) < count:
                 numbers = float(total[env]), float(step.score[env]), int(steps[env])
@@ -93,5 +93,5 @@ def run_episodes(
                 )
                 done += 1
         total[over], steps[over] = 0, 0
-        progress(done)
+        progress(done + float((steps / batch.longest)[left > 0].sum()))
     return [episode for own in found for episode in own]

@@ -21,16 +21,18 @@ from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_atomic
 from morphgen.processes import ray_cluster, require_ray
 from morphgen.rl.evaluation import (
+    Count,
     Exam,
     Score,
     as_data,
     evaluate_reference,
     evaluate_run,
+    uncounted,
 )
 from morphgen.rl.names import REFERENCES
 from morphgen.rl.runs import RunConfig, require_open
 from morphgen.rl.sources import Source, members, other_side, tasks_of
-from morphgen.rl.trained import MODES
+from morphgen.rl.trained import MODES, Mode
 from morphgen.rl.training import Part, Show, Way, train
 
 SCORES = "scores.json"
@@ -137,7 +139,12 @@ def require_cells(cells: Sequence[Cell]) -> None:
         read_scores(cell)
 
 
-def do(cell: Cell, way: Way, show: Callable[[Part], Show] | None = None) -> None:
+def do(
+    cell: Cell,
+    way: Way,
+    show: Callable[[Part], Show] | None = None,
+    count: Count = uncounted,
+) -> None:
     """Train and evaluate what is not there yet. Nobody else may work on the cell.
 
     Raises:
@@ -147,17 +154,10 @@ def do(cell: Cell, way: Way, show: Callable[[Part], Show] | None = None) -> None
         return
     exam = replace(cell.exam, workers=way.workers)
     if cell.config is None:
-        found = {cell.agent: _reference(cell, exam)}
+        found = {cell.agent: _reference(cell, exam, count)}
     else:
         train(cell.folder, cell.config, resume=True, way=way, show=show, hold=_held)
-        found = {
-            mode: [
-                score
-                for side in cell.sides
-                for score in evaluate_run(cell.folder, side, exam, mode, device=cell.config.device)
-            ]
-            for mode in MODES
-        }
+        found = {mode: _trained(cell, cell.config, exam, mode, count) for mode in MODES}
     data = {
         "exam": asdict(cell.exam),
         "source": asdict(cell.source),
@@ -167,7 +167,10 @@ def do(cell: Cell, way: Way, show: Callable[[Part], Show] | None = None) -> None
 
 
 def work_here(
-    cells: Sequence[Cell], way: Way, show: Callable[[Part], Show] | None = None
+    cells: Sequence[Cell],
+    way: Way,
+    show: Callable[[Part], Show] | None = None,
+    count: Count = uncounted,
 ) -> Iterator[Outcome]:
     """Do cells one after another.
 
@@ -178,7 +181,7 @@ def work_here(
     passed = 0
     while waiting:
         cell = waiting.popleft()
-        outcome = _alone(cell, way, show)
+        outcome = _alone(cell, way, show, count)
         if outcome is not None:
             passed = 0
             yield outcome
@@ -227,12 +230,14 @@ def _on_ray(cell: Cell, way: Way) -> str:
     return outcome.why
 
 
-def _alone(cell: Cell, way: Way, show: Callable[[Part], Show] | None) -> Outcome | None:
+def _alone(
+    cell: Cell, way: Way, show: Callable[[Part], Show] | None, count: Count
+) -> Outcome | None:
     """Do a cell; None if another process works on it."""
     try:
         cell.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(cell.folder / LOCK, timeout=0):
-            do(cell, way, show)
+            do(cell, way, show, count)
     except Timeout:
         return None
     except MorphgenError as error:
@@ -256,13 +261,23 @@ def _score(data: Mapping[str, Any]) -> Score:
     return Score(**whole)
 
 
-def _reference(cell: Cell, exam: Exam) -> list[Score]:
+def _trained(cell: Cell, config: RunConfig, exam: Exam, mode: Mode, count: Count) -> list[Score]:
+    """Of the sides that the cell is scored on."""
+    found = []
+    for side in cell.sides:
+        tell = count(f"{cell.agent} {mode} on {side}")
+        found += evaluate_run(cell.folder, side, exam, mode, device=config.device, tell=tell)
+    return found
+
+
+def _reference(cell: Cell, exam: Exam, count: Count) -> list[Score]:
     """Of both sides; those whose robots are at other tasks have none."""
     found = []
     for side in cell.sides:
         source = other_side(cell.source, side)
         if set(tasks_of(source)) & set(REFERENCES[cell.agent]):
-            found += evaluate_reference(cell.agent, source, exam)
+            tell = count(f"{cell.agent} on {side}")
+            found += evaluate_reference(cell.agent, source, exam, tell=tell)
     return found
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_json, add_library
+from morphgen.cli.progress import counted
 from morphgen.cli.train import count, require_words
 from morphgen.rl.names import REFERENCES
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
-    from morphgen.rl.evaluation import Exam, Score
+    from morphgen.rl.evaluation import Count, Exam, Score
     from morphgen.rl.runs import RunConfig
     from morphgen.rl.sources import Source
     from morphgen.rl.trained import Mode
@@ -96,7 +97,11 @@ def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
         raise TaskError(f"{option} is for policies; {args.checkpoint} has none")
     sources = _sources(args)
     exam = Exam(_episodes(args), args.sim or "pybullet", args.seed, args.workers)
-    found = (evaluate_reference(args.checkpoint, source, exam) for source in sources)
+    with counted() as told:
+        found = [
+            evaluate_reference(args.checkpoint, source, exam, tell=told(source.side))
+            for source in sources
+        ]
     return {args.checkpoint: [score for scores in found for score in scores]}
 
 
@@ -117,11 +122,12 @@ def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
                 file=sys.stderr,
             )
     modes: tuple[Mode, ...] = (args.mode,) if args.mode else MODES
-    return {mode: _policy(args, files, config, mode) for mode in modes}
+    with counted() as told:
+        return {mode: _policy(args, files, config, mode, told) for mode in modes}
 
 
 def _policy(
-    args: argparse.Namespace, files: list[Path], config: RunConfig, mode: Mode
+    args: argparse.Namespace, files: list[Path], config: RunConfig, mode: Mode, told: Count
 ) -> list[Score]:
     from morphgen.rl.evaluation import evaluate_checkpoints, evaluate_run
 
@@ -129,12 +135,18 @@ def _policy(
     if args.words:
         sources = _sources(args)
         found = [
-            evaluate_checkpoints(files, one, exam, mode, device=args.device) for one in sources
+            evaluate_checkpoints(
+                files, one, exam, mode, device=args.device, tell=told(f"{mode} on {one.side}")
+            )
+            for one in sources
         ]
     else:
         sides: tuple[Side, ...] = ("train", "test") if config.source.split else ("train",)
         wanted = sides if args.on is None else (args.on,)
-        found = [evaluate_run(path, side, exam, mode, device=args.device) for side in wanted]
+        found = [
+            evaluate_run(path, side, exam, mode, device=args.device, tell=told(f"{mode} on {side}"))
+            for side in wanted
+        ]
     return [score for scores in found for score in scores]
 
 

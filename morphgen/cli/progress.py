@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NoReturn
@@ -10,8 +11,11 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+    from morphgen.rl.evaluation import Count, Tell
     from morphgen.rl.report import Report
     from morphgen.rl.training import Part, Show
+
+MINUTE = 60.0
 
 
 @contextmanager
@@ -31,6 +35,16 @@ def shown(again: str = "with --resume") -> Iterator[Shower]:
             file=sys.stderr,
         )
         raise
+    finally:
+        shower.close()
+
+
+@contextmanager
+def counted() -> Iterator[Count]:
+    """Counts episodes of evaluations on stderr."""
+    shower = Shower()
+    try:
+        yield shower.counting
     finally:
         shower.close()
 
@@ -60,6 +74,28 @@ class Shower:
         )
         return self._show
 
+    def counting(self, name: str) -> Tell:
+        """Begin with an evaluation; on no terminal it is a line a minute."""
+        self.close()
+        if not sys.stderr.isatty():
+            return _Minutes(name)
+        from tqdm import tqdm
+
+        bar = self._bar = tqdm(
+            desc=name,
+            unit="episode",
+            file=sys.stderr,
+            dynamic_ncols=True,
+            leave=False,
+            bar_format="{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]",
+        )
+
+        def told(done: float, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return told
+
     def close(self) -> None:
         """Leave the bar as it is."""
         if self._bar is not None:
@@ -75,6 +111,19 @@ class Shower:
         self._bar.update(report.transitions - self._bar.n)
         if report.unstable:
             self._bar.write(_unstable(self._bar.desc, report), file=sys.stderr)
+
+
+class _Minutes:
+    """Says how far an evaluation is, once a minute."""
+
+    def __init__(self, name: str) -> None:
+        self._name, self._last = name, time.monotonic()
+
+    def __call__(self, done: float, total: int) -> None:
+        """Be told how many episodes are over."""
+        if time.monotonic() - self._last > MINUTE:
+            self._last = time.monotonic()
+            print(f"{self._name}: {done:.0f} of {total} episodes", file=sys.stderr, flush=True)
 
 
 def _print(name: str, report: Report, updates: int) -> None:

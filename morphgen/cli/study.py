@@ -144,7 +144,7 @@ def _work(args: argparse.Namespace, cells: list[Cell]) -> int:
     failed = 0
     with shown("if the same command is given again") as show:
         if args.ray is None:
-            outcomes = work_here(cells, way_of(args), show)
+            outcomes = work_here(cells, way_of(args), show, show.counting)
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
             outcomes = work_on_ray(args.ray or None, gpus=gpus)(cells, way_of(args))

@@ -151,6 +151,31 @@ def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
     assert test.score == pytest.approx(np.mean([each.score for each in alone]))
 
 
+@pytest.mark.parametrize(
+    ("limit", "value", "calls", "whole"),
+    [("AT_ONCE", 34, 300, 6), ("AT_ONCE", 2, 600, 8), ("AT_MOST", {"mujoco": 4}, 600, 6)],
+    ids=["at once", "in rounds", "in batches"],
+)
+def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
+    monkeypatch.setattr(evaluation, limit, value)
+    seen = []
+    exam = replace(EXAM, episodes=3)
+    evaluate_reference("zero", small_source(), exam, tell=lambda *now: seen.append(now))
+    parts = [done for done, _ in seen]
+    assert {total for _, total in seen} == {whole}
+    assert len(parts) == calls
+    assert 0 < parts[0] < 0.05
+    assert parts == sorted(set(parts))
+    assert parts[-1] == whole
+
+
+def test_of_policies_of_single_robots_it_tells_all_that_play(tmp_path):
+    train(tmp_path, small_config(small_source(), agent="se", transitions=64), way=QUIET)
+    seen = []
+    evaluate_run(tmp_path, "test", EXAM, "deterministic", tell=lambda *now: seen.append(now))
+    assert (len(seen), seen[300], seen[-1]) == (600, (pytest.approx(2 + 1 / 150), 4), (4, 4))
+
+
 def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_path):
     config, learner = read_checkpoint(run)
     learner["layout"]["obstacles"] = 0
