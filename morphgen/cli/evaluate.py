@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_json, add_library
-from morphgen.cli.progress import counted
+from morphgen.cli.progress import Shower
 from morphgen.cli.train import count, require_words
 from morphgen.rl.names import REFERENCES
 
@@ -97,9 +98,9 @@ def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
         raise TaskError(f"{option} is for policies; {args.checkpoint} has none")
     sources = _sources(args)
     exam = Exam(_episodes(args), args.sim or "pybullet", args.seed, args.workers)
-    with counted() as told:
+    with closing(Shower()) as shower:
         found = [
-            evaluate_reference(args.checkpoint, source, exam, tell=told(source.side))
+            evaluate_reference(args.checkpoint, source, exam, tell=shower.counting(source.side))
             for source in sources
         ]
     return {args.checkpoint: [score for scores in found for score in scores]}
@@ -122,8 +123,8 @@ def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
                 file=sys.stderr,
             )
     modes: tuple[Mode, ...] = (args.mode,) if args.mode else MODES
-    with counted() as told:
-        return {mode: _policy(args, files, config, mode, told) for mode in modes}
+    with closing(Shower()) as shower:
+        return {mode: _policy(args, files, config, mode, shower.counting) for mode in modes}
 
 
 def _policy(

@@ -1,4 +1,4 @@
-"""How runs that train are going, as they go."""
+"""How runs that train, and evaluations, are going, as they go."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from morphgen.rl.evaluation import Count, Tell
+    from morphgen.rl.evaluation import Tell
     from morphgen.rl.report import Report
     from morphgen.rl.training import Part, Show
 
 MINUTE = 60.0
+"""Seconds between lines of an evaluation."""
 
 
 @contextmanager
@@ -39,18 +40,8 @@ def shown(again: str = "with --resume") -> Iterator[Shower]:
         shower.close()
 
 
-@contextmanager
-def counted() -> Iterator[Count]:
-    """Counts episodes of evaluations on stderr."""
-    shower = Shower()
-    try:
-        yield shower.counting
-    finally:
-        shower.close()
-
-
 class Shower:
-    """Shows how a run goes."""
+    """Shows how a run or an evaluation goes."""
 
     def __init__(self) -> None:
         self._bar: tqdm[NoReturn] | None = None

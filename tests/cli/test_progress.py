@@ -1,15 +1,50 @@
-"""What is said of evaluations while they go on."""
+"""What is said of runs and evaluations: bars for eyes, lines for files, what went wrong in both."""
 
 import sys
+from contextlib import closing
+from dataclasses import fields, replace
+from types import SimpleNamespace
+
+import pytest
 
 from morphgen.cli import progress
+from morphgen.cli.progress import Shower
+from morphgen.rl.report import Report
+from small_runs import small_config
+
+FLOATS = [each.name for each in fields(Report) if each.type == "float"]
+REPORT = Report(
+    update=1,
+    transitions=32,
+    scores=(1.0,),
+    episodes=7,
+    unstable=0,
+    terms={},
+    **dict.fromkeys(FLOATS, 0.5),
+)
+
+
+@pytest.fixture(params=[True, False], ids=["terminal", "file"])
+def show(request, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: request.param)
+    shower = Shower()
+    yield shower(SimpleNamespace(config=small_config()))
+    shower.close()
+
+
+def test_episodes_cut_short_are_told_at_once_and_only_then(show, capsys):
+    show(replace(REPORT, update=99, transitions=99 * 32), 100)
+    assert "unstable" not in capsys.readouterr().err
+    show(replace(REPORT, update=99, transitions=99 * 32, unstable=2), 100)
+    told = "update 99: 2 of 7 episodes ended because their simulation became unstable\n"
+    assert told in capsys.readouterr().err
 
 
 def test_what_takes_minutes_says_how_far_it_is_once_in_each(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    with progress.counted() as count:
-        tell = count("stochastic on test")
+    with closing(Shower()) as shower:
+        tell = shower.counting("stochastic on test")
         for i in range(1, 13):
             now[0] += 11
             tell(i / 2, 6)
@@ -22,11 +57,11 @@ def test_what_takes_minutes_says_how_far_it_is_once_in_each(capsys, monkeypatch)
 
 def test_on_a_terminal_it_is_a_bar_that_goes_away(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with progress.counted() as count:
-        tell = count("train")
+    with closing(Shower()) as shower:
+        tell = shower.counting("train")
         tell(0.5, 2)
         tell(2, 2)
-        count("test")(1, 2)
+        shower.counting("test")(1, 2)
     err = capsys.readouterr().err
     assert "train" in err
     assert "test" in err
