@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.tasks.bodies import Bodies
-from morphgen.tasks.kinematics import tool_frames, tool_jacobians
+from morphgen.tasks.kinematics import quaternions, tool_frames, tool_jacobians
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ def towards(
     T = tool_frames(bodies.chain, body, q)[:, -1]
     J = tool_jacobians(bodies.chain, body, q)
     off = (position - T[:, :3, 3])[..., None]
-    turn = _rotation_vectors(rotation @ T[:, :3, :3].transpose(1, 2))[..., None]
+    turn = rotation_vectors(rotation @ T[:, :3, :3].transpose(1, 2))[..., None]
     lower, upper = bodies.lower[body], bodies.upper[body]
     moves = bodies.moves_tool[body]
     eye = torch.eye(q.shape[1], device=q.device)
@@ -126,9 +126,14 @@ def _damped_inverse(J: torch.Tensor, damping: float) -> torch.Tensor:
     return J.transpose(1, 2) @ inverse
 
 
-def _rotation_vectors(R: torch.Tensor) -> torch.Tensor:
-    """Axes of rotations (n, 3, 3), as long as the sines of half of their angles, twice; (n, 3)."""
-    skew = R - R.transpose(1, 2)
-    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
-    trace = R.diagonal(dim1=1, dim2=2).sum(dim=1, keepdim=True)
-    return axis / torch.sqrt((1 + trace).clamp(min=0.05))
+def rotation_vectors(R: torch.Tensor) -> torch.Tensor:
+    """Return rotations (n, 3, 3) as rotation vectors, angle times axis, shape (n, 3), rad.
+
+    This is the logarithm of the unit quaternion, which is well-conditioned at 0 and at pi.
+    """
+    quaternion = quaternions(R)
+    w, v = quaternion[:, :1], quaternion[:, 1:]
+    sine = torch.linalg.vector_norm(v, dim=1, keepdim=True)
+    angle = 2 * torch.atan2(sine, w)
+    # The limit of angle / sine at 0 is 2.
+    return v * torch.where(sine > 0, angle / sine.clamp(min=1e-30), 2.0)

@@ -104,9 +104,9 @@ class PPOConfig:
     """Of the first update; falls in a line to zero after the last (Schulman et al. 2017)."""
     target_kl: float = 0.0
     """If not 0, the actor's learning rate is lowered where an update changes its actions by more
-    than this, and raised where by less, ``learning_rate`` at most. KL divergence, nats (after Rudin
-    et al. 2022, "Learning to Walk in Minutes"; for robots that learn alone with few environments,
-    where the same learning rate changes more)."""
+    than this, and raised where by less: between a hundredth of ``learning_rate`` and all of it. KL
+    divergence, nats (after Rudin et al. 2022, "Learning to Walk in Minutes"; for robots that learn
+    alone with few environments, where the same learning rate changes more)."""
     adam_epsilon: float = 1e-5
     """Huang et al. 2022, "The 37 implementation details of PPO"."""
     gradient_clip: float = 1.0

@@ -155,7 +155,7 @@ def evaluate_checkpoints(
     episodes count alike.
 
     Raises:
-        TaskError: If one is no checkpoint, or for other observations.
+        TaskError: If one is no checkpoint, or for other observations or actions.
         MorphgenError: If a robot or simulator cannot be made.
     """
     trained = [read_checkpoint(path) for path in paths]
@@ -166,7 +166,31 @@ def evaluate_checkpoints(
             for one, own in zip(trained, sources, strict=True)
         )
         return [score for scores in found for score in scores]
+    _require_same_interface(paths, [run for run, _ in trained])
     return _evaluate_together(trained, source, exam, mode, device, tell)
+
+
+def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) -> None:
+    """Require that all policies take the same observations and actions.
+
+    Raises:
+        TaskError: If one does not; it says in what.
+    """
+    first, *others = [_flat(run.interface) for run in runs]
+    for path, other in zip(paths[1:], others, strict=True):
+        wrong = [
+            f"{key} {other[key]}, not {first[key]}" for key in first if other[key] != first[key]
+        ]
+        if wrong:
+            raise TaskError(
+                f"{path}: its policy is for other observations or actions than that of "
+                f"{paths[0]}: {'; '.join(wrong)}; evaluate it on its own"
+            )
+
+
+def _flat(wanted: Interface) -> dict[str, Any]:
+    numbers = asdict(wanted)
+    return {**numbers, **numbers.pop("channels")}
 
 
 def _of_same(one: Source, whole: Source) -> bool:
@@ -186,7 +210,7 @@ def _evaluate_together(
 ) -> list[Score]:
     """The episodes of all policies count together."""
     acting = [_policy(learner, mode, exam.seed, device) for _, learner in trained]
-    (wanted,) = {run.interface for run, _ in trained}
+    wanted = trained[0][0].interface
     return evaluate(acting, source, exam, wanted, tell=tell)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -209,7 +210,7 @@ class FreeWays:
 
     def _free_part(self, start: Array, end: Array, block: Array | None) -> float:
         """Which part of the straight way between two configurations is free, from the start."""
-        parts = max(int(np.abs(end - start).max() / STRIDE) + 1, 2)
+        parts = max(math.ceil(np.abs(end - start).max() / STRIDE), 1) + 1
         way = start + np.linspace(0, 1, parts)[:, None] * (end - start)
         free = self._space.free(way, None if block is None else np.tile(block, (parts, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (parts - 1)

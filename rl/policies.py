@@ -26,6 +26,10 @@ CHANNELS = ("velocity", "previous_action")
 """Numbers of a link that an observation may have beside its token, in order."""
 LINK_ROWS = ("tokens", "links", "actions", *CHANNELS)
 """Parts of an observation that have a row for each link."""
+ENTITIES = ("links", "goal", "object", "line", "obstacles", "cloud")
+"""Kinds of vectors, in the order of the vectors and of the rows of ``Entities.kind``.
+
+Checkpoints have the rows in this order, without the kinds that a layout lacks."""
 SMALL = 0.01
 """Scale of the last layer's weights at the start: all actions begin alike, values at zero."""
 
@@ -141,14 +145,17 @@ class Entities(nn.Module):
         ).repeat(2)
         with torch.no_grad():
             next(self.project["links"].parameters()).mul_(smooth)
-        self.kind = nn.Parameter(0.02 * torch.randn(len(sizes), features))
+        self.kinds = tuple(name for name in ENTITIES if name in sizes)
+        """Name of each row of ``kind``."""
+        self.kind = nn.Parameter(0.02 * torch.randn(len(self.kinds), features))
         self.count = layout.links + 3 + layout.obstacles + bool(layout.points)
 
     def forward(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor]:
         """Vectors (n, T, features), zeros where there is nothing, and where there is, (n, T)."""
         entries = self._entries(observation)
         vectors, masks = [], []
-        for (name, (values, mask)), kind in zip(entries.items(), self.kind, strict=True):
+        for name, kind in zip(self.kinds, self.kind, strict=True):
+            values, mask = entries[name]
             shown = torch.where(mask[..., None], values, 0.0)
             vectors.append(torch.where(mask[..., None], self.project[name](shown) + kind, 0.0))
             masks.append(mask)

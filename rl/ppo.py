@@ -39,6 +39,10 @@ LEARNED = (*LOSSES, "actor_gradient", "critic_gradient")
 """What is reported of gradient steps; see ``Report``."""
 KL_FACTOR = 1.2
 """Between the actor's learning rates of two updates, where they follow ``target_kl``."""
+LEAST_SHARE = 0.01
+"""Least share of the learning rate that the actor keeps, as in rsl_rl (1e-5 of 1e-3).
+
+Without it, a share that fell for long needs as many updates to rise again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +152,12 @@ class Learner:
         )
 
     def checkpoint(self) -> dict[str, Any]:
-        """Everything to go on from here; ``torch.load`` reads it with ``weights_only``.
+        """Return the state of training; ``torch.load`` reads it with ``weights_only``.
 
-        All episodes begin anew after this, here as after ``resume``: the state of a simulator is in
-        no checkpoint. So a run that is taken up again equals one that went on if both make their
-        checkpoints after the same updates.
+        The learner does not change. The state of the simulator is not part of a checkpoint, so
+        that a resumed run begins new episodes. A run that continues equals a resumed one only if it
+        calls ``restart_episodes`` after the checkpoint.
         """
-        self._observation = None
         learned = {name: net.state_dict() for name, net in self._networks().items()}
         return {
             **copy.deepcopy({**learned, "optimiser": self.optimiser.state_dict()}),
@@ -169,8 +172,14 @@ class Learner:
             "config": asdict(self.config),
         }
 
+    def restart_episodes(self) -> None:
+        """Begin new episodes in all environments at the next ``iterate``."""
+        self._observation = None
+
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on where another learner of the same batch, configuration and device stopped.
+
+        All environments begin new episodes.
 
         Raises:
             TaskError: If these are not the same; nothing is changed then.
@@ -186,7 +195,7 @@ class Learner:
         for name, generator in self._generators.items():
             generator.set_state(checkpoint["generators"][name].cpu())
         self.update, self._share = checkpoint["update"], checkpoint["share"]
-        self._observation = None
+        self.restart_episodes()
 
     def adopt(self, checkpoint: Mapping[str, Any]) -> None:
         """Begin with the networks of a checkpoint, and nothing else of it: to fine-tune.
@@ -372,7 +381,7 @@ def learning_rate(config: PPOConfig, update: int, updates: int) -> float:
 
 
 def next_share(config: PPOConfig, share: float, kl: float) -> float:
-    """The actor's share of the learning rate in the next update, at most 1.
+    """The actor's share of the learning rate in the next update, ``LEAST_SHARE`` to 1.
 
     Args:
         config: The algorithm; without a ``target_kl`` it is 1.
@@ -382,7 +391,7 @@ def next_share(config: PPOConfig, share: float, kl: float) -> float:
     if not config.target_kl:
         return 1.0
     if kl > config.target_kl:
-        return share / KL_FACTOR
+        return max(share / KL_FACTOR, LEAST_SHARE)
     return min(share * KL_FACTOR, 1.0)
 
 

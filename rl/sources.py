@@ -180,7 +180,8 @@ def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
     if source.split:
         own = replace(source, split="", only=None)
         return [_of_member(member, own, recipe) for member in members(source)]
-    assert source.task is not None
+    if source.task is None:
+        raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
     robot = robot_of(source.name, library=map(Path, source.library))
     if source.body not in ("", robot_hash(robot)):
         raise TaskError(f"{source.name}: it is not the body that it was when the run began")

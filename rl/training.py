@@ -261,6 +261,8 @@ def _learn(learner: Learner, part: Part, way: Way, show: Show) -> None:
             rest = learner.updates - learner.update
             if not rest or (learner.update % often == 0 and rest >= often):
                 write_checkpoint(part.folder, part.config, learner.checkpoint())
+                # A resumed run begins new episodes here, and must come to the same weights.
+                learner.restart_episodes()
             show(report, learner.updates)
 
 

@@ -46,7 +46,10 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What an action led to; where an episode ended, the next one has begun."""
+    """What an action led to; where an episode ended, the next one has begun.
+
+    All tensors belong to the caller: the batch does not use them again.
+    """
 
     observation: Observation
     """After the action, or of the next episode's start."""
@@ -62,7 +65,8 @@ class Step:
     final_observation: Observation
     """After the action, whatever followed: to bootstrap from where time ran out."""
     success: torch.Tensor
-    """Whether the tool is near its goal, or the block across the line, shape (n,), bool."""
+    """Whether the tool is near its goal, or the block across the line, shape (n,), bool; never
+    where the simulation became unstable."""
     distance: torch.Tensor
     """Metres from success: of tool and goal, or of block and line, shape (n,)."""
     score: torch.Tensor
@@ -168,22 +172,22 @@ class TaskBatch:
     @property
     def q(self) -> torch.Tensor:
         """Positions of the independent joints, shape (n, J), rad or m; J is that of ``bodies``."""
-        return self._widened(self.simulation.q)
+        return self._q.clone()
 
     @property
     def goal(self) -> torch.Tensor:
         """Wanted pose of the tool, shape (n, 7); zeros for push."""
-        return self._reach.goal
+        return self._reach.goal.clone()
 
     @property
     def witness(self) -> torch.Tensor:
         """Joint positions that bring the tool to its goal, shape (n, J); zeros for push."""
-        return self._reach.witness
+        return self._reach.witness.clone()
 
     @property
     def line(self) -> torch.Tensor:
         """Where the block must cross now, y of its centre, shape (n,), metres; zeros for reach."""
-        return self._push.line
+        return self._push.line.clone()
 
     def reset(self, seed: int | None = None, *, spread: bool = False) -> Observation:
         """Begin an episode everywhere.
@@ -215,15 +219,15 @@ class TaskBatch:
         self._act(actions)
         unstable = self._move()
         self.elapsed += 1
-        verdict = self._judge()
+        verdict = self._judge(unstable)
         truncated = ((self.elapsed >= self.longest) | unstable) & ~verdict.terminated
         final = self.observe()
-        q, block_pose = self.q.clone(), self.simulation.block_pose.clone()
+        q, block_pose = self.q, self.simulation.block_pose.clone()
         over = torch.nonzero(truncated | verdict.terminated)[:, 0]
         if len(over):
             self._begin(over)
         return Step(
-            observation=self.observe() if len(over) else final,
+            observation=self.observe() if len(over) else _copied(final),
             reward=torch.stack(list(verdict.terms.values())).sum(dim=0),
             terminated=verdict.terminated,
             truncated=truncated,
@@ -238,14 +242,14 @@ class TaskBatch:
         )
 
     def observe(self) -> Observation:
-        """What agents see now."""
+        """Return what agents see now, in tensors that belong to the caller."""
         seen = {
-            "tokens": self._tokens(self.q),
+            "tokens": self._tokens(self._q),
             "goal": self._reach.goal.clone(),
             "object": box_tokens(self.simulation.block_pose, self._push.size)
             * self.pushes[:, None],
             "line": self._push.line[:, None].clone(),
-            **self._fixed,
+            **_copied(self._fixed),
         }
         if self._channels.velocity:
             qd = self._widened(self.simulation.qd)
@@ -253,7 +257,7 @@ class TaskBatch:
         if self._channels.previous_action:
             seen["previous_action"] = self._shares.clone()
         if self._channels.tool:
-            seen["tool"] = self._tools(self.q)
+            seen["tool"] = self._tools(self._q)
         if self._points is not None:
             seen["points"] = self._points(self.simulation.block_pose)
         return seen
@@ -289,7 +293,7 @@ class TaskBatch:
         for name, streams in self._streams.items():
             for stream, saved in zip(streams, state[name], strict=True):
                 stream.bit_generator.state = saved
-        self._push.line = state["line"].to(self.device)
+        self._push.line = state["line"].to(self.device, copy=True)
 
     def close(self) -> None:
         """Free the simulation."""
@@ -313,13 +317,14 @@ class TaskBatch:
             self._qd[envs] = 0
         return unstable
 
-    def _judge(self) -> Verdict:
-        q, qd = self.q, self._widened(self.simulation.qd)
+    def _judge(self, unstable: torch.Tensor) -> Verdict:
+        q, qd = self._q, self._widened(self.simulation.qd)
         state = State(
             tool=self._tools(q),
             block=self.simulation.block_pose[:, :3],
             beyond=beyond_limits(q, self._lower, self._upper),
             acceleration=added((qd - self._qd).abs()) / CONTROL_PERIOD,
+            unstable=unstable,
         )
         self._qd = qd.clone()
         if len(self._tasks) == 1:
@@ -343,10 +348,19 @@ class TaskBatch:
         self._qd[envs] = 0
         self._shares[envs] = 0
 
+    @property
+    def _q(self) -> torch.Tensor:
+        """``q``, or a view of the simulation's own."""
+        return self._widened(self.simulation.q)
+
     def _widened(self, values: torch.Tensor) -> torch.Tensor:
         """Values of the simulation's joints, padded to those of ``bodies``."""
         more = self.bodies.max_joints - self._joints
         return torch.nn.functional.pad(values, (0, more)) if more else values
+
+
+def _copied(observation: Observation) -> Observation:
+    return {name: values.clone() for name, values in observation.items()}
 
 
 def _streams(seed: int, numbers: Sequence[int]) -> dict[str, list[np.random.Generator]]:

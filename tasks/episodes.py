@@ -34,6 +34,8 @@ class State:
     """See ``beyond_limits``, shape (n,)."""
     acceleration: torch.Tensor
     """Mean over the control step, absolute, all joints together, shape (n,)."""
+    unstable: torch.Tensor
+    """Whether the simulation diverged in the step, shape (n,), bool; this is never a success."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +109,9 @@ class Reach:
         """Judge all rows as if they reached."""
         distance = lengths(state.tool - self.goal[:, :3])
         terms = reach_terms(self._config, distance, state.beyond, state.acceleration)
-        near = distance < self._config.near
+        success = (distance < self._config.near) & ~state.unstable
         score = anybody_score(self._config, distance)
-        return Verdict(near, torch.zeros_like(near), distance, score, terms)
+        return Verdict(success, torch.zeros_like(success), distance, score, terms)
 
 
 class Push:
@@ -153,10 +155,10 @@ class Push:
     def judge(self, state: State) -> Verdict:
         """Judge all rows as if they pushed."""
         to_go = torch.clamp(self.line - state.block[:, 1], min=0)
-        success = state.block[:, 1] > self.line
+        success = (state.block[:, 1] > self.line) & ~state.unstable
         approach = lengths(state.tool - state.block)
         terms = push_terms(self._config, to_go, approach, state.beyond, success)
-        return Verdict(success, success, to_go, success.float(), terms)
+        return Verdict(success, success.clone(), to_go, success.float(), terms)
 
 
 def _padded(

@@ -1,4 +1,4 @@
-"""The paper's scenarios: which robots each is made of. Their files lie in ``scenarios/``.
+"""The paper's scenarios: which robots each is made of. Their files lie in ``splits/``.
 
 After a change here, or of a part that they use, ``write_scenarios`` makes the files anew.
 """

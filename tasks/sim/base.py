@@ -104,7 +104,7 @@ class Simulation(Protocol):
         Raises:
             UnstableError: If simulations became unstable; it names them, and each must be reset
                 before the next step. All others have moved.
-            SimulationError: If a worker died, or MuJoCo has no memory for an environment.
+            SimulationError: If a worker died.
         """
 
     def close(self) -> None:

@@ -17,10 +17,10 @@ from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
-from morphgen.tasks.sim.mujoco_state import MAX_SPEED, State
+from morphgen.tasks.sim.mujoco_state import State
 
 Array = NDArray[np.float64]
-Work = tuple[mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
+Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 
 
 class MujocoSimulation:
@@ -69,7 +69,9 @@ class MujocoSimulation:
         for i, (world, data) in enumerate(zip(self._worlds, self._data, strict=True)):
             self._has_target[i, : world.robot.dof] = True
             controls, applied = self._controls[i, : world.robot.dof], self._control.applied_to(i)
-            self._work.append((world.model, data, data.ctrl, controls, data.qfrc_applied, applied))
+            self._work.append(
+                (i, world.model, data, data.ctrl, controls, data.qfrc_applied, applied)
+            )
             block = self.scenes[i].block
             pose = (*block.pose.position, *block.pose.quaternion) if block is not None else ()
             # As a reset to what the tensors say would: their digits, not more.
@@ -134,9 +136,9 @@ class MujocoSimulation:
 
         Raises:
             ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
-            UnstableError: If environments became unstable; all have moved, and these remain so
-                until they are reset.
-            SimulationError: If the contacts of one do not fit into MuJoCo's memory; all have moved.
+            UnstableError: If environments became unstable, or their contacts do not fit into
+                MuJoCo's memory; all others have moved, and these remain so until they are reset.
+            SimulationError: If the simulation is closed.
         """
         self._require_open()
         if targets.shape != self._targets.shape:
@@ -152,15 +154,11 @@ class MujocoSimulation:
                 self._targets, *self._state.joints(), self._state.velocities, out=self._controls
             )
             with unclocked():
-                self._advance()
+                refused = self._advance()
             self._state.read()
-        full, unstable = self._state.faults()
-        if full:
-            where = self._where(full[0])
-            raise SimulationError(f"{where}: its contacts do not fit into MuJoCo's memory")
-        if unstable:
-            why = f"unstable: a velocity is not finite or beyond {MAX_SPEED:g}"
-            raise UnstableError({env: f"{self._where(env)}: {why}" for env in unstable})
+        faults = self._state.faults() | refused
+        if faults:
+            raise UnstableError({env: f"{self._where(env)}: {why}" for env, why in faults.items()})
 
     def close(self) -> None:
         """Free everything; a second time does nothing."""
@@ -186,17 +184,19 @@ class MujocoSimulation:
             if mujoco.mju_normalize4(quaternion) < 0.5:
                 raise ValueError(f"{self._where(env)}: {list(pose)} is no pose of a block")
 
-    def _advance(self) -> None:
-        work = iter(self._work)
+    def _advance(self) -> dict[int, str]:
+        """Step all environments; return those that MuJoCo could not step, with its reasons."""
+        work, refused = iter(self._work), dict[int, str]()
         helpers = []
         if self._pool is not None:
-            helpers = [self._pool.submit(_drain, work) for _ in range(self._helpers)]
+            helpers = [self._pool.submit(_drain, work, refused) for _ in range(self._helpers)]
         try:
-            _drain(work)
+            _drain(work, refused)
         finally:
             wait(helpers)
         for helper in helpers:
             helper.result()
+        return refused
 
     def _require_open(self) -> None:
         if not self._work:
@@ -208,9 +208,17 @@ class MujocoSimulation:
         return f"environment {env} (robot {name!r}, {steps} steps after its reset)"
 
 
-def _drain(work: Iterator[Work]) -> None:
-    """Step environments until none is left; several threads may share the iterator."""
-    for model, data, actuators, controls, torques, applied in work:
+def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
+    """Step environments until none is left; several threads may share both arguments.
+
+    Args:
+        work: Environments to step.
+        refused: Where to put those that MuJoCo could not step, with its reason.
+    """
+    for env, model, data, actuators, controls, torques, applied in work:
         actuators[:] = controls
         torques[:] = applied
-        mujoco.mj_step(model, data, nstep=SUBSTEPS)
+        try:
+            mujoco.mj_step(model, data, nstep=SUBSTEPS)
+        except mujoco.FatalError as error:  # its stack is full
+            refused[env] = f"unstable: MuJoCo: {str(error).splitlines()[0]}"

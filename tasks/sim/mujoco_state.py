@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 MAX_SPEED = 1e4
 """Velocity from which a simulation counts as exploded, SI units."""
+_TOO_FAST = f"unstable: a velocity is not finite or beyond {MAX_SPEED:g}"
+_NO_MEMORY = "unstable: its contacts do not fit into MuJoCo's memory"
 _FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
 
 
@@ -77,22 +79,24 @@ class State:
             spin[:] = _rotated(quaternion, spin)
             self.block_velocity.numpy()[:] = velocity
 
-    def faults(self) -> tuple[list[int], list[int]]:
-        """Environments whose numbers mean nothing any more.
+    def faults(self) -> dict[int, str]:
+        """Return the environments that diverged, each with the reason.
 
-        Returns:
-            Those whose contacts do not fit into MuJoCo's memory, and the others: they have a
-            velocity that is not finite, or beyond ``MAX_SPEED``.
+        Their contacts do not fit into MuJoCo's memory, or they have a velocity that is not finite
+        or beyond ``MAX_SPEED``.
         """
         warnings = np.array(self._warnings)
         speeds = np.abs(self._velocities.flat)
         if speeds.max() <= MAX_SPEED and not warnings.any():
-            return [], []
+            return {}
         begin = self._velocities.begin
         slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
         full = warnings[:, _FULL].any(axis=1)
-        unstable = (~np.array(slow) | warnings.any(axis=1)) & ~full
-        return np.flatnonzero(full).tolist(), np.flatnonzero(unstable).tolist()
+        unstable = ~np.array(slow) | warnings.any(axis=1)
+        return {
+            env: _NO_MEMORY if full[env] else _TOO_FAST
+            for env in np.flatnonzero(full | unstable).tolist()
+        }
 
     def forget(self) -> None:
         """Let go of the environments' data."""

@@ -22,6 +22,7 @@ def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
     went_on = learner(**options)
     went_on.iterate(), went_on.iterate()
     checkpoint = stored(went_on.checkpoint())
+    went_on.restart_episodes()
     reports = [went_on.iterate(), went_on.iterate()]
 
     kind = "discrete" if discrete else "continuous"
@@ -43,6 +44,7 @@ def test_a_run_that_forgets_a_part_does_not_equal_one_that_went_on(part):
     went_on = learner(**options)
     went_on.iterate(), went_on.iterate()
     checkpoint = stored(went_on.checkpoint())
+    went_on.restart_episodes()
     went_on.iterate()
     again = learner(OnALine(8, seed=99), seed=77, **options)
     again.iterate()
@@ -62,6 +64,15 @@ def test_a_checkpoint_does_not_change_with_the_learner():
     assert all(checkpoint["actor"][k].equal(before["actor"][k]) for k in before["actor"])
     steps = [each["step"] for each in checkpoint["optimiser"]["state"].values()]
     assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
+
+
+def test_a_learner_does_not_change_with_a_checkpoint():
+    looked_at, alone = learner(), learner()
+    for each in (looked_at, alone):
+        each.iterate()
+    looked_at.checkpoint()
+    assert untimed(looked_at.iterate()) == untimed(alone.iterate())
+    assert equal(weights(looked_at), weights(alone))
 
 
 def test_the_same_seed_gives_the_same_run():

@@ -186,6 +186,23 @@ def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_
     evaluate_run(tmp_path, "test", EXAM, "deterministic")
 
 
+def test_policies_for_other_observations_or_actions_are_not_evaluated_together(run, tmp_path):
+    config, learner = read_checkpoint(run)
+    for name, changed in {
+        "wider": replace(config, max_links=30),
+        "continuous": replace(config, policy=replace(config.policy, discrete=False)),
+    }.items():
+        write_checkpoint(tmp_path, changed, learner)
+        other = (tmp_path / "checkpoint.pt").rename(tmp_path / f"{name}.pt")
+        difference = {
+            "wider": "max_links 30, not 23",
+            "continuous": "kind continuous, not discrete",
+        }
+        message = rf"^{other}: its policy .* than that of {run}: {difference[name]}; evaluate it on"
+        with pytest.raises(TaskError, match=message):
+            evaluate_checkpoints([run, other], small_source(), EXAM, "deterministic")
+
+
 @pytest.mark.parametrize("agent", ["me-mlp", "se"])
 def test_obstacles_may_be_on_one_side_or_around_one_robot_alone(agent, tmp_path):
     def made(words, obstacles):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morphgen.model.geometry import Pose
-from morphgen.rl.free_ways import FreeWays, Price
+from morphgen.rl.free_ways import STRIDE, FreeWays, Price
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 from scenes import ball
@@ -118,3 +118,21 @@ def test_ways_that_take_longer_than_there_is_time_come_last():
     assert end([51.0, 0.0]) == 0
     assert end([40.0, 40.0]) == 1
     assert end([-30.0, -30.0]) == 0, "both are far too late"
+
+
+@pytest.mark.parametrize("far", [0.0, 0.03, 0.0501, 0.0999, 0.1499, 0.52, 0.999])
+def test_no_two_configurations_that_are_tested_are_farther_apart_than_the_stride(far):
+    class Noting(FreeSpace):
+        tested = None
+
+        def free(self, q, blocks=None):
+            self.tested = np.array(q)
+            return super().free(q, blocks)
+
+    space = Noting(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1))))
+    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
+    start = np.array([-0.5, -0.5])
+    end = start + np.array([far, far / 3])
+    assert ways.find(start, end[None]) is not None
+    assert space.tested[[0, -1]] == pytest.approx(np.array([end, start]))
+    assert np.abs(np.diff(space.tested, axis=0)).max() <= STRIDE + 1e-12

@@ -9,6 +9,7 @@ from morphgen.benchmark.token_layout import POSITION
 from morphgen.errors import TaskError
 from morphgen.rl.config import AGENTS, PolicyConfig
 from morphgen.rl.policies import (
+    Entities,
     layout_of,
     make_networks,
     require_layout,
@@ -413,3 +414,31 @@ def test_a_policy_sees_the_tool_if_it_is_to_and_only_then(shown):
 
 def without_obstacles():
     return {**observed(extras=False), "obstacles": torch.zeros(N, 0, 13)}
+
+
+def test_kinds_of_entities_are_matched_by_name(monkeypatch):
+    seen = observed()
+    actor, critic = networks(seen=seen)
+    before = actor(seen), critic(seen)
+    entries = Entities._entries
+
+    def reversed_entries(self, observation):
+        return dict(reversed(entries(self, observation).items()))
+
+    monkeypatch.setattr(Entities, "_entries", reversed_entries)
+    assert torch.equal(actor(seen), before[0])
+    assert torch.equal(critic(seen), before[1])
+
+
+@pytest.mark.parametrize("extras", [True, False], ids=["cloud", "no cloud"])
+def test_the_rows_of_kinds_in_a_checkpoint_keep_their_meaning(extras):
+    """Each row is added to the vectors of one kind alone, in the order of older checkpoints."""
+    seen = observed(extras=extras)
+    found = Entities(layout_of(seen), 8, blind=False)
+    with torch.no_grad():
+        for project in found.project.values():
+            project.weight.zero_()
+        found.kind.copy_(torch.eye(8)[: len(found.kind)])
+    vectors, mask = found(seen)
+    rows = [0] * LINKS + [1, 2, 3] + [4] * OBSTACLES + [5] * extras
+    assert torch.equal(vectors, torch.eye(8)[rows] * mask[..., None])

@@ -11,7 +11,15 @@ import torch
 from learners import SMALL, equal, learner, weights
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.ppo import KL_FACTOR, Learner, follow, learning_rate, next_share, policy_loss
+from morphgen.rl.ppo import (
+    KL_FACTOR,
+    LEAST_SHARE,
+    Learner,
+    follow,
+    learning_rate,
+    next_share,
+    policy_loss,
+)
 from morphgen.rl.report import explained_variance, outcome
 from morphgen.rl.symlog import symlog
 from on_a_line import OnALine
@@ -47,6 +55,17 @@ def test_the_actors_share_of_the_rate_follows_the_divergence():
     assert next_share(config, 0.5, 0.005) == 0.5 * KL_FACTOR
     assert next_share(config, 1.0, 0.005) == 1
     assert next_share(SMALL, 1.0, 9.9) == 1
+
+
+def test_the_actors_share_of_the_rate_has_a_floor():
+    config, share = replace(SMALL, target_kl=0.01), 1.0
+    for _ in range(1000):
+        share = next_share(config, share, 9.9)
+    assert share == LEAST_SHARE > 0
+    updates = 0
+    while share < 1:
+        share, updates = next_share(config, share, 0.0), updates + 1
+    assert updates < 30, "it must rise again within a run"
 
 
 def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():

@@ -225,6 +225,43 @@ def test_a_batch_goes_on_from_its_state(made):
         made(2).load_state_dict(state)
 
 
+def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
+    """Whoever keeps it finds it as it was, and whoever writes into it changes no batch."""
+    options = {
+        "obstacles": True,
+        "channels": Channels(velocity=True, previous_action=True, tool=True, points=8),
+    }
+    batch, whole, chance = made(**options), made(**options), Random(0)
+
+    def tensors(step):
+        parts = {"now": step.observation, "final": step.final_observation, "terms": step.terms}
+        plain = ("reward", "terminated", "truncated", "unstable", "success", "distance", "score")
+        named = {f"{of} {k}": v for of, part in parts.items() for k, v in part.items()}
+        return named | {k: getattr(step, k) for k in (*plain, "q", "block_pose")}
+
+    def spoil(values):
+        for each in values:
+            each.copy_(~each if each.dtype == torch.bool else each + 7)
+
+    spoil(batch.reset().values())
+    whole.reset()
+    state = batch.state_dict()
+    batch.load_state_dict(state)
+    spoil([state["line"], batch.q, batch.goal, batch.witness, batch.line])
+    for _ in range(3):
+        actions = chance.act(whole)
+        spoiled, kept = tensors(batch.step(actions)), tensors(whole.step(actions))
+        before = {name: each.clone() for name, each in kept.items()}
+        whole.observe()
+        for name, each in spoiled.items():
+            assert torch.equal(each, before[name]), name
+            spoil([each])
+        places = [each.data_ptr() for each in spoiled.values() if each.numel()]
+        assert len(places) == len(set(places))
+        spoil(batch.observe().values())
+        assert all(torch.equal(kept[name], before[name]) for name in kept)
+
+
 def test_first_episodes_may_be_spread_over_time(made):
     batch = made(60, robots=(0,), seed=1)
     batch.reset(spread=True)

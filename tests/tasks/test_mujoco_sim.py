@@ -14,6 +14,7 @@ from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, movable_positions
 from morphgen.model.robot import Frame
+from morphgen.tasks.sim import mujoco_model
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
@@ -305,6 +306,36 @@ def test_what_explodes_is_named_and_can_be_reset(tmp_path, monkeypatch):
         sim.step(home[0])
     assert list(found.value.reasons) == [0, 2]
     assert list(Path(tmp_path).iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("memory", "words"),
+    [(10_750, "its contacts do not fit into MuJoCo's memory"), (14_000, "stack overflow")],
+    ids=["contacts", "stack"],
+)
+def test_contacts_without_room_are_of_one_environment_alone(monkeypatch, memory, words):
+    compiled = mujoco_model._robot_spec
+
+    def cramped(*args):
+        body, spec = compiled(*args)
+        spec.memory = memory
+        return body, spec
+
+    monkeypatch.setattr(mujoco_model, "_robot_spec", cramped)
+    sim = MujocoSimulation([push_scene(), push_scene()], threads=2)
+    home = sim.q.clone(), sim.block_pose.clone()
+    held(sim, 3)
+    inside = home[1].clone()
+    inside[1, :3] = torch.tensor([0.5, 0.2, 0.02])  # in an obstacle and the ground
+    put_back(sim, [0, 1], (home[0], inside))
+    with pytest.raises(UnstableError, match=rf"environment 1 \(robot 'prims'.*{words}") as info:
+        sim.step(home[0])
+    assert list(info.value.reasons) == [1]
+    assert "\n" not in str(info.value)
+    put_back(sim, [0, 1], home)
+    held(sim, 3)
+    alone = held(MujocoSimulation([push_scene()]), 3)
+    assert same_bits(outputs(sim, 1), outputs(alone))
 
 
 def test_targets_that_are_not_finite_move_nothing():

@@ -2,6 +2,7 @@
 
 import math
 
+import mujoco
 import pytest
 import torch
 
@@ -127,3 +128,63 @@ def test_episodes_say_so(made):
     assert (second.env, second.unstable, second.steps) == (0, False, REACH.steps)
     assert not any(each.unstable for each in others)
     assert len(others) == 2 * ENVS - 2
+
+
+def test_an_episode_that_diverges_is_never_a_success(made):
+    """Not even where the tool is at the goal, or the block across the line."""
+    batch = made()
+
+    def put_at_goals():
+        q, block = batch.simulation.q.clone(), batch.simulation.block_pose.clone()
+        joints = q.shape[1]
+        q[0], block[1, 1] = batch.witness[0, :joints], batch.line[1] + 0.05
+        batch.targets[0] = batch.witness[0]
+        batch.simulation.reset(torch.arange(2), q[:2], block[:2])
+
+    batch.reset()
+    put_at_goals()
+    good = batch.step(torch.zeros(batch.mask.shape))
+    assert good.success.tolist() == [True, True, False, False]
+    assert good.terminated.tolist() == [False, True, False, False]
+
+    batch.reset()
+    put_at_goals()
+    break_physics(batch, 0)
+    break_physics(batch, 1)
+    step = batch.step(torch.zeros(batch.mask.shape))
+    assert step.distance[:2].max() < REACH.near
+    assert step.unstable.tolist() == step.truncated.tolist() == [True, True, False, False]
+    assert not step.success.any()
+    assert not step.terminated.any()
+    assert step.score[1] == step.terms["success"][1] == 0
+
+    class Breaks:
+        def act(self, task):
+            if not task.elapsed[0]:
+                put_at_goals()
+                break_physics(task, 0)
+                break_physics(task, 1)
+            return torch.zeros(task.mask.shape)
+
+    reached, pushed, *_ = run_episodes(batch, Breaks(), 1)
+    assert reached.unstable
+    assert pushed.unstable
+    assert not reached.success
+    assert not pushed.success
+    assert pushed.score == 0
+
+
+@pytest.mark.parametrize("made", ["mujoco"], indirect=True)
+@pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
+def test_contacts_that_do_not_fit_end_one_episode(made, warning):
+    batch, whole = made(), made()
+    batch.reset()
+    whole.reset()
+    number = getattr(mujoco.mjtWarning, f"mjWARN_{warning}").value
+    batch.simulation._data[1].warning[number].number = 1
+    actions = Random(0).act(batch)
+    step, other = batch.step(actions), whole.step(actions)
+    assert step.unstable.tolist() == step.truncated.tolist() == [False, True, False, False]
+    for name, each in numbers(step).items():
+        assert torch.equal(each[[0, 2, 3]], numbers(other)[name][[0, 2, 3]]), name
+    assert not batch.step(actions).unstable.any()
