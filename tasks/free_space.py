@@ -80,7 +80,8 @@ class FreeSpace:
             Shape (n,).
 
         Raises:
-            ValueError: If ``q`` or ``blocks`` has another shape, or the scene has no block.
+            ValueError: If ``q`` or ``blocks`` has another shape or is not finite, or the scene has
+                no block.
         """
         return np.array([not found for found in self._each(q, blocks)], dtype=np.bool_)
 
@@ -94,7 +95,7 @@ class FreeSpace:
             Shape (n,).
 
         Raises:
-            ValueError: If ``blocks`` has another shape, or the scene has no block.
+            ValueError: If ``blocks`` has another shape or is not finite, or the scene has no block.
         """
         robot = self.scene.robot
         still = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
@@ -115,7 +116,7 @@ class FreeSpace:
             Shape (n, number of obstacles).
 
         Raises:
-            ValueError: If ``q`` has another shape.
+            ValueError: If ``q`` has another shape or is not finite.
         """
         rows = [{name for pair in found for name in pair} for found in self._each(q)]
         hits = [[name in row for name in self._obstacles] for row in rows]
@@ -179,6 +180,8 @@ class FreeSpace:
         robot = self.scene.robot
         if q.ndim != 2 or q.shape[1] != robot.dof:
             raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
+        if not np.isfinite(q).all():  # nothing collides there, which is not to be free
+            raise ValueError(f"q of {robot.name} is not finite")
         held = np.zeros((len(q), len(self._obstacles)))
         return self._tested.each(np.concatenate([q, held, self._placed(blocks, len(q))], axis=1))
 
@@ -192,6 +195,8 @@ class FreeSpace:
                 f"blocks have shape {blocks.shape}; {n} configurations need ({n}, 7), and a scene "
                 "with a block"
             )
+        if not np.isfinite(blocks).all():
+            raise ValueError("a pose of the block is not finite")
         turns = [to_rpy(normalized((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
         return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
 

@@ -118,6 +118,8 @@ def _array(value: object) -> NDArray[Any]:
 
 
 def _value(name: str, array: NDArray[Any]) -> object:
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} has a number that is not finite")
     if name == "block":
         return _block(array.tolist())
     if name == "obstacles":

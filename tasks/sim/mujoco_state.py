@@ -91,7 +91,7 @@ class State:
             return {}
         begin = self._velocities.begin
         slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
-        full = warnings[:, _FULL].any(axis=1)
+        full = np.asarray(warnings[:, _FULL].any(axis=1))
         unstable = ~np.array(slow) | warnings.any(axis=1)
         return {
             env: _NO_MEMORY if full[env] else _TOO_FAST

@@ -30,8 +30,9 @@ from morphgen.rl.runs import (
     read_config,
     write_checkpoint,
 )
-from morphgen.rl.sources import robot_source
+from morphgen.rl.sources import robot_source, settings_of
 from morphgen.rl.training import ROBOTS
+from morphgen.tasks.settings import Recipe
 from small_runs import small_config, small_source
 
 
@@ -283,3 +284,13 @@ def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
             each.record(report(1))
     (step, data), end = sent
     assert (step, data["score"], data["terms/distance"], end) == (1, 0.25, -0.5, "finished")
+
+
+def test_a_source_of_neither_a_split_nor_a_robot_at_a_task_is_refused():
+    config = asdict(small_config())
+    config["source"]["task"] = None
+    source = config_from(json.loads(json.dumps(config))).source
+    with pytest.raises(
+        TaskError, match=r"^'planar-cube': neither a split nor a robot with a task$"
+    ):
+        settings_of(source, Recipe())

@@ -285,3 +285,19 @@ def test_blocks_have_their_shape_and_a_scene_with_one():
         FreeSpace(Scene(aside())).free([[0.0]], [block_at(0.5, 0.5)])
     with pytest.raises(ValueError, match=r"shape \(2, 7\)"):
         pushed().free([[0.0]], [block_at(0.5, 0.5)] * 2)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_not_free_but_an_error(value):
+    scene = push_scene()
+    space, home = FreeSpace(scene), np.array([scene.robot.home])
+    block = np.array([[0.0, 0.0, 0.075, 1.0, 0.0, 0.0, 0.0]])
+    lost, gone = home.copy(), block.copy()
+    lost[0, 1] = gone[0, 0] = value
+    for q, blocks in ((lost, None), (lost, block), (home, gone)):
+        with pytest.raises(ValueError, match="not finite"):
+            space.free(q, blocks)
+    with pytest.raises(ValueError, match="not finite"):
+        space.room(gone)
+    with pytest.raises(ValueError, match="not finite"):
+        space.obstacle_hits(lost)

@@ -327,6 +327,19 @@ def test_a_broken_file_is_named(cache, tmp_path):
             goals_from_npz(set_npz(wrong), "reach", path)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["q", "poses"])
+def test_numbers_that_are_not_finite_are_refused(cache, tmp_path, name, value):
+    whole = made(reaching(), cache)[0].goals
+    values = getattr(whole, name).copy()
+    values[1, 2] = value
+    content = set_npz(replace(whole, **{name: values}))
+    with pytest.raises(
+        BenchmarkError, match=rf"s\.npz: no goal set .*: {name} has a number that is"
+    ):
+        goals_from_npz(content, "reach", tmp_path / "s.npz")
+
+
 def test_sets_travel_between_processes(cache):
     one = made(mixed(), cache)[1]
     assert one.goals is not None
