@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from morphgen.model.geometry import Box, Capsule, Geometry, Mesh, Shape
+from morphgen.model.geometry import Box, Capsule, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import inertial_of, with_inertia
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 from morphgen.model.tree import renamed
@@ -43,10 +43,10 @@ def with_body(name: str, **changes: object) -> Robot:
 
 
 def with_shape(geometry: Geometry, *, visual: bool = True) -> Robot:
-    """The sound robot, its slider's collision (and visual) shape changed."""
+    """The sound robot, its slider's collision shape changed (and drawn, too)."""
     shapes = (Shape(geometry),)
-    changes = {"collisions": shapes} | ({"visuals": shapes} if visual else {})
-    return with_link(sound(), "slider", **changes)
+    drawn = (*sound().link("slider").visuals, *(shapes if visual else ()))
+    return with_link(sound(), "slider", collisions=shapes, visuals=drawn)
 
 
 def with_end(link: Link, joint: Joint) -> Robot:
@@ -94,6 +94,9 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "massless-body": lambda: with_end(Link("stub"), hinge("stub")),
     "massless-between": _weightless_between,
     "links-too-many": lambda: _with_pads(130),
+    "links-apart": lambda: with_link(
+        sound(), "upper", visuals=(Shape(Sphere(0.02), Pose((0.0, 0.0, 0.15))),)
+    ),
     "massless-root": lambda: with_link(sound(), "base", inertial=None),
     "mass-invalid": lambda: with_body("lower", mass=-1.0),
     "inertia-without-mass": lambda: with_end(
@@ -126,7 +129,7 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "mimic-ignored-by-loaders": arm,
     "size-not-positive": lambda: with_shape(Box((0.1, 0.1, 0.0))),
     "extent-implausible": lambda: with_shape(Box((20.0, 20.0, 20.0))),
-    "visual-collision-scale": lambda: with_shape(Box((1.4e-4, 1.4e-4, 1.4e-4)), visual=False),
+    "visual-collision-scale": lambda: with_shape(Box((2.4e-4, 2.4e-4, 2.4e-4)), visual=False),
     "capsule-in-urdf": lambda: with_shape(Capsule(0.02, 0.1)),
     "name-characters": lambda: replace(renamed(sound(), {"right": "right/pad 1"}), name="an arm"),
     "name-reserved": lambda: renamed(sound(), {"right": "world"}),

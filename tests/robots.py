@@ -1,25 +1,35 @@
 """Small robots that tests build in code."""
 
+from dataclasses import replace
+
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 
 
 def rod(name: str, length: float = 0.3) -> Link:
-    """A rod along z from its link's origin, of the density of water."""
-    shape = Shape(Cylinder(0.02, length - 0.06), Pose((0.0, 0.0, length / 2)), (0.8, 0.4, 0.1, 1.0))
-    return with_inertia(Link(name, visuals=(shape,), collisions=(shape,)), 1000.0)
+    """A rod along z from its link's origin, of the density of water.
+
+    It touches nothing near its ends, and is drawn a little beyond them.
+    """
+    middle = Pose((0.0, 0.0, length / 2))
+    solid = Shape(Cylinder(0.02, length - 0.06), middle, (0.8, 0.4, 0.1, 1.0))
+    drawn = Shape(Cylinder(0.02, length + 0.04), middle, (0.8, 0.4, 0.1, 1.0))
+    return with_inertia(Link(name, visuals=(drawn,), collisions=(solid,)), 1000.0)
 
 
 def arm() -> Robot:
     """Base, two hinges, a slide and a mimicking finger pair."""
     block = Shape(Box((0.1, 0.1, 0.04)))
     base = with_inertia(Link("base", visuals=(block,), collisions=(block,)), 2000.0)
+    foot = Shape(Cylinder(0.02, 0.04), Pose((0.0, 0.0, 0.04)))
+    slider = rod("slider", 0.2)
+    rail = Shape(Box((0.02, 0.2, 0.02)), Pose((0.0, 0.0, 0.2)))
     links = (
-        base,
+        replace(base, visuals=(block, foot)),
         rod("upper"),
         rod("lower"),
-        rod("slider", 0.2),
+        replace(slider, visuals=(*slider.visuals, rail)),
         rod("left", 0.1),
         rod("right", 0.1),
     )

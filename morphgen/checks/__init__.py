@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import cast
 
 from morphgen.checks.frames import check_tool
+from morphgen.checks.gaps import check_links_apart
 from morphgen.checks.home import check_self_collision
 from morphgen.checks.inertia import check_inertia, check_masses
 from morphgen.checks.joints import check_axes, check_drive, check_home, check_limits
@@ -41,6 +42,7 @@ CHECKS: tuple[Check, ...] = (
     check_mimic_range,
     check_shapes,
     check_units,
+    check_links_apart,
     check_names,
     check_reserved,
     check_frame_names,
@@ -78,12 +80,16 @@ def check(
 
 
 def _judged(finding: Finding, robot: Robot) -> Finding:
-    """The finding, turned to information where a part says why it is as it should be."""
+    """The finding, turned to information where a part says why it is as it should be.
+
+    One of the two links of a pair may say so for both.
+    """
     accepted = cast(Mapping[str, Mapping[str, str]], robot.provenance.get("accepted", {}))
-    reason = accepted.get(finding.where.partition(" ")[2], {}).get(finding.code)
-    if reason is None:
-        return finding
-    return replace(finding, severity="info", why=f"{finding.why}; accepted: {reason}")
+    for name in finding.where.partition(" ")[2].split(", "):
+        reason = accepted.get(name, {}).get(finding.code)
+        if reason is not None:
+            return replace(finding, severity="info", why=f"{finding.why}; accepted: {reason}")
+    return finding
 
 
 def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:

@@ -53,6 +53,16 @@ class Placement:
 
 
 @dataclass(frozen=True)
+class Scaling:
+    """How one of the part's links grows."""
+
+    parameter: str | None = None
+    """Name of the parameter that holds its factor; without one the link keeps its size."""
+    face: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where it meets its parent at factor 1, in its own frame, metres; see ``model.scaling``."""
+
+
+@dataclass(frozen=True)
 class PackageSource:
     """A file of an installed data package."""
 
@@ -89,8 +99,8 @@ class Manifest:
     """Links whose visual shapes replace their collision shapes."""
     accepted: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     """Findings that are as they should be: by link or joint and code, why."""
-    scaling: Mapping[str, str] = field(default_factory=dict)
-    """Parameter that scales a link with all that is on it, by link."""
+    scaling: Mapping[str, Scaling] = field(default_factory=dict)
+    """How links grow with all that is on them, by link."""
     density: float | None = None
     """Of links without inertial, kg/m^3."""
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
@@ -143,7 +153,10 @@ def read_manifest(path: Path) -> Manifest:
             link: _names(names, f"{path}: drop.{link}")
             for link, names in _mapping(data.get("drop"), f"{path}: drop").items()
         },
-        scaling=_texts(data.get("scaling"), f"{path}: scaling"),
+        scaling={
+            link: _scaling(entry, f"{path}: scaling.{link}")
+            for link, entry in _mapping(data.get("scaling"), f"{path}: scaling").items()
+        },
         collision_from_visual=_names(
             data.get("collision_from_visual"), f"{path}: collision_from_visual"
         ),
@@ -268,8 +281,21 @@ def _home(data: Mapping[str, Any], path: Path) -> dict[str, Number]:
     }
 
 
-def _texts(data: object, where: str) -> dict[str, str]:
-    return {name: str(value) for name, value in _mapping(data, where).items()}
+def _scaling(data: object, where: str) -> Scaling:
+    if isinstance(data, str):
+        return Scaling(data)
+    if not isinstance(data, dict):
+        raise PartError(f"{where}: expected a parameter, or keys 'by' and 'face', not {data!r}")
+    entries = _mapping(data, where)
+    for key in entries:
+        if key not in ("by", "face"):
+            raise PartError(f"{where}: unknown key {key!r}{nearest(key, ('by', 'face'))}")
+    parameter = entries.get("by")
+    if not isinstance(parameter, str | None):
+        raise PartError(f"{where}.by: {parameter!r} is not the name of a parameter")
+    x, y, z = _triple(entries.get("face", (0, 0, 0)), f"{where}.face")
+    place = f"{where}.face"
+    return Scaling(parameter, (_float(x, place), _float(y, place), _float(z, place)))
 
 
 def _float(value: object, where: str) -> float:

@@ -85,7 +85,7 @@ def _load(frozen: _Frozen) -> Part:
     body = _with_bodies(_with_motion(body, manifest, values), manifest)
     T_root_mount = _mount(body, manifest, values)
     body = _with_frames(body, manifest, values)
-    body = scaled(body, _factors(body, manifest, values))
+    body = _with_scaling(body, manifest, values)
     links = safe_names(link.name for link in body.links)
     body = renamed(body, links, safe_names(joint.name for joint in body.joints))
     has_tool = manifest.tool is not None
@@ -109,18 +109,23 @@ def _with_frames(body: Robot, manifest: Manifest, values: Mapping[str, float]) -
     return replace(body, frames=tuple(frames))
 
 
-def _factors(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> dict[str, float]:
-    """Scale of every link that the manifest lets grow."""
-    for link, parameter in manifest.scaling.items():
+def _with_scaling(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Robot:
+    """The body with every link that the manifest lets grow at its size."""
+    factors: dict[str, float] = {}
+    for link, scaling in manifest.scaling.items():
         if link not in body.link_index:
             raise PartError(
                 f"{manifest.path}: scaling: no link {link!r}{nearest(link, body.link_index)}"
             )
-        if parameter not in values:
+        if scaling.parameter is None:
+            continue
+        if scaling.parameter not in values:
             raise PartError(
-                f"{manifest.path}: scaling: no parameter {parameter!r}{nearest(parameter, values)}"
+                f"{manifest.path}: scaling: no parameter {scaling.parameter!r}"
+                f"{nearest(scaling.parameter, values)}"
             )
-    return {link: values[parameter] for link, parameter in manifest.scaling.items()}
+        factors[link] = values[scaling.parameter]
+    return scaled(body, factors, {link: each.face for link, each in manifest.scaling.items()})
 
 
 def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:

@@ -6,29 +6,40 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
-from morphgen.model.robot import Inertial, Link, Robot
-from morphgen.model.rotation import Vec3
+from morphgen.model.robot import Inertial, Joint, Link, Robot
+from morphgen.model.rotation import Vec3, rotate
 
 
-def scaled(robot: Robot, factors: Mapping[str, float]) -> Robot:
+def scaled(
+    robot: Robot, factors: Mapping[str, float], faces: Mapping[str, Vec3] | None = None
+) -> Robot:
     """Scale links in all directions: shapes, the joints and frames on them, and their bodies.
 
     At equal density, mass goes with the factor's third power and inertia with its fifth.
 
+    A link is scaled about the origin of its frame. A link that meets its parent elsewhere, such as
+    at the foot of a tube below the joint's frame, would so leave its parent or sink into it. Its
+    *face*, the point where the two meet, prevents that: the joint moves so that the face of the
+    scaled link lies where the scaled parent has it. With a face on the joint's axis this only
+    slides the joint's frame along the axis, which changes no motion.
+
     Args:
         robot: The body.
         factors: Factor by the name of the link; links not named keep their size.
+        faces: Where a link meets its parent before scaling, in the link's frame, metres, by the
+            name of the link; the origin for links not named.
 
     Raises:
         RobotError: If a link does not exist.
     """
-    for name in factors:
+    faces = faces or {}
+    for name in (*factors, *faces):
         robot.link(name)
     return replace(
         robot,
         links=tuple(_link(link, factors.get(link.name, 1.0)) for link in robot.links),
         joints=tuple(
-            replace(j, T_parent_joint=_pose(j.T_parent_joint, factors.get(j.parent, 1.0)))
+            _joint(j, factors.get(j.parent, 1.0), factors.get(j.child, 1.0), faces.get(j.child))
             for j in robot.joints
         ),
         frames=tuple(
@@ -45,6 +56,16 @@ def scaled_shape(shape: Shape, factor: float) -> Shape:
         geometry=_geometry(shape.geometry, factor),
         T_link_shape=_pose(shape.T_link_shape, factor),
     )
+
+
+def _joint(joint: Joint, parent: float, child: float, face: Vec3 | None) -> Joint:
+    """The joint on a parent of that factor, with the child's face held to the parent's."""
+    pose = _pose(joint.T_parent_joint, parent)
+    if face is None or parent == child:
+        return replace(joint, T_parent_joint=pose)
+    x, y, z = _vector(rotate(pose.quaternion, face), parent - child)
+    position = (pose.position[0] + x, pose.position[1] + y, pose.position[2] + z)
+    return replace(joint, T_parent_joint=Pose(position, pose.quaternion))
 
 
 def _link(link: Link, factor: float) -> Link:

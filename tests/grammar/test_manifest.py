@@ -119,6 +119,11 @@ def test_a_missing_key_is_named(tmp_path, key):
         (REAL | {"source": "rtb-data"}, "source: expected keys and values, not 'rtb-data'"),
         (REAL | {"mass": {"palm": "heavy"}}, "mass.palm: 'heavy' is not a number"),
         (REAL | {"drop": {"palm": "hand.dae"}}, "drop.palm: expected a list of names"),
+        (REAL | {"scaling": {"palm": 2}}, "scaling.palm: expected a parameter, or keys 'by' and"),
+        (REAL | {"scaling": {"palm": {"bye": "s"}}}, "scaling.palm: unknown key 'bye'; did you"),
+        (REAL | {"scaling": {"palm": {"by": 2}}}, "scaling.palm.by: 2 is not the name of a"),
+        (REAL | {"scaling": {"palm": {"face": [0]}}}, "scaling.palm.face: [0] is not three"),
+        (REAL | {"scaling": {"palm": {"face": [0, 0, "z"]}}}, "palm.face: 'z' is not a number"),
         (REAL | {"collision_from_visual": "palm"}, "collision_from_visual: expected a list"),
     ],
 )

@@ -13,6 +13,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box
+from morphgen.model.scaling import scaled_shape
 from parts import PINCER, write_part
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
@@ -222,3 +223,45 @@ def test_a_part_that_was_edited_is_read_again(tmp_path):
     light = load_part(library.manifest(name)).body.mass
     write_part(tmp_path, density=3000)
     assert load_part(library.manifest(name)).body.mass == pytest.approx(3 * light)
+
+
+def test_a_link_grows_by_a_parameter_and_its_face_stays_on_its_parent(real):
+    size = {"size": {"default": 1, "min": 0.5, "max": 2}}
+    plain = real(parameters=size, scaling={"disc": "size"})
+    assert plain.body.joints == real().body.joints
+    for scaling in ({"disc": "size"}, {"disc": {"by": "size"}}):
+        manifest = real(parameters=size, scaling=scaling).manifest
+        larger = load_part(manifest, {"size": 2}).body
+        shapes = plain.body.link("disc").collisions
+        assert larger.link("disc").collisions == tuple(scaled_shape(s, 2) for s in shapes)
+        assert larger.joints == plain.body.joints
+    face = {"disc": {"by": "size", "face": [0, 0, -0.01]}}
+    held = load_part(real(parameters=size, scaling=face).manifest, {"size": 2}).body
+    moved = held.joints[-1].T_parent_joint.inverse() @ plain.body.joints[-1].T_parent_joint
+    assert moved.position == pytest.approx((0, 0, -0.01))
+
+
+def test_a_link_that_keeps_its_size_may_follow_the_face_of_its_parent(real):
+    size = {"size": {"default": 1, "min": 0.5, "max": 2}}
+    scaling = {"palm": {"by": "size"}, "disc": {"face": [0, 0, 0.01]}}
+    part = real(parameters=size, scaling=scaling)
+    larger = load_part(part.manifest, {"size": 2}).body
+    assert larger.link("disc") == part.body.link("disc")
+    face_before, face_after = (
+        body.joints[-1].T_parent_joint.apply((0, 0, 0.01)) for body in (part.body, larger)
+    )
+    assert face_after == pytest.approx([2 * value for value in face_before])
+
+
+@pytest.mark.parametrize(
+    ("scaling", "message"),
+    [
+        ({"disk": {"by": "size"}}, "scaling: no link 'disk'; did you mean 'disc'?"),
+        ({"disc": {"by": "sise"}}, "scaling: no parameter 'sise'; did you mean 'size'?"),
+    ],
+)
+def test_what_scaling_names_must_exist(real, scaling, message):
+    size = {"size": {"default": 1, "min": 0.5, "max": 2}}
+    with pytest.raises(PartError) as caught:
+        real(parameters=size, scaling=scaling)
+    assert message in str(caught.value)

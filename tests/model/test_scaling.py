@@ -90,3 +90,50 @@ def test_limits_axes_and_names_stay():
 def test_a_link_that_does_not_exist_is_refused():
     with pytest.raises(RobotError, match="uper"):
         scaled(arm(), {"uper": 2.0})
+
+
+FACES = {"upper": (0.02, 0.0, -0.1), "slider": (0.0, 0.01, 0.05)}
+
+
+def face_positions(robot, factors, q):
+    """Where the faces of links lie in the root frame: on the links, and on their parents."""
+    T = forward_kinematics(robot, q)
+    before = forward_kinematics(arm(), np.zeros(4))
+    for name, face in FACES.items():
+        i = robot.link_index[name]
+        j = robot.parents[i]
+        T_parent_link = np.linalg.inv(before[j]) @ before[i]
+        on_parent = (T_parent_link @ (*face, 1.0))[:3]
+        parent = robot.links[j].name
+        yield (
+            (T[i] @ (*(factors.get(name, 1.0) * np.array(face)), 1.0))[:3],
+            (T[j] @ (*(factors.get(parent, 1.0) * on_parent), 1.0))[:3],
+        )
+
+
+def test_faces_of_links_stay_on_their_parents_whatever_the_factors():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        names = [link.name for link in arm().links if rng.random() < 0.8]
+        factors = {name: rng.uniform(0.5, 1.5) for name in names}
+        robot = scaled(arm(), factors, FACES)
+        for on_link, on_parent in face_positions(robot, factors, STRAIGHT):
+            assert on_link == pytest.approx(on_parent, abs=1e-12)
+
+
+def test_without_faces_they_would_not():
+    factors = {"upper": 1.5}
+    robot = scaled(arm(), factors)
+    apart = [np.linalg.norm(a - b) for a, b in face_positions(robot, factors, STRAIGHT)]
+    assert max(apart) > 0.05
+
+
+def test_links_of_one_factor_need_no_faces():
+    factors = dict.fromkeys((link.name for link in arm().links), 1.3)
+    assert scaled(arm(), factors, FACES).joints == scaled(arm(), factors).joints
+    assert scaled(arm(), {}, FACES).joints == arm().joints
+
+
+def test_a_face_of_a_link_that_does_not_exist_is_refused():
+    with pytest.raises(RobotError, match="uper"):
+        scaled(arm(), {}, {"uper": (0.0, 0.0, 0.0)})
