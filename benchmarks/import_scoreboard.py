@@ -1,42 +1,59 @@
-"""Every URDF and xacro of the two data packages through ``morphgen import``.
+"""Every URDF and xacro of packages through ``morphgen import``, beside ROS's ``check_urdf``.
 
-    python benchmarks/import_scoreboard.py [--limit N] [--verbose]
+    python benchmarks/import_scoreboard.py [PACKAGE|DIR ...] [--conform] [--all]
 
-Each file is imported in a process of its own and comes out as one of
+A package is named as pip does and must be installed; by default those of ``PACKAGES``. Each file is
+imported in a process of its own, with the package's folder as root, and comes out as one of
 
-    imported   the bundle loads in every simulator with the same joints, mass and poses
-    wrong      it was imported, but a loader disagrees
-    refused    exit code 2 and one line that says why
-    fragment   a xacro of macros or a URDF without a root link of its own: no robot in it
+    imported   the bundle was written (with --conform: and every loader agrees on it)
+    wrong      it was imported, but a loader disagrees (--conform)
+    refused    morphgen says in one line why
+    fragment   a xacro of macros: no robot in it
     CRASHED    a traceback, or a time-out
 
-Exit code 1 if anything crashed or is wrong.
+``check_urdf`` (Debian: liburdfdom-tools) is asked about what is refused; for a xacro it cannot be.
+Files that it accepts and morphgen refuses are listed, each with its reason; --all lists every file
+that is not imported. Exit code 1 if anything crashed or is wrong.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import contextlib
+import io
+import multiprocessing
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import traceback
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import distribution
+from importlib.metadata import PackageNotFoundError, distribution
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from tabulate import tabulate
 from tqdm import tqdm
 
-ROOTS = {
+from morphgen.checks.conformance import conformance
+from morphgen.cli import main as morphgen
+
+PACKAGES = {
+    "pybullet": "pybullet_data",
+    "robosuite": "robosuite",
+    "airo-models": "airo_models",
+    "dexmate-urdf": "dexmate_urdf",
     "rtb-data": "rtbdata",
     "example-robot-data": "cmeel.prefix/share/example-robot-data/robots",
 }
+"""Folder with the robots of each package."""
 TIMEOUT_S = 300
+_CHECKER = shutil.which("check_urdf")
+_FORK = multiprocessing.get_context("fork")
 _FRAGMENT = re.compile(r"<link|<xacro:(?!macro|include|property|arg)\w")
 
 
@@ -44,68 +61,97 @@ _FRAGMENT = re.compile(r"<link|<xacro:(?!macro|include|property|arg)\w")
 class Outcome:
     """What became of a file."""
 
+    package: str
     file: str
     result: str
     reason: str = ""
+    accepted: bool | None = None
+    """Whether ``check_urdf`` accepts it; None if it was not asked."""
 
 
 def main() -> int:
     """Import everything."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--limit", type=int, help="only the first N files")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sources", nargs="*", metavar="PACKAGE|DIR", default=list(PACKAGES))
+    parser.add_argument("--conform", action="store_true", help="load every bundle everywhere, too")
+    parser.add_argument("--all", action="store_true", help="list all that is not imported")
     parser.add_argument("--only", default="", help="only files whose path contains this")
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
-    files = [(name, path) for name, path in _files() if args.only in str(path)][: args.limit]
+    folders = [(source, _folder(source)) for source in args.sources]
+    files = [
+        (package, root, path)
+        for package, root in folders
+        for path in _files(root)
+        if args.only in str(path)
+    ]
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(args.jobs) as pool:
         jobs = [
-            pool.submit(_import, name, path, Path(scratch) / str(i))
-            for i, (name, path) in enumerate(files)
+            pool.submit(_outcome, package, root, path, Path(scratch) / str(i), args.conform)
+            for i, (package, root, path) in enumerate(files)
         ]
         outcomes = [job.result() for job in tqdm(jobs, unit="file", file=sys.stderr)]
-    print(tabulate([(o.result, o.file, o.reason) for o in outcomes], ["result", "file", "reason"]))
-    counts = Counter(outcome.result for outcome in outcomes)
-    print(", ".join(f"{n} {result}" for result, n in counts.most_common()))
-    return int(counts["CRASHED"] + counts["wrong"] > 0)
+    _print(outcomes, everything=args.all)
+    return int(any(outcome.result in ("CRASHED", "wrong") for outcome in outcomes))
 
 
-def _files() -> Iterator[tuple[str, Path]]:
-    for package, folder in ROOTS.items():
-        root = Path(str(distribution(package).locate_file(folder)))
-        for path in sorted([*root.rglob("*.urdf"), *root.rglob("*.xacro")]):
-            yield path.relative_to(root).as_posix(), path
-
-
-def _import(name: str, path: Path, out: Path) -> Outcome:
-    done = _run(["import", str(path), "--no-picture", "--out", str(out), "--name", "robot"])
-    if done is None:
-        return Outcome(name, "CRASHED", f"no answer in {TIMEOUT_S} s")
-    if done.returncode == 2 and "Traceback" not in done.stderr:
-        reason = done.stderr.strip().splitlines()[-1].removeprefix("morphgen: ")
-        is_fragment = path.suffix == ".xacro" and _is_fragment(path)
-        return Outcome(name, "fragment" if is_fragment else "refused", _short(reason, path))
-    if done.returncode != 0:
-        return Outcome(name, "CRASHED", done.stderr.strip().splitlines()[-1])
-    folder = out / "robot"
-    compared = _run(["conform", str(folder), "--samples", "20", "--json"])
-    if compared is None or compared.returncode not in (0, 1):
-        return Outcome(name, "CRASHED", "conform: " + (compared.stderr[-160:] if compared else ""))
-    (report,) = json.loads(compared.stdout)
-    if not report["passed"]:
-        bad = [f"{r['loader']}: {r['message']}" for r in report["rows"] if r["passed"] is False]
-        return Outcome(name, "wrong", "; ".join(bad))
-    card = json.loads((folder / "card.json").read_text(encoding="utf-8"))
-    shutil.rmtree(folder)
-    return Outcome(name, "imported", f"{card['links']} links, {card['dof']} DoF")
-
-
-def _run(arguments: list[str]) -> subprocess.CompletedProcess[str] | None:
-    """Run a morphgen command; None if it does not answer in time."""
-    command = [sys.executable, "-m", "morphgen.cli", *arguments]
+def _folder(source: str) -> Path:
+    if Path(source).is_dir():
+        return Path(source).resolve()
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
-    except subprocess.TimeoutExpired:
+        return Path(str(distribution(source).locate_file(PACKAGES.get(source, "")))).resolve()
+    except PackageNotFoundError:
+        sys.exit(f"{source} is neither a folder nor an installed package")
+
+
+def _files(root: Path) -> Iterator[Path]:
+    yield from sorted([*root.rglob("*.urdf"), *root.rglob("*.xacro")])
+
+
+def _outcome(package: str, root: Path, path: Path, out: Path, conform: bool) -> Outcome:
+    """Import a file in a process of its own."""
+    receiving, sending = _FORK.Pipe(duplex=False)
+    child = _FORK.Process(target=_import, args=(sending, root, path, out, conform))
+    child.start()
+    sending.close()
+    result, reason = "CRASHED", f"no answer in {TIMEOUT_S} s"
+    if receiving.poll(TIMEOUT_S):
+        try:
+            result, reason = receiving.recv()
+        except EOFError:
+            reason = "the process died"
+    child.kill()
+    child.join()
+    shutil.rmtree(out, ignore_errors=True)
+    accepted = _is_accepted(path) if result == "refused" else None
+    return Outcome(package, path.relative_to(root).as_posix(), result, reason, accepted)
+
+
+def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool) -> None:
+    printed, errors = io.StringIO(), io.StringIO()
+    words = ["import", str(path), "--root", str(root), "--no-picture", "--out", str(out)]
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
+            code = morphgen([*words, "--name", "robot"])
+        if code == 2:
+            is_fragment = path.suffix == ".xacro" and _is_fragment(path)
+            reason = errors.getvalue().strip().removeprefix("morphgen: ").replace(f"{root}/", "")
+            answer.send(("fragment" if is_fragment else "refused", reason))
+            return
+        rows = conformance(out / "robot", samples=20).rows if conform else ()
+        bad = [f"{row.loader}: {row.message}" for row in rows if row.passed is False]
+        answer.send(("wrong", "; ".join(bad)) if bad else ("imported", ""))
+    except BaseException:
+        answer.send(("CRASHED", traceback.format_exc().strip().splitlines()[-1]))
+
+
+def _is_accepted(path: Path) -> bool | None:
+    if _CHECKER is None or path.suffix == ".xacro":
         return None
+    done = subprocess.run([_CHECKER, str(path)], capture_output=True, text=True, errors="replace")
+    return done.returncode == 0 and "Successfully" in done.stdout
 
 
 def _is_fragment(path: Path) -> bool:
@@ -116,8 +162,24 @@ def _is_fragment(path: Path) -> bool:
     return _FRAGMENT.search(outside) is None
 
 
-def _short(reason: str, path: Path) -> str:
-    return reason.replace(str(path), path.name)[:160]
+def _print(outcomes: list[Outcome], *, everything: bool) -> None:
+    results = ("imported", "wrong", "refused", "fragment", "CRASHED")
+    rows = []
+    for package in dict.fromkeys(outcome.package for outcome in outcomes):
+        own = [outcome for outcome in outcomes if outcome.package == package]
+        counts = Counter(outcome.result for outcome in own)
+        accepted = sum(outcome.accepted is True for outcome in own)
+        rows.append([package, len(own), *(counts[result] for result in results), accepted])
+    heads = ["package", "files", *results, "refused, but accepted by check_urdf"]
+    print(tabulate(rows, heads))
+    if _CHECKER is None:
+        print("check_urdf is not installed (Debian: liburdfdom-tools)")
+    for outcome in outcomes:
+        bad = outcome.result in ("CRASHED", "wrong") or outcome.accepted
+        if bad or (everything and outcome.result == "refused"):
+            verdict = {True: "accepts", False: "refuses", None: "not asked"}[outcome.accepted]
+            print(f"{outcome.package}: {outcome.file}: {outcome.result} (check_urdf: {verdict})")
+            print(f"    {outcome.reason[:300]}")
 
 
 if __name__ == "__main__":

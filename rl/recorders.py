@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any, Protocol
 
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
+from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import write_atomic
 from morphgen.rl.report import Report
 from morphgen.rl.runs import RunConfig
@@ -42,13 +43,13 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     path = folder / METRICS
     if not path.is_file():
         return []
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
+    lines = read_text(path).split("\n")[:-1]
     found = []
     for number, line in enumerate(lines, 1):
         try:
-            report = json.loads(line)
+            report = parse_json(line, f"{path}:{number}")
             report["update"], report["transitions"], report["score"]
-        except (ValueError, KeyError, TypeError) as error:
+        except (FormatError, KeyError, TypeError) as error:
             raise FormatError(f"{path}, line {number}: not the report of an update") from error
         found.append(report)
     return found

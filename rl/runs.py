@@ -15,6 +15,7 @@ import torch
 
 from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import FormatError, TaskError
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_of, write_atomic
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.sources import Source, most_obstacles
@@ -144,7 +145,7 @@ def read_config(folder: Path) -> RunConfig:
     """
     path = folder / CONFIG
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         _require_format(path, data)
         return config_from(data)
     except OSError as error:

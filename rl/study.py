@@ -18,6 +18,7 @@ from filelock import FileLock, Timeout
 
 from morphgen.benchmark.split import Side
 from morphgen.errors import FormatError, MorphgenError, TaskError
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, write_atomic
 from morphgen.processes import ray_cluster, require_ray
 from morphgen.rl.evaluation import (
@@ -114,7 +115,7 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
     if not path.is_file():
         return None
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         found = {mode: [_score(each) for each in own] for mode, own in data["scores"].items()}
         made_with = data["exam"], data["source"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -19,6 +19,7 @@ from morphgen.benchmark.built import README, SUMS, read_sums
 from morphgen.benchmark.contents import sums_text
 from morphgen.benchmark.split import Side
 from morphgen.errors import BenchmarkError
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import alone, replacing_folder, write_atomic
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.goal_making import Made, SplitGoals, gathered
@@ -150,7 +151,7 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
     folder = Path(folder) / GOALS
     path = folder / INDEX
     try:
-        return _parsed(json.loads(path.read_text(encoding="utf-8")), folder)
+        return _parsed(read_json(path), folder)
     except FileNotFoundError as error:
         raise BenchmarkError(
             f"{error.filename}: no such file; morphgen split build --goals makes goal sets"

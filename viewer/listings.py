@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.split import SIDES, Split
+from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD
+from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
@@ -119,8 +120,8 @@ def neighbours(place: str, places: Places) -> tuple[str, str]:
 
 def _set_entries(place: str, folder: Path) -> Iterator[Entry]:
     try:
-        grammar = str(json.loads((folder / SETTINGS).read_text(encoding="utf-8"))["grammar"])
-    except (OSError, ValueError, KeyError, TypeError):
+        grammar = str(read_json(folder / SETTINGS)["grammar"])
+    except (FormatError, OSError, KeyError, TypeError):
         grammar = ""  # a set without its settings still has its robots
     for record in _index(folder / INDEX, file_stamp(folder / INDEX)):
         yield Entry(
@@ -140,11 +141,11 @@ def _set_entries(place: str, folder: Path) -> Iterator[Entry]:
 def _index(path: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], ...]:
     del stamp
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        records = tuple(json.loads(line) for line in lines)
+        lines = read_text(path).splitlines()
+        records = tuple(parse_json(line, str(path)) for line in lines)
         for record in records:
             record["name"], record["index"], record["dof"], record["findings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (FormatError, OSError, KeyError, TypeError) as error:
         raise PlaceError(f"{path}: no index of a set: {error!r}") from error
     return records
 
@@ -155,11 +156,11 @@ def _bundle_entry(place: str, folder: Path, order: int) -> Entry:
             folder.name, place, "light" if (folder / DERIVATION).is_file() else "", order=order
         )
     try:
-        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+        card = read_json(folder / CARD)
         findings = {finding["code"] for finding in card["findings"] if finding["severity"] in _LOUD}
         category = "composed" if "derivation" in card else "imported"
         numbers = (card["dof"], card["links"], card["reach"], card["mass"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (FormatError, OSError, KeyError, TypeError):
         return Entry(folder.name, place, findings=(UNREADABLE,), order=order)
     return Entry(
         folder.name,

@@ -12,7 +12,6 @@ SHA256SUMS         of all these files, written last; ``sha256sum -c`` reads it
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,7 +24,8 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.split import SIDES, Side
 from morphgen.benchmark.token_layout import TOKEN_SIZE
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, FormatError
+from morphgen.formats.data_files import parse_json, read_text
 
 SPLIT = "split.yaml"
 ROBOTS = "robots.jsonl"
@@ -147,9 +147,9 @@ def read_records(path: Path) -> list[Record]:
     records = []
     for number, line in enumerate(_text(path).splitlines(), 1):
         try:
-            record = json.loads(line)
-        except ValueError as error:
-            raise BenchmarkError(f"{path}:{number}: no valid JSON: {error}") from error
+            record = parse_json(line, f"{path}:{number}")
+        except FormatError as error:
+            raise BenchmarkError(str(error)) from error
         if not isinstance(record, dict) or "name" not in record or record.get("side") not in SIDES:
             raise BenchmarkError(f"{path}:{number}: expected an object with a name and a side")
         records.append(record)
@@ -201,7 +201,7 @@ def read_settings(path: Path) -> tuple[str, bool]:
         BenchmarkError: If it is missing or no such file.
     """
     try:
-        data = json.loads(_text(path))
+        data = parse_json(_text(path), str(path))
         if data["format"] != FORMAT:
             raise BenchmarkError(f"{path}: format {data['format']!r}; this version reads {FORMAT}")
         return str(data["split"]), bool(data["light"])
@@ -211,8 +211,10 @@ def read_settings(path: Path) -> tuple[str, bool]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path)
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
     except FileNotFoundError as error:
         raise BenchmarkError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise BenchmarkError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error

@@ -39,6 +39,7 @@ from morphgen.benchmark.split import Member, Split, member_robot
 from morphgen.benchmark.split_file import split_text
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, alone, partial_of, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, mapped, unseen
@@ -154,7 +155,9 @@ def _prepare(home: Path, split: Split, settings: Settings) -> None:
             )
         home.mkdir(parents=True, exist_ok=True)
         write_atomic(home / SETTINGS, wanted[SETTINGS])
-    found = json.loads((home / SETTINGS).read_text(encoding="utf-8"))
+    found = read_json(home / SETTINGS)
+    if not isinstance(found, dict):
+        raise BenchmarkError(f"{home / SETTINGS}: expected an object, not {type(found).__name__}")
     for key, value in json.loads(wanted[SETTINGS]).items():
         if found.get(key) != value:
             raise BenchmarkError(

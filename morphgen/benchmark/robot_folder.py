@@ -22,6 +22,7 @@ from morphgen.formats.bundle import (
     write_bundle,
 )
 from morphgen.formats.card import card_of, card_text
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.robot_set import DERIVATION, light_urdf
@@ -65,7 +66,7 @@ def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
     """Whether this version of morphgen would write a folder without differences again."""
     if light:
         return True
-    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    card = read_json(folder / CARD)
     has_picture = (folder / PICTURE).is_file()
     return card["versions"] == {"morphgen": version("morphgen")} and has_picture == picture
 
@@ -101,7 +102,7 @@ def _differences(folder: Path, robot: Robot) -> Iterator[str]:
         yield str(error)
         return
     yield from (f"{finding.where}: {finding.why}" for finding in findings)
-    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    card = read_json(folder / CARD)
     urdf = folder / URDF
     if urdf.is_file() and _MESH.sub(r'\1"', urdf.read_text("utf-8", "replace")) != _nameless(robot):
         yield f"file {URDF} is not the robot's"

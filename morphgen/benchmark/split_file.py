@@ -13,7 +13,8 @@ import yaml
 
 from morphgen.benchmark.split import FORMAT, Member, Split, split_id
 from morphgen.benchmark.split_reader import MEMBER, ROBOT_NAME, SplitFile, parse_split
-from morphgen.errors import BenchmarkError, nearest
+from morphgen.errors import BenchmarkError, FormatError, nearest
+from morphgen.formats.data_files import read_text
 from morphgen.formats.files import write_atomic
 
 SUFFIX = ".yaml"
@@ -84,10 +85,11 @@ def read_split_file(path: Path) -> SplitFile:
         BenchmarkError: If it cannot be read or is malformed.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "no UTF-8 text"
-        raise BenchmarkError(f"{path}: cannot be read: {why}") from error
+        text = read_text(path)
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
+    except OSError as error:
+        raise BenchmarkError(f"{path}: cannot be read: {error.strerror}") from error
     return parse_split(text, path)
 
 

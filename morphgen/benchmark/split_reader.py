@@ -22,7 +22,8 @@ from morphgen.benchmark.split import (
     Task,
     split_id,
 )
-from morphgen.errors import BenchmarkError, nearest
+from morphgen.errors import BenchmarkError, FormatError, nearest
+from morphgen.formats.data_files import require_plain_yaml
 
 FIELDS = (
     "format",
@@ -77,11 +78,14 @@ def parse_split(text: str, path: Path) -> SplitFile:
         BenchmarkError: If it is malformed.
     """
     try:
+        require_plain_yaml(text, str(path))
         loader = _Loader(text)
         try:
             return _Reader(path, loader).file(loader.get_single_node())
         finally:
             loader.dispose()
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
     except yaml.MarkedYAMLError as error:
         raise BenchmarkError(f"{path}{_place(error)}") from error
     except yaml.YAMLError as error:

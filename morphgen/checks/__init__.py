@@ -56,7 +56,7 @@ CHECKS: tuple[Check, ...] = (
 
 _RANK = {"error": 0, "warning": 1, "info": 2}
 
-__all__ = ["CHECKS", "Check", "check", "fix"]
+__all__ = ["CHECKS", "Check", "check", "fix", "with_repairs"]
 
 
 def check(
@@ -76,6 +76,7 @@ def check(
     if home_tested:
         checks = tuple(run for run in checks if run is not check_self_collision)
     findings = {_judged(finding, robot) for run in checks for finding in run(robot)}
+    findings.update(robot.source_findings)
     return tuple(sorted(findings, key=lambda f: (_RANK[f.severity], f.code, f.where, f.why)))
 
 
@@ -99,7 +100,18 @@ def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
         robot: The body.
 
     Returns:
-        The repaired body and the findings that are gone.
+        The repaired body, whose provenance names the repairs, and the findings that are gone.
     """
     gone = tuple(f for f in check(robot, tool_required=False) if f.fixable)
-    return (repaired(robot) if gone else robot), gone
+    return (with_repairs(repaired(robot), gone) if gone else robot), gone
+
+
+def with_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:
+    """A copy whose provenance, and with it its card, names repairs after those that it names.
+
+    What was repaired in its file is no finding any more: nothing written of the robot has it.
+    """
+    made = cast(list[str], robot.provenance.get("repairs", []))
+    new = [f"{finding.where}: {finding.repair}" for finding in findings]
+    provenance = {**robot.provenance, "repairs": [*made, *new]}
+    return replace(robot, provenance=provenance, source_findings=())

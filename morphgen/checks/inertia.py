@@ -23,6 +23,9 @@ DENSITY_RANGE = (20.0, 25_000.0)
 """Plausible mean densities, kg/m^3: from foam to tungsten."""
 TRIANGLE_MARGIN = 1e-12
 """Relative margin of the triangle inequality; MuJoCo refuses what rounding pushes over it."""
+_FROM_SOLID = (
+    f"its mass and inertia were set to those of its solid geometry at {DEFAULT_DENSITY:g} kg/m^3"
+)
 
 
 def check_masses(robot: Robot) -> Iterator[Finding]:
@@ -39,7 +42,7 @@ def check_masses(robot: Robot) -> Iterator[Finding]:
                 f"mass {link.inertial.mass:g} kg with its centre at {link.inertial.com}",
                 f"write a finite mass of at least 0; the repair takes the solid geometry's at "
                 f"{DEFAULT_DENSITY:g} kg/m^3",
-                fixable=solid_of(link) is not None,
+                repair=_FROM_SOLID if solid_of(link) is not None else "",
             )
         if is_inertia_without_mass(link):
             yield Finding(
@@ -48,7 +51,7 @@ def check_masses(robot: Robot) -> Iterator[Finding]:
                 f"link {link.name}",
                 "it has a rotational inertia but no mass",
                 "give it a mass, or set its inertia to zero as the repair does",
-                fixable=True,
+                repair="its inertia was set to zero: it has no mass",
             )
 
 
@@ -68,7 +71,9 @@ def check_inertia(robot: Robot) -> Iterator[Finding]:
                 f"{fault}; MuJoCo refuses it, PyBullet takes zero",
                 "correct the inertia; the repair takes, at the same mass, the solid geometry's or, "
                 f"without any, that of a ball of {DEFAULT_DENSITY:g} kg/m^3",
-                fixable=True,
+                repair="its inertia was set to that of "
+                + ("a ball" if solid is None else "its solid geometry")
+                + f" at the same mass, {body.mass:g} kg",
             )
         if solid is not None:
             if fault is None:
@@ -128,7 +133,7 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
             why,
             f"give it mass and inertia; the repair takes those of its solid geometry at "
             f"{DEFAULT_DENSITY:g} kg/m^3",
-            fixable=solid_of(link) is not None,
+            repair=_FROM_SOLID if solid_of(link) is not None else "",
         )
     if group.mass > 0 or any(not link.is_empty for link in group.links):
         return

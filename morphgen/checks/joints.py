@@ -37,7 +37,7 @@ def check_axes(robot: Robot) -> Iterator[Finding]:
                 f"its axis {joint.axis} is {length:.4g} long"
                 + ("; PyBullet moves it that many times as far" if prismatic else ""),
                 "scale the axis to unit length, as the repair does",
-                fixable=True,
+                repair=f"the axis {joint.axis} was scaled to unit length",
             )
 
 
@@ -54,7 +54,7 @@ def check_limits(robot: Robot) -> Iterator[Finding]:
                     f"it is continuous but has limits {joint.limits}, which PyBullet reports "
                     "and MuJoCo drops",
                     "make it revolute if the limits are real; the repair drops them",
-                    fixable=True,
+                    repair=f"its limits {joint.limits} were dropped: it is continuous",
                 )
             continue
         if joint.limits is None or not all(map(math.isfinite, joint.limits)):
@@ -62,7 +62,7 @@ def check_limits(robot: Robot) -> Iterator[Finding]:
                 "limits-missing",
                 "error",
                 where,
-                f"it is {joint.kind} with limits {joint.limits}: PyBullet refuses the file, "
+                f"it is {joint.kind} {_limits_in_words(joint)}: PyBullet refuses the file, "
                 "MuJoCo lets it move without end",
                 "write limits" + (", or make it continuous" if joint.kind == "revolute" else ""),
             )
@@ -77,7 +77,7 @@ def check_limits(robot: Robot) -> Iterator[Finding]:
                 where,
                 f"lower {upper:g} is above upper {lower:g}: MuJoCo drops or refuses such limits",
                 "swap the limits, as the repair does",
-                fixable=True,
+                repair=f"its limits were swapped to {lower:g} to {upper:g}",
             )
         if span == 0:
             yield Finding(
@@ -102,25 +102,26 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
     for joint in _movable(robot):
         where = f"joint {joint.name}"
         linear = joint.kind == "prismatic"
+        effort = f"{DEFAULT_EFFORT:g} {'N' if linear else 'N m'}"
+        velocity = f"{DEFAULT_VELOCITY:g} {'m/s' if linear else 'rad/s'}"
         if joint.is_independent and not is_positive(joint.effort):
             yield Finding(
                 "effort-missing",
                 "warning",
                 where,
-                f"its effort is {joint.effort}: PyBullet has no force to move it, MuJoCo no limit",
-                f"write its largest effort; the repair takes {DEFAULT_EFFORT:g} "
-                + ("N" if linear else "N m"),
-                fixable=True,
+                f"{_in_words('effort', joint.effort)}: PyBullet has no force to move it, MuJoCo no "
+                "limit",
+                f"write its largest effort; the repair takes {effort}",
+                repair=f"its effort was set to {effort}",
             )
         if joint.is_independent and not is_positive(joint.velocity):
             yield Finding(
                 "velocity-missing",
                 "warning",
                 where,
-                f"its velocity is {joint.velocity}",
-                f"write its largest velocity; the repair takes {DEFAULT_VELOCITY:g} "
-                + ("m/s" if linear else "rad/s"),
-                fixable=True,
+                _in_words("velocity", joint.velocity),
+                f"write its largest velocity; the repair takes {velocity}",
+                repair=f"its velocity was set to {velocity}",
             )
         for name, value in (("damping", joint.damping), ("friction", joint.friction)):
             if not value >= 0 or math.isinf(value):
@@ -145,7 +146,7 @@ def check_home(robot: Robot) -> Iterator[Finding]:
                 f"joint {joint.name}",
                 f"home is {position:g}, its limits are {lower:g} to {upper:g}",
                 "move home between the limits, as the repair does",
-                fixable=True,
+                repair=f"its home was moved from {position:g} to the nearest limit",
             )
 
 
@@ -180,6 +181,14 @@ def reachable(joint: Joint) -> tuple[float, float]:
 def is_positive(value: float | None) -> bool:
     """Whether a value is given, finite and above zero."""
     return value is not None and math.isfinite(value) and value > 0
+
+
+def _in_words(name: str, value: float | None) -> str:
+    return f"it has no {name}" if value is None else f"its {name} is {value:g}"
+
+
+def _limits_in_words(joint: Joint) -> str:
+    return "without limits" if joint.limits is None else f"with limits {joint.limits}"
 
 
 def _movable(robot: Robot) -> Iterator[Joint]:

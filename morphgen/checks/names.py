@@ -25,7 +25,7 @@ def check_names(robot: Robot) -> Iterator[Finding]:
                 f"{what} {name}",
                 f"its name holds {characters or 'nothing'}: paths, scopes and USD break on that",
                 "use letters, digits, '_', '-' and '.'; the repair writes '_'",
-                fixable=True,
+                repair="its name was rewritten with '_' for what loaders dislike",
             )
 
 
@@ -38,7 +38,7 @@ def check_reserved(robot: Robot) -> Iterator[Finding]:
             f"link {_WORLD}",
             "MuJoCo keeps the name 'world' for what the root stands on, and this is not the root",
             "rename the link, as the repair does",
-            fixable=True,
+            repair="it was renamed: MuJoCo keeps that name for the world",
         )
 
 

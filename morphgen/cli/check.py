@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         findings, repaired = _checked(path, args.fix)
         report[str(path)] = {
             "findings": [finding.as_dict() for finding in findings],
-            "repaired": [finding.as_dict() for finding in repaired],
+            "repaired": [finding.as_dict() | {"repair": finding.repair} for finding in repaired],
         }
         failed |= any(finding.severity in failing for finding in findings)
         if not args.json:
@@ -75,7 +75,7 @@ def _checked(path: Path, fix_into: Path | None) -> tuple[tuple[Finding, ...], tu
 
 def _print(path: Path, findings: tuple[Finding, ...], repaired: tuple[Finding, ...]) -> None:
     for finding in repaired:
-        print(f"{path}: repaired {finding.code} at {finding.where}: {finding.fix}")
+        print(f"{path}: repaired {finding.code} at {finding.where}: {finding.repair}")
     counts = {
         severity: sum(finding.severity == severity for finding in findings)
         for severity in ("error", "warning", "info")

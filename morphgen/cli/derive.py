@@ -67,6 +67,7 @@ def run_mutate(args: argparse.Namespace) -> int:
 
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import write_bundle
+    from morphgen.formats.data_files import read_json, read_text
     from morphgen.grammar.derivation import difference
     from morphgen.grammar.model import grammar_from_text
     from morphgen.grammar.mutation import mutate
@@ -78,8 +79,10 @@ def run_mutate(args: argparse.Namespace) -> int:
     records = {record["name"]: record for record in read_index(folder)}
     if args.robot.name not in records:
         raise FormatError(f"{args.robot.name!r} is not in the index of {folder}")
-    name = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))["grammar"]
-    grammar = grammar_from_text((folder / GRAMMAR).read_text(encoding="utf-8"), name)
+    settings = read_json(folder / SETTINGS)
+    if not isinstance(settings, dict) or not isinstance(settings.get("grammar"), str):
+        raise FormatError(f"{folder / SETTINGS}: does not name the grammar of the set")
+    grammar = grammar_from_text(read_text(folder / GRAMMAR), settings["grammar"])
     choices = records[args.robot.name]["choices"]
     origin = _derivation(args.robot)
     out = args.out or folder.parent / f"{folder.name}-mutants"
@@ -138,12 +141,13 @@ def _replay(args: argparse.Namespace, derivation: Derivation) -> int:
 def _derivation(folder: Path) -> Derivation:
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import CARD
+    from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import parse_derivation
     from morphgen.grammar.robot_set import DERIVATION
 
     light, card = folder / DERIVATION, folder / CARD
     if light.is_file():
-        return parse_derivation(light.read_text(encoding="utf-8"), str(light))
+        return parse_derivation(read_text(light), str(light))
     if not card.is_file():
         raise FormatError(f"{folder} is no robot: it has neither {CARD} nor {DERIVATION}")
     content = _card(folder)
@@ -156,12 +160,12 @@ def _card(folder: Path) -> dict[str, Any]:
     """A bundle's card; empty for a robot of a light set."""
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import CARD
+    from morphgen.formats.data_files import read_json
 
     card = folder / CARD
     if not card.is_file():
         return {}
-    try:
-        content: dict[str, Any] = json.loads(card.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{card}: no valid JSON: {error}") from error
+    content = read_json(card)
+    if not isinstance(content, dict):
+        raise FormatError(f"{card}: expected an object, not {type(content).__name__}")
     return content

@@ -13,7 +13,9 @@ def add_parser(commands: Subparsers) -> None:
     parser = commands.add_parser(
         "import",
         help="turn any URDF or xacro into a bundle",
-        description="Turn any URDF or xacro into a bundle, with meshes baked to metres and z up.",
+        description="Turn any URDF or xacro into a bundle, with meshes baked to metres and z up. "
+        "Exit code 1 if an error is left that no safe repair removes (see morphgen check); the "
+        "bundle is written all the same.",
     )
     parser.add_argument("file", type=Path, help="a URDF, or a xacro by its suffix")
     parser.add_argument("--root", help="link where the robot begins (default: the file's root)")

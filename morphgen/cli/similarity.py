@@ -135,6 +135,7 @@ def _is_robot(folder: Path) -> bool:
 def _read(path: Path, library: Library) -> Robot:
     """A robot; one of a light set from its derivation, because its URDF knows no home."""
     from morphgen.formats.bundle import CARD, read_robot
+    from morphgen.formats.data_files import read_text
     from morphgen.grammar.compose import compose
     from morphgen.grammar.derivation import parse_derivation
     from morphgen.grammar.robot_set import DERIVATION
@@ -142,7 +143,7 @@ def _read(path: Path, library: Library) -> Robot:
     light = path / DERIVATION
     if not light.is_file() or (path / CARD).is_file():
         return read_robot(path)
-    derivation = parse_derivation(light.read_text(encoding="utf-8"), str(light))
+    derivation = parse_derivation(read_text(light), str(light))
     return compose(derivation, library, path.resolve().name)
 
 

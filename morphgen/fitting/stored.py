@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from morphgen.errors import FormatError
+from morphgen.formats.data_files import read_json
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import number
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
@@ -158,7 +159,7 @@ def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
     """The fits of a file as it is at its stamp."""
     del stamp
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         if data["fitter"] != VERSION:
             return {}
         return {
@@ -171,7 +172,7 @@ def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
             )
             for link in data["links"]
         }
-    except (KeyError, RecursionError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path}: no file of fitted primitives: {error!r}") from error
 
 

@@ -22,6 +22,7 @@ from morphgen.fitting.stored import (
     shapes_scale,
     stored_fit,
 )
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import keep
 from morphgen.model.geometry import Shape
 from morphgen.model.inertia import union_moments
@@ -84,7 +85,7 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
     path = user_cache_path("morphgen") / _KEPT / f"{shapes_key(shapes)}.json"
     if path.is_file():
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = read_json(path)
             return None if data is None else scaled_shape(shape_of(data), factor)
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(f"{path}: no fitted primitive: {error!r}; delete it") from error

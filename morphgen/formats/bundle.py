@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Iterable
 from dataclasses import replace
@@ -17,6 +16,7 @@ from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_frames, card_of, card_text
+from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
@@ -114,10 +114,7 @@ def _read_card(folder: Path) -> dict[str, Any]:
         light = (folder / URDF).is_file()
         what = f"; name its {URDF}, or make it again without --light" if light else ""
         raise FormatError(f"{folder} is no bundle: it has no {CARD}{what}")
-    try:
-        card = json.loads(card_path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{card_path}: no valid JSON: {error}") from error
+    card = read_json(card_path)
     if not isinstance(card, dict):
         raise FormatError(f"{card_path}: expected an object, not {type(card).__name__}")
     return card

@@ -15,6 +15,16 @@ from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 
 CARD_FORMAT = 1
+_PROVENANCE: Mapping[str, tuple[type, ...]] = {
+    "derivation": (str,),
+    "source": (str,),
+    "choices": (dict,),
+    "repairs": (list, str),
+    "parts": (list, dict),
+    "accepted": (dict, dict, str),
+    "primitives": (dict,),
+}
+"""Types of what a card keeps of a robot's provenance, and of what that holds."""
 
 
 def card_of(
@@ -106,19 +116,35 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
     Raises:
         FormatError: If the card lacks a key, or a value is of the wrong type.
     """
-    keys = ("derivation", "source", "choices", "repairs", "parts", "accepted", "primitives")
+    provenance = {key: card[key] for key in _PROVENANCE if key in card}
+    for key, value in provenance.items():
+        if not _is_of(_PROVENANCE[key], value):
+            raise FormatError(f"{origin}: {key}: not what a card holds there: {_shown(value)}")
     try:
         home = card["home"]
         return replace(
             robot,
             home=tuple(float(home[robot.joints[k].name]) for k in robot.independent),
             ignore_pairs=tuple((str(a), str(b)) for a, b in card["ignore_pairs"]),
-            provenance={key: card[key] for key in keys if key in card},
+            provenance=provenance,
         )
     except KeyError as error:
         raise FormatError(f"{origin}: has no {error}") from error
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         raise FormatError(f"{origin}: home or ignore_pairs: {error}") from error
+
+
+def _is_of(kinds: tuple[type, ...], value: object) -> bool:
+    """Whether a value is of the first type, what it holds of the second, and so on."""
+    if not isinstance(value, kinds[0]):
+        return False
+    held = value.values() if isinstance(value, dict) else value
+    return len(kinds) == 1 or all(_is_of(kinds[1:], each) for each in held)  # type: ignore[attr-defined]
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def rounded(value: float | None) -> float | None:

@@ -7,10 +7,15 @@ from collections.abc import Iterator, Sequence
 from lxml import etree
 
 from morphgen.errors import nearest
-from morphgen.formats.structure_values import Place, content_findings, place_of
+from morphgen.formats.structure_place import Place, place_of
+from morphgen.formats.structure_values import content_findings
 from morphgen.model.findings import Finding
 from morphgen.model.robot import JOINT_KINDS
 
+MOST_LINKS = 1000
+"""Links of the largest robot that is read."""
+MOST_SHAPES = 10_000
+"""Visual and collision shapes of the largest robot that is read."""
 _REPLACEMENT = {
     "floating": "fix the body to the world, or use three prismatic and three revolute joints",
     "planar": "use two prismatic joints and a revolute one",
@@ -29,6 +34,9 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
     """
     if root.tag != "robot":
         return (_wrong_root(root, origin),)
+    large = tuple(_size_findings(root, origin))
+    if large:
+        return large
     findings = _robot_findings(root, origin)
     unexpanded = _first_xacro(root)
     if unexpanded is None:
@@ -40,9 +48,26 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
         "xacro-unexpanded",
         f"<xacro:{etree.QName(unexpanded).localname}> is left in the document",
         "give the file the suffix .xacro, or expand it first",
-        severity="error" if broken else "warning",
+        "" if broken else "it was left out",
     )
     return (left,) if broken else (left, *findings)
+
+
+def _size_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
+    """What would keep a computer busy without end, asked before anything else is."""
+    for tag, elements, most in (
+        ("link", root.iterfind("link"), MOST_LINKS),
+        ("joint", root.iterfind("joint"), MOST_LINKS),
+        ("visual and collision", root.iter("visual", "collision"), MOST_SHAPES),
+    ):
+        count = sum(1 for _ in elements)
+        if count > most:
+            yield place_of(root, origin).finding(
+                root,
+                "robot-too-large",
+                f"it has {count} <{tag}> elements; at most {most} are read",
+                "leave out what is not the robot",
+            )
 
 
 def _robot_findings(root: etree._Element, origin: str) -> list[Finding]:
@@ -201,6 +226,7 @@ def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
                 "mimic-unknown",
                 f"it mimics {leader!r}, which is no joint",
                 f"name a joint{nearest(leader, by_name)}",
+                f"its <mimic> of {leader!r}, which is no joint, was left out: it moves by itself",
             )
     for cycle in _cycles(leader_of):
         yield place_of(by_name[cycle[0]], origin).finding(

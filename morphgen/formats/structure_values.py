@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from lxml import etree
 
-from morphgen.model.findings import Finding, Severity
+from morphgen.formats.structure_place import Place, shortened
+from morphgen.model.findings import Finding
 
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
@@ -26,18 +27,22 @@ class Numbers:
     nonzero: bool = False
     commas_read: bool = False
     """Whether commas between the numbers are understood all the same."""
+    surplus_read: bool = False
+    """Whether more numbers are understood all the same: the first ones count."""
 
 
 LARGEST = 1e20
 """Largest number that a URDF may hold: beyond, simulators overflow."""
 SMALLEST = 1e-6
 """Smallest length of a primitive, metres: below, simulators round it to nothing."""
+LONGEST_TEXT = 1000
+"""Characters of the longest name or file name of a URDF."""
 CHILDREN = {
     "link": ("inertial", "visual", "collision"),
     "inertial": ("origin", "mass", "inertia"),
     "visual": ("origin", "geometry", "material"),
     "collision": ("origin", "geometry"),
-    "geometry": ("box", "cylinder", "sphere", "mesh"),
+    "geometry": ("box", "capsule", "cylinder", "sphere", "mesh"),
     "material": ("color",),
     "joint": (
         "origin",
@@ -55,11 +60,17 @@ CHILDREN = {
 
 _REPEATABLE = ("visual", "collision")
 _REQUIRED_CHILDREN = {
-    "inertial": ("mass", "inertia"),
-    "visual": ("geometry",),
-    "collision": ("geometry",),
     "joint": ("parent", "child"),
 }
+_EXPECTED_CHILDREN = {
+    "inertial": {
+        "mass": "its <inertial> without <mass> was left out",
+        "inertia": "the missing <inertia> was read as zero",
+    },
+    "visual": {"geometry": "a <visual> without <geometry> was left out"},
+    "collision": {"geometry": "a <collision> without <geometry> was left out"},
+}
+"""Children that ROS reads a robot without, and what becomes of what holds them."""
 _REQUIRED_TEXT = {
     "robot": ("name",),
     "link": ("name",),
@@ -86,40 +97,17 @@ _NUMBERS = {
     ),
     "box": (Numbers("size", (3,), required=True, positive=True, commas_read=True),),
     "sphere": (Numbers("radius", required=True, positive=True),),
+    "capsule": (
+        Numbers("radius", required=True, positive=True),
+        Numbers("length", required=True, positive=True),
+    ),
     "cylinder": (
         Numbers("radius", required=True, positive=True),
         Numbers("length", required=True, positive=True),
     ),
-    "mesh": (Numbers("scale", (1, 3), nonzero=True, commas_read=True),),
+    "mesh": (Numbers("scale", (1, 3), nonzero=True, commas_read=True, surplus_read=True),),
     "color": (Numbers("rgba", (4,)),),
 }
-
-
-@dataclass(frozen=True)
-class Place:
-    """The link, joint or robot that an element belongs to."""
-
-    origin: str
-    """Name of the file."""
-    owner: str
-    """Such as ``link 'base'``."""
-
-    def finding(
-        self,
-        element: etree._Element,
-        code: str,
-        why: str,
-        fix: str,
-        severity: Severity = "error",
-    ) -> Finding:
-        """A finding at the element's line."""
-        return Finding(code, severity, f"{self.origin}:{element.sourceline} {self.owner}", why, fix)
-
-
-def place_of(element: etree._Element, origin: str) -> Place:
-    """The place named after a link, joint or other element at the top level."""
-    name = element.get("name")
-    return Place(origin, f"{element.tag} {name!r}" if name else f"{element.tag} without a name")
 
 
 def content_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
@@ -130,24 +118,10 @@ def content_findings(element: etree._Element, place: Place) -> Iterator[Finding]
         place: The place to name in findings.
     """
     tag = element.tag
-    for name in _REQUIRED_TEXT.get(tag, ()):
-        if not element.get(name, "").strip():
-            yield place.finding(
-                element,
-                "attribute-missing",
-                f"<{tag}> has no {name}",
-                f'write <{tag} {name}="...">',
-            )
+    yield from _text_findings(element, place)
     for numbers in _NUMBERS.get(tag, ()):
         yield from _number_findings(element, numbers, place)
-    for name in _REQUIRED_CHILDREN.get(tag, ()):
-        if element.find(name) is None:
-            yield place.finding(
-                element,
-                "element-missing",
-                f"<{tag}> has no <{name}>",
-                f"add <{name}> or drop <{tag}>",
-            )
+    yield from _missing_findings(element, place)
     if tag == "geometry":
         yield from _geometry_findings(element, place)
     for name in CHILDREN.get(tag, ()):
@@ -158,10 +132,52 @@ def content_findings(element: etree._Element, place: Place) -> Iterator[Finding]
                 "element-repeated",
                 f"<{tag}> has {len(children)} <{name}>; the first one counts",
                 "keep one",
-                severity="warning",
+                f"of {len(children)} <{name}> the first one was taken",
             )
         for child in children:
             yield from content_findings(child, place)
+
+
+def _text_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+    tag = element.tag
+    for name in _REQUIRED_TEXT.get(tag, ()):
+        value = element.get(name, "")
+        if len(value) > LONGEST_TEXT or not value.isprintable():
+            yield place.finding(
+                element,
+                "text-invalid",
+                f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
+                f"cannot be printed, or more than {LONGEST_TEXT} characters",
+                "write a shorter text of printable characters",
+            )
+        if not value.strip():
+            yield place.finding(
+                element,
+                "attribute-missing",
+                f"<{tag}> has no {name}",
+                f'write <{tag} {name}="...">',
+            )
+
+
+def _missing_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+    tag = element.tag
+    for name in _REQUIRED_CHILDREN.get(tag, ()):
+        if element.find(name) is None:
+            yield place.finding(
+                element,
+                "element-missing",
+                f"<{tag}> has no <{name}>",
+                f"add <{name}> or drop <{tag}>",
+            )
+    for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
+        if element.find(name) is None:
+            yield place.finding(
+                element,
+                "element-missing",
+                f"<{tag}> has no <{name}>",
+                f"add <{name}> or drop <{tag}>",
+                repair,
+            )
 
 
 def _geometry_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
@@ -169,25 +185,30 @@ def _geometry_findings(element: etree._Element, place: Place) -> Iterator[Findin
     shapes = [child for child in element if isinstance(child.tag, str)]
     if not shapes:
         yield place.finding(
-            element, "geometry-missing", "<geometry> is empty", f"put one of {_tags(kinds)} into it"
+            element,
+            "geometry-missing",
+            "<geometry> is empty",
+            f"put one of {_tags(kinds)} into it",
+            "a shape with an empty <geometry> was left out",
         )
         return
+    known = [shape for shape in shapes if shape.tag in kinds]
     for shape in shapes:
-        if shape.tag in kinds:
-            continue
-        fix = f"use one of {_tags(kinds)}"
-        if shape.tag == "capsule":
-            fix = "write a cylinder with a sphere at either end: URDF has no capsule"
+        if shape not in known:
+            yield place.finding(
+                shape,
+                "geometry-unknown",
+                f"<{shortened(shape.tag)}> is no geometry that URDF knows",
+                f"use one of {_tags(kinds)}",
+                f"the geometry <{shortened(shape.tag)}> was left out",
+            )
+    if len(known) > 1:
         yield place.finding(
-            shape, "geometry-unknown", f"<{shape.tag}> is no geometry that URDF knows", fix
-        )
-    if len(shapes) > 1:
-        yield place.finding(
-            shapes[1],
+            known[1],
             "element-repeated",
-            f"<geometry> holds {len(shapes)} shapes; the first one counts",
+            f"<geometry> holds {len(known)} shapes; the first one counts",
             "give each its own <visual> or <collision>",
-            severity="warning",
+            f"of {len(known)} shapes in one <geometry> the first one was taken",
         )
 
 
@@ -203,7 +224,7 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
                 f'write <{element.tag} {name}="...">',
             )
         return
-    shown = f'<{element.tag} {name}="{text}">'
+    shown = f'<{element.tag} {name}="{shortened(text)}">'
     counts = " or ".join(str(count) for count in numbers.counts)
     vector = max(numbers.counts) > 1
     words = text.replace(",", " ").split() if vector else text.split()
@@ -212,25 +233,29 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
         yield place.finding(
             element,
             "number-malformed",
-            f"{shown}: {wrong[0]!r} is no finite decimal number",
+            f"{shown}: {shortened(wrong[0])!r} is no finite decimal number",
             "write decimal numbers with a point, separated by spaces",
         )
         return
     if len(words) not in numbers.counts:
+        surplus = numbers.surplus_read and len(words) > max(numbers.counts)
         yield place.finding(
             element,
             "number-count",
             f"{shown} holds {len(words)} numbers",
             f"write {counts}",
+            f"of {shown} the first {max(numbers.counts)} numbers were taken" if surplus else "",
         )
-        return
+        if not surplus:
+            return
+        words = words[: max(numbers.counts)]
     if "," in text:
         yield place.finding(
             element,
             "number-commas",
             f"{shown} separates numbers by commas, which MuJoCo refuses",
             "separate them by spaces",
-            severity="warning" if numbers.commas_read else "error",
+            f"the commas of {shown} were read as spaces" if numbers.commas_read else "",
         )
     values = [float(word) for word in words]
     if max(map(abs, values)) > LARGEST or (numbers.positive and 0 < min(values) < SMALLEST):
@@ -246,6 +271,7 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
             "size-not-positive",
             f"{shown} is not positive",
             "write lengths above 0, in metres",
+            f"the shape {shown} was left out" if min(values) == 0 else "",
         )
     if numbers.nonzero and 0.0 in values:
         yield place.finding(

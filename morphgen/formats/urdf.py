@@ -14,7 +14,7 @@ from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.structure import structure_findings
 from morphgen.formats.urdf_elements import read_colour, read_joint, read_link
 from morphgen.formats.xacro import expand
-from morphgen.formats.xml import parse_xml
+from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Frame, Joint, Link, Robot
 
@@ -42,7 +42,8 @@ def read_urdf(
             environment and in the installed data packages.
 
     Returns:
-        The robot, without frames; its home is zero, or the middle of a range without zero.
+        The robot, without frames; its home is zero, or the middle of a range without zero. What
+        had to be mended or left out is in its ``source_findings``.
 
     Raises:
         UnsoundError: If the tree is broken or a mesh is not found.
@@ -77,11 +78,11 @@ def robot_from_xml(
         UnsoundError: If the tree is broken or a mesh is not found.
         FormatError: If it is not XML.
     """
-    root = parse_xml(data, str(path))
+    root, mended = parse_description(data, str(path))
     findings = () if trusted else structure_findings(root, str(path))
-    findings = tuple(finding for finding in findings if finding.severity == "error")
-    if findings:
-        raise UnsoundError(str(path), findings)
+    errors = tuple(finding for finding in findings if finding.severity == "error")
+    if errors:
+        raise UnsoundError(str(path), errors)
     missing: list[Finding] = []
     meshes = _resolved_meshes(root, path, finder, missing)
     if missing:
@@ -89,11 +90,17 @@ def robot_from_xml(
     colours = {m.get("name", ""): read_colour(m) for m in root.iterfind("material")}
     found = (read_link(element, meshes, colours) for element in root.iterfind("link"))
     links = {link.name: link for link in found}
-    joints = _topological([read_joint(element) for element in root.iterfind("joint")], links)
+    joints = _topological(_joints(root), links)
     order = [_root_name(links, joints), *(joint.child for joint in joints)]
     home = tuple(_rest(joint) for joint in joints if joint.is_independent)
     bodies = tuple(links[name] for name in order)
-    return Robot(root.get("name", ""), bodies, tuple(joints), home=home)
+    # Without the folder, a card that lists them is the same on every machine.
+    told = tuple(
+        replace(finding, where=f"{path.name}{finding.where.removeprefix(str(path))}")
+        for finding in (*mended, *findings)
+    )
+    name = root.get("name", "")
+    return Robot(name, bodies, tuple(joints), home=home, source_findings=told)
 
 
 def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
@@ -131,6 +138,16 @@ def _resolved_meshes(
                 Finding("mesh-unresolved", "error", where, str(error), "correct the mesh path")
             )
     return meshes
+
+
+def _joints(root: etree._Element) -> list[Joint]:
+    """The joints; one that mimics what is no joint moves by itself."""
+    joints = [read_joint(element) for element in root.iterfind("joint")]
+    names = {joint.name for joint in joints}
+    return [
+        joint if joint.mimic is None or joint.mimic.joint in names else replace(joint, mimic=None)
+        for joint in joints
+    ]
 
 
 def _topological(joints: list[Joint], links: Mapping[str, Link]) -> list[Joint]:

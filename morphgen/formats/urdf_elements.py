@@ -12,16 +12,20 @@ from typing import cast
 import numpy as np
 from lxml import etree
 
+from morphgen.formats.structure_values import CHILDREN
 from morphgen.model.geometry import (
     IDENTITY,
     Box,
+    Capsule,
     Cylinder,
     Geometry,
     Mesh,
     Pose,
+    Primitive,
     Rgba,
     Shape,
     Sphere,
+    dimensions,
 )
 from morphgen.model.robot import Inertial, Joint, JointKind, Link, Mimic
 from morphgen.model.rotation import Vec3
@@ -43,12 +47,14 @@ def read_link(
         element.get("name", ""),
         _inertial(element.find("inertial")),
         tuple(
-            Shape(_geometry(visual, meshes), _origin(visual), _visual_rgba(visual, colours))
+            Shape(geometry, _origin(visual), _visual_rgba(visual, colours))
             for visual in element.iterfind("visual")
+            if (geometry := _geometry(visual, meshes)) is not None
         ),
         tuple(
-            Shape(_geometry(collision, meshes), _origin(collision))
+            Shape(geometry, _origin(collision))
             for collision in element.iterfind("collision")
+            if (geometry := _geometry(collision, meshes)) is not None
         ),
     )
 
@@ -100,20 +106,27 @@ def _inertial(element: etree._Element | None) -> Inertial | None:
     return Inertial.from_matrix(mass, T.position, np.asarray(R @ body.matrix @ R.T))
 
 
-def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry:
-    shape = holder.find("geometry")
-    assert shape is not None
-    (element,) = shape
+def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry | None:
+    """The first shape that URDF knows; None if there is none, or it has no size."""
+    shapes = holder.iterfind("geometry[1]/*")
+    element = next((shape for shape in shapes if shape.tag in CHILDREN["geometry"]), None)
+    if element is None:
+        return None
+    geometry: Primitive
     match element.tag:
         case "box":
-            return Box(_vector(element.get("size", "")))
+            geometry = Box(_vector(element.get("size", "")))
         case "sphere":
-            return Sphere(float(element.get("radius", "")))
+            geometry = Sphere(float(element.get("radius", "")))
+        case "capsule":
+            geometry = Capsule(float(element.get("radius", "")), float(element.get("length", "")))
         case "cylinder":
-            return Cylinder(float(element.get("radius", "")), float(element.get("length", "")))
-    x, *rest = _numbers(element.get("scale", "")) or [1.0]
-    y, z = rest or (x, x)
-    return Mesh(meshes[element.get("filename", "")], (x, y, z))
+            geometry = Cylinder(float(element.get("radius", "")), float(element.get("length", "")))
+        case _:
+            x, *rest = _numbers(element.get("scale", "")) or [1.0]
+            y, z = rest[:2] or (x, x)
+            return Mesh(meshes[element.get("filename", "")], (x, y, z))
+    return None if 0.0 in dimensions(geometry) else geometry
 
 
 def _origin(holder: etree._Element) -> Pose:

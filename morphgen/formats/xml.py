@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 
 from lxml import etree
 
 from morphgen.errors import FormatError
+from morphgen.model.findings import Finding
 
 _PLACE = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
+_DECLARATION = re.compile(rb"<\?xml\s[^>]*\?>")
+_VERSION = re.compile(rb"""(<\?xml\s+version\s*=\s*["'])([^"'<>]{0,20})(?=["'])""")
+_START_TAG = re.compile(rb"<[A-Za-z_][^\s/>]*")
+_UNDECLARED = re.compile(r"Namespace prefix ([A-Za-z_][\w.-]*) ", re.ASCII)
+_BOM = b"\xef\xbb\xbf"
+_MOST_PREFIXES = 20
+"""Undeclared prefixes of the strangest document that is still read."""
 
 
 def parse_xml(data: bytes, origin: str) -> etree._Element:
@@ -25,13 +34,7 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     Raises:
         FormatError: The document is broken (``origin:line:column: reason``) or has a DOCTYPE.
     """
-    parser = etree.XMLParser(
-        resolve_entities=False,
-        no_network=True,
-        load_dtd=False,
-        remove_comments=True,
-        remove_pis=True,
-    )
+    parser = _parser()
     try:
         root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
@@ -41,3 +44,121 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     if root.getroottree().docinfo.internalDTD is not None:
         raise FormatError(f"{origin}: has a DOCTYPE; a robot description needs none, remove it")
     return root
+
+
+def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[Finding, ...]]:
+    """Parse a robot description as robot software does, which is less strict than XML.
+
+    Three faults that ROS and PyBullet read over are mended: blank space before the XML declaration,
+    a declared version that does not exist, and prefixes that no namespace is declared for. The
+    mended document is parsed by ``parse_xml``.
+
+    Args:
+        data: The document's bytes.
+        origin: What to call the document in errors, usually its path.
+
+    Returns:
+        The root element, and a warning for everything that was mended.
+
+    Raises:
+        FormatError: As ``parse_xml``.
+    """
+    data, findings = _with_sound_declaration(data, origin)
+    try:
+        return parse_xml(data, origin), tuple(findings)
+    except FormatError:
+        prefixes = _undeclared_prefixes(data)
+        if not prefixes:
+            raise
+    findings += [
+        Finding(
+            "prefix-undeclared",
+            "warning",
+            f"{origin}: document",
+            f"the prefix {prefix!r} is used but not declared",
+            f'declare it by xmlns:{prefix}="..."',
+            f"elements and attributes with the undeclared prefix {prefix!r} were left out",
+        )
+        for prefix in prefixes
+    ]
+    return parse_xml(_with_prefixes(data, prefixes), origin), tuple(findings)
+
+
+def _parser() -> etree.XMLParser:
+    return etree.XMLParser(
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        remove_comments=True,
+        remove_pis=True,
+    )
+
+
+def _with_sound_declaration(data: bytes, origin: str) -> tuple[bytes, list[Finding]]:
+    """The document with its XML declaration at the start and of a version that exists."""
+    findings = []
+    body = data.removeprefix(_BOM)
+    blank = body[: len(body) - len(body.lstrip())]
+    found = _DECLARATION.match(body, len(blank))
+    if found is None:
+        return data, []
+    declaration, rest = found[0], body[found.end() :]
+    version = _VERSION.match(declaration)
+    if version is not None and not re.fullmatch(rb"1\.[0-9]+", version[2]):
+        declaration = version[1] + b"1.0" + declaration[version.end() :]
+        findings.append(
+            Finding(
+                "xml-declaration",
+                "warning",
+                f"{origin}:1 document",
+                f"it declares XML version {version[2].decode(errors='replace')!r}",
+                'write version="1.0"',
+                "its XML version was read as 1.0",
+            )
+        )
+    if blank:
+        findings.append(
+            Finding(
+                "xml-declaration",
+                "warning",
+                f"{origin}:1 document",
+                "blank space stands before the XML declaration",
+                "begin the file with <?xml",
+                "blank space before the XML declaration was left out",
+            )
+        )
+    # The blank space moves behind the declaration, so that line numbers stay as they are.
+    return (declaration + blank + rest, findings) if findings else (data, [])
+
+
+def _undeclared_prefixes(data: bytes) -> list[str]:
+    """Prefixes without a namespace, in order; none if there are too many to be an oversight."""
+    prefixes: list[str] = []
+    while len(prefixes) <= _MOST_PREFIXES:
+        parser = _parser()
+        with suppress(etree.XMLSyntaxError):
+            etree.fromstring(_with_prefixes(data, prefixes), parser)
+        # The log ends after 100 errors, so that some prefixes may show the next time only.
+        matches = [_UNDECLARED.match(entry.message or "") for entry in parser.error_log]
+        names = dict.fromkeys(match[1] for match in matches if match is not None)
+        new = [name for name in names if name not in prefixes]
+        if not new:
+            return prefixes
+        prefixes += new
+    return []
+
+
+def _with_prefixes(data: bytes, prefixes: list[str]) -> bytes:
+    """The document with prefixes declared in its first start tag."""
+    at = 0
+    while prefixes:
+        at = data.find(b"<", at)
+        tag = _START_TAG.match(data, max(at, 0))
+        if tag is not None:
+            declared = "".join(f' xmlns:{name}="undeclared:{name}"' for name in prefixes)
+            return data[: tag.end()] + declared.encode() + data[tag.end() :]
+        end = data.find(b"-->" if data.startswith(b"<!--", at) else b">", at)
+        if at < 0 or end < 0:
+            break
+        at = end
+    return data

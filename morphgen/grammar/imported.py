@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.checks import fix
+from morphgen.checks import fix, with_repairs
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import FormatError, nearest
 from morphgen.formats.urdf import read_urdf
@@ -32,7 +32,8 @@ def import_robot(
         tool: Link whose frame becomes the frame ``tool``; by default there is none.
         name: Name of the robot; by default the file's own.
         repair: Whether to make the safe repairs of ``morphgen.checks.fix``, without which some
-            loaders refuse the robot; each is named in the provenance.
+            loaders refuse the robot. Each is named in the provenance, as is what had to be mended
+            for the file to be read at all.
 
     Raises:
         FormatError: If the file cannot be read, or has no such link.
@@ -54,10 +55,9 @@ def import_robot(
     robot = replace(
         robot, name=robot.name if name is None else name, provenance={"source": path.name}
     )
+    robot = with_repairs(robot, robot.source_findings)
     if repair:
-        robot, repaired = fix(robot)
-        repairs = [f"{finding.where}: {finding.why}" for finding in repaired]
-        robot = replace(robot, provenance={**robot.provenance, "repairs": repairs})
+        robot, _ = fix(robot)
     return replace(robot, ignore_pairs=ignore_pairs(robot))
 
 

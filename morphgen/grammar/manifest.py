@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import yaml
 
-from morphgen.errors import PartError, nearest
+from morphgen.errors import FormatError, PartError, nearest
+from morphgen.formats.data_files import read_bytes, require_plain_yaml
 from morphgen.grammar.parameters import Parameter
 
 Kind = Literal["base", "arm", "ee", "segment", "body"]
@@ -180,13 +181,17 @@ def load_yaml(path: Path) -> object:
         PartError: If it cannot be read; a syntax error is named by line and column.
     """
     try:
-        return yaml.load(path.read_bytes(), Loader=_Loader)
+        data = read_bytes(path)
+        require_plain_yaml(data, str(path))
+        return yaml.load(data, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
         raise PartError(f"{path}{place}: no valid YAML: {error.problem}") from error
     except (yaml.YAMLError, ValueError) as error:
         raise PartError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from error
+    except FormatError as error:
+        raise PartError(str(error)) from error
     except OSError as error:
         raise PartError(f"{path}: cannot be read: {error.strerror}") from error
 

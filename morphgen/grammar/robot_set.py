@@ -22,6 +22,7 @@ from typing import Any
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.card import rounded
+from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.files import alone, partial_of, replacing_folder, write_atomic
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.urdf_text import urdf_text
@@ -36,6 +37,8 @@ SETTINGS = "set.json"
 GRAMMAR = "grammar.grammar"
 DERIVATION = "derivation.txt"
 JOURNAL = ".journal.jsonl"
+_LARGEST_INDEX = 2**30
+"""Bytes of the largest index that is read at once; a robot takes about one kilobyte."""
 
 Record = dict[str, Any]
 """A line of the index."""
@@ -154,7 +157,12 @@ def read_index(folder: Path) -> list[Record]:
     path = folder / INDEX
     if not path.is_file():
         raise FormatError(f"{folder} is no finished set: it has no {INDEX}")
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = read_text(path, _LARGEST_INDEX).splitlines()
+    records = [parse_json(line, f"{path}:{number}") for number, line in enumerate(lines, 1)]
+    for number, record in enumerate(records, 1):
+        if not isinstance(record, dict) or not isinstance(record.get("name"), str):
+            raise FormatError(f"{path}:{number}: expected an object with a name")
+    return records
 
 
 def _record(drawn: Sample) -> Record:
@@ -200,10 +208,9 @@ def _prepare(plan: SetPlan) -> None:
         except OSError as error:
             raise FormatError(f"cannot write to {plan.folder}: {error.strerror}") from error
         return
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise FormatError(f"{path}: no valid JSON: {error}") from error
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise FormatError(f"{path}: expected an object, not {type(found).__name__}")
     for key, value in wanted.items():
         if found.get(key) != value:
             raise FormatError(
@@ -212,6 +219,14 @@ def _prepare(plan: SetPlan) -> None:
             )
     if (plan.folder / GRAMMAR).read_text(encoding="utf-8") != plan.grammar_text:
         raise FormatError(f"{plan.folder} holds a set of another grammar; name another folder")
+
+
+def _is_record(record: object) -> bool:
+    return (
+        isinstance(record, dict)
+        and isinstance(record.get("name"), str)
+        and isinstance(record.get("index"), int)
+    )
 
 
 def _is_barely_begun(plan: SetPlan) -> bool:
@@ -238,9 +253,9 @@ def _finished(plan: SetPlan) -> dict[int, tuple[Path, int]]:
             for line in lines:
                 try:
                     record = json.loads(line)
-                except ValueError:
+                except (RecursionError, ValueError):
                     record = None
-                if record and (plan.folder / record["name"] / URDF).is_file():
+                if _is_record(record) and (plan.folder / record["name"] / URDF).is_file():
                     places[record["index"]] = (path, offset)
                 offset += len(line)
     for leftover in plan.folder.glob(".*.*"):

@@ -21,9 +21,16 @@ class Finding:
     """What is the case, with the value."""
     fix: str
     """What to do about it."""
-    fixable: bool = False
-    """Whether ``morphgen check --fix`` repairs it."""
+    repair: str = ""
+    """What a repair has changed or would change; empty if there is none."""
+
+    @property
+    def fixable(self) -> bool:
+        """Whether ``morphgen check --fix`` repairs it."""
+        return bool(self.repair)
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for JSON."""
-        return asdict(self)
+        data = asdict(self)
+        del data["repair"]
+        return {**data, "fixable": self.fixable}

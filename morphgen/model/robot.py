@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import RobotError, nearest
+from morphgen.model.findings import Finding
 from morphgen.model.geometry import IDENTITY, Pose, Shape
 from morphgen.model.rotation import Vec3
 
@@ -157,6 +158,8 @@ class Robot:
     """Sorted pairs of links whose contact is not self-collision."""
     provenance: Mapping[str, object] = field(default_factory=dict)
     """Where the body comes from, ready for its card: derivation, parts, licences."""
+    source_findings: tuple[Finding, ...] = ()
+    """What was suspicious, mended or left out when the robot's file was read."""
 
     def __post_init__(self) -> None:
         if not self.links:

@@ -149,12 +149,14 @@ def test_import_passes_arguments_to_xacro_and_tells_its_repairs(run, tmp_path):
     words = ("import", path, "--arg", "length=0.4", "--no-picture", "--out", "o")
     code, out, err = run(*words)
     assert (code, err) == (0, "")
-    assert "  repaired joint left_slide: its axis (0.0, 2.0, 0.0) is 2 long" in out
+    assert "  repaired joint left_slide: the axis (0.0, 2.0, 0.0) was scaled to unit length" in out
     palm = read_bundle(tmp_path / "o" / "pincer").link("palm")
     assert palm.collisions[0].geometry.size == pytest.approx((0.02, 0.02, 0.4))
     code, out, _ = run(*words, "--as-is", "--name", "as_is")
-    assert code == 0
+    assert code == 1
+    assert "  error axis-not-unit at joint left_slide: its axis (0.0, 2.0, 0.0) is 2 long" in out
     assert "repaired" not in out
+    assert (tmp_path / "o" / "as_is" / "card.json").is_file()
 
 
 def test_conform_compares_all_loaders(run, tmp_path):
