@@ -135,14 +135,16 @@ def _is_robot(folder: Path) -> bool:
 def _read(path: Path, library: Library) -> Robot:
     """A robot; one of a light set from its derivation, because its URDF knows no home."""
     from morphgen.formats.bundle import CARD, read_robot
+    from morphgen.formats.files import read_text
     from morphgen.grammar.compose import compose
     from morphgen.grammar.derivation import parse_derivation
+    from morphgen.grammar.limits import MAX_DERIVATION_TEXT
     from morphgen.grammar.robot_set import DERIVATION
 
     light = path / DERIVATION
     if not light.is_file() or (path / CARD).is_file():
         return read_robot(path)
-    derivation = parse_derivation(light.read_text(encoding="utf-8"), str(light))
+    derivation = parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
     return compose(derivation, library, path.resolve().name)
 
 

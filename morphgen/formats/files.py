@@ -44,6 +44,29 @@ def save(path: Path, content: str | bytes) -> None:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
 
+def read_text(path: Path, most: int) -> str:
+    """Return the text of a file.
+
+    Args:
+        path: The file, in UTF-8.
+        most: Length beyond which it is refused [bytes].
+
+    Raises:
+        FormatError: If it cannot be read, is no UTF-8, or is too long.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}") from error
+    if len(content) > most:
+        raise FormatError(f"{path}: {path.stat().st_size:,} bytes; expected at most {most:,}")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: not UTF-8: {error}") from error
+
+
 def partial_of(path: Path) -> Path:
     """Where a file is written before it takes its place."""
     return path.with_name(f".{path.name}.partial")
