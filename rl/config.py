@@ -11,6 +11,10 @@ from morphgen.errors import TaskError, nearest
 AgentName = Literal["se", "me-mlp", "me-tf"]
 AGENTS: tuple[AgentName, ...] = get_args(AgentName)
 """``se`` is for one robot, and sees no morphology; ``me-...`` are for many."""
+MAX_WIDTH = 8192
+"""Numbers of a layer of a network; the weights between two such layers are 256 MiB."""
+MAX_LAYERS = 100
+"""Layers of a network."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,12 @@ class PolicyConfig:
             raise TaskError(f"logit_scale {self.logit_scale:g}: expected more than 0")
         for each in fields(self):
             if each.type == "int":
+                most = MAX_LAYERS if each.name.endswith("layers") else MAX_WIDTH
                 _at_least(each.name, getattr(self, each.name), 1)
+                if getattr(self, each.name) > most:
+                    raise TaskError(
+                        f"{each.name} {getattr(self, each.name)}: expected at most {most}"
+                    )
         if self.features % self.heads:
             raise TaskError(f"features {self.features}: expected a multiple of heads {self.heads}")
 

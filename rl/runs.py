@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
-import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import FormatError, TaskError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_of, write_atomic
+from morphgen.rl.checkpoint_content import require_fields, require_learner
+from morphgen.rl.checkpoint_file import packed, unpacked
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.sources import Source, most_obstacles
 from morphgen.tasks.actions import ActionKind
@@ -147,24 +145,32 @@ def read_config(folder: Path) -> RunConfig:
     try:
         data = read_json(path)
         _require_format(path, data)
-        return config_from(data)
     except OSError as error:
         raise TaskError(f"{folder} is no run's folder: it has no {CONFIG}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise TaskError(f"{path} is not the config of a run: {error}") from error
+    try:
+        return config_from(data)
+    except TaskError as error:
         raise TaskError(f"{path} is not the config of a run: {error}") from error
 
 
-def config_from(data: Mapping[str, Any]) -> RunConfig:
+def config_from(data: object) -> RunConfig:
     """A config from what JSON keeps of it.
 
     Raises:
-        KeyError: If something is missing.
-        TypeError: If something is unknown.
-        TaskError: If something is out of its range.
+        TaskError: If something is missing, unknown, of another type or out of its range.
     """
+    if not isinstance(data, Mapping):
+        raise TaskError("run: expected a table")
     own = {key: value for key, value in data.items() if key not in ("format", "morphgen")}
-    source = {**own.pop("source")}
-    source["library"] = tuple(source["library"])
+    require_fields(RunConfig, own, "run")
+    made = {"source": Source, "policy": PolicyConfig, "ppo": PPOConfig}
+    for name, kind in {**made, "reach": ReachConfig, "push": PushConfig}.items():
+        if name not in own:
+            raise TaskError(f"run: no {name}")
+        require_fields(kind, own[name], name)
+    source = _tuples(own.pop("source"))
     tasks = {name: _tuples(own.pop(name)) for name in ("reach", "push")}
     return RunConfig(
         Source(**source),
@@ -181,12 +187,13 @@ def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]
 
     Raises:
         FormatError: If it cannot be written.
+        TaskError: If a number is not finite; the last checkpoint stays.
     """
-    content = io.BytesIO()
-    torch.save({"format": FORMAT, "run": asdict(config), "learner": dict(learner)}, content)
     path = folder / CHECKPOINT
+    data = {"format": FORMAT, "run": asdict(config), "learner": dict(learner)}
+    content = packed(data, f"{path} is not replaced")
     try:
-        write_atomic(path, content.getvalue())
+        write_atomic(path, content)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
@@ -198,30 +205,26 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
         path: The file, or the run's folder. Nothing in it is executed.
 
     Raises:
-        TaskError: If there is none, or it is none of a run.
+        TaskError: If there is none, or it is none of a run: it is damaged, incomplete or beyond a
+            limit, or a number in it is not finite.
     """
     file = path / CHECKPOINT if path.is_dir() else path
     if not file.is_file():
         raise TaskError(f"{file}: no such checkpoint")
+    data = unpacked(file)
+    if data.keys() != {"format", "run", "learner"}:
+        raise TaskError(f"{file} is not a checkpoint of morphgen train")
+    _require_format(file, data)
     try:
-        data = torch.load(file, map_location="cpu", weights_only=True)
-        _require_format(file, data)
-        return config_from(data["run"]), data["learner"]
-    except (
-        pickle.UnpicklingError,
-        RuntimeError,
-        EOFError,
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        AttributeError,
-    ) as error:
-        raise TaskError(f"{file} is not a checkpoint of morphgen train") from error
+        config = config_from(data["run"])
+    except TaskError as error:
+        raise TaskError(f"{file}: {error}") from error
+    require_learner(data["learner"], str(file))
+    return config, data["learner"]
 
 
 def _require_format(path: Path, data: Mapping[str, Any]) -> None:
-    if data["format"] != FORMAT:
+    if data["format"] != FORMAT or isinstance(data["format"], bool):
         raise TaskError(
             f"{path} has format {data['format']!r}, and this morphgen reads {FORMAT}: it was "
             "written by another version"

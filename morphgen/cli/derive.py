@@ -67,11 +67,12 @@ def run_mutate(args: argparse.Namespace) -> int:
 
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import write_bundle
-    from morphgen.formats.data_files import read_json, read_text
+    from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import difference
+    from morphgen.grammar.limits import MAX_TEXT
     from morphgen.grammar.model import grammar_from_text
     from morphgen.grammar.mutation import mutate
-    from morphgen.grammar.robot_set import GRAMMAR, SETTINGS, read_index
+    from morphgen.grammar.robot_set import GRAMMAR, read_index, read_settings
 
     folder = args.robot.resolve().parent
     if not (folder / GRAMMAR).is_file():
@@ -79,10 +80,8 @@ def run_mutate(args: argparse.Namespace) -> int:
     records = {record["name"]: record for record in read_index(folder)}
     if args.robot.name not in records:
         raise FormatError(f"{args.robot.name!r} is not in the index of {folder}")
-    settings = read_json(folder / SETTINGS)
-    if not isinstance(settings, dict) or not isinstance(settings.get("grammar"), str):
-        raise FormatError(f"{folder / SETTINGS}: does not name the grammar of the set")
-    grammar = grammar_from_text(read_text(folder / GRAMMAR), settings["grammar"])
+    name = read_settings(folder)["grammar"]
+    grammar = grammar_from_text(read_text(folder / GRAMMAR, MAX_TEXT), name)
     choices = records[args.robot.name]["choices"]
     origin = _derivation(args.robot)
     out = args.out or folder.parent / f"{folder.name}-mutants"
@@ -143,15 +142,16 @@ def _derivation(folder: Path) -> Derivation:
     from morphgen.formats.bundle import CARD
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import parse_derivation
+    from morphgen.grammar.limits import MAX_DERIVATION_TEXT
     from morphgen.grammar.robot_set import DERIVATION
 
     light, card = folder / DERIVATION, folder / CARD
     if light.is_file():
-        return parse_derivation(read_text(light), str(light))
+        return parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
     if not card.is_file():
         raise FormatError(f"{folder} is no robot: it has neither {CARD} nor {DERIVATION}")
     content = _card(folder)
-    if "derivation" not in content:
+    if not isinstance(content.get("derivation"), str):
         raise FormatError(f"{card} has no derivation: the robot was imported, not composed")
     return parse_derivation(content["derivation"], str(card))
 

@@ -60,21 +60,25 @@ def run_check(args: argparse.Namespace) -> int:
 
 def run_count(args: argparse.Namespace) -> int:
     """Print the number of structures and what is drawn."""
-    from morphgen.grammar.analysis import count, variables
+    from morphgen.grammar.analysis import variables
+    from morphgen.grammar.limits import COUNT_DIGITS, MAX_COUNT
+    from morphgen.grammar.structures import count
 
     grammar = _load(args)
     structures = count(grammar)
+    finite = structures != math.inf
     drawn = variables(grammar)
     if args.json:
-        number = None if math.isinf(structures) else int(structures)
+        number = int(structures) if structures <= MAX_COUNT else None
         names = [
             {"where": v.where, "draw": v.text, "continuous": v.distribution.is_continuous}
             for v in drawn
         ]
-        print(json.dumps({"structures": number, "variables": names}))
+        print(json.dumps({"structures": number, "finite": finite, "variables": names}))
         return 0
-    number_text = "infinitely many" if math.isinf(structures) else f"{int(structures)}"
-    print(f"{grammar.name}: {number_text} structures, {len(drawn)} values drawn")
+    text = f"{structures}" if structures <= MAX_COUNT else f"more than 10^{COUNT_DIGITS}"
+    text = text if finite else "infinitely many"
+    print(f"{grammar.name}: {text} structures, {len(drawn)} values drawn")
     for variable in drawn:
         kind = "continuous" if variable.distribution.is_continuous else "discrete"
         print(f"  {kind:10}  {variable.where} = {variable.text}")
@@ -83,11 +87,18 @@ def run_count(args: argparse.Namespace) -> int:
 
 def run_enumerate(args: argparse.Namespace) -> int:
     """Print a derivation a line."""
-    from morphgen.grammar.analysis import enumerate_structures
+    from morphgen.errors import GrammarError
+    from morphgen.grammar.structures import enumerate_structures
 
+    if args.limit < 0:
+        raise GrammarError(f"--limit {args.limit}: expected 0 or more")
     structures = enumerate_structures(_load(args), library_of(args))
-    texts = [str(derivation) for derivation in itertools.islice(structures, args.limit)]
-    print(json.dumps(texts) if args.json else "\n".join(texts))
+    texts = map(str, itertools.islice(structures, args.limit))
+    if args.json:
+        print(json.dumps(list(texts)))
+        return 0
+    for text in texts:
+        print(text)
     return 0
 
 

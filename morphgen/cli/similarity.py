@@ -138,12 +138,13 @@ def _read(path: Path, library: Library) -> Robot:
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.compose import compose
     from morphgen.grammar.derivation import parse_derivation
+    from morphgen.grammar.limits import MAX_DERIVATION_TEXT
     from morphgen.grammar.robot_set import DERIVATION
 
     light = path / DERIVATION
     if not light.is_file() or (path / CARD).is_file():
         return read_robot(path)
-    derivation = parse_derivation(read_text(light), str(light))
+    derivation = parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
     return compose(derivation, library, path.resolve().name)
 
 

@@ -1,28 +1,29 @@
-"""What a grammar can make: faults, the number of structures, and the structures themselves."""
+"""What is wrong with a grammar, and which values it draws."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from morphgen.errors import CompositionError, GrammarError
 from morphgen.grammar.compose import own_values, require_root
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
-    MAX_PARTS,
-    EndlessError,
-    First,
     argument,
     attached_parameters,
-    derive,
     require_part,
 )
 from morphgen.grammar.library import Library
+from morphgen.grammar.limits import MAX_FAULTS, MAX_PARTS
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.part import load_part
-from morphgen.grammar.syntax import Alternative, Expression, Item, Production
+from morphgen.grammar.structures import SearchError, count, enumerate_structures, typical_names
+from morphgen.grammar.syntax import Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, distribution_of, evaluate, no_draw
 
 CHECKED_STRUCTURES = 500
@@ -53,17 +54,9 @@ def faults(grammar: Grammar, library: Library) -> list[str]:
     return [*found, *_unreached(grammar), *_unused(grammar)]
 
 
-def count(grammar: Grammar) -> float:
-    """Number of structures, values aside; infinite for a grammar that recurs.
-
-    One that can be derived in two ways counts twice.
-    """
-    return _count(grammar, grammar.start, ())
-
-
 def variables(grammar: Grammar) -> list[Variable]:
     """Every value that the grammar draws."""
-    names = _typical_names(grammar)
+    names = typical_names(grammar)
     found = [
         Variable(f"let {let.name}", *_described(call, names))
         for let in grammar.lets
@@ -77,56 +70,6 @@ def variables(grammar: Grammar) -> list[Variable]:
     return found
 
 
-def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivation]:
-    """Every structure once, with typical values; small ones first where there is no end.
-
-    Raises:
-        GrammarError: If a structure cannot be derived.
-    """
-    seen: set[str] = set()
-    endless = math.isinf(count(grammar))
-    for parts in range(1, MAX_PARTS + 1) if endless else (MAX_PARTS,):
-        for derivation in _structures(grammar, library, parts):
-            fits = not endless or sum(1 for _ in derivation.walk()) == parts
-            if fits and derivation.digest not in seen:
-                seen.add(derivation.digest)
-                yield derivation
-
-
-@dataclass
-class _Script(First):
-    """Follows a list of decisions, then takes the first; notes how many options there were."""
-
-    decisions: list[int]
-    options: list[int] = field(default_factory=list)
-
-    def alternative(self, key: str, weights: list[float]) -> int:
-        possible = [i for i, weight in enumerate(weights) if weight > 0]
-        return possible[self._decide(len(possible))]
-
-    def count(self, key: str, low: int, high: int) -> int:
-        return low + self._decide(high - low + 1)
-
-    def _decide(self, options: int) -> int:
-        position = len(self.options)
-        self.options.append(options)
-        return self.decisions[position] if position < len(self.decisions) else 0
-
-
-def _structures(grammar: Grammar, library: Library, max_parts: int) -> Iterator[Derivation]:
-    decisions: list[int] = []
-    while True:
-        script = _Script(decisions)
-        with suppress(EndlessError):  # too many parts; the next structure may have fewer
-            yield derive(grammar, library, script, max_parts)
-        decisions = (decisions + [0] * len(script.options))[: len(script.options)]
-        while decisions and decisions[-1] + 1 >= script.options[len(decisions) - 1]:
-            decisions.pop()
-        if not decisions:
-            return
-        decisions[-1] += 1
-
-
 def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     for draw in (_lowest, _highest, no_draw, _inner):
         names: dict[str, tuple[float, str]] = {}
@@ -138,9 +81,8 @@ def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
             return
         scope = Scope(names, draw, "")
         items = (item for production in grammar.productions for item in _items(production))
-        reported = {
-            fault: None for item in items for fault in _faults_of(item, grammar, library, scope)
-        }
+        found = (fault for item in items for fault in _faults_of(item, grammar, library, scope))
+        reported = dict.fromkeys(islice(found, MAX_FAULTS))
         yield from reported
         if reported:
             return
@@ -170,19 +112,27 @@ def _require_bare(item: Item) -> None:
 def _endless(grammar: Grammar) -> Iterator[str]:
     """Symbols none of whose derivations ends."""
     symbols = {production.symbol for production in grammar.productions}
+    open_symbols: list[tuple[str, set[str]]] = []
+    """(symbol, symbols of one of its alternatives that are not known to end)."""
+    waiting: dict[str, list[int]] = {}
+    fresh: list[str] = []
+    for production in grammar.productions:
+        for alternative in production.alternatives:
+            below = {item.name for item in alternative.items} & symbols
+            for name in below:
+                waiting.setdefault(name, []).append(len(open_symbols))
+            open_symbols.append((production.symbol, below))
+            fresh += [] if below else [production.symbol]
     ending: set[str] = set()
-    while True:
-        more = {
-            production.symbol
-            for production in grammar.productions
-            if any(
-                all(item.name in ending or item.name not in symbols for item in alternative.items)
-                for alternative in production.alternatives
-            )
-        }
-        if more <= ending:
-            break
-        ending |= more
+    while fresh:
+        name = fresh.pop()
+        if name in ending:
+            continue
+        ending.add(name)
+        for number in waiting.get(name, ()):
+            symbol, below = open_symbols[number]
+            below.discard(name)
+            fresh += [] if below else [symbol]
     for production in grammar.productions:
         if production.symbol not in ending:
             yield f"{production.place}: {production.symbol!r} never ends: it always holds itself"
@@ -190,19 +140,22 @@ def _endless(grammar: Grammar) -> Iterator[str]:
 
 def _circular(grammar: Grammar) -> Iterator[str]:
     """Symbols that can be rewritten to themselves and nothing else."""
-    alone = {
-        production.symbol: {
-            alternative.items[0].name
-            for alternative in production.alternatives
-            if len(alternative.items) == 1
-        }
+    number = {production.symbol: i for i, production in enumerate(grammar.productions)}
+    alone = [
+        (number[production.symbol], number[alternative.items[0].name])
         for production in grammar.productions
-    }
-    for production in grammar.productions:
-        below = set(alone[production.symbol])
-        while more := {name for symbol in below for name in alone.get(symbol, ())} - below:
-            below |= more
-        if production.symbol in below:
+        for alternative in production.alternatives
+        if len(alternative.items) == 1 and alternative.items[0].name in number
+    ]
+    graph = coo_matrix(
+        (np.ones(len(alone)), np.array(alone, dtype=int).reshape(-1, 2).T),
+        shape=(len(number), len(number)),
+    )
+    _, component = connected_components(graph, connection="strong")
+    sizes = np.bincount(component)
+    itself = {one for one, other in alone if one == other}
+    for i, production in enumerate(grammar.productions):
+        if sizes[component[i]] > 1 or i in itself:
             yield f"{production.place}: {production.symbol!r} can be rewritten to itself alone"
 
 
@@ -233,46 +186,29 @@ def _unused(grammar: Grammar) -> Iterator[str]:
 
 
 def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
-    structures = enumerate_structures(grammar, library)
+    start = grammar.production(grammar.start)
+    place = start.place if start else grammar.name
+    most = CHECKED_ENDLESS if count(grammar) == math.inf else CHECKED_STRUCTURES
     roots: set[str] = set()
+    derived = False
     try:
-        for _ in range(CHECKED_ENDLESS if math.isinf(count(grammar)) else CHECKED_STRUCTURES):
-            structure = next(structures, None)
-            if structure is None:
-                return
+        for structure in islice(enumerate_structures(grammar, library), most):
+            derived = True
             if structure.part not in roots:
                 roots.add(structure.part)
                 require_root(load_part(library.manifest(structure.part), own_values(structure)))
     except CompositionError as error:
-        start = grammar.production(grammar.start)
-        yield f"{start.place if start else grammar.name}: {error}"
+        yield f"{place}: {error}"
+        return
+    except SearchError as error:
+        if not derived:
+            yield f"{place}: {error}"
+        return  # the structures that were derived are sound
     except GrammarError as error:
         yield str(error)
-
-
-def _count(grammar: Grammar, symbol: str, above: tuple[str, ...]) -> float:
-    production = grammar.production(symbol)
-    if production is None:
-        return 1
-    if symbol in above:
-        return math.inf
-    total: float = 0
-    for alternative in _possible(grammar, production):
-        product: float = 1
-        for item in alternative.items:
-            each = _count(grammar, item.name, (*above, symbol))
-            low, high = item.repetition or (1, 1)
-            product *= sum(each**n for n in range(low, high + 1))
-        total += product
-    return total
-
-
-def _possible(grammar: Grammar, production: Production) -> Iterator[Alternative]:
-    """Alternatives whose weight is not zero where values are typical."""
-    scope = Scope(_typical_names(grammar), no_draw, "")
-    for alternative in production.alternatives:
-        if alternative.weight is None or evaluate(alternative.weight, scope)[0] > 0:
-            yield alternative
+        return
+    if not derived:
+        yield f"{place}: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
 
 
 def _items(production: Production) -> Iterator[Item]:
@@ -290,13 +226,6 @@ def _calls(expression: Expression) -> Iterator[Expression]:
 def _name_set(expression: Expression) -> set[str]:
     below = {name for operand in expression.operands for name in _name_set(operand)}
     return below | ({expression.text} if expression.operator == "name" else set())
-
-
-def _typical_names(grammar: Grammar) -> dict[str, tuple[float, str]]:
-    names: dict[str, tuple[float, str]] = {}
-    for let in grammar.lets:
-        names[let.name] = evaluate(let.expression, Scope(names, no_draw, ""))
-    return names
 
 
 def _described(call: Expression, names: dict[str, tuple[float, str]]) -> tuple[Distribution, str]:

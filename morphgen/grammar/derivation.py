@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from lark import Lark, Token, Transformer, UnexpectedInput, v_args
+from lark import Lark, Token, UnexpectedInput, v_args
+from lark.exceptions import VisitError
+from lark.visitors import Transformer_NonRecursive
 
 from morphgen.errors import GrammarError
 from morphgen.formats.urdf_text import number
+from morphgen.grammar.limits import MAX_DERIVATION_TEXT, MAX_PARTS
 
 _SYNTAX = r"""
 node: NAME "=" NAME ["(" value ("," value)* ")"] ["[" child ("," child)* "]"]
@@ -64,15 +67,23 @@ def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
     """Read a derivation's text.
 
     Raises:
-        GrammarError: At the first place that is none.
+        GrammarError: At the first place that is none; or if it is too long, or of more than
+            ``MAX_PARTS`` parts.
     """
+    if len(text) > MAX_DERIVATION_TEXT:
+        raise GrammarError(
+            f"{origin}: a derivation of {len(text):,} characters; expected at most "
+            f"{MAX_DERIVATION_TEXT:,}"
+        )
     try:
-        derivation: Derivation = _Builder().transform(_parser().parse(text))
+        derivation: Derivation = _Builder(origin).transform(_parser().parse(text))
     except UnexpectedInput as error:
         place = f"{origin}:{max(error.line, 1)}:{max(error.column, 1)}"
         raise GrammarError(
             f"{place}: no derivation, such as base=fixed[top: arm=ur5[flange: ee=stick]]"
         ) from error
+    except VisitError as error:
+        raise error.orig_exc from error
     return derivation
 
 
@@ -120,10 +131,19 @@ def _parser() -> Lark:
 
 
 @v_args(inline=True)
-class _Builder(Transformer[Token, Any]):
-    """Lark's tree to derivations."""
+class _Builder(Transformer_NonRecursive[Token, Any]):
+    """Lark's tree to derivations, however deep."""
+
+    def __init__(self, origin: str) -> None:
+        super().__init__()
+        self._origin, self._parts = origin, 0
 
     def node(self, label: Token, part: Token, *rest: Any) -> Derivation:
+        self._parts += 1
+        if self._parts > MAX_PARTS:
+            raise GrammarError(
+                f"{self._origin}: a derivation of more than {MAX_PARTS} parts, the most of a robot"
+            )
         values = tuple(entry for entry in rest if isinstance(entry[1], float))
         children = tuple(entry for entry in rest if isinstance(entry[1], Derivation))
         return Derivation(str(label), str(part), values, children)

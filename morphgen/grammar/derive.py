@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -12,14 +13,13 @@ from morphgen.errors import GrammarError, PartError, nearest
 from morphgen.formats.urdf_text import number
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
+from morphgen.grammar.limits import MAX_PARTS
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.parameters import MOUNT_YAW, Parameter, require_range
 from morphgen.grammar.syntax import Alternative, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
 
-MAX_PARTS = 100
-"""Parts of one robot beyond which a recursion is taken to be endless; loaders hold fewer."""
 MAIN_PORTS = ("top", "flange", "end")
 """Ports where the next part goes when none is named."""
 
@@ -65,7 +65,8 @@ class Random:
     def alternative(self, key: str, weights: list[float]) -> int:
         """In proportion to the weights."""
         total = np.cumsum(weights)
-        return int(np.searchsorted(total, self._rng.random() * total[-1], side="right"))
+        drawn = int(np.searchsorted(total, self._rng.random() * total[-1], side="right"))
+        return min(drawn, int(np.flatnonzero(weights)[-1]))  # the product may round up to total
 
     def count(self, key: str, low: int, high: int) -> int:
         """Uniformly."""
@@ -131,12 +132,26 @@ class _Node:
         )
 
 
+@dataclass(frozen=True)
+class Known:
+    """What derivations of one grammar with the same values of ``let`` share."""
+
+    weights: dict[str, list[float]] = field(default_factory=dict)
+    """Weights of each symbol's alternatives, as far as they were needed."""
+    fewest: Mapping[str, int] = field(default_factory=dict)
+    """Fewest parts of each symbol; with them a derivation is given up as early as it can be."""
+
+
 class EndlessError(GrammarError):
     """A derivation has more parts than allowed."""
 
 
 def derive(
-    grammar: Grammar, library: Library, chooser: Chooser, max_parts: int = MAX_PARTS
+    grammar: Grammar,
+    library: Library,
+    chooser: Chooser,
+    max_parts: int = MAX_PARTS,
+    known: Known | None = None,
 ) -> Derivation:
     """Rewrite the start symbol until only parts are left.
 
@@ -145,23 +160,32 @@ def derive(
         library: Where its parts are.
         chooser: Decides alternatives, counts and values.
         max_parts: Parts beyond which the derivation is given up.
+        known: What earlier derivations with the same values of ``let`` found out.
 
     Raises:
         GrammarError: If a name is unknown, a port is missing or taken, a value does not fit its
             parameter, or the derivation does not end (``EndlessError``); the message says where in
             the grammar.
     """
-    return _Run(grammar, library, chooser, max_parts).tree().frozen()
+    return _Run(grammar, library, chooser, max_parts, known or Known()).tree().frozen()
 
 
 class _Run:
     """One derivation."""
 
     def __init__(
-        self, grammar: Grammar, library: Library, chooser: Chooser, max_parts: int
+        self,
+        grammar: Grammar,
+        library: Library,
+        chooser: Chooser,
+        max_parts: int,
+        known: Known,
     ) -> None:
         self._grammar, self._library, self._chooser = grammar, library, chooser
         self._max_parts = max_parts
+        self._known = known
+        self._pending = known.fewest.get(grammar.start, 0)
+        """Fewest parts that are still to come."""
         self._labels: set[str] = set()
         self._names: dict[str, tuple[float, str]] = {}
         for let in grammar.lets:
@@ -228,10 +252,28 @@ class _Run:
             return [(prefix + item.name, prefix, key)]
         low, high = item.repetition
         n = low if low == high else self._chooser.count(f"{key}#", low, high)
+        if fewest := self._known.fewest:
+            self._expect((n - low) * fewest.get(item.name, 1), item)
         names = [f"{prefix}{item.name}{i}" for i in range(1, n + 1)]
         return [(name, f"{name}_", f"{key}[{i}]") for i, name in enumerate(names, start=1)]
 
     def _alternative(self, production: Production, key: str) -> Alternative:
+        weights = self._known.weights.get(production.symbol)
+        if weights is None:
+            weights = self._known.weights[production.symbol] = self._weighed(production, key)
+        index = self._chooser.alternative(key, weights) if len(weights) > 1 else 0
+        alternative = production.alternatives[index]
+        if fewest := self._known.fewest:
+            self._expect(fewest_parts(alternative, fewest) - fewest[production.symbol], production)
+        return alternative
+
+    def _expect(self, more: int, where: Item | Production) -> None:
+        """Count parts to come; give up if there will be too many."""
+        self._pending += more
+        if len(self._labels) + self._pending > self._max_parts:
+            raise EndlessError(f"{where.place}: more than {self._max_parts} parts: does it end?")
+
+    def _weighed(self, production: Production, key: str) -> list[float]:
         weights = []
         for alternative in production.alternatives:
             weight = 1.0
@@ -243,11 +285,13 @@ class _Run:
                         f"{alternative.weight.place}: a weight is negative: {weight:g}"
                     )
             weights.append(weight)
+        if not math.isfinite(sum(weights)):
+            raise GrammarError(
+                f"{production.place}: the weights of {production.symbol!r} sum to no finite number"
+            )
         if sum(weights) <= 0:
             raise GrammarError(f"{production.place}: all weights of {production.symbol!r} are zero")
-        if len(weights) == 1:
-            return production.alternatives[0]
-        return production.alternatives[self._chooser.alternative(key, weights)]
+        return weights
 
     def _part(self, item: Item, label: str, key: str) -> _Node:
         manifest = require_part(item, self._grammar, self._library)
@@ -259,6 +303,7 @@ class _Run:
         if values[MOUNT_YAW.name] == 0.0:
             del values[MOUNT_YAW.name]
         node = _Node(self._free(label), item.name, values, tuple(manifest.ports))
+        self._pending -= 1
         if len(self._labels) > self._max_parts:
             raise EndlessError(f"{item.place}: more than {self._max_parts} parts: does it end?")
         return node
@@ -270,6 +315,13 @@ class _Run:
             free = f"{label}_{k}"
         self._labels.add(free)
         return free
+
+
+def fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> int:
+    """The fewest parts of an alternative, given those of each symbol."""
+    return sum(
+        (item.repetition or (1, 1))[0] * fewest.get(item.name, 1) for item in alternative.items
+    )
 
 
 def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:

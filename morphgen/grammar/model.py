@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 
 from morphgen.errors import GrammarError, nearest
 from morphgen.grammar.conditions import require_condition
+from morphgen.grammar.limits import MAX_FILES, MAX_STATEMENTS, MAX_TEXT
 from morphgen.grammar.syntax import (
     Alternative,
     Expression,
@@ -41,7 +43,11 @@ class Grammar:
 
     def production(self, symbol: str) -> Production | None:
         """How a symbol is rewritten; None if the name is a part."""
-        return next((p for p in self.productions if p.symbol == symbol), None)
+        return self._by_symbol.get(symbol)
+
+    @cached_property
+    def _by_symbol(self) -> Mapping[str, Production]:
+        return {production.symbol: production for production in self.productions}
 
 
 def grammar_names() -> list[str]:
@@ -78,9 +84,11 @@ def load_grammar(path: Path, folders: Iterable[Path] = ()) -> Grammar:
     A file may say anew what a symbol or value of an included file is.
 
     Raises:
-        GrammarError: If a file cannot be read or parsed, includes itself, or names a symbol twice.
+        GrammarError: If a file cannot be read or parsed, includes itself or a file outside of its
+            folder and the libraries, names a symbol twice, or is beyond a limit.
     """
-    return _assembled(path.stem, str(path), *_read(path, tuple(folders), ()))
+    reader = _Reader(path, tuple(folders))
+    return _assembled(path.stem, str(path), reader.statements, reader.texts)
 
 
 def grammar_from_text(text: str, name: str) -> Grammar:
@@ -98,14 +106,23 @@ def grammar_from_text(text: str, name: str) -> Grammar:
 
 
 def grammar_text(grammar: Grammar) -> str:
-    """The grammar with its includes as one text, the start symbol first."""
+    """The grammar with its includes as one text, the start symbol first.
+
+    Raises:
+        GrammarError: If the text is so long that it could not be read again.
+    """
     ordered = sorted(grammar.productions, key=lambda p: p.symbol != grammar.start)
     lines = [f"let {let.name} = {let.expression}" for let in grammar.lets]
     for production in ordered:
         alternatives = " | ".join(_alternative_text(a) for a in production.alternatives)
         lines.append(f"{production.symbol} -> {alternatives}")
     lines += [f"where {condition}" for condition in grammar.wheres]
-    return "".join(f"{line}\n" for line in lines)
+    text = "".join(f"{line}\n" for line in lines)
+    if len(text) > MAX_TEXT:
+        raise GrammarError(
+            f"{grammar.name}: {len(text):,} characters as one text; expected at most {MAX_TEXT:,}"
+        )
+    return text
 
 
 def _alternative_text(alternative: Alternative) -> str:
@@ -144,40 +161,69 @@ def _assembled(name: str, origin: str, statements: list[Statement], texts: list[
     )
 
 
-def _read(
-    path: Path, folders: tuple[Path, ...], above: tuple[Path, ...]
-) -> tuple[list[Statement], list[str]]:
-    """Statements of a file after those of its includes, and all texts."""
-    if path.resolve() in (p.resolve() for p in above):
-        chain = " -> ".join(p.name for p in (*above, path))
-        raise GrammarError(f"{above[-1]}: grammars include each other: {chain}")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise GrammarError(f"{path}: cannot be read: {error}") from error
-    statements: list[Statement] = []
-    texts = [text]
-    own: list[Statement] = []
-    for statement in parse_grammar(text, str(path)):
-        if not isinstance(statement, Include):
-            own.append(statement)
-            continue
+class _Reader:
+    """Reads a grammar with its includes, within the limits of all of them together."""
+
+    def __init__(self, path: Path, folders: tuple[Path, ...]) -> None:
+        self._folders = folders
+        self._roots = [folder.resolve() for folder in (path.parent, *folders, _shipped())]
+        self.statements: list[Statement] = []
+        """Those of an include before those of the file that includes it."""
+        self.texts: list[str] = []
+        self._read(path, ())
+        if len(self.statements) > MAX_STATEMENTS:
+            raise GrammarError(
+                f"{path}: {len(self.statements):,} statements with its includes; expected at most "
+                f"{MAX_STATEMENTS:,}"
+            )
+
+    def _read(self, path: Path, above: tuple[Path, ...]) -> None:
+        if path.resolve() in (p.resolve() for p in above):
+            chain = " -> ".join(p.name for p in (*above, path))
+            raise GrammarError(f"{above[-1]}: grammars include each other: {chain}")
+        text = self._text(path)
+        own: list[Statement] = []
+        for statement in parse_grammar(text, str(path)):
+            if isinstance(statement, Include):
+                self._read(self._included(statement, path), (*above, path))
+            else:
+                own.append(statement)
+        _require_unique(own)
+        self.statements += own
+
+    def _text(self, path: Path) -> str:
+        if len(self.texts) == MAX_FILES:
+            raise GrammarError(
+                f"{path}: one file too many: a grammar is read from at most {MAX_FILES}"
+            )
+        room = MAX_TEXT - sum(len(text.encode()) for text in self.texts)
         try:
-            target = _included(statement, path, folders)
-        except GrammarError as error:
-            raise GrammarError(f"{statement.place}: {error}") from error
-        below, more = _read(target, folders, (*above, path))
-        statements += below
-        texts += more
-    _require_unique(own)
-    return [*statements, *own], texts
+            with path.open("rb") as file:
+                content = file.read(room + 1)
+            text = content.decode("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise GrammarError(f"{path}: cannot be read: {error}") from error
+        if len(content) > room:
+            raise GrammarError(
+                f"{path}: {path.stat().st_size:,} bytes; expected at most {MAX_TEXT:,} in a "
+                "grammar with its includes"
+            )
+        self.texts.append(text)
+        return text
 
-
-def _included(statement: Include, path: Path, folders: tuple[Path, ...]) -> Path:
-    beside = path.parent / statement.target
-    if beside.suffix == SUFFIX and beside.is_file():
-        return beside
-    return find_grammar(statement.target, folders)
+    def _included(self, include: Include, path: Path) -> Path:
+        target = path.parent / include.target
+        if target.suffix != SUFFIX or not target.is_file():
+            try:
+                target = find_grammar(include.target, self._folders)
+            except GrammarError as error:
+                raise GrammarError(f"{include.place}: {error}") from error
+        if not any(target.resolve().is_relative_to(root) for root in self._roots):
+            raise GrammarError(
+                f"{include.place}: include {include.target!r} leads outside of {self._roots[0]}; "
+                "an include stays in the folder of its grammar or in a library (--library DIR)"
+            )
+        return target
 
 
 def _require_unique(statements: Iterable[Statement]) -> None:

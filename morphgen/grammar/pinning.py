@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from morphgen.errors import GrammarError, nearest
 from morphgen.grammar.library import Library
+from morphgen.grammar.limits import MAX_WORD
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value
 from morphgen.grammar.syntax import (
@@ -108,7 +109,7 @@ def _with_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
     if production is None:
         valid = [*(p.symbol for p in grammar.productions), *(let.name for let in grammar.lets)]
         raise GrammarError(f"{symbol}={value}: no symbol {symbol!r}{nearest(symbol, valid)}")
-    if value.isdigit():
+    if value.isdecimal() and len(value) <= MAX_WORD:
         pinned = _with_count(production, int(value))
     else:
         kept = tuple(a for a in production.alternatives if a.items[0].name == value)

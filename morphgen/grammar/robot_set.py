@@ -11,6 +11,7 @@ While a run lasts, what is done stands in ``.journal.jsonl``.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -22,11 +23,12 @@ from typing import Any
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.card import rounded
-from morphgen.formats.data_files import parse_json, read_json, read_text
+from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import alone, partial_of, replacing_folder, write_atomic
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.limits import MAX_TEXT
 from morphgen.grammar.model import Grammar, grammar_from_text
 from morphgen.grammar.sampling import Sample, draw
 from morphgen.grammar.syntax import parse_condition
@@ -37,8 +39,6 @@ SETTINGS = "set.json"
 GRAMMAR = "grammar.grammar"
 DERIVATION = "derivation.txt"
 JOURNAL = ".journal.jsonl"
-_LARGEST_INDEX = 2**30
-"""Bytes of the largest index that is read at once; a robot takes about one kilobyte."""
 
 Record = dict[str, Any]
 """A line of the index."""
@@ -152,17 +152,53 @@ def read_index(folder: Path) -> list[Record]:
     """The index of a set.
 
     Raises:
-        FormatError: If the folder is no finished set.
+        FormatError: If the folder is no finished set, or a line of the index is none.
     """
     path = folder / INDEX
     if not path.is_file():
         raise FormatError(f"{folder} is no finished set: it has no {INDEX}")
-    lines = read_text(path, _LARGEST_INDEX).splitlines()
-    records = [parse_json(line, f"{path}:{number}") for number, line in enumerate(lines, 1)]
-    for number, record in enumerate(records, 1):
-        if not isinstance(record, dict) or not isinstance(record.get("name"), str):
-            raise FormatError(f"{path}:{number}: expected an object with a name")
+    records = []
+    with path.open("rb") as lines:
+        for i, line in enumerate(lines, 1):
+            record = _record_in(line)
+            if record is None:
+                raise FormatError(f"{path}:{i}: not a line of an index of morphgen sample")
+            records.append(record)
     return records
+
+
+def read_settings(folder: Path) -> Record:
+    """What a set was made with: its ``set.json``.
+
+    Raises:
+        FormatError: If it is missing or invalid.
+    """
+    path = folder / SETTINGS
+    try:
+        settings = read_json(path)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
+    if not isinstance(settings, dict) or not isinstance(settings.get("grammar"), str):
+        raise FormatError(f"{path}: expected the settings of a set, with the name of its grammar")
+    return settings
+
+
+def _record_in(line: bytes) -> Record | None:
+    """The record of a line; None if the line is cut short or is no record."""
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    kinds = {"index": int, "name": str, "hash": str, "rejected": dict, "choices": dict}
+    if not isinstance(record, dict) or any(
+        not isinstance(record.get(key), kind) for key, kind in kinds.items()
+    ):
+        return None
+    numbers = (*record["rejected"].values(), *record["choices"].values())
+    if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
+        return None
+    leads_out = record["name"] in ("", ".", "..") or set(record["name"]) & {"/", "\0"}
+    return None if leads_out else record
 
 
 def _record(drawn: Sample) -> Record:
@@ -208,25 +244,15 @@ def _prepare(plan: SetPlan) -> None:
         except OSError as error:
             raise FormatError(f"cannot write to {plan.folder}: {error.strerror}") from error
         return
-    found = read_json(path)
-    if not isinstance(found, dict):
-        raise FormatError(f"{path}: expected an object, not {type(found).__name__}")
+    found = read_settings(plan.folder)
     for key, value in wanted.items():
         if found.get(key) != value:
             raise FormatError(
                 f"{plan.folder} holds another set: its {key} is {found.get(key)!r}, not {value!r}; "
                 "name another folder"
             )
-    if (plan.folder / GRAMMAR).read_text(encoding="utf-8") != plan.grammar_text:
+    if read_text(plan.folder / GRAMMAR, MAX_TEXT) != plan.grammar_text:
         raise FormatError(f"{plan.folder} holds a set of another grammar; name another folder")
-
-
-def _is_record(record: object) -> bool:
-    return (
-        isinstance(record, dict)
-        and isinstance(record.get("name"), str)
-        and isinstance(record.get("index"), int)
-    )
 
 
 def _is_barely_begun(plan: SetPlan) -> bool:
@@ -251,11 +277,8 @@ def _finished(plan: SetPlan) -> dict[int, tuple[Path, int]]:
         offset = 0
         with path.open("rb") as lines:
             for line in lines:
-                try:
-                    record = json.loads(line)
-                except (RecursionError, ValueError):
-                    record = None
-                if _is_record(record) and (plan.folder / record["name"] / URDF).is_file():
+                record = _record_in(line)
+                if record and (plan.folder / record["name"] / URDF).is_file():
                     places[record["index"]] = (path, offset)
                 offset += len(line)
     for leftover in plan.folder.glob(".*.*"):

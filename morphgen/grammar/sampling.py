@@ -14,8 +14,9 @@ from morphgen.formats.card import rounded
 from morphgen.grammar.compose import TOUCH, join, survey_of
 from morphgen.grammar.conditions import Properties, clauses, holds
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import MAX_PARTS, EndlessError, Random, Recorded, derive
+from morphgen.grammar.derive import EndlessError, Random, Recorded, derive
 from morphgen.grammar.library import Library
+from morphgen.grammar.limits import MAX_PARTS
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.syntax import Expression
 from morphgen.model.findings import Finding

@@ -1,91 +1,24 @@
-"""The notation: ``*.grammar`` text to a syntax tree, with errors by line and column."""
+"""The syntax tree of a ``*.grammar`` text, with errors by line and column."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
 from typing import Any
 
-from lark import Lark, Token, Transformer, UnexpectedInput, v_args
+from lark import Token, v_args
 from lark.exceptions import VisitError
+from lark.visitors import Transformer_NonRecursive
 
 from morphgen.errors import GrammarError, nearest
-
-_SYNTAX = r"""
-grammar: _END? [statement (_END statement)*]
-?statement: include | let | where | production
-include: "include" (STRING | NAME)
-let: "let" NAME "=" sum
-where: "where" or_
-production: NAME _ARROW alternative ("|" alternative)*
-alternative: weight? item+
-weight: _WEIGHT "(" sum ")"
-item: [NAME ":"] NAME ["(" [argument ("," argument)*] ")"] [repetition]
-argument: NAME "=" sum
-repetition: "{" INT ["," INT] "}"
-
-?or_: and_ ("or" and_)*
-?and_: not_ ("and" not_)*
-?not_: "not" not_ -> negation
-     | comparison
-?comparison: sum (COMPARATOR sum)*
-
-?sum: product (SIGN product)*
-?product: signed (FACTOR signed)*
-?signed: SIGN signed -> unary
-       | atom
-?atom: QUANTITY -> quantity
-     | INT -> quantity
-     | NAME "(" [sum ("," sum)*] ")" -> call
-     | NAME -> name
-     | "(" or_ ")"
-
-_ARROW: "->"
-_WEIGHT: "@weight"
-COMPARATOR: "<=" | ">=" | "==" | "!=" | "<" | ">"
-SIGN: "+" | "-"
-FACTOR: "*" | "/"
-INT: /\d+(?![\w.])/
-QUANTITY: /(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?[a-zA-Z]*/
-NAME: /(?!(include|let|where|and|or|not)\b)[A-Za-z_]\w*/
-STRING: /"[^"\n]*"/
-_END: /\n+(?=[^ \t\r\n|#])/
-_CONTINUED: /\n(?=[ \t\r\n|#]|\Z)/
-_COMMENT: /#[^\n]*/
-_SPACE: /[ \t\r]+/
-%ignore _CONTINUED
-%ignore _COMMENT
-%ignore _SPACE
-"""
-
-_WORDS = {
-    "$END": "the end",
-    "_END": "a new line",
-    "NAME": "a name",
-    "INT": "a whole number",
-    "QUANTITY": "a number",
-    "STRING": 'a "path"',
-    "SIGN": "'+' or '-'",
-    "FACTOR": "'*' or '/'",
-    "COMPARATOR": "a comparison such as '<'",
-    "LPAR": "'('",
-    "RPAR": "')'",
-    "LBRACE": "'{'",
-    "RBRACE": "'}'",
-    "VBAR": "'|'",
-    "EQUAL": "'='",
-    "COLON": "':'",
-    "COMMA": "','",
-    "AND": "'and'",
-    "OR": "'or'",
-    "NOT": "'not'",
-    "INCLUDE": "'include'",
-    "LET": "'let'",
-    "WHERE": "'where'",
-    "_WEIGHT": "'@weight'",
-    "_ARROW": "'->'",
-}
+from morphgen.grammar.limits import (
+    MAX_ALTERNATIVES,
+    MAX_NESTING,
+    MAX_PARTS,
+    MAX_STATEMENTS,
+    MAX_WORD,
+)
+from morphgen.grammar.notation import parse_tree
 
 
 @dataclass(frozen=True)
@@ -113,6 +46,22 @@ class Expression:
     """The name, the function's name, or the unit of a number."""
     value: float = 0.0
     """Of a number, as written: not in SI yet."""
+    levels: int = field(init=False, repr=False, compare=False)
+    """Levels of the expression: 1 without operands. Functions that recurse rely on its limit."""
+
+    def __post_init__(self) -> None:
+        """Count the levels.
+
+        Raises:
+            GrammarError: If there are more than ``MAX_NESTING``.
+        """
+        levels = 1 + max((operand.levels for operand in self.operands), default=0)
+        if levels > MAX_NESTING:
+            raise GrammarError(
+                f"{self.place}: an expression of more than {MAX_NESTING} levels; expected at most "
+                f"{MAX_NESTING}"
+            )
+        object.__setattr__(self, "levels", levels)
 
     def __str__(self) -> str:
         match self.operator:
@@ -210,42 +159,16 @@ def parse_condition(text: str, origin: str = "--where") -> Expression:
 
 
 def _parsed(text: str, origin: str, start: str) -> Any:
-    try:
-        tree = _parser().parse(text.replace("\r\n", "\n"), start=start)
-    except UnexpectedInput as error:
-        raise GrammarError(_explained(error, text, origin)) from error
+    tree = parse_tree(text, origin, start)
     try:
         return _Builder(origin).transform(tree)
     except VisitError as error:
         raise error.orig_exc from error
 
 
-@lru_cache(maxsize=1)
-def _parser() -> Lark:
-    return Lark(_SYNTAX, parser="lalr", start=["grammar", "or_"], maybe_placeholders=True)
-
-
-def _explained(error: UnexpectedInput, text: str, origin: str) -> str:
-    line, column, token = error.line, error.column, getattr(error, "token", None)
-    ended = token is not None and token.type == "$END"
-    if ended:
-        lines = text.rstrip().split("\n")
-        line, column = len(lines), len(lines[-1]) + 1
-    names = getattr(error, "accepts", None) or getattr(error, "expected", None)
-    names = names or getattr(error, "allowed", None) or ()
-    expected = sorted({_WORDS.get(name, name) for name in names})
-    if ended:
-        found = "the end"
-    elif token is not None:
-        found = "the end of the line" if token.type == "_END" else repr(str(token))
-    else:
-        found = repr(text.splitlines()[line - 1][column - 1 : column])
-    return f"{origin}:{line}:{column}: found {found}, expected {' or '.join(expected)}"
-
-
 @v_args(inline=True)
-class _Builder(Transformer[Token, Any]):
-    """Lark's tree to ours."""
+class _Builder(Transformer_NonRecursive[Token, Any]):
+    """Lark's tree to ours, however deep."""
 
     def __init__(self, origin: str) -> None:
         super().__init__()
@@ -254,8 +177,24 @@ class _Builder(Transformer[Token, Any]):
     def _place(self, token: Token) -> Place:
         return Place(self._origin, token.line or 1, token.column or 1)
 
-    def grammar(self, *statements: Statement | None) -> list[Statement]:
-        return [statement for statement in statements if statement is not None]
+    def _word(self, token: Token) -> Token:
+        if len(token) > MAX_WORD:
+            raise GrammarError(
+                f"{self._place(token)}: a word of {len(token):,} characters; expected at most "
+                f"{MAX_WORD}"
+            )
+        return token
+
+    NAME = INT = QUANTITY = _word
+
+    def grammar(self, *given: Statement | None) -> list[Statement]:
+        statements = [statement for statement in given if statement is not None]
+        if len(statements) > MAX_STATEMENTS:
+            raise GrammarError(
+                f"{self._origin}: {len(statements):,} statements; expected at most "
+                f"{MAX_STATEMENTS:,}"
+            )
+        return statements
 
     def include(self, target: Token) -> Include:
         return Include(str(target).strip('"'), self._place(target))
@@ -267,7 +206,13 @@ class _Builder(Transformer[Token, Any]):
         return Where(condition)
 
     def production(self, symbol: Token, *alternatives: Alternative) -> Production:
-        return Production(str(symbol), alternatives, self._place(symbol))
+        place = self._place(symbol)
+        if len(alternatives) > MAX_ALTERNATIVES:
+            raise GrammarError(
+                f"{place}: {len(alternatives):,} alternatives of {str(symbol)!r}; expected at most "
+                f"{MAX_ALTERNATIVES:,}"
+            )
+        return Production(str(symbol), alternatives, place)
 
     def weight(self, expression: Expression) -> Expression:
         return expression
@@ -285,6 +230,11 @@ class _Builder(Transformer[Token, Any]):
         if not 0 < counts[0] <= counts[1]:
             raise GrammarError(
                 f"{self._place(low)}: repetition {{{counts[0]},{counts[1]}}} needs 1 <= m <= n"
+            )
+        if counts[1] > MAX_PARTS:
+            raise GrammarError(
+                f"{self._place(low)}: repetition {{{counts[0]},{counts[1]}}}: expected at most "
+                f"{MAX_PARTS}, the most parts of a robot"
             )
         return counts
 

@@ -219,6 +219,8 @@ def _require_arguments(distribution: Distribution, expression: Expression) -> No
     ordered = given[-2] <= given[-1] if wanted is not None else True
     if not ordered:
         raise GrammarError(f"{place}: {expression}: low is above high in {signature}")
+    if not math.isfinite(high - low) or (low > 0 and not math.isfinite(high / low)):
+        raise GrammarError(f"{place}: {expression}: {low:g} and {high:g} are too far apart")
     if distribution.kind == "loguniform" and low <= 0:
         raise GrammarError(f"{place}: {expression}: low must be above zero")
     if distribution.kind == "normal" and given[1] < 0:

@@ -192,10 +192,28 @@ def test_grammar_count_says_how_many_and_what_is_drawn(run, mine):
     )
     assert json.loads(run("grammar", "count", mine, "--json")[1]) == {
         "structures": 2,
+        "finite": True,
         "variables": [
             {"where": "ee: plane.size", "draw": "uniform(5cm, 15cm)", "continuous": True}
         ],
     }
+
+
+def test_a_huge_number_of_structures_is_counted_at_once(run, mine):
+    mine.write_text(
+        "robot -> slides a0\n"
+        + "".join(f"a{i} -> a{i + 1} a{i + 1}\n" for i in range(64))
+        + "a64 -> bead | beam\n"
+    )
+    line = "mine: more than 10^100 structures, 0 values drawn"
+    assert run("grammar", "count", mine)[1].splitlines() == [line]
+    found = json.loads(run("grammar", "count", mine, "--json")[1])
+    assert (found["structures"], found["finite"]) == (None, True)
+
+
+def test_a_negative_limit_is_refused(run, mine):
+    code, _, err = run("grammar", "enumerate", mine, "--limit", -1)
+    assert (code, err) == (2, "morphgen: --limit -1: expected 0 or more\n")
 
 
 def test_grammar_count_of_a_recursion(run, mine):

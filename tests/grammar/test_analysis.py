@@ -8,8 +8,9 @@ import pytest
 
 from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.analysis import count, enumerate_structures, faults, variables
+from morphgen.grammar.analysis import faults, variables
 from morphgen.grammar.derive import Random, derive
+from morphgen.grammar.structures import count, enumerate_structures
 
 
 def structures(found, limit=None):

@@ -7,7 +7,8 @@ import pytest
 
 from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.derive import MAX_PARTS, EndlessError, First, Random, Recorded, derive
+from morphgen.grammar.derive import EndlessError, First, Random, Recorded, derive
+from morphgen.grammar.limits import MAX_PARTS
 
 
 def first(*lines):

@@ -12,10 +12,11 @@ from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar import sampling
-from morphgen.grammar.analysis import count, faults
+from morphgen.grammar.analysis import faults
 from morphgen.grammar.derive import Random, derive
 from morphgen.grammar.model import grammar_from_text, grammar_text
 from morphgen.grammar.sampling import SamplingError, draw, robot_name, sample
+from morphgen.grammar.structures import count
 from morphgen.grammar.syntax import parse_condition
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from commands import tree
+from learners import learner
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.rl.recorders import (
     METRICS,
@@ -129,12 +130,14 @@ def test_a_broken_config_is_refused(tmp_path, text):
 
 def test_a_checkpoint_tells_its_run(tmp_path):
     config = small_config(robot_source("planar-cube", "push", obstacles=True))
-    write_checkpoint(tmp_path, config, {"update": 3, "weight": torch.ones(2)})
+    write_checkpoint(
+        tmp_path, config, {**learner().checkpoint(), "update": 3, "weight": torch.ones(2)}
+    )
     for path in (tmp_path, tmp_path / CHECKPOINT):
-        run, learner = read_checkpoint(path)
+        run, found = read_checkpoint(path)
         assert run == config
-        assert learner["update"] == 3
-        assert learner["weight"].equal(torch.ones(2))
+        assert found["update"] == 3
+        assert found["weight"].equal(torch.ones(2))
     assert list(tree(tmp_path)) == [CHECKPOINT]
 
 
@@ -146,6 +149,7 @@ def test_a_run_of_another_format_is_refused(tmp_path):
     with pytest.raises(TaskError, match=r"config.json has format 1, and this morphgen reads 2"):
         read_config(tmp_path)
     data = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    del data["sha256"]
     torch.save({**data, "format": 1}, tmp_path / CHECKPOINT)
     with pytest.raises(TaskError, match=r"checkpoint.pt has format 1"):
         read_checkpoint(tmp_path)

@@ -266,11 +266,11 @@ def test_two_runs_do_not_write_to_one_folder(tmp_path):
 
 
 def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(tmp_path):
-    train(tmp_path / "run", small_config(transitions=64), way=QUIET)
     config = small_config(transitions=64)
-    run, learner = read_checkpoint(tmp_path / "run")
-    learner["layout"]["links"] = 30
-    write_checkpoint(tmp_path / "run", run, learner | {"update": 1})
+    train(tmp_path / "wide", replace(config, max_links=30), way=QUIET)
+    train(tmp_path / "run", config, way=QUIET)
+    _, learner = read_checkpoint(tmp_path / "wide")
+    write_checkpoint(tmp_path / "run", config, learner | {"update": 1})
     with pytest.raises(TaskError, match="other observations: links 30, here 23"):
         train(tmp_path / "run", config, resume=True, way=QUIET)
 

@@ -1,0 +1,219 @@
+"""Hostile grammars are refused in one line or answered soon, within bounds of time and memory."""
+
+import itertools
+import math
+import time
+
+import pytest
+
+from grammars import LIBRARY, grammar
+from morphgen.errors import GrammarError
+from morphgen.grammar.analysis import faults
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.derive import First, Random, derive
+from morphgen.grammar.limits import MAX_COUNT, MAX_NESTING, MAX_PARTS
+from morphgen.grammar.model import grammar_text, load_grammar
+from morphgen.grammar.structures import SearchError, count, enumerate_structures
+from morphgen.grammar.syntax import parse_condition
+
+SOON = 10.0
+"""CPU seconds."""
+DOUBLING = [f"a{i} -> a{i + 1} a{i + 1}" for i in range(64)]
+
+
+@pytest.fixture(autouse=True)
+def soon():
+    began = time.process_time()
+    yield
+    assert time.process_time() - began < SOON
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["robot -> post bead{1,1000000000} jaw"], r"g:1:20: repetition \{1,1000000000\}: expec"),
+        (["robot -> post bead{1," + "9" * 6000 + "}"], "g:1:22: a word of 6,000 characters; exp"),
+        (["robot -> " + "a" * 101], "g:1:10: a word of 101 characters; expected at most 100"),
+        (["let x = 1e" + "9" * 200, "robot -> cubes"], "g:1:9: a word of 202 characters"),
+        (["robot -> cubes", "where " + "not " * 5000 + "mass < 4"], "more than 100 levels"),
+        (["let x = " + "+".join(["1"] * 5000), "robot -> cubes"], "more than 100 levels"),
+        (["let x = " + "-" * 5000 + "1", "robot -> cubes"], "more than 100 levels"),
+        (["let x = " + "choice(" * 500 + "1" + ")" * 500, "robot -> cubes"], "than 100 levels"),
+        (["robot -> cubes", "where " + "(mass<4 or (mass<5 and " * 900 + "mass<4" + "))" * 900],
+         "more than 100 levels"),
+        (["robot -> " + "|".join(["cubes"] * 1001)], "g:1:1: 1,001 alternatives of 'robot'"),
+        (["robot -> cubes"] + [f"a{i} -> cubes" for i in range(1000)], "g: 1,001 statements"),
+        (["robot -> cubes", "#" * 70_000], "g: a text of 70,016 characters; expected at most 65"),
+    ],
+)  # fmt: skip
+def test_what_is_beyond_a_limit_is_refused_with_the_limit(lines, message):
+    with pytest.raises(GrammarError, match=message) as refused:
+        grammar(*lines)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 300
+
+
+def test_what_is_within_the_limits_is_read():
+    x = "+".join(["1"] * MAX_NESTING)
+    found = grammar(f"let x = {x}", "robot -> " + "|".join(["@weight(x) cubes"] * 1000))
+    assert count(found) == 1000
+    assert faults(found, LIBRARY) == []
+    brackets = "(" * 20_000
+    assert count(grammar(f"let x = {brackets}1{brackets.replace('(', ')')}", "robot -> cubes")) == 1
+
+
+def test_blank_lines_take_linear_time():
+    assert count(grammar("robot -> cubes", "\n" * 60_000, " | cartpole")) == 2
+
+
+def test_conditions_have_the_same_limits():
+    with pytest.raises(GrammarError, match=r"--where:1:.*more than 100 levels"):
+        parse_condition("not " * 200 + "mass < 4")
+
+
+@pytest.mark.parametrize(
+    ("lines", "number"),
+    [
+        (["robot -> slides a0", *DOUBLING, "a64 -> bead"], 1),
+        (["robot -> slides a0", *DOUBLING, "a64 -> bead | beam"], MAX_COUNT + 1),
+        (["robot -> slides a{100}", "a -> " + "|".join(["bead"] * 10)], 10**100),
+        (["robot -> slides a{1,100}", "a -> " + "|".join(["bead"] * 10)], MAX_COUNT + 1),
+        (["robot -> a0"] + [f"a{i} -> a{i + 1}" for i in range(990)] + ["a990 -> cubes"], 1),
+        (["robot -> slides " + "a " * 10_000, "a -> bead | beam"], MAX_COUNT + 1),
+    ],
+)
+def test_huge_numbers_of_structures_are_counted_at_once(lines, number):
+    found = count(grammar(*lines))
+    assert found == number
+    assert found != math.inf
+
+
+@pytest.mark.parametrize("last", ["a64 -> bead", "a64 -> bead | beam"])
+def test_a_grammar_of_too_large_robots_alone_is_faulty(last):
+    found = grammar("robot -> slides a0", *DOUBLING, last)
+    assert faults(found, LIBRARY) == [
+        f"g:1:1: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
+    ]
+    assert list(enumerate_structures(found, LIBRARY)) == []
+
+
+def test_alternatives_that_lead_to_too_large_robots_are_left_out_of_the_list():
+    found = grammar("robot -> slides a0 | slides cube", *DOUBLING, "a64 -> bead | beam")
+    (only,) = enumerate_structures(found, LIBRARY)
+    assert [node.part for node in only.walk()] == ["slides", "cube"]
+    assert faults(found, LIBRARY) == []
+
+
+def test_an_endless_grammar_of_many_alternatives_is_listed_from_its_smallest():
+    many = "|".join(["bead", "beam"] * 400)
+    found = grammar("robot -> slides a", "a -> b a | a a bead | bead", f"b -> {many}")
+    listed = itertools.islice(enumerate_structures(found, LIBRARY), 3)
+    assert [sum(1 for _ in each.walk()) for each in listed] == [2, 3, 3]
+    assert faults(found, LIBRARY) == []
+
+
+def test_a_search_for_another_structure_is_given_up():
+    found = grammar("robot -> slides a{1,20}", "a -> " + "|".join(["bead"] * 200))
+    listed = enumerate_structures(found, LIBRARY)
+    next(listed)
+    with pytest.raises(SearchError, match="g: no new structure in the last 20,0"):
+        list(listed)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("let x = 1e400", "is not finite"),
+        ("let x = 1e308 * 10", "is not finite"),
+        ("let x = randint(-1e308, 1e308)", "too far apart"),
+        ("let x = uniform(-1e308, 1e308)", "too far apart"),
+        ("let x = loguniform(1e-300, 1e300)", "too far apart"),
+        ("let x = nan", "unknown value 'nan'"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_faults(line, message):
+    (fault,) = faults(grammar(line, "robot -> @weight(x) cubes"), LIBRARY)
+    assert fault.startswith("g:1:")
+    assert message in fault
+
+
+def test_weights_that_sum_to_no_finite_number_are_refused():
+    found = grammar("robot -> @weight(1e308) cubes | @weight(1e308) cartpole")
+    with pytest.raises(GrammarError, match="g:1:1: the weights of 'robot' sum to no finite number"):
+        derive(found, LIBRARY, First())
+
+
+def test_the_smallest_weight_draws_its_own_alternative():
+    class Last:
+        def random(self):
+            return 1 - 2**-53
+
+    found = grammar("robot -> @weight(5e-324) cubes | @weight(0) cartpole")
+    assert derive(found, LIBRARY, Random(Last())).part == "cubes"
+
+
+def test_many_faults_are_reported_as_the_first_of_them():
+    found = faults(grammar("robot -> fixed " + " ".join(f"u{i}" for i in range(9000))), LIBRARY)
+    assert len(found) == 20
+
+
+def test_a_text_that_could_not_be_read_again_is_not_printed():
+    found = grammar("robot -> cubes", "where " + "<".join(["mass"] * 12_000))
+    with pytest.raises(GrammarError, match="216,001 characters as one text; expected at most"):
+        grammar_text(found)
+
+
+@pytest.mark.parametrize("target", ["/etc/passwd", "../outside.grammar", "link.grammar"])
+def test_an_include_does_not_leave_the_folder_of_its_grammar(tmp_path, target):
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    (tmp_path / "outside.grammar").write_text("secret -> cubes\n")
+    (inside / "link.grammar").symlink_to(tmp_path / "outside.grammar")
+    mine = inside / "mine.grammar"
+    mine.write_text(f'include "{target}"\nrobot -> cubes\n')
+    with pytest.raises(
+        GrammarError, match=r"mine.grammar:1:9: include '.*' leads outside of"
+    ) as no:
+        load_grammar(mine)
+    assert "secret" not in str(no.value)
+    if target.endswith(".grammar"):  # the folder around it as a library
+        assert load_grammar(mine, [tmp_path]).start == "robot"
+
+
+def test_includes_that_double_are_refused(tmp_path):
+    for i in range(24):
+        include = f'include "f{i + 1}.grammar"\n'
+        (tmp_path / f"f{i}.grammar").write_text(include + include + f"r{i} -> cubes\n")
+    (tmp_path / "f24.grammar").write_text("r24 -> cubes\n")
+    with pytest.raises(GrammarError, match="a grammar is read from at most 100"):
+        load_grammar(tmp_path / "f0.grammar")
+
+
+def test_a_long_chain_of_includes_is_refused(tmp_path):
+    for i in range(1200):
+        (tmp_path / f"f{i}.grammar").write_text(f'include "f{i + 1}.grammar"\n')
+    with pytest.raises(GrammarError, match="a grammar is read from at most 100"):
+        load_grammar(tmp_path / "f0.grammar")
+
+
+def test_a_large_file_and_a_binary_one_are_refused(tmp_path):
+    (tmp_path / "big.grammar").write_text("robot -> cubes\n" + "#" * 10_000_000)
+    with pytest.raises(GrammarError, match=r"big.grammar: 10,000,015 bytes; expected at most 65,5"):
+        load_grammar(tmp_path / "big.grammar")
+    (tmp_path / "binary.grammar").write_bytes(bytes(range(256)))
+    with pytest.raises(GrammarError, match=r"binary.grammar: cannot be read: 'utf-8' codec"):
+        load_grammar(tmp_path / "binary.grammar")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a=b[c:" * 20_000 + "a=b" + "]" * 20_000, "^d: a derivation of more than 100 parts"),
+        ("a=b[" + ",".join(["c:a=b"] * 20_000) + "]", "^d: a derivation of more than 100 parts"),
+        ("a=b[c:" * 300_000, "^d: a derivation of 1,800,000 characters; expected at most 262,144"),
+        ("a=b[" * 20_000, "^d:1:6: no derivation"),
+    ],
+)
+def test_a_derivation_beyond_the_limits_is_refused(text, message):
+    with pytest.raises(GrammarError, match=message):
+        parse_derivation(text, "d")
