@@ -1,13 +1,19 @@
-"""Draw the README's picture: python docs/pictures.py."""
+"""Draw the pictures of robots: python docs/pictures.py [robots|panda_variations]."""
 
 from __future__ import annotations
 
+import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from PIL import Image
 
 import morphgen
+from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split_file import read_split
+from morphgen.grammar.library import default_library
+from morphgen.model.robot import Robot
 
 REQUESTS = (
     "arm=ur5 ee=plane",
@@ -21,17 +27,39 @@ COLUMNS = 3
 TILE = (480, 360)
 
 
+def robots() -> list[Robot]:
+    """The README's robots."""
+    return [morphgen.compose(request) for request in REQUESTS]
+
+
+def panda_variations() -> list[Robot]:
+    """Six of the train robots of interpolation/panda."""
+    library = default_library()
+    members = read_split("interpolation/panda/reach").train[:6]
+    return [member_robot(member, library) for member in members]
+
+
+SHEETS: tuple[Callable[[], list[Robot]], ...] = (robots, panda_variations)
+
+
 def main() -> None:
-    """Compose every request and paste the previews into one picture."""
-    rows = -(-len(REQUESTS) // COLUMNS)
-    sheet = Image.new("RGB", (COLUMNS * TILE[0], rows * TILE[1]), "white")
+    """Paste the previews of every sheet's robots into one picture."""
+    asked = sys.argv[1:]
+    for sheet in SHEETS:
+        if not asked or sheet.__name__ in asked:
+            draw(sheet(), Path(__file__).parent / "images" / f"{sheet.__name__}.png")
+
+
+def draw(shown: list[Robot], target: Path) -> None:
+    """Write robots beside each other into a picture."""
+    rows = -(-len(shown) // COLUMNS)
+    picture = Image.new("RGB", (COLUMNS * TILE[0], rows * TILE[1]), "white")
     with tempfile.TemporaryDirectory() as scratch:
-        for i, request in enumerate(REQUESTS):
-            folder = morphgen.write(morphgen.compose(request), scratch)
+        for i, robot in enumerate(shown):
+            folder = morphgen.write(robot, scratch)
             tile = Image.open(folder / "preview.png").resize(TILE, Image.Resampling.LANCZOS)
-            sheet.paste(tile, (i % COLUMNS * TILE[0], i // COLUMNS * TILE[1]))
-    target = Path(__file__).parent / "images" / "robots.png"
-    sheet.quantize(256).save(target, optimize=True)
+            picture.paste(tile, (i % COLUMNS * TILE[0], i // COLUMNS * TILE[1]))
+    picture.quantize(256).save(target, optimize=True)
     print(target)
 
 

@@ -57,6 +57,10 @@ MANIFEST = {
     "home": {"left_slide": 0.01, "wheel": 0.5},
     "density": 1000,
     "parameters": {"length": {"default": 0.2, "min": 0.1, "max": 0.5, "unit": "m"}},
+    "accepted": {
+        name: {"links-apart": "drawn without what holds it to the palm"}
+        for name in ("left", "right", "disc")
+    },
     "licence": "MIT",
 }
 

@@ -23,7 +23,7 @@ from morphgen.model.geometry import (
     Sphere,
     dimensions,
 )
-from morphgen.model.inertia import bounding_box, solid_mesh
+from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
@@ -74,7 +74,7 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
                 "warning",
                 f"links {robot.links[above].name}, {link.name}",
                 f"at home {1000 * gap:.3g} mm of air are between what one sees of them",
-                "correct the origin of the joint between them or of their meshes, or a mesh's scale",
+                "correct the origin of the joint between them or of a mesh, or a mesh's scale",
             )
 
 

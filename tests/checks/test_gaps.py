@@ -1,6 +1,7 @@
 """Links that nothing visible joins to their parent are named; those that touch are not."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def pair(parent, child, T_parent_child=Pose(), between=()):  # noqa: B008
     )
     joints = tuple(
         Joint(name, "fixed", above, name, T_parent_child if name == "child" else Pose())
-        for above, name in zip(names, names[1:], strict=False)
+        for above, name in pairwise(names)
     )
     return Robot("pair", links, joints)
 
