@@ -150,7 +150,7 @@ def read_config(folder: Path) -> RunConfig:
         return config_from(data)
     except OSError as error:
         raise TaskError(f"{folder} is no run's folder: it has no {CONFIG}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TaskError(f"{path} is not the config of a run: {error}") from error
 
 
