@@ -23,6 +23,7 @@ import contextlib
 import io
 import multiprocessing
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -40,7 +41,6 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.checks.conformance import conformance
-from morphgen.cli import main as morphgen
 
 PACKAGES = {
     "pybullet": "pybullet_data",
@@ -134,7 +134,7 @@ def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool
     words = ["import", str(path), "--root", str(root), "--no-picture", "--out", str(out)]
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
-            code = morphgen([*words, "--name", "robot"])
+            code = _morphgen([*words, "--name", "robot"])
         if code == 2:
             is_fragment = path.suffix == ".xacro" and _is_fragment(path)
             reason = errors.getvalue().strip().removeprefix("morphgen: ").replace(f"{root}/", "")
@@ -145,6 +145,16 @@ def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool
         answer.send(("wrong", "; ".join(bad)) if bad else ("imported", ""))
     except BaseException:
         answer.send(("CRASHED", traceback.format_exc().strip().splitlines()[-1]))
+
+
+def _morphgen(words: list[str]) -> int:
+    """Run a command as ``python -m morphgen.cli`` does; return its exit code."""
+    sys.argv[1:] = words
+    try:
+        runpy.run_module("morphgen.cli", run_name="__main__")
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
 
 
 def _is_accepted(path: Path) -> bool | None:

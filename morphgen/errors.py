@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Iterable, Mapping
 
 _LISTED = 24
+_LONGEST = 200
+"""Characters of the longest name that is compared with others, which takes their square."""
 
 
 class MorphgenError(Exception):
@@ -77,6 +79,15 @@ class MissingDependencyError(MorphgenError):
     """An optional package that the command needs is not installed."""
 
 
+def one_line(text: str) -> str:
+    """Return text as one line of a terminal: white space made single, what cannot be shown escaped.
+
+    A name from a file can hold line breaks, or characters that move a terminal's cursor.
+    """
+    words = " ".join(text.split())
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return a hint for an unknown name: the closest valid one and the list, if not too long.
 
@@ -88,6 +99,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
         Text to append to an error, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
     """
     choices = sorted(valid)
+    if len(name) > _LONGEST:
+        return f"; {len(choices)} are valid"
     close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
     if len(choices) > _LISTED:

@@ -147,7 +147,7 @@ def read_config(folder: Path) -> RunConfig:
         _require_format(path, data)
     except OSError as error:
         raise TaskError(f"{folder} is no run's folder: it has no {CONFIG}") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TaskError(f"{path} is not the config of a run: {error}") from error
     try:
         return config_from(data)

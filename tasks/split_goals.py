@@ -18,7 +18,7 @@ from typing import Any
 from morphgen.benchmark.built import README, SUMS, read_sums
 from morphgen.benchmark.contents import sums_text
 from morphgen.benchmark.split import Side
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import alone, replacing_folder, write_atomic
 from morphgen.tasks.config import PushConfig, ReachConfig
@@ -158,7 +158,7 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
         ) from error
     except OSError as error:
         raise BenchmarkError(f"{error.filename}: cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BenchmarkError(f"{path}: no index of goal sets: {error!r}") from error
 
 

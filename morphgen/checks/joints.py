@@ -85,7 +85,8 @@ def check_limits(robot: Robot) -> Iterator[Finding]:
                 "error",
                 where,
                 f"both limits are {lower:g}: MuJoCo drops or refuses that, PyBullet locks it",
-                "write the real limits, or make the joint fixed",
+                "write the real limits, or make the joint fixed, as the repair does at zero",
+                repair="it was made fixed: both limits are 0" if is_locked(robot, joint) else "",
             )
         if span > widest:
             yield Finding(
@@ -104,7 +105,8 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
         linear = joint.kind == "prismatic"
         effort = f"{DEFAULT_EFFORT:g} {'N' if linear else 'N m'}"
         velocity = f"{DEFAULT_VELOCITY:g} {'m/s' if linear else 'rad/s'}"
-        if joint.is_independent and not is_positive(joint.effort):
+        drives = joint.is_independent and not is_locked(robot, joint)
+        if drives and not is_positive(joint.effort):
             yield Finding(
                 "effort-missing",
                 "warning",
@@ -114,7 +116,7 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
                 f"write its largest effort; the repair takes {effort}",
                 repair=f"its effort was set to {effort}",
             )
-        if joint.is_independent and not is_positive(joint.velocity):
+        if drives and not is_positive(joint.velocity):
             yield Finding(
                 "velocity-missing",
                 "warning",
@@ -168,6 +170,17 @@ def has_inverted_limits(joint: Joint) -> bool:
         and joint.limits is not None
         and all(map(math.isfinite, joint.limits))
         and joint.limits[0] > joint.limits[1]
+    )
+
+
+def is_locked(robot: Robot, joint: Joint) -> bool:
+    """Whether a joint's limits hold it at zero, so that a fixed joint is the same to the robot."""
+    mimics = (other.mimic for other in robot.joints if other.mimic is not None)
+    return (
+        joint.kind in ("revolute", "prismatic")
+        and joint.limits == (0.0, 0.0)
+        and joint.mimic is None
+        and all(mimic.joint != joint.name for mimic in mimics)
     )
 
 

@@ -18,6 +18,7 @@ from morphgen.checks.joints import (
     has_inverted_limits,
     is_axis_unit,
     is_axis_valid,
+    is_locked,
     is_positive,
     reachable,
 )
@@ -39,10 +40,12 @@ from morphgen.model.tree import renamed
 def repaired(robot: Robot) -> Robot:
     """A copy without the findings that say they are fixable; what is sound stays as it is."""
     moving = {link.name for g in rigid_groups(robot) if not g.is_root for link in g.links}
-    joints = tuple(_joint(joint) for joint in robot.joints)
+    locked = {joint.name for joint in robot.joints if is_locked(robot, joint)}
+    joints = tuple(_joint(joint, locked=joint.name in locked) for joint in robot.joints)
     home = tuple(
         _nearest_reachable(joints[k], position)
         for k, position in zip(robot.independent, robot.home, strict=True)
+        if joints[k].name not in locked
     )
     links = tuple(_link(link, moves=link.name in moving) for link in robot.links)
     return _renamed(replace(robot, links=links, joints=joints, home=home))
@@ -70,7 +73,9 @@ def _ball(body: Inertial) -> Inertial:
     return Inertial.from_matrix(body.mass, body.com, 0.4 * body.mass * radius**2 * np.eye(3))
 
 
-def _joint(joint: Joint) -> Joint:
+def _joint(joint: Joint, *, locked: bool) -> Joint:
+    if locked:
+        return Joint(joint.name, "fixed", joint.parent, joint.child, joint.T_parent_joint)
     if not joint.is_movable:
         return joint
     if is_axis_valid(joint) and not is_axis_unit(joint):

@@ -31,7 +31,7 @@ from morphgen.cli import (
     train,
     view,
 )
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, one_line
 
 COMMANDS = (
     compose,
@@ -121,7 +121,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def _refused(error: Exception, text: str, args: argparse.Namespace) -> int:
     """Say in one line why the input was refused; return the exit code."""
-    message = " ".join(text.split())
+    message = one_line(text)
     if getattr(args, "json", False):
         print(json.dumps({"error": type(error).__name__, "message": message}))
     print(f"morphgen: {message}", file=sys.stderr)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_json
+from morphgen.errors import one_line
 
 if TYPE_CHECKING:
     from morphgen.model.findings import Finding
@@ -75,12 +76,15 @@ def _checked(path: Path, fix_into: Path | None) -> tuple[tuple[Finding, ...], tu
 
 def _print(path: Path, findings: tuple[Finding, ...], repaired: tuple[Finding, ...]) -> None:
     for finding in repaired:
-        print(f"{path}: repaired {finding.code} at {finding.where}: {finding.repair}")
+        print(one_line(f"{path}: repaired {finding.code} at {finding.where}: {finding.repair}"))
     counts = {
         severity: sum(finding.severity == severity for finding in findings)
         for severity in ("error", "warning", "info")
     }
-    print(f"{path}: " + ", ".join(f"{n} {severity}" for severity, n in counts.items()))
+    print(one_line(f"{path}: " + ", ".join(f"{n} {what}" for what, n in counts.items())))
     for finding in findings:
-        print(f"  {finding.severity} {finding.code} at {finding.where}: {finding.why}")
-        print(f"    fix: {finding.fix}{' (check --fix does it)' if finding.fixable else ''}")
+        print(
+            "  " + one_line(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")
+        )
+        hint = " (check --fix does it)" if finding.fixable else ""
+        print("    " + one_line(f"fix: {finding.fix}{hint}"))

@@ -87,7 +87,7 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
         try:
             data = read_json(path)
             return None if data is None else scaled_shape(shape_of(data), factor)
-        except (KeyError, TypeError, ValueError) as error:
+        except (FormatError, KeyError, TypeError, ValueError) as error:
             raise FormatError(f"{path}: no fitted primitive: {error!r}; delete it") from error
     shape = _fitted(shapes)
     data = None if shape is None else shape_data(scaled_shape(shape, 1 / factor))

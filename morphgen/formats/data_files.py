@@ -128,10 +128,10 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
                 count += 1
             case yaml.AliasEvent():
                 if any(anchor == event.anchor for anchor, _ in opened):
-                    line = event.start_mark.line + 1
+                    line = event.start_mark.line + 1 if event.start_mark else 1
                     why = "found unconstructable recursive node"
                     raise FormatError(f"{origin}:{line}: no valid YAML: {why}")
-                count += sizes.get(event.anchor, 1)
+                count += sizes.get(event.anchor or "", 1)
         if len(opened) > DEEPEST:
             raise _too_deep(origin)
         if count > MOST_VALUES:

@@ -16,6 +16,8 @@ MOST_LINKS = 1000
 """Links of the largest robot that is read."""
 MOST_SHAPES = 10_000
 """Visual and collision shapes of the largest robot that is read."""
+MOST_ERRORS = 50
+"""Errors after which no more are looked for."""
 _REPLACEMENT = {
     "floating": "fix the body to the world, or use three prismatic and three revolute joints",
     "planar": "use two prismatic joints and a revolute one",
@@ -37,7 +39,7 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
     large = tuple(_size_findings(root, origin))
     if large:
         return large
-    findings = _robot_findings(root, origin)
+    findings = _first(_robot_findings(root, origin))
     unexpanded = _first_xacro(root)
     if unexpanded is None:
         return tuple(findings)
@@ -48,7 +50,7 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
         "xacro-unexpanded",
         f"<xacro:{etree.QName(unexpanded).localname}> is left in the document",
         "give the file the suffix .xacro, or expand it first",
-        "" if broken else "it was left out",
+        "" if broken else f"<xacro:{etree.QName(unexpanded).localname}> was left out",
     )
     return (left,) if broken else (left, *findings)
 
@@ -70,23 +72,31 @@ def _size_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
             )
 
 
-def _robot_findings(root: etree._Element, origin: str) -> list[Finding]:
+def _first(findings: Iterator[Finding]) -> list[Finding]:
+    """Findings up to ``MOST_ERRORS`` errors: nobody reads more, and each takes its time."""
+    found, errors = [], 0
+    for finding in findings:
+        found.append(finding)
+        errors += finding.severity == "error"
+        if errors == MOST_ERRORS:
+            break
+    return found
+
+
+def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     links, joints = root.findall("link"), root.findall("joint")
-    findings = list(content_findings(root, place_of(root, origin)))
+    yield from content_findings(root, place_of(root, origin))
     if not links:
-        findings.append(
-            place_of(root, origin).finding(
-                root, "link-missing", "<robot> has no <link>", "add at least one link"
-            )
+        yield place_of(root, origin).finding(
+            root, "link-missing", "<robot> has no <link>", "add at least one link"
         )
-    findings += _duplicates(links, origin)
-    findings += _duplicates(joints, origin)
-    findings += _tree(links, joints, origin)
-    findings += _kinds(joints, origin)
-    findings += _mimics(joints, origin)
+    yield from _duplicates(links, origin)
+    yield from _duplicates(joints, origin)
+    yield from _tree(links, joints, origin)
+    yield from _kinds(joints, origin)
+    yield from _mimics(joints, origin)
     for element in [*links, *joints, *root.findall("material")]:
-        findings += content_findings(element, place_of(element, origin))
-    return findings
+        yield from content_findings(element, place_of(element, origin))
 
 
 def _wrong_root(root: etree._Element, origin: str) -> Finding:

@@ -37,7 +37,9 @@ class Place:
 def place_of(element: etree._Element, origin: str) -> Place:
     """The place named after a link, joint or other element at the top level."""
     name = element.get("name")
-    return Place(origin, f"{element.tag} {name!r}" if name else f"{element.tag} without a name")
+    return Place(
+        origin, f"{element.tag} {shortened(name)!r}" if name else f"{element.tag} without a name"
+    )
 
 
 def shortened(text: str) -> str:

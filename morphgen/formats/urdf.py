@@ -10,6 +10,7 @@ from pathlib import Path
 from lxml import etree
 
 from morphgen.errors import FormatError
+from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.structure import structure_findings
 from morphgen.formats.urdf_elements import read_colour, read_joint, read_link
@@ -17,6 +18,9 @@ from morphgen.formats.xacro import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Frame, Joint, Link, Robot
+
+LARGEST_DESCRIPTION = 8 * 2**20
+"""Bytes of the largest URDF that is read."""
 
 
 class UnsoundError(FormatError):
@@ -50,7 +54,8 @@ def read_urdf(
         FormatError: If the file cannot be read, is not XML or does not expand.
     """
     if not path.is_file():
-        raise FormatError(f"{path}: no such file")
+        why = "is no regular file" if path.exists() else "no such file"
+        raise FormatError(f"{path}: {why}")
     if str(path).encode(errors="replace").decode() != str(path):
         raise FormatError(f"{str(path)!a}: the file's name is no UTF-8 text")
     finder = finder or default_finder()
@@ -59,7 +64,7 @@ def read_urdf(
     elif args:
         raise FormatError(f"{path}: xacro arguments {', '.join(args)} for a file that is no xacro")
     else:
-        data = path.read_bytes()
+        data = read_bytes(path, LARGEST_DESCRIPTION)
     return robot_from_xml(data, path, finder)
 
 

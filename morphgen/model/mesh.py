@@ -17,6 +17,7 @@ trimesh applies neither; it applies the scene graph's transforms, and so does th
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import struct
@@ -29,10 +30,19 @@ import collada
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from PIL import Image
 from trimesh.visual import TextureVisuals
 
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Mesh, Rgba
+from morphgen.model.mesh_files import (
+    MOST_FACES,
+    MOST_PIXELS,
+    Companions,
+    require_bounded,
+    require_readable,
+    without_materials,
+)
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """File formats that can be read, by lower-case suffix."""
@@ -41,7 +51,9 @@ _UNREADABLE = (
     ArithmeticError,
     AssertionError,
     AttributeError,
+    Image.DecompressionBombError,
     LookupError,
+    MemoryError,
     NameError,
     OSError,
     RuntimeError,
@@ -175,8 +187,13 @@ def _read(path: Path) -> list[tuple[Rgba | None, _Triangles]]:
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"{path}: cannot read {path.suffix!r} meshes; valid: {', '.join(SUFFIXES)}")
     try:
-        scene = trimesh.load_scene(path, process=False)
+        require_readable(path)
+        require_bounded(path)
+        scene = _scene(path)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        faces = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in placed)
+        if faces > MOST_FACES:
+            raise ValueError(f"{faces} triangles; at most {MOST_FACES} are read")
         return [
             (_colour(geometry), _in_scene(geometry, T_scene_node))
             for T_scene_node, name in placed
@@ -185,6 +202,15 @@ def _read(path: Path) -> list[tuple[Rgba | None, _Triangles]]:
     except _UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: not a readable {path.suffix[1:]} mesh: {reason}") from error
+
+
+def _scene(path: Path) -> trimesh.Scene:
+    scene = trimesh.load_scene(path, process=False, resolver=Companions(path.parent))
+    if path.suffix.lower() == ".dae" and not scene.geometry:
+        # pycollada drops a geometry with its material, as where a texture's image is not declared.
+        plain = io.BytesIO(without_materials(path))
+        scene = trimesh.load_scene(plain, file_type="dae", process=False)
+    return scene
 
 
 def _in_scene(geometry: trimesh.Trimesh, T_scene_node: NDArray[np.float64]) -> _Triangles:
@@ -220,6 +246,8 @@ def _colour(geometry: trimesh.Trimesh) -> Rgba | None:
         if visual.uv is None or image is None:
             rgba = material.main_color
         else:
+            if math.prod(image.size) > MOST_PIXELS:
+                raise ValueError(f"a texture of {image.size[0]} x {image.size[1]} pixels")
             colours = material.to_color(visual.uv)
             rgba = np.mean(colours, axis=0)
     else:

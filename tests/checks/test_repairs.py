@@ -130,3 +130,11 @@ def test_a_link_without_solid_geometry_keeps_its_fault():
     finding = next(finding for finding in check(broken) if finding.code == "mass-invalid")
     assert not finding.fixable
     assert fix(broken)[1] == ()
+
+
+def test_a_joint_that_is_locked_at_zero_is_made_fixed():
+    robot, gone = fix(with_joint(sound(), "elbow", limits=(0.0, 0.0), effort=None))
+    assert {finding.code for finding in gone} == {"home-outside-limits", "limits-empty"}
+    assert robot.joints[robot.joint_index["elbow"]].kind == "fixed"
+    assert "joint elbow: it was made fixed: both limits are 0" in robot.provenance["repairs"]
+    assert fix(robot)[1] == ()

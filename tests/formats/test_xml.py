@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from morphgen.errors import FormatError
-from morphgen.formats.xml import parse_xml
+from morphgen.formats.xml import parse_description, parse_xml
 
 
 def failure(data: bytes) -> str:
@@ -76,3 +76,42 @@ def test_the_documents_own_encoding_is_respected() -> None:
     data = '<?xml version="1.0" encoding="ISO-8859-1"?><robot name="é"/>'.encode("latin-1")
     assert parse_xml(data, "robot.urdf").get("name") == "é"
     assert parse_xml('<robot name="é"/>'.encode("utf-16"), "robot.urdf").get("name") == "é"
+
+
+@pytest.mark.parametrize(
+    ("start", "codes"),
+    [
+        (b'<?xml version="0.0"?>', ["xml-declaration"]),
+        (b'\n\r\n <?xml version="1.0"?>', ["xml-declaration"]),
+        (b'\xef\xbb\xbf\n<?xml version="0.0" encoding="utf-8" ?>', ["xml-declaration"] * 2),
+        (b'\xef\xbb\xbf<?xml version="1.0"?>', []),
+        (b'<?xml version="1.1"?>', []),
+        (b"\n", []),
+    ],
+)
+def test_a_declaration_that_robot_software_reads_over_is_mended(
+    start: bytes, codes: list[str]
+) -> None:
+    root, findings = parse_description(start + b'<robot name="\xc3\xa9"><l/></robot>', "r.urdf")
+    assert root.get("name") == "é"
+    assert [finding.code for finding in findings] == codes
+    assert all(finding.severity == "warning" and finding.repair for finding in findings)
+    assert root[0].sourceline == start.count(b"\n") + 1
+
+
+def test_undeclared_prefixes_are_mended() -> None:
+    uses = b'<drake:a/><l gazebo:b="1" name="x"/>' * 200
+    text = b"<!-- <no:t> > --><?p ?><robot>" + uses + b"<last:c/></robot>"
+    root, findings = parse_description(text, "r.urdf")
+    assert root.findall("l")[199].get("name") == "x"
+    assert [finding.code for finding in findings] == ["prefix-undeclared"] * 3
+    assert [finding.why.split("'")[1] for finding in findings] == ["drake", "gazebo", "last"]
+
+
+def test_with_undeclared_prefixes_other_faults_are_still_found() -> None:
+    with pytest.raises(FormatError, match="tag mismatch"):
+        parse_description(b"<robot><drake:a></robot>", "r.urdf")
+    with pytest.raises(FormatError, match="DOCTYPE"):
+        parse_description(
+            b'\n<?xml version="0.0"?><!DOCTYPE r [<!ENTITY e "x">]><r a:b="1">&e;</r>', "r.urdf"
+        )

@@ -234,3 +234,11 @@ def test_the_kr210_visual_in_inches_has_the_size_of_its_collision(data: Path) ->
     visual = load_mesh(Mesh(meshes / "visual" / "link_2.dae"))
     collision = load_mesh(Mesh(meshes / "collision" / "link_2.stl"))
     np.testing.assert_allclose(sorted(visual.extents), sorted(collision.extents), atol=1e-3)
+
+
+def test_a_collada_geometry_whose_material_is_broken_is_read_without_colours(
+    tmp_path: Path,
+) -> None:
+    path = dae(tmp_path / "m.dae")
+    path.write_text(path.read_text().replace('-fx"/>', '-missing"/>'))
+    assert mesh_parts(path) == (MeshPart(None, 4),)
