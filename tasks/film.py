@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 import torch
@@ -175,22 +177,68 @@ def write_film(frames: Iterable[Frame], path: Path, fps: float) -> None:
         fps: Frames a second.
 
     Raises:
-        FormatError: If it cannot be written there.
+        FormatError: If it cannot be written there, or ffmpeg is missing, fails or is killed; then
+            nothing is left.
     """
     require_film(path)
+    written = 0
     try:
         with replacing_file(path) as partial:
-            writer: Any = imageio.get_writer(partial, **_writing(path.suffix, fps))
+            # In memory, a GIF's writer cannot fail a second time when Python disposes of it.
+            image = io.BytesIO() if path.suffix == ".gif" else None
+            writer: Any = imageio.get_writer(image or partial, **_writing(path.suffix, fps))
             with writer:
                 for frame in frames:
-                    writer.append_data(frame)
+                    _append(writer, frame)
+                    written += 1
+            if image:
+                partial.write_bytes(image.getvalue())
+            else:
+                _require_whole(partial, written)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
+    except FilmError as error:
+        raise FormatError(f"cannot write {path}: {error}") from error
+
+
+class FilmError(Exception):
+    """Why ffmpeg did not write a film."""
+
+
+def _append(writer: Any, frame: Frame) -> None:  # noqa: ANN401
+    try:
+        writer.append_data(frame)
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        log = str(error).rpartition("FFMPEG STDERR OUTPUT:")[2].strip()
+        reason = log.splitlines()[-1] if log else "it ended early"
+        raise FilmError(f"ffmpeg failed: {reason}") from error
+    except RuntimeError as error:
+        raise FilmError(str(error)) from error
+
+
+def _require_whole(film: Path, frames: int) -> None:
+    """Require that a film has all frames: ffmpeg's exit code is not known, and it may have failed.
+
+    Raises:
+        FilmError: If it has not, as on a full disk.
+    """
+    try:
+        count, _ = imageio_ffmpeg.count_frames_and_secs(str(film))
+    except RuntimeError as error:
+        raise FilmError(
+            "ffmpeg left a film that cannot be read; is the disk full, or was ffmpeg ended?"
+        ) from error
+    if count != frames:
+        raise FilmError(
+            f"ffmpeg wrote {count} of {frames} frames; is the disk full, or was ffmpeg ended?"
+        )
 
 
 def _writing(suffix: str, fps: float) -> dict[str, Any]:
     if suffix == ".gif":
-        return {"mode": "I", "duration": 1000 / fps, "loop": 0}
+        return {"format": "GIF", "mode": "I", "duration": 1000 / fps, "loop": 0}
     return {
         "format": "FFMPEG",
         "mode": "I",
