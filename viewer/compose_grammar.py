@@ -13,19 +13,17 @@ from morphgen.grammar.derivation import Derivation, outline
 from morphgen.grammar.derive import First, derive
 from morphgen.grammar.model import (
     Grammar,
-    find_grammar,
     grammar_from_text,
     grammar_names,
     grammar_text,
-    load_grammar,
 )
 from morphgen.grammar.sampling import draw
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address, AddressError
+from morphgen.viewer.address import Address, AddressError, whole_number
 from morphgen.viewer.choice import first_parts
 from morphgen.viewer.composed import Composed, fault, show_robot
 from morphgen.viewer.packed_text import packed, unpacked
-from morphgen.viewer.places import DERIVED
+from morphgen.viewer.places import DERIVED, grammar_at
 from morphgen.viewer.session import say, set_value, show_state, when
 
 
@@ -119,9 +117,8 @@ def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
 
 
 def _load(tab: GrammarTab, name: str) -> None:
-    folders = tab.composed.session.places.library.folders
     tab.grammar = name
-    tab.original = grammar_text(load_grammar(find_grammar(name, folders), folders))
+    tab.original = grammar_text(grammar_at(name, tab.composed.session.places))
     set_value(tab.text, tab.original)
     show_derived(tab, drawn=False)
 
@@ -160,7 +157,7 @@ def _read_grammar(tab: GrammarTab) -> bool:
         grammar = grammar_from_text(tab.text.value, tab.grammar)
         derive(grammar, tab.composed.session.places.library, First())
     except GrammarError as error:
-        tab.fault.content = fault(error)
+        tab.fault.content = fault(error, tab.composed.session.places)
         return False
     tab.fault.content = ""
     return True
@@ -190,4 +187,4 @@ def _show_tree(tab: GrammarTab, derivation: Derivation, n: int) -> None:
 
 
 def _count(text: str) -> int:
-    return int(text) if text.isdigit() else 0
+    return whole_number(text, 0)

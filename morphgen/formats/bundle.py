@@ -20,7 +20,7 @@ from morphgen.formats.card import apply_card, card_frames, card_of, card_text
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
-from morphgen.formats.urdf import read_urdf, with_frames
+from morphgen.formats.urdf import own_frames, read_urdf, with_frames
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape
@@ -32,6 +32,7 @@ MJCF = "robot.xml"
 CARD = "card.json"
 PICTURE = "preview.png"
 MESHES = "meshes"
+XACRO = ".xacro"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 
@@ -156,7 +157,10 @@ def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
         return read_bundle(path)
     if path.name == URDF and (path.parent / CARD).is_file():
         return read_bundle(path.parent)
-    return read_urdf(path, args)
+    robot = read_urdf(path, args)
+    if path.suffix == XACRO:
+        return robot
+    return with_frames(robot, own_frames(path.read_bytes(), str(path)))
 
 
 def split_colours(robot: Robot) -> Robot:
