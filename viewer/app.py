@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import shutil
 import socket
-import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import viser
 
@@ -70,6 +69,8 @@ class Viewer:
     """The page that is shown to those who name none."""
     places: Places
     workers: Workers
+    uploads: TemporaryDirectory[str]
+    """Where uploads are kept; it goes with the viewer, or with its process."""
     sessions: dict[int, Session] = field(default_factory=dict)
     shared: dict[str, object] = field(default_factory=dict)
     """What took long to find."""
@@ -86,7 +87,7 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
         self.workers.close()
-        shutil.rmtree(self.places.uploads, ignore_errors=True)
+        self.uploads.cleanup()
 
 
 def serve(
@@ -114,16 +115,12 @@ def serve(
     start = target_address(words, places)
     gate = gate_of(host, origins)
     _require_address(host)
-    uploads = Path(tempfile.mkdtemp(prefix="morphgen-uploads-")).resolve()
-    places = Places(places.folders, places.roots, uploads)
-    try:
-        server = start_server(host, port, gate)
-    except BaseException:
-        shutil.rmtree(uploads, ignore_errors=True)
-        raise
+    uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
+    places = Places(places.folders, places.roots, Path(uploads.name).resolve())
+    server = start_server(host, port, gate)
     # What a browser misses that has just gone is no news.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    viewer = Viewer(server, start, places, Workers(WORKERS))
+    viewer = Viewer(server, start, places, Workers(WORKERS), uploads)
 
     async def connect(client: viser.ClientHandle) -> None:
         session = Session(client, places, viewer.workers, start, viewer.shared)

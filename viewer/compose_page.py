@@ -34,11 +34,11 @@ def show(session: Session) -> None:
     add_floor(session.client.scene, 2.0)
     tabs = gui.add_tab_group()
     if is_grammar:
-        written = add_grammar_tab(composed, tabs, grammar)
+        written = add_grammar_tab(composed, tabs, grammar, name)
         add_parts_tab(composed, tabs, choice)
     else:
         chosen = add_parts_tab(composed, tabs, choice)
-        add_grammar_tab(composed, tabs, grammar)
+        add_grammar_tab(composed, tabs, grammar, name)
     add_check_tab(composed, tabs)
     add_get_tab(composed, tabs)
     if is_grammar:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -65,7 +66,13 @@ def show_choice(tab: PartsTab) -> None:
     tab.fault.content = ""
     session.address = Address("compose", (words,))
     show_state(session, f"compose {name}")
-    show_robot(tab.composed, robot, derivation, f"morphgen compose {words}", WORDS + words)
+    show_robot(
+        tab.composed,
+        robot,
+        derivation,
+        shlex.join(["morphgen", "compose", *words.split()]),
+        WORDS + words,
+    )
 
 
 def _add_slots(tab: PartsTab) -> None:

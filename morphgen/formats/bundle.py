@@ -136,7 +136,14 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
         raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
     for name, expected in hashes.items():
         path = folder / name
-        if not path.is_file():
+        try:
+            is_own = path.resolve().is_relative_to(folder.resolve())
+            is_there = is_own and path.is_file()
+        except (OSError, ValueError):  # a name that no file system takes
+            is_own, is_there = True, False
+        if not is_own:
+            raise FormatError(f"{folder / CARD}: hashes: {name!r} leads out of the folder")
+        if not is_there:
             code, why = "file-missing", "the card names it, but it is not there"
         elif hashlib.sha256(path.read_bytes()).hexdigest() != expected:
             code, why = "file-changed", "its content is not what the card was written for"

@@ -174,10 +174,20 @@ def _read(
 
 
 def _included(statement: Include, path: Path, folders: tuple[Path, ...]) -> Path:
-    beside = path.parent / statement.target
-    if beside.suffix == SUFFIX and beside.is_file():
-        return beside
-    return find_grammar(statement.target, folders)
+    target = statement.target
+    if not (target.endswith(SUFFIX) or "/" in target):
+        return find_grammar(target, folders)
+    beside = path.parent / target
+    try:
+        is_own = beside.resolve().is_relative_to(path.parent.resolve())
+        is_there = is_own and beside.is_file()
+    except (OSError, ValueError):  # a name that no file system takes
+        is_own, is_there = True, False
+    if not is_own:
+        raise GrammarError(f"include {target!r} leads out of the folder of {path.name}")
+    if not is_there:
+        raise GrammarError(f"include {target!r}: no such file")
+    return beside
 
 
 def _require_unique(statements: Iterable[Statement]) -> None:
