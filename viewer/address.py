@@ -80,9 +80,9 @@ def parse_address(query: str) -> Address | None:
     robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in named else ()
     pages = [page for page in PAGES if page in named and not (page == ROBOT and robots)]
     if not pages:
-        raise AddressError(f"address {query!r} names no page{nearest(pairs[0][0], PAGES)}")
+        raise AddressError(f"address {query!r:.100} names no page{nearest(pairs[0][0], PAGES)}")
     if len(pages) > 1:
-        raise AddressError(f"address {query!r} names two pages: {' and '.join(pages)}")
+        raise AddressError(f"address {query!r:.100} names two pages: {' and '.join(pages)}")
     of = tuple(value for key, value in pairs if key == pages[0])
     state = {key: value for key, value in pairs if key not in PAGES}
     return Address(pages[0], of, state, robots)

@@ -31,9 +31,10 @@ from morphgen.viewer import (
 from morphgen.viewer.address import Address, Page, parse_address
 from morphgen.viewer.gate import gate_of
 from morphgen.viewer.messages import check_values
-from morphgen.viewer.places import Places, target_address
+from morphgen.viewer.places import Places
 from morphgen.viewer.server import start_server
 from morphgen.viewer.session import BUG, Session, close, post, refuse
+from morphgen.viewer.targets import target_address
 from morphgen.viewer.workers import Workers
 
 NOTHING = "There is nothing to see here"

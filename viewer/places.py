@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import re
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -30,11 +30,10 @@ from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import SUFFIX, Grammar, find_grammar, grammar_names, load_grammar
+from morphgen.grammar.model import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.request import default_name, parse_words
 from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
 from morphgen.model.robot import TOOL, Frame, Robot
-from morphgen.viewer.address import Address, Page
 
 WORDS, DERIVED, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 SPLIT_SUFFIX = ".yaml"
@@ -103,58 +102,6 @@ def shortened(text: str, most: int = 100) -> str:
     """A text for a message: no control characters, and not longer than a number of characters."""
     plain = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text[: most + 1])
     return plain if len(plain) <= most else f"{plain[:most]}..."
-
-
-def target_address(words: Sequence[str], places: Places) -> Address:
-    """The page that ``morphgen view`` opens for its words.
-
-    Args:
-        words: None of them for the library; a folder, file or split's name; or words to compose.
-        places: What may be looked at.
-
-    Raises:
-        MorphgenError: If there is no such thing.
-    """
-    if not words:
-        return Address("library")
-    if len(words) == 1 and "=" not in words[0]:
-        return _single_address(words[0], places)
-    words_at(" ".join(words), places)
-    return Address("robot", (WORDS + " ".join(words),))
-
-
-def _single_address(word: str, places: Places) -> Address:
-    if Path(word).exists():
-        path = places.path(word)
-        if path.suffix in PLAYED or (path / CHECKPOINT).is_file():
-            return _played_address(word, places)
-        if path.is_file():
-            pages: dict[str, Page] = {SPLIT_SUFFIX: "split", SUFFIX: "compose"}
-            return Address(pages.get(path.suffix, "robot"), (word,))
-        if (path / SPLIT).is_file():
-            return Address("split", (word,))
-        return Address("robot" if is_robot(path) else "gallery", (word,))
-    if word in split_names():
-        return Address("split", (word,))
-    if word in grammar_names():
-        return Address("compose", (word,))
-    valid = (*split_names(), *grammar_names())
-    raise PlaceError(
-        f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}"
-    )
-
-
-def _played_address(word: str, places: Places) -> Address:
-    """The page that plays an episode, or the policy of a checkpoint or a run's folder."""
-    if word.endswith(EPISODE_SUFFIX):
-        from morphgen.viewer.episode import read_episode
-
-        read_episode(places.path(word), places)
-        return Address("play", (word,))
-    from morphgen.rl.runs import read_checkpoint
-
-    read_checkpoint(places.path(word))
-    return Address("play", state={"policy": word})
 
 
 def is_robot(folder: Path) -> bool:

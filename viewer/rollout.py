@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -167,17 +168,21 @@ def policy_file(policy: str, task: Task, places: Places) -> str:
         PlaceError: If it is a file that may not be looked at.
     """
     if policy not in REFERENCES:
-        try:
-            return str(places.path(policy))
-        except PlaceError as error:
-            if "/" in policy or policy.endswith(".pt"):
-                raise
-            valid = references_for(task)
-            raise TaskError(
-                f"{shortened(policy)!r} is no checkpoint, and no policy{nearest(policy, valid)}"
-            ) from error
+        return str(_checkpoint_file(policy, references_for(task), places))
     require_policy(policy, task)
     return policy
+
+
+def _checkpoint_file(policy: str, references: Iterable[str], places: Places) -> Path:
+    """The file or folder of a checkpoint."""
+    try:
+        return places.path(policy)
+    except PlaceError as error:
+        if "/" in policy or policy.endswith(".pt"):
+            raise
+        raise TaskError(
+            f"{shortened(policy)!r} is no checkpoint, and no policy{nearest(policy, references)}"
+        ) from error
 
 
 def checkpoints(places: Places, most: int = 50) -> list[str]:
@@ -197,7 +202,7 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
     Raises:
         MorphgenError: If it is no checkpoint, or its robot has no parts to be made of.
     """
-    source = read_checkpoint(places.path(policy))[0].source
+    source = read_checkpoint(_checkpoint_file(policy, REFERENCES, places))[0].source
     rows = members(source)
     if rows:
         named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]

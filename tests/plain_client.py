@@ -62,7 +62,7 @@ class PlainClient:
                 self._take(self.websocket.recv(timeout=0.2))
             except TimeoutError:
                 continue
-        raise AssertionError(f"not within {seconds} s; the page said {self.text!r:.3000}")
+        raise AssertionError(f"not within {seconds} s; the page said ...{self.text[-2000:]!r}")
 
     def until_closed(self):
         """Take messages until the server closes the connection; return code and reason."""
@@ -97,6 +97,7 @@ class PlainClient:
     def upload(self, name, content, *, size=None, parts=None):
         """Send a file by the button of the first page, in parts as a browser does."""
         button = self.control("UploadButton", "Look at a URDF or a zipped bundle")
+        self.control("Text", "Search")  # comes after it, when the server listens to the button
         transfer, step = uuid.uuid4().hex, 512 * 1024
         pieces = [content[at : at + step] for at in range(0, len(content), step)]
         begin = {
