@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import time
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 _ENDS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
 """Signals that end it as Ctrl-C does: of a service manager, of a terminal that is closed."""
+_NAP = 0.5
+"""Seconds after which a signal is seen for certain."""
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
@@ -82,7 +85,8 @@ def _sleep(host: str, viewer: Viewer) -> None:
             )
         name = f"[{host}]" if ":" in host else host
         print(f"http://{name}:{viewer.port}  (stop with Ctrl-C)", flush=True)
-        viewer.server.sleep_forever()
+        while True:  # a signal that another thread takes does not end a sleep
+            time.sleep(_NAP)
     finally:
         for signal_name in (signal.SIGINT, *_ENDS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind
