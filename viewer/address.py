@@ -11,6 +11,10 @@ from morphgen.errors import MorphgenError, nearest
 
 Page = Literal["library", "gallery", "robot", "compose", "compare", "split", "play"]
 PAGES: tuple[Page, ...] = get_args(Page)
+LONGEST = 8000
+"""Characters of a query."""
+MOST_DIGITS = 15
+"""Of a number in an address; browsers have no larger whole numbers."""
 ROBOT: Page = "robot"
 """Key of a page, and on the page ``play`` of the robots that play."""
 
@@ -49,6 +53,12 @@ class Address:
         return replace(self, state=state)
 
 
+def whole_number(text: str, default: int) -> int:
+    """A number of an address, 0 or more; the default if it is none that a page can hold."""
+    is_number = text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS
+    return int(text) if is_number else default
+
+
 def parse_address(query: str) -> Address | None:
     """Read the query of a URL.
 
@@ -61,6 +71,8 @@ def parse_address(query: str) -> Address | None:
     Raises:
         AddressError: If it names no page, or two different ones.
     """
+    if len(query) > LONGEST:
+        raise AddressError(f"the address has {len(query)} characters; at most {LONGEST} are read")
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
     if not pairs:
         return None
@@ -68,9 +80,9 @@ def parse_address(query: str) -> Address | None:
     robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in named else ()
     pages = [page for page in PAGES if page in named and not (page == ROBOT and robots)]
     if not pages:
-        raise AddressError(f"address {query!r} names no page{nearest(pairs[0][0], PAGES)}")
+        raise AddressError(f"address {query!r:.100} names no page{nearest(pairs[0][0], PAGES)}")
     if len(pages) > 1:
-        raise AddressError(f"address {query!r} names two pages: {' and '.join(pages)}")
+        raise AddressError(f"address {query!r:.100} names two pages: {' and '.join(pages)}")
     of = tuple(value for key, value in pairs if key == pages[0])
     state = {key: value for key, value in pairs if key not in PAGES}
     return Address(pages[0], of, state, robots)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
-import shutil
 import socket
-import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import viser
 
@@ -29,10 +29,15 @@ from morphgen.viewer import (
     split_page,
 )
 from morphgen.viewer.address import Address, Page, parse_address
-from morphgen.viewer.places import Places, target_address
-from morphgen.viewer.session import Session, close, post
+from morphgen.viewer.gate import gate_of
+from morphgen.viewer.messages import check_values
+from morphgen.viewer.places import Places
+from morphgen.viewer.server import start_server
+from morphgen.viewer.session import BUG, Session, close, post, refuse
+from morphgen.viewer.targets import target_address
 from morphgen.viewer.workers import Workers
 
+NOTHING = "There is nothing to see here"
 WORKERS = 2
 """Processes that draw thumbnails and compare robots."""
 
@@ -65,6 +70,8 @@ class Viewer:
     """The page that is shown to those who name none."""
     places: Places
     workers: Workers
+    uploads: TemporaryDirectory[str]
+    """Where uploads are kept; it goes with the viewer, or with its process."""
     sessions: dict[int, Session] = field(default_factory=dict)
     shared: dict[str, object] = field(default_factory=dict)
     """What took long to find."""
@@ -81,7 +88,7 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
         self.workers.close()
-        shutil.rmtree(self.places.uploads, ignore_errors=True)
+        self.uploads.cleanup()
 
 
 def serve(
@@ -89,6 +96,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8080,
     library: Sequence[Path] = (),
+    origins: Sequence[str] = (),
 ) -> Viewer:
     """Start a viewer.
 
@@ -98,6 +106,7 @@ def serve(
         host: Address to bind.
         port: Port; if it is taken, the next free one.
         library: Folders of the user's own parts.
+        origins: Sites, besides its own, whose pages may use it.
 
     Raises:
         MorphgenError: If there is no such thing, or the address is none of this machine's.
@@ -105,22 +114,19 @@ def serve(
     places = Places(default_library(library).folders, _roots(words), Path("/nowhere"))
     places.library.names()  # a folder that is missing, or a part that is broken, is told now
     start = target_address(words, places)
-    try:
-        with socket.socket() as probe:
-            probe.bind((host, 0))
-    except OSError as error:
-        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
-    uploads = Path(tempfile.mkdtemp(prefix="morphgen-uploads-")).resolve()
-    places = Places(places.folders, places.roots, uploads)
-    with contextlib.redirect_stdout(io.StringIO()):  # its banner names the port before we do
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+    gate = gate_of(host, origins)
+    _require_address(host)
+    uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
+    places = Places(places.folders, places.roots, Path(uploads.name).resolve())
+    server = start_server(host, port, gate)
     # What a browser misses that has just gone is no news.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    viewer = Viewer(server, start, places, Workers(WORKERS))
+    viewer = Viewer(server, start, places, Workers(WORKERS), uploads)
 
     async def connect(client: viser.ClientHandle) -> None:
         session = Session(client, places, viewer.workers, start, viewer.shared)
         viewer.sessions[client.client_id] = session
+        check_values(client, functools.partial(refuse, session))
         post(session, lambda: open_page(session))
 
     async def disconnect(client: viser.ClientHandle) -> None:
@@ -133,6 +139,16 @@ def serve(
     return viewer
 
 
+def _require_address(host: str) -> None:
+    """Require that a host is an address of this machine."""
+    try:
+        kind, _, _, _, address = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
+
+
 def open_page(session: Session) -> None:
     """Build the page that a browser's URL names."""
     client = session.client
@@ -141,11 +157,15 @@ def open_page(session: Session) -> None:
         session.address = parse_address(browser.read_query(client)) or session.address
         SHOW[session.address.page](session)
     except UnsoundError as error:
-        _show_fault(session, str(error.origin), markup.findings_table(error.findings))
-    except MorphgenError as error:
-        _show_fault(session, "There is nothing to see here", escape(str(error)))
-    except (RuntimeError, TimeoutError):
+        findings = markup.findings_table(error.findings, session.places.told)
+        _show_fault(session, session.places.told(error.origin), findings)
+    except (MorphgenError, TimeoutError) as error:
+        _show_fault(session, NOTHING, escape(session.places.told(error)))
+    except RecursionError:
+        _show_fault(session, NOTHING, "what the address names is nested too deeply")
+    except Exception:
         if not session.closed.is_set():
+            _show_fault(session, NOTHING, BUG)
             raise
 
 

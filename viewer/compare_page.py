@@ -317,7 +317,7 @@ def _compare(page: ComparePage) -> None:
         made = in_worker(session, likeness, page.robots, session.places.folders)
     except MorphgenError as error:
         page.texts["likeness"].content = markup.framed(
-            markup.tag("cannot be compared", "warning"), escape(str(error))
+            markup.tag("cannot be compared", "warning"), escape(session.places.told(error))
         )
         say(session, "")
         return

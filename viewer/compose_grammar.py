@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
 import viser
 
@@ -12,20 +14,19 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, outline
 from morphgen.grammar.derive import First, derive
 from morphgen.grammar.model import (
+    SUFFIX,
     Grammar,
-    find_grammar,
     grammar_from_text,
     grammar_names,
     grammar_text,
-    load_grammar,
 )
 from morphgen.grammar.sampling import draw
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address, AddressError
+from morphgen.viewer.address import Address, AddressError, whole_number
 from morphgen.viewer.choice import first_parts
 from morphgen.viewer.composed import Composed, fault, show_robot
 from morphgen.viewer.packed_text import packed, unpacked
-from morphgen.viewer.places import DERIVED
+from morphgen.viewer.places import DERIVED, grammar_at
 from morphgen.viewer.session import say, set_value, show_state, when
 
 
@@ -35,7 +36,7 @@ class GrammarTab:
 
     composed: Composed
     grammar: str
-    """Name of the grammar in the text field."""
+    """The grammar in the text field, by its name or file."""
     original: str
     """Its text before it was edited."""
     text: viser.GuiTextHandle
@@ -48,11 +49,22 @@ class GrammarTab:
     derivation: Derivation | None = None
     """Of the whole robot; the one that is shown may have fewer parts."""
 
+    @property
+    def name(self) -> str:
+        """Of the grammar, which robots get."""
+        return Path(self.grammar).stem if self.grammar.endswith(SUFFIX) else self.grammar
+
 
 def add_grammar_tab(
-    composed: Composed, tabs: viser.GuiTabGroupHandle, grammar: Grammar
+    composed: Composed, tabs: viser.GuiTabGroupHandle, grammar: Grammar, source: str
 ) -> GrammarTab:
     """Add the tab with a grammar, edited as the page's address has it; ``show_derived`` shows it.
+
+    Args:
+        composed: Where.
+        tabs: Where the tab is added.
+        grammar: What is written.
+        source: The grammar's name or file, as the address has it.
 
     Raises:
         AddressError: If the address has no text.
@@ -60,9 +72,9 @@ def add_grammar_tab(
     session = composed.session
     gui, state = session.client.gui, session.address.state
     original = grammar_text(grammar)
-    names = tuple(dict.fromkeys((grammar.name, *grammar_names())))
+    names = tuple(dict.fromkeys((source, *grammar_names())))
     with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
-        chosen = gui.add_dropdown("start from", names, initial_value=grammar.name)
+        chosen = gui.add_dropdown("start from", names, initial_value=source)
         text = unpacked(state["text"]) if "text" in state else original
         written = gui.add_text("text", text, multiline=True)
         why_not, too_long = gui.add_html(""), gui.add_html("")
@@ -73,7 +85,7 @@ def add_grammar_tab(
         tree = gui.add_html("")
     tab = GrammarTab(
         composed,
-        grammar.name,
+        source,
         original,
         text=written,
         fault=why_not,
@@ -95,8 +107,8 @@ def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
     session, library = tab.composed.session, tab.composed.session.places.library
     if not _read_grammar(tab):
         return
-    grammar = grammar_from_text(tab.text.value, tab.grammar)
-    name = f"{tab.grammar}.grammar" if _is_edited(tab) else tab.grammar
+    grammar = grammar_from_text(tab.text.value, tab.name)
+    name = shlex.quote(f"{tab.name}{SUFFIX}" if _is_edited(tab) else tab.grammar)
     note = f"# with the text of the tab Grammar in {name}\n" if _is_edited(tab) else ""
     command = f"{note}morphgen compose {name}"
     if drawn:
@@ -108,7 +120,7 @@ def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
         command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
     else:
         tab.derivation = derive(grammar, library, First())
-        robot = compose(tab.derivation, library, tab.grammar)
+        robot = compose(tab.derivation, library, tab.name)
     n = sum(1 for _ in tab.derivation.walk())
     tab.step.max = max(n, 2)
     set_value(tab.step, n)
@@ -119,9 +131,8 @@ def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
 
 
 def _load(tab: GrammarTab, name: str) -> None:
-    folders = tab.composed.session.places.library.folders
     tab.grammar = name
-    tab.original = grammar_text(load_grammar(find_grammar(name, folders), folders))
+    tab.original = grammar_text(grammar_at(name, tab.composed.session.places))
     set_value(tab.text, tab.original)
     show_derived(tab, drawn=False)
 
@@ -157,10 +168,10 @@ def _is_edited(tab: GrammarTab) -> bool:
 def _read_grammar(tab: GrammarTab) -> bool:
     """Say whether the text is a grammar that can be derived; if not, where it fails."""
     try:
-        grammar = grammar_from_text(tab.text.value, tab.grammar)
+        grammar = grammar_from_text(tab.text.value, tab.name)
         derive(grammar, tab.composed.session.places.library, First())
     except GrammarError as error:
-        tab.fault.content = fault(error)
+        tab.fault.content = fault(error, tab.composed.session.places)
         return False
     tab.fault.content = ""
     return True
@@ -179,7 +190,7 @@ def _show_step(tab: GrammarTab) -> None:
     n = tab.step.value
     partial = first_parts(tab.derivation, n)
     _show_tree(tab, tab.derivation, n)
-    robot = compose(partial, tab.composed.session.places.library, tab.grammar)
+    robot = compose(partial, tab.composed.session.places.library, tab.name)
     show_robot(tab.composed, robot, partial, f"# {partial}", f"{DERIVED}{partial}")
 
 
@@ -190,4 +201,4 @@ def _show_tree(tab: GrammarTab, derivation: Derivation, n: int) -> None:
 
 
 def _count(text: str) -> int:
-    return int(text) if text.isdigit() else 0
+    return whole_number(text, 0)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from morphgen.grammar.model import find_grammar, load_grammar
 from morphgen.viewer import markup
 from morphgen.viewer.choice import parse_choice
 from morphgen.viewer.compose_grammar import add_grammar_tab, show_derived
 from morphgen.viewer.compose_parts import add_parts_tab, show_choice
 from morphgen.viewer.composed import Composed, add_check_tab, add_get_tab
+from morphgen.viewer.places import grammar_at
 from morphgen.viewer.robot_page import SIDE, add_floor
 from morphgen.viewer.session import Session
 
@@ -23,7 +23,7 @@ def show(session: Session) -> None:
     is_grammar = bool(words) and "=" not in words[0]
     choice = parse_choice(["arm=ur5", "ee=plane"] if is_grammar or not words else words, library)
     name = words[0] if is_grammar else "arm3"
-    grammar = load_grammar(find_grammar(name, library.folders), library.folders)
+    grammar = grammar_at(name, session.places)
     gui = session.client.gui
     gui.set_panel_label("morphgen")
     gui.main_panel.dock_right()
@@ -34,11 +34,11 @@ def show(session: Session) -> None:
     add_floor(session.client.scene, 2.0)
     tabs = gui.add_tab_group()
     if is_grammar:
-        written = add_grammar_tab(composed, tabs, grammar)
+        written = add_grammar_tab(composed, tabs, grammar, name)
         add_parts_tab(composed, tabs, choice)
     else:
         chosen = add_parts_tab(composed, tabs, choice)
-        add_grammar_tab(composed, tabs, grammar)
+        add_grammar_tab(composed, tabs, grammar, name)
     add_check_tab(composed, tabs)
     add_get_tab(composed, tabs)
     if is_grammar:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -9,7 +10,6 @@ import viser
 
 from morphgen.errors import MorphgenError
 from morphgen.grammar.compose import compose
-from morphgen.grammar.request import parse_words
 from morphgen.viewer.address import Address
 from morphgen.viewer.choice import (
     NOTHING,
@@ -23,7 +23,7 @@ from morphgen.viewer.choice import (
     with_value,
 )
 from morphgen.viewer.composed import Composed, fault, show_robot
-from morphgen.viewer.places import WORDS
+from morphgen.viewer.places import WORDS, words_at
 from morphgen.viewer.session import show_state, when
 
 
@@ -58,15 +58,21 @@ def show_choice(tab: PartsTab) -> None:
     session, words = tab.composed.session, tab.choice.words
     library = session.places.library
     try:
-        derivation, name = parse_words(words.split(), library)
+        derivation, name = words_at(words, session.places)
         robot = compose(derivation, library, name)
     except MorphgenError as error:
-        tab.fault.content = fault(error)
+        tab.fault.content = fault(error, session.places)
         return
     tab.fault.content = ""
     session.address = Address("compose", (words,))
     show_state(session, f"compose {name}")
-    show_robot(tab.composed, robot, derivation, f"morphgen compose {words}", WORDS + words)
+    show_robot(
+        tab.composed,
+        robot,
+        derivation,
+        shlex.join(["morphgen", "compose", *words.split()]),
+        WORDS + words,
+    )
 
 
 def _add_slots(tab: PartsTab) -> None:

@@ -18,6 +18,7 @@ from morphgen.viewer import markup, robot_tables
 from morphgen.viewer.address import Address
 from morphgen.viewer.downloads import robot_files, zipped
 from morphgen.viewer.overlays import has_tool
+from morphgen.viewer.places import Places
 from morphgen.viewer.robot_view import RobotView, add_robot, look_at, robot_bounds
 from morphgen.viewer.session import Session, in_worker, later, notify, say, when
 
@@ -93,9 +94,9 @@ def show_robot(
     later(composed.session, lambda: _check(composed), "check")
 
 
-def fault(error: MorphgenError) -> str:
+def fault(error: MorphgenError, places: Places) -> str:
     """Why there is no robot."""
-    return markup.framed(markup.tag("error", "error"), f" {escape(str(error))}")
+    return markup.framed(markup.tag("error", "error"), f" {escape(places.told(error))}")
 
 
 def _check(composed: Composed) -> None:
@@ -103,8 +104,9 @@ def _check(composed: Composed) -> None:
     if robot is None or composed.findings is None:
         return
     findings = check(robot, tool_required=has_tool(robot))
+    told = composed.session.places.told
     if robot is composed.robot:
-        composed.findings.content = markup.framed(markup.findings_table(findings))
+        composed.findings.content = markup.framed(markup.findings_table(findings, told))
 
 
 def _write(composed: Composed, name: str) -> None:
@@ -112,7 +114,7 @@ def _write(composed: Composed, name: str) -> None:
     if robot is None:
         return
     folder = bundle_folder(session.places.roots[0] / ROBOTS, name or robot.name)
-    say(session, f"writing {folder}")
+    say(session, f"writing {ROBOTS}/{folder.name}")
     in_worker(session, _bundle, robot, folder)
     say(session, "")
     notify(session, "Written", f"{ROBOTS}/{folder.name}")
@@ -129,6 +131,6 @@ def _send(composed: Composed, name: str) -> None:
         return
     say(session, "packing the bundle")
     files = in_worker(session, robot_files, robot)
-    name = name or robot.name
+    name = bundle_folder(Path(), name or robot.name or "robot").name
     session.client.send_file_download(f"{name}.zip", zipped(name, files), save_immediately=True)
     say(session, "")

@@ -49,8 +49,9 @@ def zipped(name: str, files: dict[str, bytes]) -> bytes:
 
 
 def _files(folder: Path) -> dict[str, bytes]:
+    """The files below a folder; links that lead out of it are left out."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        if path.is_file() and path.resolve().is_relative_to(folder.resolve())
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 
 import viser
@@ -91,7 +92,9 @@ def _save(rows: Gallery, wanted: _Wanted) -> None:
     regime = next(each for each in REGIMES if each == wanted.regime.value)
     path = save_split(wanted.name.value, regime, train, test, session.places)
     shown = path.relative_to(session.places.roots[0])
-    wanted.told.content = markup.framed(markup.code(f"morphgen split audit {shown}"))
+    wanted.told.content = markup.framed(
+        markup.code(f"morphgen split audit {shlex.quote(str(shown))}")
+    )
     notify(session, "Saved", str(shown))
 
 

@@ -12,7 +12,7 @@ import viser
 
 from morphgen.formats.bundle import PICTURE
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address
+from morphgen.viewer.address import Address, whole_number
 from morphgen.viewer.entries import (
     NUMBERS,
     PAGE_SIZES,
@@ -110,7 +110,7 @@ def build(gallery: Gallery) -> None:
             _add_range(gallery, fact)
         sizes = [str(size) for size in PAGE_SIZES]
         controls["size"] = _dropdown(gui, "On a page", sizes, state.get("size", sizes[0]))
-    gallery.number = int(state.get("n", "1")) if state.get("n", "1").isdigit() else 1
+    gallery.number = whole_number(state.get("n", ""), 1)
     turn = gui.add_button_group("Page", tuple(_STEPS))
     for control in controls.values():
         when(control, gallery.session, lambda: _refilter(gallery), "filter")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 
 from morphgen.model.findings import Finding
@@ -88,15 +88,20 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequenc
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def findings_table(findings: Sequence[Finding]) -> str:
-    """Findings with what to do about them, or that there are none."""
+def findings_table(findings: Sequence[Finding], told: Callable[[str], str] = str) -> str:
+    """Findings with what to do about them, or that there are none.
+
+    Args:
+        findings: What was found.
+        told: How a text of them may be shown, see ``Places.told``.
+    """
     if not findings:
         return '<div class="dim">no findings</div>'
     rows = [
         (
             tag(finding.severity, finding.severity) + f"<br><code>{escape(finding.code)}</code>",
-            f"<b>{escape(finding.where)}</b>: {escape(finding.why)}<br>"
-            f'<span class="dim">{escape(finding.fix)}</span>',
+            f"<b>{escape(told(finding.where))}</b>: {escape(told(finding.why))}<br>"
+            f'<span class="dim">{escape(told(finding.fix))}</span>',
         )
         for finding in findings
     ]

@@ -11,10 +11,12 @@ from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.viewer.places import MEMBER, Places, derivation_at, member_at, read_place
+from morphgen.viewer.places import MEMBER, Places, derivation_at, member_at, read_place, shortened
 
 SPLITS = "splits"
 """Folder below which they are written."""
+LONGEST_NAME = 200
+"""Characters of a split's name."""
 
 
 def member_of(place: str, category: str, task: Task, obstacles: bool, places: Places) -> Member:
@@ -50,6 +52,8 @@ def save_split(
         raise BenchmarkError(
             f"{len(train)} train and {len(test)} test robots: one at least of each"
         )
+    if len(name) > LONGEST_NAME:
+        raise BenchmarkError(f"name {shortened(name)!r}: at most {LONGEST_NAME} characters")
     path = places.roots[0] / SPLITS / f"{name}.yaml"
     if path.exists():
         raise BenchmarkError(f"{path} exists; choose another name")

@@ -12,8 +12,10 @@ A robot's place is a text that fits into an address:
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import re
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -28,11 +30,10 @@ from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import grammar_names
+from morphgen.grammar.model import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.request import default_name, parse_words
 from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
-from morphgen.model.robot import Robot
-from morphgen.viewer.address import Address
+from morphgen.model.robot import TOOL, Frame, Robot
 
 WORDS, DERIVED, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 SPLIT_SUFFIX = ".yaml"
@@ -40,6 +41,9 @@ EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
 PLAYED = (EPISODE_SUFFIX, ".pt")
 """What files end in that are played: episodes and checkpoints."""
 ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml")
+LONGEST_TOLD = 1000
+"""Characters of an error that a page shows."""
+_TEMPORARY = re.compile(rf"{re.escape(tempfile.gettempdir())}/(tmp|morphgen-)[^/\s]*/?(robot/)?")
 
 
 class PlaceError(MorphgenError):
@@ -68,70 +72,36 @@ class Places:
         Raises:
             PlaceError: If it does not exist, or is outside of ``roots``.
         """
-        base, name = self.roots[0], text
+        base, name, allowed = self.roots[0], text, self.roots
         if text.startswith(UPLOAD):
-            base, name = self.uploads, text.removeprefix(UPLOAD)
+            base, name, allowed = self.uploads, text.removeprefix(UPLOAD), (self.uploads,)
         path = base / name
-        allowed = (*self.roots, self.uploads)
-        if not any(path.resolve().is_relative_to(root) for root in allowed):
+        try:
+            inside = any(path.resolve().is_relative_to(root) for root in allowed)
+            exists = inside and path.exists()
+        except (OSError, ValueError):  # a name that no file system takes
+            inside, exists = True, False
+        if not inside:
             raise PlaceError(
-                f"{text}: is outside of the folders that this viewer was started for: "
-                + ", ".join(map(str, self.roots))
+                f"{shortened(text)}: is outside of the folders that this viewer was started for"
             )
-        if not path.exists():
-            raise PlaceError(f"{text}: no such file or folder")
+        if not exists:
+            raise PlaceError(f"{shortened(text)}: no such file or folder")
         return path
 
-
-def target_address(words: Sequence[str], places: Places) -> Address:
-    """The page that ``morphgen view`` opens for its words.
-
-    Args:
-        words: None of them for the library; a folder, file or split's name; or words to compose.
-        places: What may be looked at.
-
-    Raises:
-        MorphgenError: If there is no such thing.
-    """
-    if not words:
-        return Address("library")
-    if len(words) == 1 and "=" not in words[0]:
-        return _single_address(words[0], places)
-    parse_words(words, places.library)
-    return Address("robot", (WORDS + " ".join(words),))
+    def told(self, error: object) -> str:
+        """The text of an error as a page may show it: without folders of this machine."""
+        text = str(error).replace(f"{self.uploads}/", UPLOAD).replace(str(self.uploads), UPLOAD)
+        text = _TEMPORARY.sub("", text)
+        for root in self.roots:
+            text = text.replace(f"{root}/", "")
+        return shortened(text, LONGEST_TOLD)
 
 
-def _single_address(word: str, places: Places) -> Address:
-    if Path(word).exists():
-        path = places.path(word)
-        if path.suffix in PLAYED or (path / CHECKPOINT).is_file():
-            return _played_address(word, places)
-        if path.is_file():
-            return Address("split" if path.suffix == SPLIT_SUFFIX else "robot", (word,))
-        if (path / SPLIT).is_file():
-            return Address("split", (word,))
-        return Address("robot" if is_robot(path) else "gallery", (word,))
-    if word in split_names():
-        return Address("split", (word,))
-    if word in grammar_names() or word.endswith(".grammar"):
-        return Address("compose", (word,))
-    valid = (*split_names(), *grammar_names())
-    raise PlaceError(
-        f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}"
-    )
-
-
-def _played_address(word: str, places: Places) -> Address:
-    """The page that plays an episode, or the policy of a checkpoint or a run's folder."""
-    if word.endswith(EPISODE_SUFFIX):
-        from morphgen.viewer.episode import read_episode
-
-        read_episode(places.path(word), places)
-        return Address("play", (word,))
-    from morphgen.rl.runs import read_checkpoint
-
-    read_checkpoint(places.path(word))
-    return Address("play", state={"policy": word})
+def shortened(text: str, most: int = 100) -> str:
+    """A text for a message: no control characters, and not longer than a number of characters."""
+    plain = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text[: most + 1])
+    return plain if len(plain) <= most else f"{plain[:most]}..."
 
 
 def is_robot(folder: Path) -> bool:
@@ -155,7 +125,50 @@ def read_place(place: str, places: Places) -> Robot:
         return member_robot(member_at(place, places), places.library)
     if derivation := derivation_at(place, places):
         return compose(derivation, places.library, _name(place, derivation, places))
-    return read_robot(places.path(place))
+    path = places.path(place)
+    if place.startswith(UPLOAD) and path.is_file() and path.suffix != ROBOT_SUFFIXES[0]:
+        raise PlaceError(f"{shortened(place)}: only a URDF or a bundle is read from an upload")
+    return _with_tool(read_robot(path))
+
+
+def _with_tool(robot: Robot) -> Robot:
+    """The robot with its link ``tool`` as tool, as tasks take it, if it has no other."""
+    if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
+        return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
+    return robot
+
+
+def grammar_at(name: str, places: Places) -> Grammar:
+    """The grammar of a name, or of a file.
+
+    Raises:
+        PlaceError: If the file may not be looked at.
+        GrammarError: If there is none, or it cannot be read.
+    """
+    folders = places.library.folders
+    (word,) = _with_path([name], places)
+    return load_grammar(find_grammar(word, folders), folders)
+
+
+def words_at(text: str, places: Places) -> tuple[Derivation, str]:
+    """What words of ``morphgen compose`` derive, and the robot's name; see ``parse_words``.
+
+    Raises:
+        PlaceError: If they name a grammar's file that may not be looked at.
+        MorphgenError: If they name what does not exist or does not fit.
+    """
+    return parse_words(_with_path(text.split(), places), places.library)
+
+
+def _with_path(words: list[str], places: Places) -> list[str]:
+    """Words with the path of the grammar's file that the first of them names, if it does."""
+    first = words[0] if words else ""
+    if "=" in first or not (first.endswith(SUFFIX) or "/" in first):
+        return words
+    path = places.path(first)
+    if path.suffix != SUFFIX:
+        raise PlaceError(f"{shortened(first)}: a grammar's file ends in {SUFFIX}")
+    return [str(path), *words[1:]]
 
 
 def as_in_library(robot: Robot, library: Library) -> Robot:
@@ -193,7 +206,7 @@ def derivation_at(place: str, places: Places) -> Derivation | None:
         MorphgenError: If there is no such place, or its derivation is none.
     """
     if place.startswith(WORDS):
-        return parse_words(place.removeprefix(WORDS).split(), places.library)[0]
+        return words_at(place.removeprefix(WORDS), places)[0]
     if place.startswith(DERIVED):
         return parse_derivation(place.removeprefix(DERIVED))
     if place.startswith(MEMBER):
@@ -206,7 +219,7 @@ def derivation_at(place: str, places: Places) -> Derivation | None:
 
 def _name(place: str, derivation: Derivation, places: Places) -> str:
     if place.startswith(WORDS):
-        return parse_words(place.removeprefix(WORDS).split(), places.library)[1]
+        return words_at(place.removeprefix(WORDS), places)[1]
     if place.startswith(DERIVED):
         return default_name(derivation, places.library)
     return places.path(place).resolve().name

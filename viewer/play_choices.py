@@ -12,7 +12,7 @@ from morphgen.benchmark.split import TASKS
 from morphgen.errors import MorphgenError, nearest
 from morphgen.rl.names import REFERENCES, references_for
 from morphgen.viewer import browser, play_bodies
-from morphgen.viewer.address import Address
+from morphgen.viewer.address import Address, whole_number
 from morphgen.viewer.places import WORDS, name_of
 from morphgen.viewer.play_bodies import Bodies
 from morphgen.viewer.play_screen import PlayPage, asked, playing
@@ -42,14 +42,14 @@ def wanted_of(address: Address, trained: Bodies) -> Wanted:
         name = state["sim"]
         raise MorphgenError(f"simulator {name!r} is not here{nearest(name, installed)}")
     seed = state.get("seed", "0")
-    if not (seed.isascii() and seed.isdigit()):
-        raise MorphgenError(f"seed {seed!r}: expected a whole number, 0 or more")
+    if (number := whole_number(seed, -1)) < 0:
+        raise MorphgenError(f"seed {seed!r:.80}: expected a whole number, 0 or more")
     default = trained[0][1] if trained else BODY
     return Wanted(
         task,
         (address.robots or (default,))[:MOST],
         state.get("policy") or references_for(task)[0],
-        int(seed),
+        number,
         bool(state.get("obstacles")),
         simulator,
     )

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import viser
 
 from morphgen.tasks.film import SIZE, Frame, Stage, write_film
 from morphgen.tasks.goals import GoalSet
@@ -17,7 +16,9 @@ from morphgen.tasks.push_sets import PushSet
 from morphgen.tasks.settings import Setting
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.viewer.episode import Episode, Track
+from morphgen.viewer.gate import Gate
 from morphgen.viewer.play_scene import add_episode, show_step
+from morphgen.viewer.server import start_server
 
 STRIDE = 2
 """Control steps between two pictures."""
@@ -44,8 +45,7 @@ def recording(episode: Episode) -> bytes:
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = start_server("127.0.0.1", 0, Gate(names=frozenset()))  # nobody may ask it
     try:
         shown = add_episode(server.scene, episode)
         serializer = server.get_scene_serializer()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from html import escape
 from typing import Any
@@ -54,9 +55,12 @@ class PlayPage:
             look_at(client, self.scene.low, self.scene.high)
         slider = self.controls["time"]
         slider.max = max(source.longest, 1) * source.episode.period
-        self.texts["fault"].content = "".join(map(fault_text, source.faults.values()))
+        self.texts["fault"].content = self._faults(source.faults.values())
         self.planned = self.wanted is None or source.episode.policy not in PLANNERS
         say(self.session, "" if self.planned else "the policy plans its way")
+
+    def _faults(self, texts: Iterable[str]) -> str:
+        return "".join(fault_text(self.session.places.told(text)) for text in texts)
 
     def shown(self, step: int) -> None:
         """Show a moment."""
@@ -75,12 +79,12 @@ class PlayPage:
         """Say what has gone wrong on the way."""
         tracks = self.source.episode.tracks if self.source else []
         if found := [track.fault for track in tracks if track.fault]:
-            self.texts["fault"].content = "".join(map(fault_text, found))
+            self.texts["fault"].content = self._faults(found)
 
     def failed(self, why: str) -> None:
         """Say why there is nothing to see."""
         say(self.session, "")
-        self.texts["fault"].content = fault_text(why)
+        self.texts["fault"].content = self._faults([why])
         self.texts["score"].content = ""
         if self.scene is not None:
             self.scene.root.remove()

@@ -56,7 +56,7 @@ def portrait(place: str, places: Places) -> Portrait:
             return Portrait(data["thumbnail"], facts)
         made = _made(place, places)
     except (MorphgenError, OSError) as error:
-        return Portrait("", {"findings": ("broken",)}, str(error))
+        return Portrait("", {"findings": ("broken",)}, places.told(error))
     with suppress(OSError):  # where nothing can be kept it is drawn again next time
         keep(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
     return made

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import io
+import shlex
 from collections.abc import Callable
 
 import viser
 from PIL import Image
 
+from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.downloads import bundle_files, zipped
-from morphgen.viewer.places import WORDS
+from morphgen.viewer.places import UPLOAD, WORDS
 from morphgen.viewer.robot_state import (
     RobotPage,
 )
@@ -45,10 +47,14 @@ def add_downloads(page: RobotPage) -> None:
 
 def _command(page: RobotPage) -> str:
     if page.place.startswith(WORDS):
-        return f"morphgen compose {page.place.removeprefix(WORDS)}"
+        return shlex.join(["morphgen", "compose", *page.place.removeprefix(WORDS).split()])
     derivation = page.robot.provenance.get("derivation")
-    made = f"\n# {derivation}" if derivation else ""
-    return f"morphgen describe {page.place}{made}" if ":" not in page.place else f"# {derivation}"
+    made = f"# {derivation}" if derivation else ""
+    if ":" not in page.place:
+        return f"morphgen show {shlex.quote(page.place)}\n{made}".rstrip()
+    if page.place.startswith(UPLOAD):
+        return f"# of the file that you sent: morphgen show FILE\n{made}".rstrip()
+    return made
 
 
 def _in_background(session: Session, work: Callable[[], object]) -> Callable[[], None]:
@@ -73,9 +79,12 @@ def _send_file(page: RobotPage, file: str) -> None:
 
 def _send_screenshot(page: RobotPage) -> None:
     camera = page.session.client.camera
-    picture = page.session.client.get_render(
-        camera.image_height, camera.image_width, transport_format="png", timeout=60.0
-    )
+    try:
+        picture = page.session.client.get_render(
+            camera.image_height, camera.image_width, transport_format="png", timeout=60.0
+        )
+    except (OSError, ValueError, RuntimeError, TimeoutError) as error:
+        raise MorphgenError(f"the browser sent no picture: {error}") from error
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "PNG")
     name = f"{page.robot.name or 'robot'}.png"

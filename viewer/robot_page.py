@@ -232,12 +232,15 @@ def _examine(page: RobotPage) -> None:
     findings = list(check(page.robot, tool_required=overlays.has_tool(page.robot)))
     if ":" not in page.place and (folder := session.places.path(page.place)).is_dir():
         findings += file_findings(folder) if (folder / CARD).is_file() else ()
-    page.texts["findings"].content = markup.framed(markup.findings_table(findings))
+    page.texts["findings"].content = markup.framed(
+        markup.findings_table(findings, session.places.told)
+    )
     say(session, "")
     try:
         page.tested = SelfCollision(page.robot)
     except MorphgenError as error:
-        text = f'<div class="dim">collisions cannot be tested: {escape(str(error))}</div>'
+        why = escape(session.places.told(error))
+        text = f'<div class="dim">collisions cannot be tested: {why}</div>'
         page.texts["collisions"].content = markup.framed(text)
         return
     post(session, lambda: show_moved(page), "move")

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 
 from morphgen.benchmark.split import Task
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.fitting.dressed import as_primitives
 from morphgen.formats.bundle import split_colours
-from morphgen.rl.names import REFERENCES
+from morphgen.grammar.model import SUFFIX
+from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.play import controller, demands, require_policy
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
@@ -25,16 +26,18 @@ from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import moment
 from morphgen.tasks.gym_env import PushEnv, ReachEnv, TaskEnv
 from morphgen.tasks.make import SIMULATORS, SimulatorName
-from morphgen.tasks.robots import robot_of
+from morphgen.tasks.robots import is_file, robot_of
 from morphgen.viewer.episode import Array, Episode, Track
 from morphgen.viewer.places import (
     CHECKPOINT,
     DERIVED,
+    WORDS,
     PlaceError,
     Places,
     as_in_library,
     name_of,
     read_place,
+    shortened,
 )
 
 MOST = 9
@@ -165,12 +168,21 @@ def policy_file(policy: str, task: Task, places: Places) -> str:
         PlaceError: If it is a file that may not be looked at.
     """
     if policy not in REFERENCES:
-        with suppress(PlaceError):
-            return str(places.path(policy))
-        if "/" in policy or policy.endswith(".pt"):
-            places.path(policy)
+        return str(_checkpoint_file(policy, references_for(task), places))
     require_policy(policy, task)
     return policy
+
+
+def _checkpoint_file(policy: str, references: Iterable[str], places: Places) -> Path:
+    """The file or folder of a checkpoint."""
+    try:
+        return places.path(policy)
+    except PlaceError as error:
+        if "/" in policy or policy.endswith(".pt"):
+            raise
+        raise TaskError(
+            f"{shortened(policy)!r} is no checkpoint, and no policy{nearest(policy, references)}"
+        ) from error
 
 
 def checkpoints(places: Places, most: int = 50) -> list[str]:
@@ -190,12 +202,19 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
     Raises:
         MorphgenError: If it is no checkpoint, or its robot has no parts to be made of.
     """
-    source = read_checkpoint(places.path(policy))[0].source
+    source = read_checkpoint(_checkpoint_file(policy, REFERENCES, places))[0].source
     rows = members(source)
     if rows:
         named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]
         return rows[0].task, any(row.obstacles for row in rows), named
-    derivation = robot_of(source.name, library=places.folders).provenance.get("derivation")
+    words = source.name.split()
+    if is_file(source.name):
+        robot = read_place(source.name, places)
+    elif words and words[0].endswith(SUFFIX):
+        robot = read_place(WORDS + source.name, places)
+    else:
+        robot = robot_of(source.name, library=places.folders)
+    derivation = robot.provenance.get("derivation")
     place = f"{DERIVED}{derivation}" if derivation else source.name
     return source.task or "reach", source.obstacles, [(source.name, place)]
 

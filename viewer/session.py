@@ -18,6 +18,9 @@ from morphgen.viewer.address import Address
 from morphgen.viewer.places import Places
 from morphgen.viewer.workers import Workers
 
+BUG = "something is wrong with morphgen itself; what it is stands where the viewer was started"
+"""What a page says of an error that should not happen."""
+
 Work = Callable[[], object]
 T = TypeVar("T")
 
@@ -174,9 +177,18 @@ def _do(session: Session, work: Work, key: str) -> None:
         return
     try:
         work()
-    except MorphgenError as error:
-        say(session, "")
-        notify(session, "That did not work", str(error), error=True)
+    except (MorphgenError, RecursionError) as error:
+        refuse(session, error)
+    except Exception:
+        if not session.closed.is_set():
+            refuse(session, BUG)
+        raise
+
+
+def refuse(session: Session, error: object) -> None:
+    """Say on the page why something was not done."""
+    say(session, "")
+    notify(session, "That did not work", session.places.told(error), error=True)
 
 
 def _tell_bug(future: Future[None], session: Session) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -198,7 +199,7 @@ def _add_new_split(page: SplitPage) -> None:
         chosen = regime.value
         path = save_split(name.value, chosen, sides["train"], sides["test"], session.places)
         shown = path.relative_to(session.places.roots[0])
-        told.content = markup.framed(markup.code(f"morphgen split audit {shown}"))
+        told.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(str(shown))}"))
         notify(session, "Saved", str(shown))
 
     when(button, session, save)

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import time
+from types import FrameType
+from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library
 
+if TYPE_CHECKING:
+    from morphgen.viewer.app import Viewer
+
+_ENDS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+"""Signals that end it as Ctrl-C does: of a service manager, of a terminal that is closed."""
+_NAP = 0.5
+"""Seconds after which a signal is seen for certain."""
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
@@ -34,6 +45,14 @@ def add_parser(commands: Subparsers) -> None:
         "--host", default="127.0.0.1", help="address to bind (default: this machine)"
     )
     parser.add_argument("--port", type=int, default=8080)
+    parser.add_argument(
+        "--allow-origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="a site whose pages may use this one, such as https://hub.example.com where a proxy "
+        "shows it, or the name of this machine, http://box:8080; may be repeated",
+    )
     add_library(parser)
     parser.set_defaults(run=run)
 
@@ -45,16 +64,35 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 < args.port < 65536:
         raise MorphgenError(f"--port {args.port}: expected 1 to 65535")
-    viewer = serve(args.words, args.host, args.port, args.library)
-    if args.host not in LOCAL:
-        print(
-            f"morphgen: warning: --host {args.host}: whoever can reach this machine can use this "
-            "page, see the robots of this folder and write into it; there is no password",
-            file=sys.stderr,
-        )
-    print(f"http://{args.host}:{viewer.port}  (stop with Ctrl-C)", flush=True)
+    for name in _ENDS:
+        signal.signal(name, _interrupt)
     try:
-        viewer.server.sleep_forever()
+        viewer = serve(args.words, args.host, args.port, args.library, args.allow_origin)
+        _sleep(args.host, viewer)
     except KeyboardInterrupt:
-        viewer.stop()
+        pass
     return 0
+
+
+def _sleep(host: str, viewer: Viewer) -> None:
+    """Say where it serves, and wait until it is interrupted."""
+    try:
+        if host not in LOCAL:
+            print(
+                f"morphgen: warning: --host {host}: whoever can reach this machine can use this "
+                "page, see the robots of this folder and write into it; there is no password",
+                file=sys.stderr,
+            )
+        name = f"[{host}]" if ":" in host else host
+        print(f"http://{name}:{viewer.port}  (stop with Ctrl-C)", flush=True)
+        while True:  # a signal that another thread takes does not end a sleep
+            time.sleep(_NAP)
+    finally:
+        for signal_name in (signal.SIGINT, *_ENDS):
+            signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind
+        viewer.stop()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """End as Ctrl-C does."""
+    raise KeyboardInterrupt

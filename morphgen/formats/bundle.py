@@ -20,7 +20,7 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
-from morphgen.formats.urdf import read_urdf, with_frames
+from morphgen.formats.urdf import own_frames, read_urdf, with_frames
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape
@@ -32,6 +32,7 @@ MJCF = "robot.xml"
 CARD = "card.json"
 PICTURE = "preview.png"
 MESHES = "meshes"
+XACRO = ".xacro"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 
@@ -132,7 +133,14 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
         raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
     for name, expected in hashes.items():
         path = folder / name
-        if not path.is_file():
+        try:
+            is_own = path.resolve().is_relative_to(folder.resolve())
+            is_there = is_own and path.is_file()
+        except (OSError, ValueError):  # a name that no file system takes
+            is_own, is_there = True, False
+        if not is_own:
+            raise FormatError(f"{folder / CARD}: hashes: {name!r} leads out of the folder")
+        if not is_there:
             code, why = "file-missing", "the card names it, but it is not there"
         elif hashlib.sha256(path.read_bytes()).hexdigest() != expected:
             code, why = "file-changed", "its content is not what the card was written for"
@@ -153,7 +161,10 @@ def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
         return read_bundle(path)
     if path.name == URDF and (path.parent / CARD).is_file():
         return read_bundle(path.parent)
-    return read_urdf(path, args)
+    robot = read_urdf(path, args)
+    if path.suffix == XACRO:
+        return robot
+    return with_frames(robot, own_frames(path.read_bytes(), str(path)))
 
 
 def split_colours(robot: Robot) -> Robot:

@@ -14,6 +14,7 @@ from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.structure import structure_findings
 from morphgen.formats.urdf_elements import read_colour, read_joint, read_link
+from morphgen.formats.urdf_text import OWN
 from morphgen.formats.xacro import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding
@@ -46,8 +47,9 @@ def read_urdf(
             environment and in the installed data packages.
 
     Returns:
-        The robot, without frames; its home is zero, or the middle of a range without zero. What
-        had to be mended or left out is in its ``source_findings``.
+        The robot, without frames; its home is that of a file of morphgen's own, else zero, or the
+        middle of a range without zero. What had to be mended or left out is in its
+        ``source_findings``.
 
     Raises:
         UnsoundError: If the tree is broken or a mesh is not found.
@@ -97,7 +99,8 @@ def robot_from_xml(
     links = {link.name: link for link in found}
     joints = _topological(_joints(root), links)
     order = [_root_name(links, joints), *(joint.child for joint in joints)]
-    home = tuple(_rest(joint) for joint in joints if joint.is_independent)
+    positions = _told_home(root, str(path))
+    home = tuple(positions.get(j.name, _rest(j)) for j in joints if j.is_independent)
     bodies = tuple(links[name] for name in order)
     # Without the folder, a card that lists them is the same on every machine.
     told = tuple(
@@ -124,6 +127,31 @@ def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
         joints=tuple(joint for joint in robot.joints if joint.child not in names),
         frames=tuple(Frame(n, joints[n].parent, joints[n].T_parent_joint) for n in names),
     )
+
+
+def own_frames(data: bytes, origin: str) -> tuple[str, ...]:
+    """Names of the links that ``urdf_text`` wrote for frames; none in a file of others.
+
+    Raises:
+        FormatError: If it is not XML.
+    """
+    root, _ = parse_description(data, origin)
+    return tuple(frame.get("name", "") for frame in root.iterfind(f"{OWN}/frame"))
+
+
+def _told_home(root: etree._Element, origin: str) -> dict[str, float]:
+    """Positions at home by joint, as ``urdf_text`` wrote them."""
+    home = {}
+    for element in root.iterfind(f"{OWN}/home"):
+        text = element.get("position", "")
+        try:
+            position = float(text)
+        except ValueError:
+            position = math.nan
+        if not math.isfinite(position):
+            raise FormatError(f"{origin}:{element.sourceline}: home position {text!r} is no number")
+        home[element.get("joint", "")] = position
+    return home
 
 
 def _resolved_meshes(

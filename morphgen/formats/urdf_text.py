@@ -18,6 +18,9 @@ from morphgen.model.robot import (
     Robot,
 )
 
+OWN = "morphgen"
+"""Element of a URDF with what only morphgen reads."""
+
 MeshUri = Callable[[Mesh], str]
 
 
@@ -30,6 +33,9 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     become a cylinder and two spheres. A hinge without limits becomes ``continuous``, and a missing
     effort or velocity the default: with half a ``<limit>`` Pinocchio refuses the file and PyBullet
     reads zeros.
+
+    A ``<morphgen>`` element, which loaders pass over, holds what URDF has no word for: the home,
+    and which links are frames.
 
     Args:
         robot: The body.
@@ -49,8 +55,20 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     for frame in robot.frames:
         T = frame.T_link_frame
         _write_joint(root, Joint(f"{frame.name}_joint", "fixed", frame.link, frame.name, T))
+    _write_own(root, robot)
     etree.indent(root)
     return etree.tostring(root, encoding="unicode", xml_declaration=False) + "\n"
+
+
+def _write_own(root: etree._Element, robot: Robot) -> None:
+    if not (robot.home or robot.frames):
+        return
+    own = etree.SubElement(root, OWN)
+    for row, position in zip(robot.independent, robot.home, strict=True):
+        home = {"joint": robot.joints[row].name, "position": number(position)}
+        etree.SubElement(own, "home", home)
+    for frame in robot.frames:
+        etree.SubElement(own, "frame", name=frame.name)
 
 
 def number(value: float) -> str:

@@ -213,7 +213,11 @@ class _Reader:
 
     def _included(self, include: Include, path: Path) -> Path:
         target = path.parent / include.target
-        if target.suffix != SUFFIX or not target.is_file():
+        try:
+            is_there = target.suffix == SUFFIX and target.is_file()
+        except (OSError, ValueError) as error:  # a name that no file system takes
+            raise GrammarError(f"{include.place}: include: no such file: {error}") from error
+        if not is_there:
             try:
                 target = find_grammar(include.target, self._folders)
             except GrammarError as error:

@@ -1,12 +1,16 @@
 """``morphgen view`` serves, warns and refuses."""
 
+import re
 import signal
 import urllib.request
+from pathlib import Path
 
 import pytest
+from websockets.exceptions import InvalidStatus
 
 from commands import start
 from morphgen.formats.bundle import write_bundle
+from plain_client import PlainClient
 from robots import arm
 
 
@@ -27,6 +31,46 @@ def test_a_bundle_is_served_until_interrupted(tmp_path):
     _, errors = viewing.communicate(timeout=60)
     assert viewing.returncode == 0
     assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_however_it_ends_no_upload_is_left(tmp_path, monkeypatch, end):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    viewing = start("view", "--port", "8933")
+    port = int(re.search(r":(\d+)", address(viewing))[1])
+    with PlainClient(port) as client:
+        client.upload("a.urdf", b'<robot name="r"><link name="a"/></robot>')
+        client.sent_to()
+    (folder,) = tmp_path.glob("morphgen-uploads-*")
+    assert [path.name for path in folder.rglob("*.urdf")] == ["a.urdf"]
+    viewing.send_signal(end)
+    _, errors = viewing.communicate(timeout=60)
+    assert (viewing.returncode, errors) == (0, "")
+    assert list(tmp_path.glob("morphgen-uploads-*")) == []
+
+
+def test_it_serves_the_sites_that_are_allowed(tmp_path):
+    site = "https://hub.example.com"
+    viewing = start("view", "--port", "8934", "--allow-origin", site)
+    port = int(re.search(r":(\d+)", address(viewing))[1])
+    with PlainClient(port, origin=site, host="hub.example.com") as client:
+        client.shows("Categories")
+    with pytest.raises(InvalidStatus):
+        PlainClient(port, origin="https://other.example.com")
+    viewing.send_signal(signal.SIGTERM)
+    assert viewing.communicate(timeout=60)[1] == ""
+
+
+@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="no IPv6 here")
+def test_it_serves_at_ipv6(tmp_path):
+    viewing = start("view", "--port", "8935", "--host", "::1")
+    where = address(viewing)
+    port = int(where.rpartition(":")[2])
+    assert where == f"http://[::1]:{port}"
+    with PlainClient(port, address="::1", origin=where) as client:
+        client.shows("Categories")
+    viewing.send_signal(signal.SIGTERM)
+    assert viewing.communicate(timeout=60)[1] == ""
 
 
 def test_another_host_is_warned_of(tmp_path):
@@ -56,6 +100,8 @@ def test_a_file_that_cannot_be_played_is_refused(refused, tmp_path, name, why):
         (["--host", "nosuch.invalid"], "cannot serve at"),
         (["--port", "0"], "--port 0: expected 1 to 65535"),
         (["--library", "nowhere"], "library folder"),
+        (["--allow-origin", "null"], "--allow-origin 'null': expected a site"),
+        (["--allow-origin", "http://box/page"], "without a path"),
     ],
 )
 def test_what_cannot_be_served_is_refused(refused, words, why):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from morphgen.errors import FormatError
+from morphgen.formats.bundle import read_robot
 from morphgen.formats.urdf import UnsoundError, read_urdf, with_frames
 from morphgen.formats.urdf_text import number, urdf_text
 from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
@@ -67,7 +68,25 @@ def test_missing_limits_are_not_read_as_zero(tmp_path):
 def test_home_is_in_the_middle_of_a_range_without_zero(tmp_path):
     joint = Joint("j", "prismatic", "a", "b", limits=(0.2, 0.8), effort=1.0, velocity=1.0)
     robot = Robot("r", (Link("a"), Link("b")), (joint,), home=(0.3,))
-    assert read_urdf(written(robot, tmp_path)).home == (0.5,)
+    path = written(robot, tmp_path)
+    assert read_urdf(path).home == (0.3,)
+    path.write_text(path.read_text().replace("morphgen>", "others>"))
+    assert read_urdf(path).home == (0.5,)
+
+
+def test_a_urdf_alone_has_its_tool_and_home(tmp_path):
+    path = written(arm(), tmp_path)
+    alone = read_robot(path)
+    assert (alone.home, alone.frames) == (arm().home, arm().frames)
+    assert [link.name for link in alone.links] == [link.name for link in arm().links]
+
+
+@pytest.mark.parametrize("position", ["nan", "inf", "1e999", "left", ""])
+def test_a_home_that_is_no_number_is_refused(tmp_path, position):
+    path = written(arm(), tmp_path)
+    path.write_text(path.read_text().replace('position="0.4"', f'position="{position}"'))
+    with pytest.raises(FormatError, match=rf"robot.urdf:\d+: home position '{position}'"):
+        read_robot(path)
 
 
 def test_a_turned_inertial_frame_is_turned_into_link_axes(tmp_path):

@@ -20,8 +20,8 @@ from morphgen.viewer.places import (
     content_key,
     read_place,
     split_at,
-    target_address,
 )
+from morphgen.viewer.targets import target_address
 from robots import arm
 
 

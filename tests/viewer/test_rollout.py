@@ -18,11 +18,12 @@ from morphgen.rl.training import train
 from morphgen.tasks.gym_env import ReachEnv
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, still
-from morphgen.viewer.places import CHECKPOINT, Places, target_address
+from morphgen.viewer.places import CHECKPOINT, Places
 from morphgen.viewer.play_choices import address_of, wanted_of
 from morphgen.viewer.play_files import recording, setting_of
 from morphgen.viewer.play_scene import GAP, area, places_in_grid
 from morphgen.viewer.rollout import Recorded, Rollout, Wanted, simulators
+from morphgen.viewer.targets import target_address
 from robots import arm
 from small_runs import QUIET, small_config
 

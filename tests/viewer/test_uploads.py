@@ -1,17 +1,24 @@
 """Uploads are kept only if they are robots that keep to their folder."""
 
 import io
+import stat
+import tempfile
+import warnings
 import zipfile
+from dataclasses import replace
 
 import pytest
+import trimesh
 
+from morphgen.benchmark.split import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
-from morphgen.viewer import uploads
+from morphgen.viewer import archives, uploads
 from morphgen.viewer.downloads import bundle_files, zipped
-from morphgen.viewer.places import Places, read_place
+from morphgen.viewer.places import PlaceError, Places, read_place
 from morphgen.viewer.uploads import UploadError, keep
+from plain_client import PlainClient
 from robots import arm
 
 URDF = b'<robot name="r"><link name="a"/></robot>'
@@ -87,9 +94,260 @@ def test_a_damaged_zip_is_refused(places, how):
 
 
 def test_large_uploads_are_refused(places, monkeypatch):
-    monkeypatch.setattr(uploads, "LARGEST", 1000)
+    monkeypatch.setattr(uploads, "LARGEST_UPLOAD", 1000)
     with pytest.raises(UploadError, match="at most"):
         keep("a.urdf", b" " * 1001, places)
-    bomb = archive({"a.urdf": URDF, "b.bin": b"0" * 5000})
-    with pytest.raises(UploadError, match=r"at most|unpacks to more"):
+    monkeypatch.setattr(archives, "LARGEST", 1000)
+    bomb = archive({"a.urdf": URDF, "b.stl": b"0" * 5000}, zipfile.ZIP_DEFLATED)
+    assert len(bomb) < 1000
+    with pytest.raises(UploadError, match="unpacks to more"):
         keep("a.zip", bomb, places)
+    assert list(places.uploads.iterdir()) == []
+
+
+def test_a_zip_unpacks_to_no_more_than_it_says(places):
+    whole = archive({"a.urdf": URDF, "b.stl": b"0" * 5_000_000}, zipfile.ZIP_DEFLATED)
+    small = (10).to_bytes(4, "little")
+    with pytest.raises(UploadError, match="no readable zip"):
+        keep("a.zip", whole.replace((5_000_000).to_bytes(4, "little"), small), places)
+
+
+XACRO = b"""<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="a"/>
+<xacro:property name="x" value="${python.vars(python.type(xacro.load_yaml))}"/></robot>"""
+
+
+def linked(name, target):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as made:
+        made.writestr("a.urdf", URDF)
+        entry = zipfile.ZipInfo(name)
+        entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+        made.writestr(entry, target)
+    return content.getvalue()
+
+
+def twice(*names):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as made, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in names:
+            made.writestr(name, URDF)
+    return content.getvalue()
+
+
+def patched(whole, old, new):
+    assert old in whole
+    return whole.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (twice("x", "x/a.urdf"), "in a folder that is a file"),
+        (twice("a.urdf", "a.urdf"), "is there twice"),
+        (twice("a.urdf", "./A.URDF"), "is there twice"),
+        (archive({"a" * 300 + ".urdf": URDF}), "longer than 100"),
+        (archive({"é" * 80 + ".urdf": URDF}), "longer than 100"),
+        (archive({"d/" * 30 + "a.urdf": URDF}), "more than 20 folders"),
+        (archive({"a\n.urdf": URDF}), "no name of a file"),
+        (archive({"C:/a.urdf": URDF}), "leads out"),
+        (archive({"b/../a.urdf": URDF}), "leads out"),
+        (patched(archive({"aXb.urdf": URDF}), b"aXb", b"a\0b"), "no name of a file|no readable"),
+        (linked("meshes", "/etc"), "is a link"),
+        (linked("meshes/x.stl", "../../../etc/passwd"), "is a link"),
+        (archive({f"{i}.stl": b"" for i in range(2001)}), "more than 2000 files"),
+        (archive({"a.urdf": URDF}, zipfile.ZIP_LZMA), "method other than deflate"),
+        (archive({"a.urdf": URDF}, zipfile.ZIP_BZIP2), "method other than deflate"),
+        (archive({"a.urdf": URDF})[:-30], "no readable zip"),
+        (b"", "no readable zip"),
+        (archive({"a.urdf.xacro": XACRO}), "no xacro of an upload is expanded"),
+        (archive({"a.xacro": XACRO, "b.yaml": b"x: 1"}), "no xacro of an upload is expanded"),
+        (archive({"a.urdf": XACRO}), "a.urdf:2: is a xacro; none of an upload is expanded"),
+        (archive({"a.urdf": URDF, "robot.xml": b'<mujoco><include file="/etc/passwd"/></mujoco>'}),
+         "leads out"),
+        (archive({"a.urdf": URDF, "m.xml": b'<mujoco><compiler meshdir="../.."/></mujoco>'}),
+         "leads out"),
+        (archive({"a.urdf": URDF, "m.xml": b'<mujoco><asset><mesh file="/x"/></asset></mujoco>'}),
+         "leads out"),
+        (archive({"robot.urdf": URDF, "card.json": b"["}), "card.json: no valid JSON"),
+        (archive({"robot.urdf": URDF, "card.json": b"[" * 100_000}), "card.json: no valid JSON"),
+        (archive({"robot.urdf": URDF, "card.json": b'{"hashes": {"/etc/passwd": "0"}}'}),
+         "leads out"),
+        (archive({"robot.urdf": URDF, "card.json": b'{"hashes": {"../x": "0"}}'}), "leads out"),
+        (archive({"a.urdf": MESHED % b"x.stl"}), "a.urdf:1: mesh 'x.stl' is not in the upload"),
+        (archive({"a.urdf": MESHED % b"..%2f..%2fx.stl"}), "is not in the upload"),
+        (archive({"a.urdf": MESHED % b"package://rtb_data/x.stl"}), "is not in the upload"),
+        (archive({"a.urdf": MESHED % b""}), "is not in the upload"),
+    ],
+    ids=lambda each: each[:40] if isinstance(each, str) else "",
+)  # fmt: skip
+def test_an_odd_zip_is_refused_in_a_sentence(places, content, why):
+    with pytest.raises(UploadError, match=why) as refused:
+        keep("a.zip", content, places)
+    assert str(places.uploads) not in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert list(places.uploads.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["a" * 300 + ".urdf", "\0.urdf", "a b.urdf", "a\n.urdf", "", "é.urdf"]
+)
+def test_an_odd_name_is_refused(places, name):
+    with pytest.raises(UploadError, match="no file name that can be kept"):
+        keep(name, URDF, places)
+
+
+def test_a_mesh_is_not_taken_from_another_upload_or_the_folder_above(places):
+    box = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
+    first = keep(
+        "a.zip", archive({"p/m.stl": box, "a.urdf": MESHED % b"package://p/m.stl"}), places
+    )
+    assert read_place(first, places).links[0].visuals
+    (places.uploads.parent / "q").mkdir()
+    (places.uploads.parent / "q" / "m.stl").write_bytes(box)
+    token = first.removeprefix("upload:").partition("/")[0]
+    for uri in (f"package://{token}/p/m.stl", "package://q/m.stl", f"..%2f{token}/p/m.stl"):
+        with pytest.raises(UploadError, match="is not in the upload"):
+            keep("a.urdf", MESHED % uri.encode(), places)
+
+
+def test_only_descriptions_meshes_and_cards_are_kept(places):
+    box = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
+    files = {
+        "p/urdf/a.urdf": MESHED % b"package://p/meshes/m.STL",
+        "p/meshes/m.STL": box,
+        "p/package.xml": b"<package><name>p</name></package>",
+        "p/robot.xml": b"<mujoco/>",
+        "p/other.xml": b"<x/>",
+        "p/broken.xml": b"<x",
+        "p/urdf/a.xacro": XACRO,
+        "p/macros.urdf.xacro": XACRO,
+        "p/load.yaml": b"x: 1",
+        "p/run.py": b"print()",
+        "p/derivation": b"arm=ur5",
+        "p/.git/config": b"",
+        "__MACOSX/p/._a.urdf": b"\0",
+    }
+    place = keep("p.zip", archive(files), places)
+    assert read_place(place, places).name == "r"
+    (folder,) = places.uploads.iterdir()
+    kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert kept == {"p/urdf/a.urdf", "p/meshes/m.STL", "p/package.xml", "p/robot.xml"}
+
+
+def test_no_xacro_is_read_below_the_uploads(places):
+    folder = places.uploads / "1"
+    folder.mkdir()
+    (folder / "a.xacro").write_bytes(XACRO)
+    with pytest.raises(PlaceError, match="only a URDF or a bundle is read from an upload"):
+        read_place("upload:1/a.xacro", places)
+
+
+def test_no_more_are_kept_than_a_number(places, monkeypatch):
+    monkeypatch.setattr(uploads, "MOST_KEPT", 2)
+    keep("a.urdf", URDF, places)
+    keep("a.urdf", URDF, places)
+    with pytest.raises(UploadError, match="2 uploads are kept already"):
+        keep("a.urdf", URDF, places)
+
+
+def test_a_full_disk_keeps_nothing(places, monkeypatch):
+    def full(self, data):
+        raise OSError(28, "No space left on device", str(self))
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(UploadError, match="cannot be kept: No space left on device") as refused:
+        keep("a.urdf", URDF, places)
+    assert str(places.uploads) not in str(refused.value)
+    assert list(places.uploads.iterdir()) == []
+
+
+@pytest.mark.parametrize(("as_zip", "pairs"), [(False, ()), (True, (("upper", "right"),))])
+def test_a_robot_of_morphgen_keeps_its_tool_and_home(places, tmp_path, as_zip, pairs):
+    robot = replace(arm(), ignore_pairs=(("upper", "right"),), provenance={"source": {"x": "y"}})
+    write_bundle(robot, tmp_path / "arm", picture=False)
+    files = bundle_files("arm", places)
+    name, content = (
+        ("arm.zip", zipped("arm", files)) if as_zip else ("robot.urdf", files["robot.urdf"])
+    )
+    back = read_place(keep(name, content, places), places)
+    assert (back.home, back.frames, back.ignore_pairs) == (robot.home, robot.frames, pairs)
+    assert robot_hash(back) == robot_hash(robot)
+    assert bool(back.provenance) == as_zip
+
+
+def test_a_link_called_tool_is_the_tool(places):
+    text = b"""<robot name="r"><link name="a"/><link name="tool"/><joint name="j" type="fixed">
+    <parent link="a"/><child link="tool"/></joint></robot>"""
+    assert read_place(keep("a.urdf", text, places), places).frame("tool").link == "tool"
+
+
+def test_uploads_come_through_a_websocket_and_are_read(viewer, tmp_path):
+    write_bundle(arm(), tmp_path / "arm", picture=False)
+    on = viewer()
+    content = zipped("arm", {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()})
+    with PlainClient(on.port) as client:
+        client.upload("arm.zip", content)
+        query = client.sent_to()
+    with PlainClient(on.port, query) as client:
+        client.control("Slider", "shoulder")
+        client.until(lambda: "see it" in client.text)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        ("a.zip", archive({"a.urdf": XACRO}), "a.urdf:2: is a xacro"),
+        ("a.zip", archive({"a.xacro": XACRO}), "no xacro of an upload is expanded"),
+        ("a.zip", twice("x", "x/a.urdf"), "in a folder that is a file"),
+        ("a.zip", archive({"a" * 300 + ".urdf": URDF}), "longer than 100"),
+        ("a.zip", linked("x", "/etc/passwd"), "is a link"),
+        ("a.urdf", b"", "a.urdf:1:1"),
+        ("a.urdf", MESHED % b"x.stl", "is not in the upload"),
+        ("../../a" + "b" * 10_000 + ".urdf", URDF, "no file name that can be kept"),
+    ],
+)
+def test_a_hostile_upload_is_a_sentence_on_the_page(viewer, capfd, name, content, why):
+    on = viewer()
+    with PlainClient(on.port) as client:
+        client.upload(name, content)
+        client.shows(why)
+        assert tempfile.gettempdir() not in client.text
+        assert list(on.places.uploads.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_upload_that_is_not_as_it_was_said_to_be_is_dropped(viewer, capfd):
+    on = viewer()
+    with PlainClient(on.port) as client:
+        client.upload("a.urdf", b" " * 2000, size=1000)
+        client.shows("longer than it was said to be")
+        client.upload("a.urdf", b"", size=200 * 2**20, parts=1)
+        client.shows("200 MB; at most 100 MB are taken")
+        client.upload("a.urdf", b"", size=-1, parts=0)
+        client.shows("-1 bytes in 0 parts")
+        client.upload("a.urdf", b"", size=10, parts=10**9)
+        client.shows("10 bytes in 1000000000 parts")
+        client.upload("a.urdf", URDF)
+        assert client.sent_to().startswith("?robot=upload:")
+        ((_, session),) = on.sessions.items()
+        assert session.client.gui._current_file_upload_states == {}
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_error_tells_no_temporary_path(viewer, capfd):
+    broken = URDF.replace(b'<link name="a"/>', b'<link name="a"/><link name="b"/>')
+    on = viewer()
+    with PlainClient(on.port) as client:
+        client.upload("a.urdf", broken)
+        query = client.sent_to()
+    with PlainClient(on.port, query) as client:
+        client.shows("upload:")
+        client.shows("a.urdf")
+        client.shows("tag error")
+        assert tempfile.gettempdir() not in client.text
+    for text in (
+        f"{on.places.uploads}/x/a.urdf:1: bad",
+        f"{tempfile.gettempdir()}/tmpab12/robot/x",
+    ):
+        assert tempfile.gettempdir() not in on.places.told(text)

@@ -1,0 +1,151 @@
+"""A client of a viewer that is no browser: it speaks viser's protocol over a real websocket."""
+
+import socket
+import time
+import uuid
+
+import msgspec
+import viser
+import zstandard
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [1.0, 1.0, 1.0],
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 600,
+    "image_width": 1200,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+
+
+class PlainClient:
+    """Connects, tells an address when it is asked for it, and keeps all that it is sent."""
+
+    def __init__(self, port, query="", *, origin=None, host=None, address="127.0.0.1"):
+        name = f"[{address}]" if ":" in address else address
+        self.query, self.messages = query, []
+        self.websocket = connect(
+            f"ws://{host or f'{name}:{port}'}",
+            origin=Origin(origin) if origin else None,
+            subprotocols=[f"viser-v{viser.__version__}"],
+            sock=socket.create_connection((address, port)),
+            max_size=None,
+            open_timeout=60,
+        )
+
+    def __enter__(self):
+        self.say(CAMERA)
+        return self
+
+    def __exit__(self, *fault):
+        self.websocket.close()
+
+    def say(self, message):
+        """Send a message, or bytes as they are."""
+        data = message if isinstance(message, bytes) else msgspec.msgpack.encode(message)
+        self.websocket.send(data)
+
+    def until(self, condition, seconds=60):
+        """Take messages until a condition holds of all of them; return what it gives."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if found := condition():
+                return found
+            try:
+                self._take(self.websocket.recv(timeout=0.2))
+            except TimeoutError:
+                continue
+        raise AssertionError(f"not within {seconds} s; the page said ...{self.text[-2000:]!r}")
+
+    def until_closed(self):
+        """Take messages until the server closes the connection; return code and reason."""
+        try:
+            while True:
+                self._take(self.websocket.recv(timeout=60))
+        except ConnectionClosed as closed:
+            return closed.rcvd.code, closed.rcvd.reason
+
+    @property
+    def text(self):
+        """All texts of the page: HTML, notifications, labels."""
+        return "\n".join(_texts(self.messages))
+
+    def shows(self, text):
+        """Wait until the page shows a text."""
+        self.until(lambda: text in self.text)
+
+    def control(self, kind, label):
+        """The control of a kind with a label, when it is there: its identity."""
+
+        def found():
+            of_kind = [each for each in self.messages if each["type"] == f"Gui{kind}Message"]
+            return next((m["uuid"] for m in of_kind if m["props"]["label"] == label), None)
+
+        return self.until(found)
+
+    def change(self, control, value):
+        """Change a control's value."""
+        self.say({"type": "GuiUpdateMessage", "uuid": control, "updates": {"value": value}})
+
+    def upload(self, name, content, *, size=None, parts=None):
+        """Send a file by the button of the first page, in parts as a browser does."""
+        button = self.control("UploadButton", "Look at a URDF or a zipped bundle")
+        self.control("Text", "Search")  # comes after it, when the server listens to the button
+        transfer, step = uuid.uuid4().hex, 512 * 1024
+        pieces = [content[at : at + step] for at in range(0, len(content), step)]
+        begin = {
+            "type": "FileTransferStartUpload",
+            "source_component_uuid": button,
+            "transfer_uuid": transfer,
+            "filename": name,
+            "mime_type": "",
+            "part_count": len(pieces) if parts is None else parts,
+            "size_bytes": len(content) if size is None else size,
+        }
+        self.say(begin)
+        for i, piece in enumerate(pieces):
+            part = {"part_index": i, "content": piece, "transfer_uuid": transfer}
+            self.say({"type": "FileTransferPart", "source_component_uuid": button, **part})
+
+    def sent_to(self):
+        """Wait until the page is told to load another; return that query."""
+
+        def found():
+            sources = [m["source"] for m in self.messages if m["type"] == "RunJavascriptMessage"]
+            orders = [each for each in sources if "location.assign" in each]
+            return orders and msgspec.json.decode(orders[-1].split("(", 1)[1].rstrip(");"))
+
+        return self.until(found)
+
+    def _take(self, data):
+        size = int.from_bytes(data[8:16], "little")
+        plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
+        for message in msgspec.msgpack.decode(plain)["messages"]:
+            self.messages.append(message)
+            if message["type"] == "LocalStorageGetItemRequestMessage":
+                answer = {"request_uuid": message["request_uuid"], "error": None}
+                self.say(
+                    {
+                        "type": "LocalStorageGetItemResponseMessage",
+                        "value": self.query,
+                        **answer,
+                    }
+                )
+
+
+def _texts(value):
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for each in value.values():
+            yield from _texts(each)
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _texts(each)

@@ -1,0 +1,178 @@
+"""Pages of other sites cannot use the viewer, by whatever name they ask it."""
+
+import http.client
+import re
+
+import pytest
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidStatus
+
+from morphgen.errors import MorphgenError
+from morphgen.viewer.gate import Gate, gate_of, refusal
+from morphgen.viewer.server import start_server
+from plain_client import PlainClient
+
+HUB = "https://hub.example.com"
+
+
+def asked(gate, host, origin=None, path="/"):
+    headers = Headers({"Host": host} if host is not None else {})
+    if origin is not None:
+        headers["Origin"] = origin
+    return refusal(gate, path, headers)
+
+
+@pytest.mark.parametrize(
+    ("bound", "host", "origin"),
+    [
+        ("127.0.0.1", "localhost:8080", None),
+        ("127.0.0.1", "127.0.0.1:8080", "http://127.0.0.1:8080"),
+        ("127.0.0.1", "LOCALHOST:8080", "http://localhost:8080"),
+        ("::1", "[::1]:8080", "http://[::1]:8080"),
+        ("127.0.0.1", "localhost:9000", "http://localhost:9000"),  # ssh -L 9000:localhost:8080
+        ("127.0.0.1", "localhost", "https://localhost"),  # behind a proxy with TLS
+        ("127.0.0.1", "localhost:8080", HUB),  # a proxy that keeps the origin
+        ("127.0.0.1", "hub.example.com", HUB),  # a proxy that keeps both
+        ("box", "box:8080", "http://box:8080"),
+        ("192.168.1.5", "192.168.1.5:8080", "http://192.168.1.5:8080"),
+        ("0.0.0.0", "192.168.1.5:8080", "http://192.168.1.5:8080"),
+        ("0.0.0.0", "localhost:8080", None),
+        ("::", "[fe80::1]:8080", "http://[fe80::1]:8080"),
+    ],
+)
+def test_its_own_names_and_allowed_sites_may_ask(bound, host, origin):
+    assert asked(gate_of(bound, [HUB]), host, origin) == ""
+
+
+@pytest.mark.parametrize(
+    ("bound", "host", "origin"),
+    [
+        ("127.0.0.1", "localhost:8080", "http://evil.example"),
+        ("127.0.0.1", "localhost:8080", "null"),
+        ("127.0.0.1", "localhost:8080", ""),
+        ("127.0.0.1", "localhost:8080", "http://localhost:3000"),
+        ("127.0.0.1", "localhost:8080", "http://127.0.0.1:8080"),
+        ("127.0.0.1", "localhost:8080", "file://localhost:8080"),
+        ("127.0.0.1", "localhost:8080", "http://localhost:99999"),
+        ("127.0.0.1", "localhost:8080", "http://localhost.evil.example:8080"),
+        ("127.0.0.1", "evil.example:8080", "http://evil.example:8080"),  # DNS rebinding
+        ("127.0.0.1", "evil.example:8080", None),
+        ("127.0.0.1", "localhost.:8080", None),
+        ("127.0.0.1", "me@localhost:8080", None),
+        ("127.0.0.1", "localhost:8080/x", None),
+        ("127.0.0.1", "192.168.1.5:8080", None),
+        ("127.0.0.1", "", None),
+        ("127.0.0.1", "[::1", None),
+        ("127.0.0.1", None, None),
+        ("0.0.0.0", "evil.example:8080", "http://evil.example:8080"),
+        ("0.0.0.0", "192.168.1.5:8080", "http://203.0.113.9"),
+        ("0.0.0.0", "192.168.1.5:8080", "http://evil.example"),
+    ],
+)
+def test_all_others_may_not(bound, host, origin):
+    assert asked(gate_of(bound), host, origin)
+
+
+def test_two_hosts_or_origins_are_refused():
+    for key in ("Host", "Origin"):
+        headers = Headers([("Host", "localhost"), ("Origin", "http://localhost")])
+        headers[key] = headers[key]
+        assert refusal(Gate(), "/", headers).startswith("expected one Host")
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "websocket=wss://evil.example",
+        "robot=x&websocket=ws://evil.example:8080/",
+        "websocket=//[",
+        "playbackPath=https://evil.example/a.viser",
+        "playbackPath=a.viser",
+    ],
+)
+def test_an_address_cannot_bring_in_another_server(query):
+    assert "another server" in asked(Gate(), "localhost:8080", path=f"/?{query}")
+    assert asked(Gate(), "localhost:8080", path="/?websocket=ws://localhost:8080/proxy") == ""
+
+
+@pytest.mark.parametrize(
+    "origin", ["null", "*", "evil.example", "http://", "http://a/b", "ftp://a", "http://u@a", ""]
+)
+def test_a_malformed_origin_is_refused(origin):
+    with pytest.raises(MorphgenError, match=re.escape(f"--allow-origin {origin!r}: expected")):
+        gate_of("127.0.0.1", [origin])
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:{port}"])
+def test_a_foreign_page_gets_no_websocket(viewer, origin):
+    port = viewer().port
+    with pytest.raises(InvalidStatus) as refused:
+        PlainClient(port, origin=origin.format(port=port))
+    assert refused.value.response.status_code == 403
+    assert b"may not use this viewer" in refused.value.response.body
+
+
+def test_a_foreign_name_gets_no_websocket(viewer):
+    port = viewer().port
+    host = f"evil.example:{port}"
+    with pytest.raises(InvalidStatus) as refused:
+        PlainClient(port, host=host, origin=f"http://{host}")
+    assert b"is no name of this viewer" in refused.value.response.body
+
+
+@pytest.mark.parametrize("origin", [None, "http://127.0.0.1:{port}", HUB])
+def test_its_own_page_and_an_allowed_site_get_one(viewer, origin):
+    on = viewer(origins=[HUB])
+    with PlainClient(on.port, origin=origin and origin.format(port=on.port)) as client:
+        client.shows("Categories")
+
+
+def fetched(port, path="/", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
+    for key, value in headers.items():
+        connection.putheader(key, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    return answer, answer.read()
+
+
+def test_pages_are_served_to_its_own_names_only(viewer, capfd):
+    port = viewer().port
+    answer, page = fetched(port, Host=f"localhost:{port}")
+    assert (answer.status, b"<html" in page) == (200, True)
+    assert f"connect-src 'self' ws://localhost:{port} " in answer.headers["Content-Security-Policy"]
+    assert "frame-ancestors 'self' ;" in answer.headers["Content-Security-Policy"]
+    for headers in (
+        {"Host": "evil.example"},
+        {"Host": f"localhost:{port}", "Origin": "http://evil.example"},
+        {},
+    ):
+        answer, page = fetched(port, **headers)
+        assert (answer.status, b"<html" in page) == (403, False)
+    answer, page = fetched(port, "/?websocket=wss://evil.example", Host="localhost")
+    assert (answer.status, b"another server" in page) == (403, True)
+    for path in ("/%00", "/" + "a" * 9000, "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd"):
+        answer, page = fetched(port, path, Host="localhost")
+        assert (answer.status, b"root:" in page) == (404, False)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_no_request_leaves_no_traceback(viewer, capfd):
+    port = viewer().port
+    for data in (b"\x16\x03\x01\x02\x00", b"GET / HTTP/1.1\r\nHost", b"a" * 70_000, b"\r\n\r\n"):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        connection.connect()
+        connection.sock.sendall(data)
+        connection.close()
+    assert fetched(port, Host="localhost")[0].status == 200
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nobody_may_ask_the_server_of_a_recording():
+    server = start_server("127.0.0.1", 0, Gate(names=frozenset()))
+    try:
+        with pytest.raises(InvalidStatus):
+            PlainClient(server.get_port())
+    finally:
+        server.stop()

@@ -1,0 +1,92 @@
+"""Messages that no page of the viewer sends change nothing, and leave no traceback."""
+
+import msgspec
+import pytest
+
+from morphgen.viewer.messages import message_fault
+from plain_client import CAMERA, PlainClient
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"\xc1",
+        b"\x91" * 100_000,
+        msgspec.msgpack.encode([1, 2]),
+        msgspec.msgpack.encode({"no": "type"}),
+        {"type": "NoSuchMessage"},
+        {"type": "ShareUrlRequest"},
+        {"type": "RunJavascriptMessage", "source": "alert()"},
+        {"type": "GuiUpdateMessage", "uuid": 3, "updates": {}},
+        {"type": "GuiUpdateMessage", "uuid": "x", "updates": {}, "more": 1},
+        {"type": "GuiUpdateMessage", "uuid": "x"},
+        {**CAMERA, "wxyz": [1.0, 0.0]},
+        {**CAMERA, "wxyz": [0.0, 0.0, 0.0, 0.0]},
+        {**CAMERA, "position": [float("nan"), 0.0, 0.0]},
+        {**CAMERA, "image_width": "wide"},
+    ],
+    ids=lambda message: repr(message)[:50],
+)
+def test_a_malformed_message_closes_its_connection_only(viewer, capfd, message):
+    on = viewer()
+    with PlainClient(on.port) as client, PlainClient(on.port) as other:
+        client.shows("Categories")
+        client.say(message)
+        code, reason = client.until_closed()
+        assert (code, bool(reason)) == (1008, True)
+        other.shows("Categories")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_text_message_closes_its_connection(viewer):
+    with PlainClient(viewer().port) as client:
+        client.websocket.send("text")
+        assert client.until_closed() == (1008, "expected a binary message")
+
+
+def test_messages_of_a_page_are_taken():
+    assert message_fault(msgspec.msgpack.encode(CAMERA)) == ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "label", "value", "why"),
+    [
+        ("Text", "Search", 3, "expected a text"),
+        ("Text", "Search", "x" * 200_001, "expected a text"),
+        ("Dropdown", "Sort by", "/etc/passwd", "none of the choices"),
+        ("Dropdown", "Sort by", ["name"], "none of the choices"),
+        ("ButtonGroup", "Page", "beyond", "none of the choices"),
+        ("UploadButton", "Look at a URDF or a zipped bundle", "x", "takes no value"),
+    ],
+)
+def test_a_value_that_a_control_cannot_have_is_refused(viewer, capfd, kind, label, value, why):
+    with PlainClient(viewer().port) as client:
+        client.change(client.control(kind, label), value)
+        client.shows("That did not work")
+        client.shows(why)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "updates", [{}, {"update_cb": []}, {"value": "x", "sync_cb": None}, {"_impl": 1}]
+)
+def test_nothing_but_a_controls_value_is_changed(viewer, capfd, updates):
+    with PlainClient(viewer().port) as client:
+        search = client.control("Text", "Search")
+        client.say({"type": "GuiUpdateMessage", "uuid": search, "updates": updates})
+        client.shows("the value of a control, and nothing else of it")
+        client.change(search, "ur5")
+        client.until(lambda: "search=ur5" in client.text)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_slider_takes_numbers_only_and_in_its_range(viewer, capfd):
+    with PlainClient(viewer().port, "?robot=robots/some-arm") as client:
+        shoulder = client.control("Slider", "shoulder")
+        for value in (float("nan"), float("inf"), "far", None, True, [1]):
+            client.change(shoulder, value)
+            client.shows(f"expected a number, not {value!r}")
+        client.change(shoulder, 1e300)
+        client.until(lambda: "q=2,0.5,0.01,0.02" in client.text)
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,152 @@
+"""No address, and no text that a browser sends, makes a page tell of files outside its folders."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from morphgen.formats.bundle import write_bundle
+from morphgen.rl.sources import Source
+from morphgen.viewer import rollout
+from plain_client import PlainClient
+from robots import arm
+
+WORD = "tellnobody"
+NOTHING = "There is nothing to see here"
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """Files outside of the viewer's folder, that quote a word wherever they fail to parse."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "a.grammar").write_text(f"robot -> {WORD} }}{WORD}\n")
+    (folder / "a.urdf").write_text(f'<robot name="{WORD}"><link name="{WORD}"')
+    (folder / "a.xacro").write_text(f'<robot name="{WORD}"><link name="{WORD}"')
+    (folder / "a.yaml").write_text(f"{WORD}: {{{WORD}\n")
+    (folder / "checkpoint.pt").write_text(WORD)
+    (folder / "a.npz").write_text(WORD)
+    (folder / "card.json").write_text(f'{{"{WORD}"')
+    (folder / "index.jsonl").write_text(WORD)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "?compose={}/a.grammar",
+        "?compose={}/a.yaml",
+        "?robot={}/a.urdf",
+        "?robot={}/a.xacro",
+        "?robot={}",
+        "?robot=words:{}/a.grammar",
+        "?robot=words:{}/a.yaml more",
+        "?robot=words:{}/a.urdf",
+        "?robot=split:{}/a.yaml@test/x",
+        "?robot=upload:{}/a.urdf",
+        "?robot=upload:..",
+        "?gallery={}",
+        "?split={}/a.yaml",
+        "?split={}",
+        "?compare={}/a.urdf&compare={}/a.grammar",
+        "?play={}/a.npz",
+        "?play=reach&policy={}/checkpoint.pt",
+        "?play=reach&policy={}",
+        "?play=&policy={}/a.yaml",
+        "?play=reach&robot={}/a.urdf",
+        "?play=reach&robot=words:{}/a.grammar",
+        "?robot=../elsewhere/a.urdf",
+        "?robot=robots/../../elsewhere/a.urdf",
+        "?compose=./../elsewhere/a.grammar",
+    ],
+)
+def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, query):
+    with PlainClient(viewer().port, query.replace("{}", str(secret))) as client:
+        client.until(lambda: NOTHING in client.text or "tag error" in client.text)
+        assert re.search("outside of the folders|no such file", client.text)
+        assert WORD not in client.text
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("query", "why"),
+    [
+        ("?robot=%00", r"\\x00: no such file or folder"),
+        ("?robot=" + "a" * 7000, "no such file or folder"),
+        ("?robot=" + "a" * 10_000, "at most 8000 are read"),
+        ("?robot=" + "a/" * 3000, "no such file or folder"),
+        ("?robot=%ff%fe", "no such file or folder"),
+        ("?robot=words:%00", "there is nothing|form key=value|unknown grammar"),
+        ("?robot=words:", "nothing to compose"),
+        ("?compose=%00.grammar", "no such file or folder"),
+        ("?gallery=%00", "no such file or folder"),
+        ("?split=%00", "no such file or folder"),
+        ("?compare=%00&compare=%00", "no such file or folder"),
+        ("?play=%00.npz", "no such file or folder"),
+        ("?play=reach&policy=%00", "no checkpoint, and no policy"),
+        ("?play=reach&policy=ikk", "did you mean 'ik'"),
+        ("?play=reach&seed=" + "9" * 5000, "seed '9+.*: expected a whole number"),
+        ("?robot=derivation:" + "a=b[c:" * 1000 + "a=b" + "]" * 1000, "nested too deeply|unknown"),
+        ("?robot=" + "&robot=".join("a" * 50), "no such file or folder"),
+        ("?" + "&".join(f"k{i}=1" for i in range(1000)), "names no page"),
+    ],
+    ids=lambda each: each[:30],
+)
+def test_an_odd_address_has_a_sentence_for_an_answer(viewer, capfd, query, why):
+    with PlainClient(viewer().port, query) as client:
+        client.until(lambda: NOTHING in client.text or "tag error" in client.text)
+        said = client.text.replace("&#x27;", "'")
+        assert re.search(why, said), said[-600:]
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("query", ["?compose=arm3&seed=²", f"?compose=arm3&number={'9' * 5000}"])
+def test_a_number_that_is_none_is_zero(viewer, capfd, query):
+    with PlainClient(viewer().port, query) as client:
+        client.until(lambda: "The same on the command line" in client.text)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_grammar_of_the_folder_includes_none_from_outside(viewer, folder, secret):
+    (folder / "mine.grammar").write_text(f'include "{secret}/a.grammar"\nrobot -> ur5\n')
+    with PlainClient(viewer().port, "?compose=mine.grammar") as client:
+        client.shows("leads out of the folder of mine.grammar")
+        assert WORD not in client.text
+
+
+def test_a_grammars_text_includes_nothing(viewer, secret):
+    with PlainClient(viewer().port, "?compose=arm3") as client:
+        text = client.control("Text", "text")
+        client.change(text, f'include "{secret}/a.grammar"\nrobot -> ur5\n')
+        client.shows("a grammar given as text includes no other")
+        assert WORD not in client.text
+
+
+def test_a_checkpoint_names_no_robot_from_outside(viewer, folder, secret, monkeypatch):
+    (folder / "runs").mkdir(exist_ok=True)
+    (folder / "runs" / "some.pt").touch()
+    for name in (f"{secret}/a.urdf", f"{secret}/a.grammar", f"{secret}"):
+        run = SimpleNamespace(source=Source(name, task="reach"))
+        monkeypatch.setattr(rollout, "read_checkpoint", lambda path, run=run: (run, None))
+        with PlainClient(viewer().port, "?play=&policy=runs/some.pt") as client:
+            client.shows(NOTHING)
+            assert "outside of the folders" in client.text
+            assert WORD not in client.text
+
+
+def test_an_episode_names_no_robot_from_outside(viewer, folder, secret):
+    about = {"format": 1, "task": "reach", "bodies": [{"place": f"{secret}/a.urdf"}]}
+    arrays = {f"0/{name}": np.zeros(1) for name in ("q", "score", "distance", "success", "goal")}
+    np.savez(folder / "mine.npz", about=np.array(str(about).replace("'", '"')), **arrays)
+    with PlainClient(viewer().port, "?play=mine.npz") as client:
+        client.shows("outside of the folders")
+        assert WORD not in client.text
+
+
+def test_a_card_names_no_file_outside(viewer, folder, secret):
+    bundle = write_bundle(arm(), folder / "robots" / "nosy", picture=False)
+    card = (bundle / "card.json").read_text()
+    (bundle / "card.json").write_text(card.replace('"robot.xml":', f'"{secret}/a.urdf":'))
+    with PlainClient(viewer().port, "?robot=robots/nosy") as client:
+        client.shows("leads out of the folder")
