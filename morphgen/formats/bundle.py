@@ -20,6 +20,7 @@ from morphgen.formats.card import apply_card, card_frames, card_of, card_text
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
+from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read_urdf, with_frames
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
@@ -96,8 +97,12 @@ def write_bundle(
     return folder
 
 
-def read_bundle(folder: Path) -> Robot:
+def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     """Read a bundle back.
+
+    Args:
+        folder: The bundle.
+        root: A folder that its meshes may come from, besides its own.
 
     Raises:
         FormatError: If it is no bundle, or broken. That a file is not the one that the card was
@@ -105,7 +110,8 @@ def read_bundle(folder: Path) -> Robot:
     """
     card = _read_card(folder)
     place = str(folder / CARD)
-    return apply_card(with_frames(read_urdf(folder / URDF), card_frames(card, place)), card, place)
+    robot = read_urdf(folder / URDF, finder=default_finder(root=root))
+    return apply_card(with_frames(robot, card_frames(card, place)), card, place)
 
 
 def _read_card(folder: Path) -> dict[str, Any]:
@@ -146,17 +152,25 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
     return tuple(found)
 
 
-def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
+def read_robot(
+    path: Path, args: dict[str, str] | None = None, *, root: Path | None = None
+) -> Robot:
     """Read a bundle's folder, a URDF or a xacro.
+
+    Args:
+        path: The file or folder.
+        args: xacro arguments.
+        root: A folder that meshes, includes and YAML may come from, besides the description's own
+            folder and package.
 
     Raises:
         FormatError: If it is none of them, or broken.
     """
     if path.is_dir():
-        return read_bundle(path)
+        return read_bundle(path, root=root)
     if path.name == URDF and (path.parent / CARD).is_file():
-        return read_bundle(path.parent)
-    return read_urdf(path, args)
+        return read_bundle(path.parent, root=root)
+    return read_urdf(path, args, default_finder(root=root))
 
 
 def split_colours(robot: Robot) -> Robot:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from xml.dom import minidom
 
@@ -9,11 +10,16 @@ import pytest
 
 from morphgen.errors import FormatError
 from morphgen.formats.resolve import PackageFinder, default_finder, distribution_file
-from morphgen.formats.xacro import evaluate, expand, expand_text
+from morphgen.formats.xacro import Expansion, evaluate, expand
 from morphgen.formats.xml import parse_xml
 
 NOWHERE = PackageFinder()
 HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+
+
+def expand_text(text: str, args: Mapping[str, str], origin: Path, finder: PackageFinder) -> bytes:
+    """Expand a text that stands for a file, in this process."""
+    return Expansion(args, origin, finder).run(text.encode())
 
 
 def robot(body: str) -> str:
@@ -85,8 +91,7 @@ def test_the_callers_arguments_are_not_changed(origin: Path) -> None:
 def test_nothing_of_one_call_is_left_for_the_next(origin: Path) -> None:
     expanded('<xacro:property name="p" value="1"/><xacro:arg name="a" default="1"/>', origin)
     assert "'p'" in failure('<link name="${p}"/>', origin)
-    failure('<link name="${python.update(q=1)}${1/0}"/>', origin)
-    assert "'q'" in failure('<link name="${python.q}"/>', origin)
+    failure('<link name="${1/0}"/>', origin)
 
 
 def test_includes_are_relative_to_the_file_that_includes(
