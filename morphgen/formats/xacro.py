@@ -56,8 +56,9 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
     Expressions are evaluated by an allow-list, files are read from the folders of
     ``require_readable`` only, and time, memory and size are bounded. A file that was installed with
     morphgen or a data package is expanded in this process, because it was chosen by who installed
-    it; its arguments may be a stranger's, which the bounds of the expansion hold for, too. Every
-    other file, also one of a user's own library, is expanded in a process with limits.
+    it, as long as it reads no others; its arguments may be a stranger's, which the bounds of the
+    expansion hold for, too. Every other file, also one of a user's own library, is expanded in a
+    process with limits.
 
     Args:
         path: The file.
@@ -73,7 +74,12 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
     """
     path = path.absolute()
     if is_installed(path):
-        return Expansion(args, path, finder).run_file()
+        expansion = Expansion(args, path, finder, installed_only=True)
+        try:
+            return expansion.run_file()
+        except FormatError:
+            if not expansion.met_foreign:
+                raise
     document: str = run_in_child("expand", path, finder, args=args)["document"]
     return document.encode()
 
@@ -112,6 +118,8 @@ class Expansion:
         origin: Path,
         finder: PackageFinder,
         objects: Mapping[str, object] | None = None,
+        *,
+        installed_only: bool = False,
     ) -> None:
         """Prepare.
 
@@ -120,6 +128,8 @@ class Expansion:
             origin: The file, absolute.
             finder: Where ``$(find package)`` looks.
             objects: Values of further arguments that reach expressions as they are.
+            installed_only: Whether to read no file but what ``is_installed``; ``met_foreign`` then
+                says whether one was asked for.
         """
         self.engine = thread_engine()
         self.engine.parse = self._parse_include
@@ -133,6 +143,8 @@ class Expansion:
         self.places = ElementPlaces()
         self.origin = origin
         self.finder = finder
+        self.installed_only = installed_only
+        self.met_foreign = False
 
     def run_file(self) -> bytes:
         """Expand the file.
@@ -202,6 +214,9 @@ class Expansion:
 
     def _read(self, filename: str, including: str) -> bytes:
         require_readable(Path(filename), self.finder, self.origin, Path(including))
+        if self.installed_only and not is_installed(Path(filename)):
+            self.met_foreign = True
+            raise RefusedError(f"{filename} was not installed")
         return read_file(Path(filename))
 
     def _list_files(self, pattern: str) -> list[str]:

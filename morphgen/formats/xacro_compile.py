@@ -98,6 +98,9 @@ class CompiledXacro:
     texts: tuple[str, ...]
     """What stands before, between and after the expressions."""
     expressions: tuple[Expression, ...]
+    """The different ones; most documents use one several times."""
+    order: tuple[int, ...]
+    """Which of them stands after each text but the last."""
 
     def fill(self, values: Mapping[str, str]) -> bytes:
         """The document for values of the parameters, given as xacro arguments.
@@ -107,14 +110,14 @@ class CompiledXacro:
         """
         names = dict(_NAMES) | {_symbol(name): _literal(text) for name, text in values.items()}
         try:
-            numbers = [expression.evaluate(names) for expression in self.expressions]
+            numbers = [str(expression.evaluate(names)) for expression in self.expressions]
         except (ArithmeticError, ValueError) as error:
             raise FormatError(
                 f"a template's expression fails for {dict(values)}: {error}"
             ) from error
         pieces = [self.texts[0]]
-        for number, text in zip(numbers, self.texts[1:], strict=True):
-            pieces += (str(number), text)
+        for k, text in zip(self.order, self.texts[1:], strict=True):
+            pieces += (numbers[k], text)
         return "".join(pieces).encode()
 
 
@@ -162,7 +165,7 @@ def _compiled(
     given = dict(constants)
     try:
         if is_installed(path):
-            traced = trace(path, given, example, finder)
+            traced = trace(path, given, example, finder, installed_only=True)
         else:
             answer = run_in_child("trace", path, finder, constants=given, numbers=example)
             traced = answer["traced"]
@@ -172,15 +175,27 @@ def _compiled(
 
 
 def trace(
-    path: Path, constants: Mapping[str, str], numbers: Mapping[str, str], finder: PackageFinder
+    path: Path,
+    constants: Mapping[str, str],
+    numbers: Mapping[str, str],
+    finder: PackageFinder,
+    *,
+    installed_only: bool = False,
 ) -> tuple[list[str], list[str]] | None:
     """Expand a xacro file in this process, with numbers that are not known yet.
+
+    Args:
+        path: The file, absolute.
+        constants: As for ``compile_xacro``.
+        numbers: As for ``compile_xacro``.
+        finder: As for ``compile_xacro``.
+        installed_only: As for ``Expansion``.
 
     Returns:
         The texts and the expressions of a ``CompiledXacro``; None as for ``compile_xacro``.
     """
     objects = {name: Traced(_symbol(name)) for name in numbers}
-    expansion = Expansion(constants, path, finder, objects)
+    expansion = Expansion(constants, path, finder, objects, installed_only=installed_only)
     for name, function in _FUNCTIONS.items():
         expansion.engine._global_symbols[name] = Function(name, _lifted(name, function))
     try:
@@ -194,7 +209,9 @@ def trace(
 
 
 def _translated(texts: Sequence[str], expressions: Sequence[str]) -> CompiledXacro:
-    return CompiledXacro(tuple(texts), tuple(map(Expression, expressions)))
+    different = list(dict.fromkeys(expressions))
+    order = tuple(map(different.index, expressions))
+    return CompiledXacro(tuple(texts), tuple(map(Expression, different)), order)
 
 
 def _lifted(name: str, function: Callable[..., object]) -> Callable[..., object]:

@@ -64,6 +64,8 @@ class Scope:
 
     def result(self, value: object) -> object:
         """A value that was made, small enough and paid for."""
+        if type(value) is float:
+            return value
         if type(value) in _NUMBERS:
             return checked(value)
         self.spend(size_of(value))
@@ -347,6 +349,8 @@ def _called(
 
 def _data(value: Value) -> Value:
     """The value, which is no function or namespace."""
+    if type(value) in _NUMBERS:
+        return value
     if isinstance(value, Function) or (isinstance(value, dict) and type(value) is not dict):
         raise TypeError(f"{value if isinstance(value, Function) else 'a namespace'} is no data")
     return value

@@ -2,14 +2,19 @@
 
 import ast
 import math
+import re
 import time
 from pathlib import Path
 
 import pytest
 
 import morphgen.formats
-from morphgen.formats.xacro_expressions import Expression
-from morphgen.formats.xacro_functions import BUILTINS, MATH, RefusedError
+from morphgen.formats import xacro_child, xacro_files
+from morphgen.formats.xacro import MAX_INCLUDE_DEPTH
+from morphgen.formats.xacro_engine import MAX_ELEMENTS, MAX_TEXT
+from morphgen.formats.xacro_expressions import MAX_LENGTH, Expression
+from morphgen.formats.xacro_functions import BUILTINS, MATH, MAX_BITS, MAX_SIZE, RefusedError
+from morphgen.formats.xacro_nodes import MAX_WORK
 
 NAMES = {
     **MATH,
@@ -172,3 +177,20 @@ def test_nothing_of_a_document_is_given_to_python_to_run():
         and node.func.id in ("eval", "exec", "compile", "__import__")
     ]
     assert calls == ["xacro_engine.py: exec(_BODY, module.__dict__)"]
+
+
+def test_the_page_names_every_function_and_bound():
+    page = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
+    words = set(re.findall(r"\w+", page))
+    assert set(BUILTINS) - words == set()
+    bounds = (
+        f"{MAX_LENGTH:,} characters, {MAX_WORK:,} steps",
+        f"{MAX_SIZE:,} characters and entries; {MAX_BITS} bits",
+        f"| {xacro_files.MAX_FILE >> 20} MiB |",
+        f"| {MAX_INCLUDE_DEPTH} |",
+        f"{MAX_ELEMENTS:,} elements processed, {xacro_files.MAX_CLONES:,} copied, {MAX_TEXT:,}",
+        f"| {xacro_files.MAX_OUTPUT:,} characters |",
+        f"{xacro_child.CPU_LIMIT} s of CPU time, {xacro_child.WALL_LIMIT} s of waiting, "
+        f"{xacro_child.MEMORY_LIMIT >> 30} GiB of memory",
+    )
+    assert [bound for bound in bounds if bound not in page] == []
