@@ -77,13 +77,18 @@ def sample(
     return (drawn.robot for drawn in draw_samples(found, parts, n, seed=seed, where=conditions))
 
 
-def read(path: str | PathLike[str]) -> Robot:
+def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) -> Robot:
     """Read a bundle's folder, a URDF or a xacro.
+
+    Args:
+        path: The file or folder.
+        root: A folder that meshes, includes and YAML may come from, besides the description's own
+            folder and package.
 
     Raises:
         FormatError: If it is none of them, or broken.
     """
-    return read_robot(Path(path))
+    return read_robot(Path(path), root=None if root is None else Path(root))
 
 
 def write(robot: Robot, folder: str | PathLike[str], *, picture: bool = True) -> Path:

@@ -74,7 +74,7 @@ def check_link_count(robot: Robot) -> Iterator[Finding]:
             "error",
             f"robot {robot.name}",
             f"{links - 1} links below the root; PyBullet holds {PYBULLET_LINKS}",
-            "leave out bare frames, or import a part of it with --root",
+            "leave out bare frames, or import a part of it with --root-link",
         )
 
 

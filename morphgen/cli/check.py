@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json
+from morphgen.cli.options import Subparsers, add_json, add_root
 from morphgen.errors import one_line
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def add_parser(commands: Subparsers) -> None:
         type=Path,
         help="write bundles with the safe repairs applied to this folder",
     )
+    add_root(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -40,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     report: dict[str, dict[str, list[dict[str, object]]]] = {}
     failed = False
     for path in args.robots:
-        findings, repaired = _checked(path, args.fix)
+        findings, repaired = _checked(path, args.fix, args.root)
         report[str(path)] = {
             "findings": [finding.as_dict() for finding in findings],
             "repaired": [finding.as_dict() | {"repair": finding.repair} for finding in repaired],
@@ -53,14 +54,16 @@ def run(args: argparse.Namespace) -> int:
     return int(failed)
 
 
-def _checked(path: Path, fix_into: Path | None) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+def _checked(
+    path: Path, fix_into: Path | None, root: Path | None
+) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """What is wrong with a robot, and what was before its repair into a folder, if any."""
     from morphgen.checks import check, fix
     from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_robot, write_bundle
     from morphgen.formats.urdf import UnsoundError
 
     try:
-        robot = read_robot(path)
+        robot = read_robot(path, root=root)
     except UnsoundError as error:
         return error.findings, ()
     is_bundle = (path / CARD).is_file() or (path.parent / CARD).is_file()

@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json
+from morphgen.cli.options import Subparsers, add_json, add_root
 
 if TYPE_CHECKING:
     from morphgen.model.robot import Joint, Robot
@@ -22,6 +22,7 @@ def add_parser(commands: Subparsers) -> None:
         description="Print a robot's link tree with joints, limits, masses and frames.",
     )
     parser.add_argument("robot", type=Path, help="a bundle's folder, a URDF or a xacro")
+    add_root(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the tree."""
     from morphgen.formats.bundle import read_robot
 
-    robot = read_robot(args.robot)
+    robot = read_robot(args.robot, root=args.root)
     print(json.dumps(_data(robot), indent=2) if args.json else _text(robot))
     return 0
 

@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, add_root, library_of
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
@@ -79,6 +79,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     add_jobs(parser)
     parser.add_argument("--seed", type=int, default=0)
+    add_root(parser)
     add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
@@ -194,7 +195,9 @@ def _target(args: argparse.Namespace) -> tuple[Robot, bool]:
 
     path = Path(args.target)
     if path.exists():
-        return read_robot(path), False
+        return read_robot(path, root=args.root), False
+    if args.root is not None:
+        raise FormatError(f"--root {args.root}: only with a bundle, a URDF or a xacro")
     library = library_of(args)
     if args.target in library.paths:
         return load_part(library.manifest(args.target)).body, True
@@ -227,6 +230,7 @@ def _store_all(args: argparse.Namespace) -> int:
 
     given = {
         "--out": args.out,
+        "--root": args.root,
         "--enclose": args.enclose,
         "--visual": args.visual,
         "--no-picture": args.no_picture,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from morphgen.cli.options import Subparsers, add_json, add_out
+from morphgen.cli.options import Subparsers, add_json, add_out, add_root
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -18,7 +18,11 @@ def add_parser(commands: Subparsers) -> None:
         "bundle is written all the same.",
     )
     parser.add_argument("file", type=Path, help="a URDF, or a xacro by its suffix")
-    parser.add_argument("--root", help="link where the robot begins (default: the file's root)")
+    parser.add_argument(
+        "--root-link",
+        metavar="LINK",
+        help="link where the robot begins (default: the file's root)",
+    )
     parser.add_argument("--tool", help="link whose frame is the tool")
     parser.add_argument(
         "--arg",
@@ -33,6 +37,7 @@ def add_parser(commands: Subparsers) -> None:
         help="do not make the safe repairs (see morphgen check), without which some loaders "
         "refuse the robot",
     )
+    add_root(parser)
     add_out(parser)
     add_json(parser)
     parser.set_defaults(run=run)
@@ -52,7 +57,18 @@ def run(args: argparse.Namespace) -> int:
         if not name or not equals:
             raise FormatError(f"--arg {name}{equals}{value}: expected NAME=VALUE")
     arguments = {name: value for name, _, value in pairs}
+    if args.root is not None and not args.root.is_dir():
+        raise FormatError(
+            f"--root {args.root}: there is no such folder; the link where the robot begins is "
+            "named by --root-link"
+        )
     robot = import_robot(
-        args.file, arguments, root=args.root, tool=args.tool, name=args.name, repair=not args.as_is
+        args.file,
+        arguments,
+        root=args.root,
+        root_link=args.root_link,
+        tool=args.tool,
+        name=args.name,
+        repair=not args.as_is,
     )
     return write_and_report(robot, args)

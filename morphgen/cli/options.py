@@ -24,6 +24,17 @@ def add_library(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_root(parser: argparse.ArgumentParser) -> None:
+    """Let the user name a folder that a description's files may come from."""
+    parser.add_argument(
+        "--root",
+        metavar="DIR",
+        type=Path,
+        help="a folder that meshes, includes and YAML may come from, besides the description's own "
+        "folder and package",
+    )
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Let the user ask for JSON."""
     parser.add_argument("--json", action="store_true", help="print JSON for machines")

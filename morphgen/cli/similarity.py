@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_json, add_library, add_root, library_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,6 +54,7 @@ def add_parser(commands: Subparsers) -> None:
         "--map", metavar="FILE.png", type=Path, help="draw the robots by their distances"
     )
     parser.add_argument("--csv", metavar="FILE", type=Path, help="write a line a pair")
+    add_root(parser)
     add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     places = list(dict.fromkeys(p for path in args.paths for p in _places(path)))
     if len(places) < 2:
         raise BenchmarkError(f"{places[0]} is one robot; name others to compare it with")
-    robots = _features(places, library, quiet=args.json)
+    robots = _features(places, library, args.root, quiet=args.json)
     names = _names(robots, places)
     matrices = _matrices(robots, measures, quiet=args.json)
     written = _write(args, names, matrices)
@@ -132,7 +133,7 @@ def _is_robot(folder: Path) -> bool:
     return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
 
 
-def _read(path: Path, library: Library) -> Robot:
+def _read(path: Path, library: Library, root: Path | None) -> Robot:
     """A robot; one of a light set from its derivation, because its URDF knows no home."""
     from morphgen.formats.bundle import CARD, read_robot
     from morphgen.formats.data_files import read_text
@@ -143,12 +144,14 @@ def _read(path: Path, library: Library) -> Robot:
 
     light = path / DERIVATION
     if not light.is_file() or (path / CARD).is_file():
-        return read_robot(path)
+        return read_robot(path, root=root)
     derivation = parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
     return compose(derivation, library, path.resolve().name)
 
 
-def _features(places: Sequence[Path], library: Library, *, quiet: bool) -> list[Features]:
+def _features(
+    places: Sequence[Path], library: Library, root: Path | None, *, quiet: bool
+) -> list[Features]:
     from tqdm import tqdm
 
     from morphgen.benchmark.similarity import features
@@ -158,7 +161,7 @@ def _features(places: Sequence[Path], library: Library, *, quiet: bool) -> list[
     made = []
     bar = tqdm(places, unit="robot", file=sys.stderr, disable=quiet or None, leave=False)
     for path in bar:
-        robot = _read(path, library)
+        robot = _read(path, library, root)
         try:
             made.append(features(robot, token_shapes(robot, library.folders)))
         except BenchmarkError as error:

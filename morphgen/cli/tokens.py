@@ -14,6 +14,7 @@ from morphgen.cli.options import (
     add_json,
     add_library,
     add_max_links,
+    add_root,
     library_of,
 )
 
@@ -59,6 +60,7 @@ def add_parser(commands: Subparsers) -> None:
         "--out", metavar="FILE.npz", type=Path, help="write the tokens to this file"
     )
     add_max_links(parser)
+    add_root(parser)
     add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
@@ -80,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         raise BenchmarkError(f"--out {args.out}: expected a name that ends in .npz")
     library = library_of(args)
     max_links = MAX_LINKS if args.max_links is None else args.max_links
-    robot = _robot(args.words, library)
+    robot = _robot(args.words, library, args.root)
     require_max_links(len(robot.links), f"robot {robot.name!r}", max_links)
     made = tokens(robot, token_shapes(robot, library.folders), max_links=max_links)
     if args.out:
@@ -97,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _robot(words: list[str], library: Library) -> Robot:
+def _robot(words: list[str], library: Library, root: Path | None) -> Robot:
     """The robot that a path or words of a request name."""
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import read_robot
@@ -108,9 +110,11 @@ def _robot(words: list[str], library: Library) -> Robot:
     path = Path(words[0])
     if len(words) == 1 and "=" not in words[0] and path.suffix != SUFFIX:
         if path.exists():
-            return read_robot(path)
+            return read_robot(path, root=root)
         if len(path.parts) > 1 or path.suffix:
             raise FormatError(f"{path}: no such file or folder")
+    if root is not None:
+        raise FormatError(f"--root {root}: only with a bundle, a URDF or a xacro")
     derivation, name = parse_words(words, library)
     return compose(derivation, library, name)
 

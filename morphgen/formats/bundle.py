@@ -20,6 +20,7 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
+from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import own_frames, read_urdf, with_frames
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
@@ -97,8 +98,12 @@ def write_bundle(
     return folder
 
 
-def read_bundle(folder: Path) -> Robot:
+def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     """Read a bundle back.
+
+    Args:
+        folder: The bundle.
+        root: A folder that its meshes may come from, besides its own.
 
     Raises:
         FormatError: If it is no bundle, or broken. That a file is not the one that the card was
@@ -106,7 +111,8 @@ def read_bundle(folder: Path) -> Robot:
     """
     card = _read_card(folder)
     place = str(folder / CARD)
-    return apply_card(with_frames(read_urdf(folder / URDF), card_frames(card, place)), card, place)
+    robot = read_urdf(folder / URDF, finder=default_finder(root=root))
+    return apply_card(with_frames(robot, card_frames(card, place)), card, place)
 
 
 def _read_card(folder: Path) -> dict[str, Any]:
@@ -151,17 +157,25 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
     return tuple(found)
 
 
-def read_robot(path: Path, args: dict[str, str] | None = None) -> Robot:
+def read_robot(
+    path: Path, args: dict[str, str] | None = None, *, root: Path | None = None
+) -> Robot:
     """Read a bundle's folder, a URDF or a xacro.
+
+    Args:
+        path: The file or folder.
+        args: xacro arguments.
+        root: A folder that meshes, includes and YAML may come from, besides the description's own
+            folder and package.
 
     Raises:
         FormatError: If it is none of them, or broken.
     """
     if path.is_dir():
-        return read_bundle(path)
+        return read_bundle(path, root=root)
     if path.name == URDF and (path.parent / CARD).is_file():
-        return read_bundle(path.parent)
-    robot = read_urdf(path, args)
+        return read_bundle(path.parent, root=root)
+    robot = read_urdf(path, args, default_finder(root=root))
     if path.suffix == XACRO:
         return robot
     return with_frames(robot, own_frames(path.read_bytes(), str(path)))

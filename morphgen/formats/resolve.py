@@ -9,10 +9,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 from morphgen.errors import FormatError
+from morphgen.formats.xacro_functions import RefusedError
 
 REQUIREMENTS = {"rtb-data": "rtb-data==1.1.0", "example-robot-data": "example-robot-data"}
 """What to install for each pip distribution that robots are read from."""
@@ -21,6 +23,9 @@ _DATA_ROOTS = {
     "rtb-data": ("rtbdata/xacro", "rtbdata"),
     "example-robot-data": ("cmeel.prefix/share", "cmeel.prefix/share/example-robot-data/robots"),
 }
+_OWN_PACKAGES = ("morphgen.templates", "morphgen.robots_real")
+_SUBFOLDERS = ("urdf", "urdfs", "xacro", "xacros", "robot", "robots")
+_WIDEN = "name the folder that it may come from as root (--root DIR of morphgen import)"
 _PACKAGE_SUFFIX = re.compile(r"_(description|support)$")
 _PACKAGE_NAME = re.compile(r"[A-Za-z][\w-]*$")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?://)?")
@@ -35,6 +40,8 @@ class PackageFinder:
     """Folders that hold package folders, in the order of search."""
     packages: tuple[tuple[str, Path], ...] = ()
     """Packages whose folder is known: (name, folder)."""
+    root: Path | None = None
+    """A folder that files may come from, besides the description's own folder and package."""
 
     def find(self, package: str, *files: Path) -> Path:
         """Return the folder of a package.
@@ -85,21 +92,33 @@ class PackageFinder:
 
 
 def default_finder(
-    roots: Iterable[Path] = (), packages: Mapping[str, Path] | None = None
+    roots: Iterable[Path] = (),
+    packages: Mapping[str, Path] | None = None,
+    root: Path | None = None,
 ) -> PackageFinder:
     """Return a finder for the given roots, then ROS's environment, then the pip data packages.
 
     Args:
         roots: Folders that hold packages, searched first.
         packages: Folders of packages by name.
+        root: A folder that files may come from, besides the description's own folder and package;
+            it is searched for packages, too.
 
     Returns:
         A finder that has read ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` once, now.
+
+    Raises:
+        FormatError: If ``root`` is no folder.
     """
+    if root is not None:
+        if not root.is_dir():
+            raise FormatError(f"root {root}: there is no such folder")
+        root = _absolute(root)
+        roots = (root, *roots)
     shares = (prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH"))
     found = map(_absolute, (*roots, *_path_list("ROS_PACKAGE_PATH"), *shares, *_data_roots()))
     named = sorted((name, _absolute(folder)) for name, folder in (packages or {}).items())
-    return PackageFinder(tuple(dict.fromkeys(found)), tuple(named))
+    return PackageFinder(tuple(dict.fromkeys(found)), tuple(named), root)
 
 
 def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
@@ -113,8 +132,10 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
     nearest folder above it with a ``package.xml``, else the nearest named ``*_description`` or
     ``*_support``, else the folder above its own (so that ``urdf/robot.urdf`` reaches
     ``meshes/``). A relative path that climbs out is refused, also when the file exists: on another
-    machine it would mean another file. So is an absolute path that lies neither in the tree nor in
-    one of the finder's folders nor in any ROS package; name its folder as a root to allow it.
+    machine it would mean another file, unless it leads into the finder's ``root``. So is an
+    absolute path that lies neither in the tree nor in one of the finder's folders nor in any ROS
+    package; name its folder as the root to allow it. All of this holds for what a symbolic link
+    leads to as well.
 
     Args:
         uri: As written in the description.
@@ -141,15 +162,57 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
     for name in dict.fromkeys([rest, unquote(rest)]):
         absolute = scheme in ("file", "") and Path(name).is_absolute()
         path = Path(os.path.normpath(name if absolute else folder / name.lstrip("/")))
-        if not path.is_relative_to(boundary) and not (absolute and _may_name(path, finder)):
+        inside = path.is_relative_to(boundary) or _is_in(path, [finder.root])
+        if not inside and not (absolute and _may_name(path, finder)):
             raise FormatError(
                 f"{base}: {uri!r} leaves {boundary}, the folder of its description;"
-                " move the file inside or refer to it by package://"
+                f" move the file inside, refer to it by package://, or {_WIDEN}"
             )
         if path.is_file():
+            real = path.resolve()
+            trees = (boundary, _tree(base.resolve()), finder.root)
+            if not _is_in(real, trees) and not _may_name(real, finder):
+                raise FormatError(
+                    f"{base}: {uri!r} is a symbolic link that leaves {boundary}, the folder of its"
+                    f" description; put the file itself there, or {_WIDEN}"
+                )
             return path
         missing.append(path)
     raise FormatError(f"{base}: {uri!r} names no file: looked for {_listed(missing)}")
+
+
+def require_readable(path: Path, finder: PackageFinder, *files: Path) -> None:
+    """Require that a xacro may read a text file or list a folder, which it could copy into a robot.
+
+    It may in the package (the nearest folder above with a ``package.xml``, else the nearest named
+    ``*_description`` or ``*_support``) of the files that it consists of; without one, in their own
+    folders, and the folder above one that is named ``urdf`` or the like. It may in every folder
+    with a ``package.xml``, in the finder's folders and in its root. What counts is where the path
+    leads, through symbolic links.
+
+    Args:
+        path: What is read.
+        finder: Where packages may lie.
+        *files: The description, and the included file that asks.
+
+    Raises:
+        RefusedError: If it lies elsewhere.
+    """
+    real = path.resolve()
+    if _is_in(real, (*finder.roots, *(folder for _, folder in finder.packages), finder.root)):
+        return
+    trees = [_text_tree(place) for file in files for place in (_absolute(file), file.resolve())]
+    packaged = any((folder / "package.xml").is_file() for folder in _ancestors(real))
+    if not packaged and not _is_in(real, trees):
+        raise RefusedError(
+            f"{str(path)!r} is not in {trees[0]}, the folder of the description, nor in a ROS"
+            f" package; move the file inside, or {_WIDEN}"
+        )
+
+
+def is_installed(path: Path) -> bool:
+    """Whether a file came with morphgen or with one of the data packages."""
+    return _is_in(path.resolve(), (*_own_folders(), *_data_roots()))
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
@@ -208,12 +271,32 @@ def _tree(base: Path) -> Path:
     return (declared + named + ancestors[1:2] + [base.parent])[0]
 
 
+def _text_tree(file: Path) -> Path:
+    """The folder that a xacro's includes and YAML must stay in: none that only happens to be near.
+
+    Meshes may come from any folder above (``_tree``); but text would be copied word for word, and
+    the folder above a download is somebody's home.
+    """
+    ancestors = _ancestors(file)
+    declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
+    named = [folder for folder in ancestors if _has_suffix(folder)]
+    above = ancestors[1:2] if file.parent.name.lower() in _SUBFOLDERS else []
+    return (declared + named + above + [file.parent])[0]
+
+
+def _is_in(path: Path, folders: Iterable[Path | None]) -> bool:
+    """Whether a path lies in one of some folders, as they are written or as links lead to them."""
+    given = [folder for folder in folders if folder is not None]
+    return any(path.is_relative_to(folder) for folder in given) or any(
+        path.is_relative_to(folder.resolve()) for folder in given
+    )
+
+
 def _may_name(path: Path, finder: PackageFinder) -> bool:
     """Whether an absolute path lies in one of the finder's folders or in some ROS package."""
-    known = {*finder.roots, *(folder for _, folder in finder.packages)}
-    return any(
-        folder in known or _has_suffix(folder) or (folder / "package.xml").is_file()
-        for folder in path.parents
+    known = (*finder.roots, *(folder for _, folder in finder.packages))
+    return _is_in(path, known) or any(
+        _has_suffix(folder) or (folder / "package.xml").is_file() for folder in path.parents
     )
 
 
@@ -246,6 +329,12 @@ def _declared_name(folder: Path) -> str | None:
 def _read_name(manifest: Path, mtime_ns: int) -> str | None:
     match = _NAME_TAG.search(manifest.read_bytes())
     return match[1].decode(errors="replace") if match else None
+
+
+@lru_cache(maxsize=1)
+def _own_folders() -> tuple[Path, ...]:
+    """Folders of morphgen's own parts."""
+    return tuple(Path(str(files(package))).resolve() for package in _OWN_PACKAGES)
 
 
 @lru_cache(maxsize=1)

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from glob import glob
 from pathlib import Path
 from xml.dom import minidom
 from xml.parsers.expat import ExpatError
-from xml.sax.saxutils import escape, quoteattr
-
-import yaml
 
 from morphgen.errors import FormatError, nearest
-from morphgen.formats.resolve import PackageFinder
+from morphgen.formats.resolve import PackageFinder, is_installed, require_readable
+from morphgen.formats.xacro_child import MEMORY_LIMIT, run_in_child
 from morphgen.formats.xacro_engine import thread_engine
+from morphgen.formats.xacro_files import (
+    ElementPlaces,
+    document_text,
+    parse_yaml,
+    place_of,
+    read_file,
+)
+from morphgen.formats.xacro_functions import RefusedError
 from morphgen.formats.xml import parse_xml
 
 MAX_INCLUDE_DEPTH = 40
 """Files that may be open within one another before it is called a loop."""
+MAX_REASON = 400
+"""Longest reason of an error [characters]; expressions can be long."""
 
 _COMMANDS = ("arg", "dirname", "eval", "find", "optenv")
 _FAULTS = (
@@ -26,13 +36,13 @@ _FAULTS = (
     AttributeError,
     ExpatError,
     LookupError,
+    MemoryError,
     NameError,
     OSError,
     RuntimeError,
     SyntaxError,
     TypeError,
     ValueError,
-    yaml.YAMLError,
 )
 """What a faulty document can make the evaluator raise, besides its own exception."""
 
@@ -43,6 +53,13 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
     The result depends on the files and the arguments only: the working directory plays no part,
     ``$(optenv NAME default)`` is always its default, and ``$(env NAME)`` and ``$(cwd)`` are errors.
 
+    Expressions are evaluated by an allow-list, files are read from the folders of
+    ``require_readable`` only, and time, memory and size are bounded. A file that was installed with
+    morphgen or a data package is expanded in this process, because it was chosen by who installed
+    it, as long as it reads no others; its arguments may be a stranger's, which the bounds of the
+    expansion hold for, too. Every other file, also one of a user's own library, is expanded in a
+    process with limits.
+
     Args:
         path: The file.
         args: Values of the document's ``xacro:arg``; the others keep their defaults.
@@ -52,28 +69,19 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
         The expanded document: UTF-8, no XML declaration, no comments.
 
     Raises:
-        FormatError: The file or one that it includes is missing, broken or cannot be expanded, or
-            ``args`` names an argument that neither declares.
+        FormatError: The file or one that it includes is missing, broken or cannot be expanded, asks
+            for what is not allowed or too much, or neither declares an argument of ``args``.
     """
-    return Expansion(args, path.absolute(), finder).run_file()
-
-
-def expand_text(
-    text: str | bytes, args: Mapping[str, str], origin: Path, finder: PackageFinder
-) -> bytes:
-    """Expand a xacro document that is in memory; see `expand`.
-
-    Args:
-        text: The document.
-        args: Values of the document's ``xacro:arg``.
-        origin: The file that it stands for: names it in errors and anchors its relative includes.
-        finder: Where ``$(find package)`` looks.
-
-    Raises:
-        FormatError: As `expand`.
-    """
-    expansion = Expansion(args, origin.absolute(), finder)
-    return expansion.run(text.encode() if isinstance(text, str) else text)
+    path = path.absolute()
+    if is_installed(path):
+        expansion = Expansion(args, path, finder, installed_only=True)
+        try:
+            return expansion.run_file()
+        except FormatError:
+            if not expansion.met_foreign:
+                raise
+    document: str = run_in_child("expand", path, finder, args=args)["document"]
+    return document.encode()
 
 
 def evaluate(expression: str, values: Mapping[str, float]) -> float:
@@ -95,7 +103,7 @@ def evaluate(expression: str, values: Mapping[str, float]) -> float:
         result = symbols._eval_literal(engine.eval_text(expression, symbols))
     except (engine.XacroException, *_FAULTS) as error:
         hint = _unknown_name_hint(error, values)
-        raise FormatError(f"{expression!r}: {_one_line(error)}{hint}") from error
+        raise FormatError(f"{expression!r}: {_reason(error)}{hint}") from error
     if isinstance(result, bool) or not isinstance(result, int | float) or not math.isfinite(result):
         raise FormatError(f"{expression!r} is {result!r}, not a finite number")
     return float(result)
@@ -110,6 +118,8 @@ class Expansion:
         origin: Path,
         finder: PackageFinder,
         objects: Mapping[str, object] | None = None,
+        *,
+        installed_only: bool = False,
     ) -> None:
         """Prepare.
 
@@ -118,16 +128,23 @@ class Expansion:
             origin: The file, absolute.
             finder: Where ``$(find package)`` looks.
             objects: Values of further arguments that reach expressions as they are.
+            installed_only: Whether to read no file but what ``is_installed``; ``met_foreign`` then
+                says whether one was asked for.
         """
         self.engine = thread_engine()
         self.engine.parse = self._parse_include
+        self.engine.load_yaml = self._load_yaml
+        self.engine.list_files = self._list_files
         self.engine.eval_extension = self._substitute
         self.objects = dict(objects or {})
         self.given = {name: str(value) for name, value in args.items()}
         self.arguments = _Arguments(self.engine.XacroException, self.given)
         self.declared: set[str] = set()
+        self.places = ElementPlaces()
         self.origin = origin
         self.finder = finder
+        self.installed_only = installed_only
+        self.met_foreign = False
 
     def run_file(self) -> bytes:
         """Expand the file.
@@ -136,9 +153,11 @@ class Expansion:
             FormatError: As ``expand``.
         """
         try:
-            data = self.origin.read_bytes()
+            data = read_file(self.origin)
         except OSError as error:
             raise FormatError(f"{self.origin}: cannot be read: {error.strerror}") from error
+        except RefusedError as error:
+            raise FormatError(str(error)) from error
         return self.run(data)
 
     def run(self, data: bytes) -> bytes:
@@ -151,41 +170,60 @@ class Expansion:
         with self._located():
             document = self._parse(data, str(self.origin))
             self.engine.process_doc(document, mappings=self.arguments)
-        known = self.declared | self.arguments.used
-        for name in (*self.given, *self.objects):
-            if name not in known:
-                raise FormatError(f"{self.origin}: no argument {name!r}{nearest(name, known)}")
-        return "".join(_serialised(document.documentElement)).encode()
+            known = self.declared | self.arguments.used
+            for name in (*self.given, *self.objects):
+                if name not in known:
+                    raise FormatError(f"{self.origin}: no argument {name!r}{nearest(name, known)}")
+            return document_text(document).encode()
 
     @contextmanager
     def _located(self) -> Iterator[None]:
-        """Turn what goes wrong into one line that names the file in hand."""
+        """Turn what goes wrong into one line that names the file and line in hand."""
         try:
             yield
         except (self.engine.XacroException, *_FAULTS) as error:
-            files, macros = self.engine.filestack, self.engine.macrostack
-            loop = isinstance(error, RecursionError)
-            reason = "macros call one another without end" if loop else _one_line(error)
+            macros, node = self.engine.macrostack, self.engine.node
+            place = place_of(node) if node is not None else str(self.origin)
             macro = f" in macro {macros[-1].body.getAttribute('name')!r}" if macros else ""
-            above = f" (included from {self.origin})" if files[-1] != str(self.origin) else ""
-            raise FormatError(f"{files[-1]}: {reason}{macro}{above}") from error
+            inside = place.startswith(str(self.origin))
+            above = "" if inside else f" (included from {self.origin})"
+            raise FormatError(f"{place}: {_reason(error)}{macro}{above}") from error
 
     def _parse(self, data: bytes, origin: str) -> minidom.Document:
         for element in parse_xml(data, origin).iter("{*}arg"):
             self.declared.add(element.get("name", ""))
-        return minidom.parseString(data)
+        return self.places.parse(data, origin)
 
     def _parse_include(self, _: object, filename: str) -> minidom.Document:
         files = self.engine.filestack
         if len(files) > MAX_INCLUDE_DEPTH:
             raise FormatError(f"{files[-2]}: includes {filename} without end (from {self.origin})")
+        including = files[-2]
         try:
-            data = Path(filename).read_bytes()
+            data = self._read(filename, including)
         except OSError as error:
             files.pop()
             missing = OSError(f"cannot include {filename}: {error.strerror}")
             raise self.engine.XacroException(exc=missing) from error
         return self._parse(data, filename)
+
+    def _load_yaml(self, filename: str) -> object:
+        name = self.engine.abs_filename_spec(filename)
+        data = self._read(name, self.engine.filestack[-1])
+        return parse_yaml(data, Path(name), self.engine.ConstructUnits)
+
+    def _read(self, filename: str, including: str) -> bytes:
+        require_readable(Path(filename), self.finder, self.origin, Path(including))
+        if self.installed_only and not is_installed(Path(filename)):
+            self.met_foreign = True
+            raise RefusedError(f"{filename} was not installed")
+        return read_file(Path(filename))
+
+    def _list_files(self, pattern: str) -> list[str]:
+        """Files of a pattern, which must begin in a folder that may be read."""
+        folder = Path(re.split(r"[*?[]", pattern)[0] + "x").parent
+        require_readable(folder, self.finder, self.origin, Path(self.engine.filestack[-1]))
+        return glob(pattern)  # noqa: PTH207 - an absolute pattern, as xacro takes it
 
     def _substitute(self, text: str) -> object:
         """Evaluate one ``$(command words)``."""
@@ -235,20 +273,22 @@ def _no_substitution(text: str) -> str:
     raise ValueError(f"{text} has no meaning here")
 
 
-def _serialised(node: minidom.Node | None) -> Iterator[str]:
-    """Write a DOM; ``minidom``'s own writer may have been replaced by somebody else."""
-    if isinstance(node, minidom.Text):
-        yield escape(node.data)
-    elif isinstance(node, minidom.Element):
-        attributes = (f" {name}={quoteattr(value)}" for name, value in node.attributes.items())
-        yield f"<{node.tagName}{''.join(attributes)}>"
-        for child in node.childNodes:
-            yield from _serialised(child)
-        yield f"</{node.tagName}>"
+def _reason(error: BaseException) -> str:
+    """What went wrong first, in one line; the package wraps an error once for each expression."""
+    suffix = ""
+    while isinstance(inner := getattr(error, "exc", None), BaseException):
+        suffix = getattr(error, "suffix", None) or suffix
+        error = inner
+    if isinstance(error, RecursionError):
+        return "macros or properties use one another without end, or too deep"
+    if isinstance(error, MemoryError):
+        return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
+    reason = _one_line(f"{error or type(error).__name__} {suffix}")
+    return reason if len(reason) <= MAX_REASON else f"{reason[:MAX_REASON]}..."
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
 
 
 def _unknown_name_hint(error: BaseException | None, values: Mapping[str, float]) -> str:

@@ -3,28 +3,35 @@
 Expanding a xacro takes longer than all else that composing does. Where parameters only enter
 numbers by arithmetic, one expansion with symbols in their place gives the document as text with
 expressions in it; filling that in for new values gives the same bytes as expanding anew.
+
+
+What a document does with its parameters is noted as expressions, which the allow-list evaluates;
+for a document that may come from a stranger, the noting happens in a process with limits.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from types import CodeType
 
 from morphgen.errors import FormatError
-from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.xacro import Expansion, expand
+from morphgen.formats.resolve import PackageFinder, is_installed
+from morphgen.formats.xacro import Expansion
+from morphgen.formats.xacro_child import run_in_child
+from morphgen.formats.xacro_expressions import Expression
+from morphgen.formats.xacro_functions import Function
 
 _OPEN, _CLOSE = "\ue000", "\ue001"
 _MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
-_NAMES: Mapping[str, object] = {
+_FUNCTIONS: Mapping[str, Callable[..., object]] = {
     name: getattr(math, name)
     for name in ("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "fabs", "pow")
 } | {"radians": math.radians, "degrees": math.degrees, "min": min, "max": max, "abs": abs}
+_NAMES = {name: Function(name, call) for name, call in _FUNCTIONS.items()}
 
 
 class UntraceableError(Exception):
@@ -90,8 +97,10 @@ class CompiledXacro:
 
     texts: tuple[str, ...]
     """What stands before, between and after the expressions."""
-    expressions: CodeType
-    """Gives the tuple of all values."""
+    expressions: tuple[Expression, ...]
+    """The different ones; most documents use one several times."""
+    order: tuple[int, ...]
+    """Which of them stands after each text but the last."""
 
     def fill(self, values: Mapping[str, str]) -> bytes:
         """The document for values of the parameters, given as xacro arguments.
@@ -101,14 +110,14 @@ class CompiledXacro:
         """
         names = dict(_NAMES) | {_symbol(name): _literal(text) for name, text in values.items()}
         try:
-            numbers = eval(self.expressions, {"__builtins__": {}}, names)
+            numbers = [str(expression.evaluate(names)) for expression in self.expressions]
         except (ArithmeticError, ValueError) as error:
             raise FormatError(
                 f"a template's expression fails for {dict(values)}: {error}"
             ) from error
         pieces = [self.texts[0]]
-        for number, text in zip(numbers, self.texts[1:], strict=True):
-            pieces += (str(number), text)
+        for k, text in zip(self.order, self.texts[1:], strict=True):
+            pieces += (numbers[k], text)
         return "".join(pieces).encode()
 
 
@@ -152,28 +161,66 @@ def _compiled(
 ) -> CompiledXacro | None:
     """The compiled form of a file as it is at ``stamp``."""
     del stamp
-    traced = {name: Traced(_symbol(name)) for name in example}
-    expansion = Expansion(dict(constants), path.absolute(), finder, traced)
-    for name, function in _NAMES.items():
-        if name in expansion.engine._global_symbols:
-            expansion.engine._global_symbols[name] = _lifted(name, function)
+    path = path.absolute()
+    given = dict(constants)
     try:
-        pieces = _MARK.split(expansion.run_file().decode())
-        code = "".join(f"{expression}," for expression in pieces[1::2])
-        compiled = CompiledXacro(tuple(pieces[::2]), compile(f"({code})", str(path), "eval"))
-        same = compiled.fill(example) == expand(path, dict(constants) | example, finder)
+        if is_installed(path):
+            traced = trace(path, given, example, finder, installed_only=True)
+        else:
+            answer = run_in_child("trace", path, finder, constants=given, numbers=example)
+            traced = answer["traced"]
+        return None if traced is None else _translated(*traced)
     except _UNTRACEABLE:
         return None
-    return compiled if same else None
 
 
-def _lifted(name: str, function: object) -> Callable[..., object]:
+def trace(
+    path: Path,
+    constants: Mapping[str, str],
+    numbers: Mapping[str, str],
+    finder: PackageFinder,
+    *,
+    installed_only: bool = False,
+) -> tuple[list[str], list[str]] | None:
+    """Expand a xacro file in this process, with numbers that are not known yet.
+
+    Args:
+        path: The file, absolute.
+        constants: As for ``compile_xacro``.
+        numbers: As for ``compile_xacro``.
+        finder: As for ``compile_xacro``.
+        installed_only: As for ``Expansion``.
+
+    Returns:
+        The texts and the expressions of a ``CompiledXacro``; None as for ``compile_xacro``.
+    """
+    objects = {name: Traced(_symbol(name)) for name in numbers}
+    expansion = Expansion(constants, path, finder, objects, installed_only=installed_only)
+    for name, function in _FUNCTIONS.items():
+        expansion.engine._global_symbols[name] = Function(name, _lifted(name, function))
+    try:
+        pieces = _MARK.split(expansion.run_file().decode())
+        same = _translated(pieces[::2], pieces[1::2]).fill(numbers)
+        if same != Expansion({**constants, **numbers}, path, finder).run_file():
+            return None
+    except _UNTRACEABLE:
+        return None
+    return pieces[::2], pieces[1::2]
+
+
+def _translated(texts: Sequence[str], expressions: Sequence[str]) -> CompiledXacro:
+    different = list(dict.fromkeys(expressions))
+    order = tuple(map(different.index, expressions))
+    return CompiledXacro(tuple(texts), tuple(map(Expression, different)), order)
+
+
+def _lifted(name: str, function: Callable[..., object]) -> Callable[..., object]:
     """A function that notes its call where an argument is not known yet."""
 
     def call(*operands: object) -> object:
         if any(isinstance(operand, Traced) for operand in operands):
             return Traced(f"{name}({', '.join(map(_code, operands))})")
-        return function(*operands)  # type: ignore[operator]
+        return function(*operands)
 
     return call
 

@@ -1,32 +1,42 @@
-"""The ``xacro`` package's evaluator, in a private copy per thread.
+"""The ``xacro`` package's document processing, in a private copy per thread.
 
 ``xacro`` keeps the file stack, the arguments and the package lookup in module globals, prints its
 warnings and replaces a method of ``xml.dom.minidom``. Here its module body runs under a private
 name, so that none of this reaches, or is reached by, another user of the package in the process.
+
+The package gives text of a document to Python's ``eval`` in one place, ``safe_eval``; it is
+replaced by the allow-list of ``xacro_expressions``. ``is_valid_name`` only parses. YAML is read
+elsewhere (`xacro_files`), so that its tags reach no other constructor.
 """
 
 from __future__ import annotations
 
-import ast
 import importlib.util
 import logging
 import sys
 import threading
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Mapping
 from importlib.machinery import SourceFileLoader
-from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any, TypeAlias
 from xml.dom import minidom
 
-import yaml
+from morphgen.formats.xacro_expressions import expression
+from morphgen.formats.xacro_functions import BUILTINS, MATH, Function, RefusedError
 
 Engine: TypeAlias = Any
 """A ``xacro`` module, which has no type hints."""
+Untyped: TypeAlias = Any
+"""What such a module passes around: elements and tables of names."""
+
+MAX_ELEMENTS = 50_000
+"""Most elements that an expansion may process; the PR2 has 2,734."""
+MAX_TEXT = 20_000_000
+"""Most text that the substitutions of an expansion may make [characters]."""
 
 _NAME = "morphgen.formats._xacro"
-_FRAMES = frozenset({"gi_frame", "cr_frame", "ag_frame", "tb_frame", "f_back", "f_builtins"})
+_READERS = ("parse", "load_yaml", "list_files", "eval_extension")
+"""Names of the module by which a document reaches files; the caller replaces them."""
 _log = logging.getLogger("morphgen.formats.xacro")
 _per_thread = threading.local()
 
@@ -34,19 +44,22 @@ _per_thread = threading.local()
 def thread_engine() -> Engine:
     """Return this thread's copy of the ``xacro`` module, without anything of an earlier call.
 
-    Two things differ from the package: expressions cannot reach Python's internals through names
-    with a double underscore or through frames, wherever they stand in the expression; and warnings
-    go to the logger ``morphgen.formats.xacro`` (level INFO) instead of the terminal.
+    These things differ from the package: expressions are evaluated by an allow-list; a document
+    may make so many elements and so much text only; ``node`` is the element in hand; and
+    warnings go to the logger ``morphgen.formats.xacro`` (level INFO) instead of the terminal.
     """
     if not hasattr(_per_thread, "engine"):
         _per_thread.engine = _fresh_module()
-        _per_thread.symbols = _per_thread.engine.create_global_symbols()
     engine = _per_thread.engine
     engine.init_stacks(None)
     engine.all_includes = []
     engine.substitution_args_context = {}
     engine.verbosity = 0
-    engine._global_symbols = _copied(_per_thread.symbols, engine)
+    engine.node = None
+    for name in _READERS:  # else the last expansion's would still be there
+        setattr(engine, name, _unread)
+    engine.elements = engine.text = 0
+    engine._global_symbols = _symbols(engine)
     return engine
 
 
@@ -56,69 +69,126 @@ def _fresh_module() -> Engine:
     module.__path__ = sys.modules[_NAME].__path__
     module.print = _record
     exec(_BODY, module.__dict__)
-    module.eval_text = _shortcut(module.eval_text)
+    module.eval_text = _shortcut(module)
     module.safe_eval = _safe_eval
-    module.load_yaml = _yaml_loader(module)
+    module.glob = SimpleNamespace(glob=lambda pattern: module.list_files(pattern))
+    module.eval_all = _counting(module)
+    for name in ("handle_macro_call", "process_include"):
+        setattr(module, name, _returning(module, getattr(module, name)))
+    for name in ("check_attrs", "reqd_attrs"):
+        setattr(module, name, _noting(module, getattr(module, name)))
     return module
 
 
-def _shortcut(eval_text: Callable[[str, Any], object]) -> Callable[[str, Any], object]:
-    """Most texts hold nothing to evaluate; the lexer takes a quarter of an expansion's time."""
-    return lambda text, symbols: eval_text(text, symbols) if "$" in text else text
-
-
-def _copied(symbols: dict[str, Any], engine: Engine) -> dict[str, Any]:
-    """Global symbols whose namespaces an expression may change without lasting effect."""
-    copies = dict(symbols)
-    for name, value in symbols.items():
-        if isinstance(value, engine.NameSpace):
-            copies[name] = engine.NameSpace()
-            dict.update(copies[name], value)
-    return copies
-
-
 def _safe_eval(
-    expression: str, symbols: dict[str, Any], local: dict[str, Any] | None = None
+    text: str, symbols: Mapping[str, object], local: Mapping[str, object] | None = None
 ) -> object:
-    symbols.update(__builtins__={})
-    return eval(_compiled(expression.strip()), symbols, local)
+    return expression(text.strip()).evaluate(symbols, local)
 
 
-@lru_cache(maxsize=4096)
-def _compiled(expression: str) -> CodeType:
-    tree = ast.parse(expression, "<expression>", "eval")
-    for node in ast.walk(tree):
-        name = getattr(node, "attr", None) or getattr(node, "id", None) or ""
-        if name.startswith("__") or name in _FRAMES:
-            raise NameError(f"{name!r} is not allowed in an expression")
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and _is_huge(node.right):
-            raise ValueError("an exponent is beyond 1000")
-    return compile(tree, "<expression>", "eval")
+def _shortcut(engine: Engine) -> Callable[[str, Any], object]:
+    """Most texts hold nothing to evaluate; the lexer takes a quarter of an expansion's time."""
+    eval_text = engine.eval_text
+
+    def evaluated(text: str, symbols: Untyped) -> object:
+        if "$" not in text:
+            return text
+        result = eval_text(text, symbols)
+        if isinstance(result, str):
+            engine.text += len(result)
+            if engine.text > MAX_TEXT:
+                raise RefusedError(f"the expansion makes more than {MAX_TEXT} characters")
+        return result
+
+    return evaluated
 
 
-def _is_huge(exponent: ast.expr) -> bool:
-    """Whether an exponent holds numbers that no robot needs and that would take for ever."""
-    numbers = [node.value for node in ast.walk(exponent) if isinstance(node, ast.Constant)]
-    tower = any(isinstance(node, ast.Pow) for node in ast.walk(exponent))
-    return tower or any(isinstance(n, int | float) and abs(n) > 1000 for n in numbers)
+def _counting(engine: Engine) -> Callable[[Any, Any, Any], None]:
+    eval_all = engine.eval_all
+
+    def counted(node: Untyped, macros: Untyped, symbols: Untyped) -> None:
+        engine.elements += 1
+        if engine.elements > MAX_ELEMENTS:
+            raise RefusedError(f"the expansion processes more than {MAX_ELEMENTS} elements")
+        engine.node = node
+        eval_all(node, macros, symbols)
+
+    return counted
 
 
-def _yaml_loader(engine: Engine) -> Callable[[str], object]:
-    class Loader(yaml.SafeLoader):
-        """YAML with xacro's unit tags, which the shared loader must not learn."""
+def _returning(engine: Engine, function: Callable[..., object]) -> Callable[..., object]:
+    """A function that goes elsewhere in the documents, and comes back if nothing fails there."""
 
-    for unit in engine.ConstructUnits:
-        Loader.add_constructor(unit.value.tag, unit.constructor)
+    def called(node: Untyped, *rest: Untyped) -> object:
+        engine.node = node
+        result = function(node, *rest)
+        engine.node = node
+        return result
 
-    def load_yaml(filename: str) -> object:
-        text = Path(engine.abs_filename_spec(filename)).read_text(encoding="utf-8")
-        return engine.YamlListWrapper.wrap(yaml.load(text, Loader))
-
-    return load_yaml
+    return called
 
 
-def _record(*words: object, **_: object) -> None:
+def _noting(engine: Engine, function: Callable[..., object]) -> Callable[..., object]:
+    def noted(node: Untyped, *rest: Untyped) -> object:
+        engine.node = node
+        return function(node, *rest)
+
+    return noted
+
+
+def _symbols(engine: Engine) -> dict[str, object]:
+    """What every document may use by name, with and without a namespace."""
+
+    def space(members: Mapping[str, object]) -> object:
+        made = engine.NameSpace()
+        dict.update(made, members)
+        return made
+
+    def fatal(*words: object) -> None:
+        raise engine.XacroException(" ".join(map(str, words)))
+
+    def tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]:
+        for character in sep[1:]:
+            text = text.replace(character, sep[0])
+        return [word for word in text.split(sep[0]) if word or not skip_empty]
+
+    files = {
+        "load_yaml": lambda name: engine.load_yaml(name),
+        "abs_filename": engine.abs_filename_spec,
+        "dotify": _same,
+    }
+    own = {
+        **files,
+        "arg": lambda name: engine.substitution_args_context["arg"][name],
+        "fatal": fatal,
+        "tokenize": tokenize,
+        **dict.fromkeys(("message", "warning", "error", "print_location"), _record),
+    }
+    functions = {name: Function(name, call) for name, call in own.items()}
+    return {
+        **MATH,
+        **BUILTINS,
+        **{name: functions[name] for name in files},
+        "math": space(MATH),
+        "python": space(BUILTINS),
+        "xacro": space(functions),
+    }
+
+
+def _same(dictionary: dict[str, object]) -> dict[str, object]:
+    """``xacro.dotify``: here the entries of any dictionary can be reached by a dot."""
+    if not isinstance(dictionary, dict):
+        raise TypeError("dotify() takes a dictionary")
+    return dictionary
+
+
+def _unread(*_: object) -> object:
+    raise RefusedError("there are no files and substitutions here")
+
+
+def _record(*words: object, **_: object) -> str:
     _log.info(" ".join(map(str, words)))
+    return ""
 
 
 def _load_package() -> CodeType:

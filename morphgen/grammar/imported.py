@@ -9,6 +9,7 @@ from pathlib import Path
 from morphgen.checks import fix, with_repairs
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import FormatError, nearest
+from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read_urdf
 from morphgen.model.robot import Frame, Robot
 from morphgen.model.tree import renamed, subtree
@@ -18,7 +19,8 @@ def import_robot(
     path: Path,
     args: Mapping[str, str] | None = None,
     *,
-    root: str | None = None,
+    root: Path | None = None,
+    root_link: str | None = None,
     tool: str | None = None,
     name: str | None = None,
     repair: bool = True,
@@ -28,7 +30,9 @@ def import_robot(
     Args:
         path: A URDF, or a xacro by its suffix.
         args: xacro arguments.
-        root: Link where the robot begins; by default the file's root.
+        root: A folder that meshes, includes and YAML may come from, besides the description's own
+            folder and package.
+        root_link: Link where the robot begins; by default the file's root.
         tool: Link whose frame becomes the frame ``tool``; by default there is none.
         name: Name of the robot; by default the file's own.
         repair: Whether to make the safe repairs of ``morphgen.checks.fix``, without which some
@@ -38,16 +42,16 @@ def import_robot(
     Raises:
         FormatError: If the file cannot be read, or has no such link.
     """
-    robot = read_urdf(path, args)
-    for option, link in (("root", root), ("tool", tool)):
+    robot = read_urdf(path, args, default_finder(root=root))
+    for option, link in (("root link", root_link), ("tool", tool)):
         if link is not None and link not in robot.link_index:
             raise FormatError(
                 f"{path}: no link {link!r} for {option}{nearest(link, robot.link_index)}"
             )
-    if root is not None:
-        robot = subtree(robot, root)
+    if root_link is not None:
+        robot = subtree(robot, root_link)
     if tool is not None and tool not in robot.link_index:
-        raise FormatError(f"{path}: tool {tool!r} is not below root {root!r}")
+        raise FormatError(f"{path}: tool {tool!r} is not below the root link {root_link!r}")
     if tool is not None:
         robot = _without_name_clash(robot)
         link = "tool_link" if tool == "tool" else tool

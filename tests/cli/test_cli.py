@@ -132,7 +132,9 @@ def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
 
 def test_import_makes_a_bundle_of_any_urdf(run, robot_urdf, tmp_path):
     path = robot_urdf(arm())
-    code, out, err = run("import", path, "--root", "upper", "--tool", "slider", "--out", "robots")
+    code, out, err = run(
+        "import", path, "--root-link", "upper", "--tool", "slider", "--out", "robots"
+    )
     assert (code, err) == (0, "")
     assert out.startswith("robots/arm: 5 links, 3 DoF, ")
     assert read_bundle(tmp_path / "robots" / "arm").frame("tool").link == "slider"

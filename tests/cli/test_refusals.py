@@ -126,7 +126,8 @@ def test_what_is_not_there_is_named(refused, argv, message):
 def test_links_that_a_file_does_not_have_name_the_nearest(refused, robot_urdf):
     path = robot_urdf(arm())
     assert "did you mean 'slider'" in refused("import", path, "--tool", "slidr")
-    assert "did you mean 'base'" in refused("import", path, "--root", "bas")
+    assert "did you mean 'base'" in refused("import", path, "--root-link", "bas")
+    assert "named by --root-link" in refused("import", path, "--root", "base")
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,12 @@ from morphgen.formats.resolve import (
     PackageFinder,
     default_finder,
     distribution_file,
+    is_installed,
+    require_readable,
     resolve_uri,
 )
+from morphgen.formats.xacro_functions import RefusedError
+from morphgen.grammar.library import default_library
 
 NOWHERE = PackageFinder()
 
@@ -200,3 +204,82 @@ def test_a_missing_distribution_says_how_to_install_it(monkeypatch: pytest.Monke
 def test_a_distributions_file_lies_below_its_install_root(relative: str) -> None:
     with pytest.raises(FormatError, match="not a path below"):
         distribution_file("rtb-data", relative)
+
+
+def test_a_symbolic_link_may_not_lead_out_of_the_tree(tmp_path: Path, urdf: Path) -> None:
+    private = touch(tmp_path / "private" / "a.stl")
+    inside = touch(urdf.parent.parent / "meshes" / "b.stl")
+    (urdf.parent / "out.stl").symlink_to(private)
+    (urdf.parent / "in.stl").symlink_to(inside)
+    (urdf.parent / "folder").symlink_to(private.parent)
+    for uri in ("out.stl", "folder/a.stl", "package://arm_description/urdf/out.stl"):
+        assert "is a symbolic link that leaves" in failure(uri, urdf)
+    assert resolve_uri("in.stl", urdf, NOWHERE) == urdf.parent / "in.stl"
+    assert resolve_uri("out.stl", urdf, default_finder(root=private.parent)).name == "out.stl"
+
+
+def test_links_between_packages_are_followed(tmp_path: Path, urdf: Path) -> None:
+    """``colcon build --symlink-install`` makes such."""
+    source = touch(tmp_path / "src" / "arm" / "meshes" / "a.stl")
+    touch(tmp_path / "src" / "arm" / "package.xml", "<package><name>arm</name></package>")
+    (urdf.parent / "a.stl").symlink_to(source)
+    assert resolve_uri("a.stl", urdf, NOWHERE) == urdf.parent / "a.stl"
+
+
+def test_a_description_that_is_a_link_may_name_what_lies_beside_its_file(tmp_path: Path) -> None:
+    """Caches of downloads keep every file as a link into a folder of blobs."""
+    store, shown = tmp_path / "store" / "blobs", tmp_path / "shown" / "snapshot"
+    shown.mkdir(parents=True)
+    for name in ("robot.urdf", "a.stl"):
+        touch(store / f"{name}-blob")
+        (shown / name).symlink_to(store / f"{name}-blob")
+    assert resolve_uri("a.stl", shown / "robot.urdf", NOWHERE) == shown / "a.stl"
+
+
+def test_a_root_widens_the_tree(tmp_path: Path) -> None:
+    urdf = touch(tmp_path / "data" / "robots" / "x" / "x.urdf")
+    mesh = touch(tmp_path / "data" / "meshes" / "a.stl")
+    packaged = touch(tmp_path / "data" / "hand" / "b.stl")
+    touch(tmp_path / "c.stl")
+    assert "or name the folder" in failure("../../meshes/a.stl", urdf)
+    finder = default_finder(root=tmp_path / "data")
+    assert resolve_uri("../../meshes/a.stl", urdf, finder) == mesh
+    assert resolve_uri("package://hand/b.stl", urdf, finder) == packaged
+    assert "leaves" in failure("../../../c.stl", urdf, finder)
+    with pytest.raises(FormatError, match="there is no such folder"):
+        default_finder(root=tmp_path / "nowhere")
+
+
+def refused_text(path: Path, base: Path, finder: PackageFinder = NOWHERE) -> bool:
+    try:
+        require_readable(path, finder, base, base)
+    except RefusedError:
+        return True
+    return False
+
+
+def test_text_is_read_from_the_own_folder_packages_and_roots_only(tmp_path: Path) -> None:
+    download = touch(tmp_path / "home" / "downloads" / "x.xacro")
+    nested = touch(tmp_path / "home" / "downloads" / "urdf" / "x.xacro")
+    near = touch(tmp_path / "home" / "secret.yaml")
+    own = touch(tmp_path / "home" / "downloads" / "config" / "a.yaml")
+    package = touch(tmp_path / "ws" / "arm" / "config" / "a.yaml")
+    touch(tmp_path / "ws" / "arm" / "package.xml", "<package><name>arm</name></package>")
+    described = touch(tmp_path / "home" / "hand_description" / "a.yaml")
+    assert not refused_text(own, download)
+    assert not refused_text(own, nested)
+    assert not refused_text(package, download)
+    assert refused_text(near, download)
+    assert refused_text(near, nested)
+    assert refused_text(described, download)
+    assert not refused_text(near, download, default_finder(root=tmp_path / "home"))
+    assert not refused_text(described, download, default_finder([tmp_path / "home"]))
+
+
+def test_what_was_installed_is_known_from_what_was_not(tmp_path: Path) -> None:
+    file = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
+    assert is_installed(file)
+    assert is_installed(default_library().manifest("plane").path)
+    (tmp_path / "link.xacro").symlink_to(file)
+    assert is_installed(tmp_path / "link.xacro")
+    assert not is_installed(touch(tmp_path / "x.xacro"))

@@ -44,7 +44,7 @@ def test_without_a_tool_there_is_no_frame(urdf):
 
 
 def test_the_robot_begins_at_the_root_that_is_named(urdf):
-    robot = import_robot(urdf(arm()), root="lower", tool="slider")
+    robot = import_robot(urdf(arm()), root_link="lower", tool="slider")
     assert [link.name for link in robot.links] == ["lower", "slider", "left", "right"]
     assert frame_pose(robot, (0.02, 0.0))[:3, 3] == pytest.approx([0, 0, 0.32])
 
@@ -97,7 +97,7 @@ def test_a_link_that_is_called_tool_makes_room_for_the_frame(urdf):
 def test_a_xacro_takes_arguments(tmp_path):
     path = tmp_path / "pincer.urdf.xacro"
     path.write_text(PINCER)
-    robot = import_robot(path, {"length": "0.3"}, root="palm")
+    robot = import_robot(path, {"length": "0.3"}, root_link="palm")
     assert robot.root.collisions[0].geometry == Box((0.02, 0.02, 0.3))
     assert robot.joints[1].mimic.joint == "left_slide"
 
@@ -105,9 +105,15 @@ def test_a_xacro_takes_arguments(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"root": "bass"}, "no link 'bass' for root; did you mean 'base'? valid: base, left,"),
+        (
+            {"root_link": "bass"},
+            "no link 'bass' for root link; did you mean 'base'? valid: base, left,",
+        ),
         ({"tool": "slidr"}, "no link 'slidr' for tool; did you mean 'slider'?"),
-        ({"root": "slider", "tool": "base"}, "tool 'base' is not below root 'slider'"),
+        (
+            {"root_link": "slider", "tool": "base"},
+            "tool 'base' is not below the root link 'slider'",
+        ),
         ({"args": {"length": "1"}}, "xacro arguments length for a file that is no xacro"),
     ],
 )

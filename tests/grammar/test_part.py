@@ -7,7 +7,7 @@ import pytest
 
 from morphgen.errors import PartError
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.xacro import expand_text
+from morphgen.formats.xacro import Expansion
 from morphgen.grammar import part as module
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
@@ -29,7 +29,7 @@ def real(tmp_path, monkeypatch):
 
     def make(**changes):
         urdf = tmp_path / "pincer.urdf"
-        urdf.write_bytes(expand_text(PINCER, {}, urdf, PackageFinder()))
+        urdf.write_bytes(Expansion({}, urdf, PackageFinder()).run(PINCER.encode()))
         monkeypatch.setattr(module, "distribution_file", lambda package, file: tmp_path / file)
         source = {"source": {"package": "rtb-data", "file": "pincer.urdf"}}
         tool = {"link": "palm", "xyz": [0, 0, 0.25]}

@@ -1,0 +1,164 @@
+"""Read and write the documents of an expansion: bounded, and with the place of every element."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+from xml.dom import expatbuilder, minidom
+from xml.sax.saxutils import escape, quoteattr
+
+import yaml
+
+from morphgen.errors import FormatError
+from morphgen.formats.xacro_functions import MAX_SIZE, RefusedError, size_of
+
+MAX_FILE = 16 * 2**20
+"""Largest file that an expansion reads [bytes]."""
+MAX_OUTPUT = 20_000_000
+"""Largest expanded document [characters]."""
+MAX_CLONES = 200_000
+"""Most elements that an expansion may copy, such as out of macros; the PR2 has 6,978 nodes."""
+
+Untyped: TypeAlias = Any
+"""What minidom and xacro have no type hints for."""
+
+_PLACE = "morphgen-place"
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a regular file: a device or a pipe might never end.
+
+    Raises:
+        OSError: If it cannot be read.
+        RefusedError: If it is no regular file, or too large.
+    """
+    status = path.stat()
+    if not path.is_file():
+        raise RefusedError(f"{path} is no regular file")
+    if status.st_size > MAX_FILE:
+        raise RefusedError(f"{path} is larger than {MAX_FILE >> 20} MiB")
+    with path.open("rb") as file:
+        data = file.read(MAX_FILE + 1)
+    if len(data) > MAX_FILE:
+        raise RefusedError(f"{path} is larger than {MAX_FILE >> 20} MiB")
+    return data
+
+
+def place_of(node: Untyped) -> str:
+    """``file:line`` of an element that ``ElementPlaces`` knows, or of a clone of one."""
+    return str(node.getUserData(_PLACE))
+
+
+class ElementPlaces:
+    """Where the elements of an expansion were written; a DOM ``UserDataHandler``.
+
+    It sees every clone of an element, too: it gives the clone its place, and counts.
+    """
+
+    def __init__(self) -> None:
+        self.clones = 0
+
+    def parse(self, data: bytes, origin: str) -> minidom.Document:
+        """Parse XML, noting places."""
+        document = _Builder(origin, self).parseString(data)
+        assert isinstance(document, minidom.Document)
+        return document
+
+    def handle(
+        self, operation: int, key: str, place: object, source: object, clone: Untyped
+    ) -> None:
+        """Note the place of a clone; minidom calls it.
+
+        Raises:
+            RefusedError: If there are too many.
+        """
+        del operation, source
+        clone.setUserData(key, place, self)
+        self.clones += 1
+        if self.clones > MAX_CLONES:
+            raise RefusedError(f"the expansion copies more than {MAX_CLONES} elements")
+
+
+class _Builder(expatbuilder.ExpatBuilderNS):
+    def __init__(self, origin: str, places: ElementPlaces) -> None:
+        super().__init__()
+        self.origin = origin
+        self.places = places
+
+    def start_element_handler(self, name: Untyped, attributes: Untyped) -> None:
+        super().start_element_handler(name, attributes)
+        place = f"{self.origin}:{self.getParser().CurrentLineNumber}"
+        self.curNode.setUserData(_PLACE, place, self.places)
+
+
+def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
+    """The content of a YAML file: texts, numbers, lists and dictionaries.
+
+    Args:
+        data: The file's content.
+        path: The file, for messages.
+        units: xacro's unit tags.
+
+    Raises:
+        FormatError: If it is no valid YAML.
+        RefusedError: If it is too large with all its aliases followed.
+    """
+
+    class Loader(yaml.SafeLoader):
+        """YAML with xacro's unit tags, which the shared loader must not learn."""
+
+        def flatten_mapping(self, node: yaml.MappingNode) -> None:
+            super().flatten_mapping(node)
+            if len(node.value) > MAX_SIZE:
+                raise RefusedError(f"{path}: a mapping has more than {MAX_SIZE} entries")
+
+    for unit in units:
+        Loader.add_constructor(unit.value.tag, unit.constructor)
+    for tag in ("set", "binary"):
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", _refuse_tag)
+    try:
+        content = yaml.load(data, Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
+        raise FormatError(f"{path}{place}: no valid YAML: {error.problem}") from error
+    except yaml.YAMLError as error:
+        raise FormatError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from error
+    size_of(content)
+    return content
+
+
+def _refuse_tag(loader: yaml.SafeLoader, node: yaml.Node) -> object:
+    del loader
+    raise yaml.constructor.ConstructorError(
+        None, None, f"{node.tag} is neither text, number, list nor mapping", node.start_mark
+    )
+
+
+def document_text(document: minidom.Document) -> str:
+    """A document as text.
+
+    Raises:
+        RefusedError: If it is too long.
+    """
+    pieces = []
+    length = 0
+    for piece in _serialised(document.documentElement):
+        pieces.append(piece)
+        length += len(piece)
+        if length > MAX_OUTPUT:
+            raise RefusedError(f"the expanded document has more than {MAX_OUTPUT} characters")
+    return "".join(pieces)
+
+
+def _serialised(node: minidom.Node | None) -> Iterator[str]:
+    """Write a DOM; ``minidom``'s own writer may have been replaced by somebody else."""
+    if isinstance(node, minidom.Text):
+        yield escape(node.data)
+    elif isinstance(node, minidom.Element):
+        attributes = (f" {name}={quoteattr(value)}" for name, value in node.attributes.items())
+        yield f"<{node.tagName}{''.join(attributes)}>"
+        for child in node.childNodes:
+            yield from _serialised(child)
+        yield f"</{node.tagName}>"

@@ -1,0 +1,325 @@
+"""A description from a stranger runs no code, reads nothing else, and ends."""
+
+import json
+import os
+import subprocess
+import sys
+from xml.sax.saxutils import quoteattr
+
+import pytest
+
+from morphgen.formats import xacro_child
+
+HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+SECRET = "root:hunter2"
+CALL = (  # runs a command with a deny-list of names that begin with __
+    "python.vars(python.type(python.vars(python.type(xacro.load_yaml))['__globals__']))['__get__']"
+    "(python.vars(python.type(xacro.load_yaml))['__globals__'], xacro.load_yaml)"
+    "['sys'].modules['os'].system('touch pwned')"
+)
+
+
+@pytest.fixture
+def hostile(tmp_path):
+    """Write a document into a folder of its own, with a secret beside that folder."""
+    folder = tmp_path / "home" / "downloads"
+    folder.mkdir(parents=True)
+    (tmp_path / "home" / "secret.yaml").write_text(f"key: {SECRET}\n")
+    (tmp_path / "home" / "secret.xml").write_text(f"<robot><link name='{SECRET}'/></robot>")
+
+    def write(body):
+        path = folder / "robot.urdf.xacro"
+        path.write_text(f"{HEAD}{body}</robot>")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def refused_at(refused, hostile):
+    """Refuse a document by every command that reads it; return the message."""
+
+    def refuse(body, line=2):
+        path = hostile(body)
+        message = refused("import", path, "--out", "robots", "--no-picture")
+        assert f"{path}:{line}: " in message
+        assert SECRET not in message
+        return message
+
+    return refuse
+
+
+def link(expression):
+    return f"<link name={quoteattr('${' + expression + '}')}/>"
+
+
+def test_the_call_that_ran_a_command_does_not(refused, hostile):
+    path = hostile(link(CALL))
+    for words in (
+        ("show", path),
+        ("check", path),
+        ("fit", path),
+        ("tokens", path),
+        ("import", path, "--out", "robots"),
+    ):
+        message = refused(*words)
+        assert f"{path}:2: name 'vars' is not defined when evaluating expression" in message
+
+
+@pytest.mark.parametrize(
+    ("expression", "construct"),
+    [
+        ("python.vars(xacro.load_yaml)", "name 'vars' is not defined"),
+        ("python.type(1)", "name 'type' is not defined"),
+        ("().__class__.__base__.__subclasses__()", "'().__class__' is not allowed"),
+        ("'{0.__globals__}'.format(xacro.load_yaml)", "unterminated string"),  # ends at the }
+        ("dict(a=1).format_map", "name 'format_map' is not defined"),
+        ("'a'.format(1)", "Attribute \"'a'.format\" is not allowed"),
+        ("(lambda: 0)()", "Lambda 'lambda: 0' is not allowed"),
+        ("[f := 1, f]", "NamedExpr 'f := 1' is not allowed"),
+        ("(i for i in ()).gi_frame", "Attribute '(i for i in ()).gi_frame' is not allowed"),
+        ("xacro.load_yaml.call", "Attribute 'xacro.load_yaml.call' is not allowed"),
+        ("xacro.update(q=1)", "name 'update' is not defined"),
+        ("xacro", "its value is a function or namespace"),
+        ("open('/etc/passwd')", "name 'open' is not defined"),
+    ],
+)
+def test_an_expression_off_the_list_is_named(refused_at, expression, construct):
+    assert construct in refused_at(link(expression))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        f'<link name="$(eval {"lambda: 0"})"/>',
+        '<xacro:if value="${lambda: 0}"/>',
+        '<xacro:property name="${lambda: 0}" value="1"/>',
+        '<xacro:macro name="m" params="a:=${lambda: 0}"/><xacro:m/>',
+        '<xacro:macro name="m"/><xacro:call macro="${lambda: 0}"/>',
+        '<xacro:include filename="${lambda: 0}"/>',
+        '<xacro:include filename="a" ns="${lambda: 0}"/>',
+        '<xacro:element xacro:name="${lambda: 0}"/>',
+        '<xacro:attribute name="a" value="${lambda: 0}"/>',
+        '<xacro:arg name="a" default="${lambda: 0}"/>',
+        "<!-- xacro:eval-comments -->${lambda: 0}",
+        '<xacro:property name="a" value="lambda: 0"/><link name="${${a}}"/>',
+        '<xacro:arg name="a" default="lambda: 0"/><link name="${$(arg a)}"/>',
+    ],
+)
+def test_every_place_of_an_expression_goes_by_the_list(refused, hostile, body):
+    message = refused("show", hostile(body))
+    assert "Lambda 'lambda: 0' is not allowed" in message or "invalid expression" in message
+
+
+def test_units_in_yaml_go_by_the_list(refused_at, hostile):
+    (hostile("").parent / "units.yaml").write_text("a: !degrees (lambda:0)()\n")
+    assert "Lambda 'lambda:0' is not allowed" in refused_at(link("xacro.load_yaml('units.yaml')"))
+
+
+def test_tags_of_yaml_make_nothing(refused_at, hostile):
+    text = "a: !!python/object/apply:os.system ['touch pwned']\n"
+    (hostile("").parent / "tags.yaml").write_text(text)
+    assert "tags.yaml:1:4: no valid YAML" in refused_at(link("xacro.load_yaml('tags.yaml')"))
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret.yaml", "{home}/secret.yaml", "link.yaml", "up/secret.yaml"]
+)
+def test_yaml_comes_from_the_own_folder_only(refused_at, hostile, tmp_path, name):
+    folder = hostile("").parent
+    (folder / "link.yaml").symlink_to(tmp_path / "home" / "secret.yaml")
+    (folder / "up").symlink_to(tmp_path / "home")
+    name = name.format(home=tmp_path / "home")
+    for call in ("load_yaml", "xacro.load_yaml"):
+        message = refused_at(link(f"{call}('{name}')"))
+        assert f"is not in {folder}, the folder of the description" in message
+        assert "--root DIR" in message
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../secret.xml",
+        "{home}/secret.xml",
+        "link.xml",
+        "../*.xml",
+        "{home}/*",
+        "$(find home)/secret.xml",
+    ],
+)
+def test_includes_come_from_the_own_folder_only(refused_at, hostile, tmp_path, name):
+    (hostile("").parent / "link.xml").symlink_to(tmp_path / "home" / "secret.xml")
+    name = name.format(home=tmp_path / "home")
+    for more in ("", ' optional="true"'):
+        message = refused_at(f'<xacro:include filename="{name}"{more}/>')
+        assert "the folder of the description" in message
+
+
+def test_a_root_lets_files_come_from_elsewhere(run, hostile, tmp_path):
+    home = tmp_path / "home"
+    (home / "ok.xml").write_text('<robot><link name="included"/></robot>')
+    (home / "ok.yaml").write_text("name: loaded\n")
+    path = hostile(
+        '<xacro:include filename="../ok.xml"/>'
+        "<link name=\"${xacro.load_yaml('../ok.yaml').name}\"/>"
+        '<joint name="j" type="fixed"><parent link="included"/><child link="loaded"/></joint>'
+    )
+    assert run("show", path)[0] == 2
+    code, out, err = run("show", path, "--root", home)
+    assert (code, err) == (0, "")
+    assert "loaded" in out
+    assert run("show", path, "--root", home / "nowhere")[0] == 2
+
+
+def test_meshes_of_a_root_are_found(run, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    (tmp_path / "data" / "meshes").mkdir(parents=True)
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "data" / "meshes" / "a.stl")
+    path = tmp_path / "data" / "robots" / "x" / "x.urdf"
+    path.parent.mkdir(parents=True)
+    shape = '<geometry><mesh filename="../../meshes/a.stl"/></geometry>'
+    path.write_text(f'<robot name="x"><link name="a"><visual>{shape}</visual></link></robot>')
+    code, out, _ = run("check", path)
+    assert code == 1
+    assert "--root DIR" in out
+    assert "mesh-unresolved" not in run("check", path, "--root", tmp_path / "data")[1]
+    words = ("import", path, "--no-picture", "--out", "robots")
+    assert run(*words, "--root", "data")[0] == 0
+    assert (tmp_path / "robots" / "x" / "meshes").is_dir()
+
+
+def test_devices_and_pipes_are_not_read(refused_at, hostile):
+    folder = hostile("").parent
+    os.mkfifo(folder / "pipe")
+    for body in ('<xacro:include filename="pipe"/>', link("xacro.load_yaml('pipe')")):
+        assert "is no regular file" in refused_at(body)
+    (folder / "zero").symlink_to("/dev/zero")
+    for name in ("/dev/zero", "zero"):
+        assert "the folder of the description" in refused_at(f'<xacro:include filename="{name}"/>')
+
+
+def aliases(depth):
+    lines = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, depth)]
+    return "\n".join(["a0: &a0 [x]", *lines])
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (aliases(12), "a value has more than 200000 characters and entries"),
+        ("a: &a [*a]", "a value has more than 200000 characters and entries"),
+        (
+            "a0: &a0 {k: 1}\n"
+            + "".join(
+                f"a{i}: &a{i} {{<<: [{','.join([f'*a{i - 1}'] * 9)}]}}\n" for i in range(1, 9)
+            ),
+            "a mapping has more than 200000 entries",
+        ),
+        ("[" * 1500, "no valid YAML"),
+        ("a: !!set {b, c}", "no valid YAML"),
+    ],
+)
+def test_yaml_cannot_swell(refused_at, hostile, content, reason):
+    (hostile("").parent / "bomb.yaml").write_text(content)
+    assert reason in refused_at(link("xacro.load_yaml('bomb.yaml')"))
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "'a'*10**10",
+        "list(range(10**9))",
+        "[0]*10**9",
+        "10**10**10",
+        "math.factorial(10**7)",
+        "'%1000000000d' % 1",
+    ],
+)
+def test_a_large_expression_is_refused(refused_at, expression):
+    message = refused_at(f"\n{link(expression)}", line=3)
+    assert f"when evaluating expression '{expression}'" in message
+
+
+MACROS = "".join(
+    f'<xacro:macro name="m{i}">{f"<xacro:m{i + 1}/>" * 10}</xacro:macro>' for i in range(8)
+)
+PROPERTIES = "".join(
+    f'<xacro:property name="p{i + 1}" value="{f"${{p{i}}}" * 10}"/>' for i in range(12)
+)
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        (
+            f'{MACROS}<xacro:macro name="m8"><link name="a"/></xacro:macro><xacro:m0/>',
+            "the expansion processes more than 50000 elements",
+        ),
+        (
+            f'<xacro:property name="p0" value="aaaaaaaaaa"/>{PROPERTIES}{link("p12")}',
+            "the expansion makes more than 20000000 characters",
+        ),
+        ("<a>" * 5000 + "</a>" * 5000, "Excessive depth"),
+        ('<xacro:macro name="m"><a><xacro:m/></a></xacro:macro><xacro:m/>', "without end"),
+        ('<xacro:include filename="robot.urdf.xacro"/>', "without end"),
+    ],
+)
+def test_a_document_cannot_swell(refused, hostile, body, reason):
+    assert reason in refused("show", hostile(body))
+
+
+ENDLESS = f"<xacro:macro name='m' params=\"a:={'a' * 60}'\"/>"
+"""The package's regular expression for parameters takes 2^60 steps for it."""
+
+
+@pytest.mark.parametrize("limit", ["CPU_LIMIT", "WALL_LIMIT"])
+def test_what_no_bound_foresees_is_ended(refused, hostile, monkeypatch, limit):
+    monkeypatch.setattr(xacro_child, limit, 2)
+    path = hostile(ENDLESS)
+    what = {"CPU_LIMIT": "2 s of CPU time", "WALL_LIMIT": "2 s"}[limit]
+    assert f"{path}: its expansion takes more than {what}\n" in refused("show", path)
+
+
+def test_memory_that_no_bound_foresees_is_refused(refused, hostile, monkeypatch):
+    monkeypatch.setattr(xacro_child, "MEMORY_LIMIT", 150 << 20)
+    path = hostile("<a/>" * 500_000)
+    assert "needs more than 150 MiB of memory" in refused("show", path)
+
+
+def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr(xacro_child, "CPU_LIMIT", 2)
+    library = tmp_path / "library"
+    library.mkdir()
+    (library / "trap.yaml").write_text(
+        "name: trap\nkind: ee\nsummary: a trap\nlicence: MIT\nfile: trap.xacro\n"
+        "root: a\ntool: {link: a}\n"
+        "parameters:\n  size: {default: 1, min: 0, max: 2}\n"
+    )
+    argument = '<xacro:arg name="size" default="1"/>'
+    for body, reason in (
+        (link(CALL), "name 'vars' is not defined"),
+        (link("load_yaml('/etc/passwd')"), "is not in"),
+        ('<link name="\ue000().__class__.__bases__\ue001"/>', "no link 'a'"),
+        (ENDLESS, "its expansion takes more than 2 s of CPU time"),
+    ):
+        (library / "trap.xacro").write_text(f"{HEAD}{argument}{body}</robot>")
+        assert reason in refused("compose", "arm=ur5", "ee=trap", "--library", library)
+
+
+def test_the_child_writes_no_file(tmp_path):
+    code = "from morphgen.formats.xacro_child import _limit; _limit(9, 2**30); "
+    write = "file = open('written', 'w'); file.write('a'); file.close()"
+    done = subprocess.run(
+        [sys.executable, "-c", code + write], capture_output=True, text=True, check=False
+    )
+    assert "File too large" in done.stderr
+    assert (tmp_path / "written").read_bytes() == b""
+
+
+def test_the_child_loads_nothing_heavy():
+    code = (
+        "import morphgen.formats.xacro, morphgen.formats.xacro_compile, sys, json;"
+        "print(json.dumps(list(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numpy", "torch", "mujoco", "trimesh", "pybullet"} & set(json.loads(done.stdout))

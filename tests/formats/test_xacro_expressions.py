@@ -1,0 +1,196 @@
+"""Expressions compute what xacro's do, and nothing else."""
+
+import ast
+import math
+import re
+import time
+from pathlib import Path
+
+import pytest
+
+import morphgen.formats
+from morphgen.formats import xacro_child, xacro_files
+from morphgen.formats.xacro import MAX_INCLUDE_DEPTH
+from morphgen.formats.xacro_engine import MAX_ELEMENTS, MAX_TEXT
+from morphgen.formats.xacro_expressions import MAX_LENGTH, Expression
+from morphgen.formats.xacro_functions import BUILTINS, MATH, MAX_BITS, MAX_SIZE, RefusedError
+from morphgen.formats.xacro_nodes import MAX_WORK
+
+NAMES = {
+    **MATH,
+    **BUILTINS,
+    "x": 3,
+    "words": "1 2.5 3",
+    "limits": {"elbow": {"max": 2.5, "keys": 7}, "list": [1, [2, 3]]},
+}
+
+
+def value(text, names=NAMES):
+    return Expression(text).evaluate(names)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2*x + 1 - x/3 + x**2 - x//2 + x%2",
+        "-x + +x + ~x + (x << 2) + (x >> 1) + (x & 2) + (x | 4) + (x ^ 1)",
+        "sqrt(x) + sin(pi/6) * hypot(x, 4) + radians(90) + atan2(x, 1) + factorial(5) + comb(5, 2)",
+        "1 < x <= 3 and not x == 4 or x in [1, 2]",
+        "'a' if x > 2 else 'b'",
+        "'left_' + 'arm' * 2",
+        "'%.3f and %d%% of %s' % (pi, x, 'y')",
+        "max(x, 5) + min([x, 1]) + abs(-x) + round(2.5, 1) + int('7') + float('1') + len(words)",
+        "[float(word) for word in words.split()]",
+        "[a * b for a in range(4) if a % 2 for b in range(a)]",
+        "[a + b for a, b in zip([1, 2], [3, 4])]",
+        "' '.join(str(a) for a in range(3))",
+        "sum(a * 2 for a in range(5))",
+        "list(map(float, words.split()))",
+        "limits['elbow']['max'] + limits['list'][1][0] + limits['list'][-1][-1]",
+        "limits.get('nothing', 1)",
+        "list(limits.keys())",
+        "dict(a=1, **{'b': [2]})",
+        "[*range(3), x][1:3]",
+        "'Ab_c'.lower().upper().replace('B', 'd').strip('A').split('_')",
+        "words.startswith('1') and words.endswith('3') and words.index('2') == 2",
+        "'abc'[::-1] + str(True) + str(None) + str([1, 'a'])",
+        "sorted([3, 1, 2], reverse=True) + list(reversed((1, 2)))",
+        "bool(x) and any([0, 1]) and all([])",
+        "divmod(7, 2) + tuple([1]) + ()",
+        "x is not None",
+    ],
+)
+def test_an_expression_is_worth_what_python_says(text):
+    python = {"__builtins__": {}} | {
+        name: getattr(math, name, None) or getattr(__builtins__, name, None) or given
+        for name, given in NAMES.items()
+    }
+    if isinstance(__builtins__, dict):
+        python |= {name: __builtins__[name] for name in NAMES if name in __builtins__}
+    assert value(text) == eval(text, python)
+
+
+def test_a_dot_reaches_entries():
+    assert value("limits.elbow.max") == 2.5
+    assert value("limits.elbow.keys") == 7
+    assert value("limits.elbow.keys()") == ["max", "keys"]
+
+
+@pytest.mark.parametrize(
+    ("text", "construct"),
+    [
+        ("().__class__.__bases__", "Attribute '().__class__' is not allowed"),
+        ("x.real", "Attribute 'x.real' is not allowed"),
+        ("sin.call", "Attribute 'sin.call' is not allowed"),
+        ("limits.__class__", "Attribute 'limits.__class__' is not allowed"),
+        ("'{0.__class__}'.format(x)", "Attribute \"'{0.__class__}'.format\" is not allowed"),
+        ("'{a}'.format_map(limits)", 'format_map" is not allowed'),
+        ("f'{x.real}'", "JoinedStr \"f'{x.real}'\" is not allowed"),
+        ("lambda: x", "Lambda 'lambda: x' is not allowed"),
+        ("(lambda: x)()", "Lambda 'lambda: x' is not allowed"),
+        ("(y := x)", "NamedExpr 'y := x' is not allowed"),
+        ("[y := 1, y ** 2]", "NamedExpr"),
+        ("(a for a in ()).gi_frame", "Attribute '(a for a in ()).gi_frame' is not allowed"),
+        ("[a.gi_frame for a in [(b for b in [])]]", "Attribute 'a.gi_frame' is not allowed"),
+        ("{1, 2}", "Set '{1, 2}' is not allowed"),
+        ("{a: 1 for a in []}", "DictComp"),
+        ("1j", "Constant '1j' is not allowed"),
+        ("b'a'", "is not allowed"),
+        ("...", "is not allowed"),
+        ("[a for limits.elbow in [1]]", "'limits.elbow' is not allowed"),
+        ("x(1)", "Call 'x(1)' is not allowed"),
+        ("'a'.split()()", "Call \"'a'.split()()\" is not allowed"),
+        ("sin", "its value is a function"),
+    ],
+)
+def test_what_is_not_on_the_list_is_refused_by_name(text, construct):
+    with pytest.raises(RefusedError) as caught:
+        value(text)
+    assert construct in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["vars(x)", "type(x)", "open('a')", "eval('1')", "getattr(x, 'real')", "__import__('os')"],
+)
+def test_other_builtins_are_unknown(text):
+    with pytest.raises(NameError, match="is not defined"):
+        value(text)
+
+
+@pytest.mark.parametrize("text", ["str(sin)", "[sin]", "dict(a=sin)", "sin == sin", "min(key=len)"])
+def test_a_function_is_no_data(text):
+    with pytest.raises(TypeError, match="is no data"):
+        value(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "'a' * 10**10",
+        "10**10 * 'a'",
+        "[0] * 10**9",
+        "list(range(10**9))",
+        "10**10**10",
+        "2**1000 * 2**1000",
+        "1 << 10**10",
+        "factorial(10**7)",
+        "comb(10**9, 10**8)",
+        "perm(10**9)",
+        "prod(range(1, 10**5))",
+        "round(5, -10**9)",
+        "'%1000000000d' % 1",
+        "'%.1000000000f' % 1",
+        "'%*d' % (10**9, 1)",
+        "'%(a(b)c)1000000000d' % {'a(b)c': 1}",
+        "'a'.zfill(10**9)",
+        "('a' * 1000).replace('a', 'b' * 1000)",
+        "('a' * 1000).join(['b'] * 1000)",
+        "[a for a in range(10**5) for b in range(10**5) for c in range(10**5)]",
+        "[0 for a in range(10**5) for b in range(10**5) if 0]",
+        "map(range, [10**5] * 1000)",
+        "[len('a' * 10**5) for a in range(10**5)]",
+        "[(a + a) for a in ['a' * 10**5] for b in range(10**4)]",
+        "str(" + "[[a, a] for a in " * 30 + "[0]" + "]" * 30 + ")",
+        "+".join(["1"] * 9000),
+        "-" * 9000 + "1",
+        "1" * 10_001,
+        "(" * 150 + "[" * 150,
+    ],
+)
+def test_no_expression_takes_long_or_makes_much(text):
+    start = time.process_time()
+    with pytest.raises((RefusedError, SyntaxError)):
+        value(text)
+    assert time.process_time() - start < 2
+
+
+def test_nothing_of_a_document_is_given_to_python_to_run():
+    """The only ``exec`` is that of the package's own code; ``eval`` and ``compile`` are nowhere."""
+    folder = Path(morphgen.formats.__file__).parent
+    calls = [
+        f"{path.name}: {ast.unparse(node)}"
+        for path in sorted(folder.glob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id in ("eval", "exec", "compile", "__import__")
+    ]
+    assert calls == ["xacro_engine.py: exec(_BODY, module.__dict__)"]
+
+
+def test_the_page_names_every_function_and_bound():
+    page = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
+    words = set(re.findall(r"\w+", page))
+    assert set(BUILTINS) - words == set()
+    bounds = (
+        f"{MAX_LENGTH:,} characters, {MAX_WORK:,} steps",
+        f"{MAX_SIZE:,} characters and entries; {MAX_BITS} bits",
+        f"| {xacro_files.MAX_FILE >> 20} MiB |",
+        f"| {MAX_INCLUDE_DEPTH} |",
+        f"{MAX_ELEMENTS:,} elements processed, {xacro_files.MAX_CLONES:,} copied, {MAX_TEXT:,}",
+        f"| {xacro_files.MAX_OUTPUT:,} characters |",
+        f"{xacro_child.CPU_LIMIT} s of CPU time, {xacro_child.WALL_LIMIT} s of waiting, "
+        f"{xacro_child.MEMORY_LIMIT >> 30} GiB of memory",
+    )
+    assert [bound for bound in bounds if bound not in page] == []
