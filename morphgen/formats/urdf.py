@@ -31,7 +31,11 @@ class UnsoundError(FormatError):
 
 
 def read_urdf(
-    path: Path, args: Mapping[str, str] | None = None, finder: PackageFinder | None = None
+    path: Path,
+    args: Mapping[str, str] | None = None,
+    finder: PackageFinder | None = None,
+    *,
+    keep_order: bool = False,
 ) -> Robot:
     """Read a URDF, or a xacro (by its suffix), with every mesh reference resolved.
 
@@ -40,6 +44,8 @@ def read_urdf(
         args: xacro arguments.
         finder: Where ROS packages are looked for; by default around ``path``, in ROS's own
             environment and in the installed data packages.
+        keep_order: Whether links stay in the order of the file's joints, if parents are first
+            there; otherwise the tree is walked depth first.
 
     Returns:
         The robot, without frames; its home is zero, or the middle of a range without zero.
@@ -59,11 +65,16 @@ def read_urdf(
         raise FormatError(f"{path}: xacro arguments {', '.join(args)} for a file that is no xacro")
     else:
         data = path.read_bytes()
-    return robot_from_xml(data, path, finder)
+    return robot_from_xml(data, path, finder, keep_order=keep_order)
 
 
 def robot_from_xml(
-    data: bytes, path: Path, finder: PackageFinder, *, trusted: bool = False
+    data: bytes,
+    path: Path,
+    finder: PackageFinder,
+    *,
+    trusted: bool = False,
+    keep_order: bool = False,
 ) -> Robot:
     """Read URDF text.
 
@@ -72,6 +83,7 @@ def robot_from_xml(
         path: Where it comes from, for messages and relative mesh paths.
         finder: Where ``package://`` is looked for.
         trusted: Whether a document of the same structure has been examined before.
+        keep_order: See ``read_urdf``.
 
     Raises:
         UnsoundError: If the tree is broken or a mesh is not found.
@@ -89,7 +101,9 @@ def robot_from_xml(
     colours = {m.get("name", ""): read_colour(m) for m in root.iterfind("material")}
     found = (read_link(element, meshes, colours) for element in root.iterfind("link"))
     links = {link.name: link for link in found}
-    joints = _topological([read_joint(element) for element in root.iterfind("joint")], links)
+    joints = [read_joint(element) for element in root.iterfind("joint")]
+    if not (keep_order and _parents_first(joints, links)):
+        joints = _topological(joints, links)
     order = [_root_name(links, joints), *(joint.child for joint in joints)]
     home = tuple(_rest(joint) for joint in joints if joint.is_independent)
     bodies = tuple(links[name] for name in order)
@@ -131,6 +145,15 @@ def _resolved_meshes(
                 Finding("mesh-unresolved", "error", where, str(error), "correct the mesh path")
             )
     return meshes
+
+
+def _parents_first(joints: Sequence[Joint], links: Mapping[str, Link]) -> bool:
+    known = {_root_name(links, joints)}
+    for joint in joints:
+        if joint.parent not in known:
+            return False
+        known.add(joint.child)
+    return True
 
 
 def _topological(joints: list[Joint], links: Mapping[str, Link]) -> list[Joint]:
