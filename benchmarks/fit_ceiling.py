@@ -299,7 +299,7 @@ def _one_thread() -> None:
 def _drawn(words: Sequence[str], jobs: int) -> list[Target]:
     # Imported here, so that a file of points can be searched where the library is not installed.
     from fit_quality import FOUR, link_tasks
-    from morphgen.fitting.stored import shapes_key
+    from morphgen.formats.fits import shapes_key
 
     names: dict[str, list[str]] = defaultdict(list)
     shapes = {}

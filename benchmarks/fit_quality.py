@@ -49,7 +49,7 @@ from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, fit_solid
 from morphgen.fitting.quality import Array, quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
-from morphgen.fitting.stored import shapes_key
+from morphgen.formats.fits import shapes_key
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere

@@ -27,8 +27,8 @@ from morphgen.errors import MorphgenError
 from morphgen.fitting.dressed import are_primitives, link_shapes
 from morphgen.fitting.link import FitOptions, fit_solid
 from morphgen.fitting.solid import solid_of
-from morphgen.fitting.stored import shapes_key
 from morphgen.formats.bundle import read_robot
+from morphgen.formats.fits import shapes_key
 from morphgen.model.geometry import Shape
 
 QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)

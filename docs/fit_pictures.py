@@ -23,8 +23,8 @@ import morphgen
 from morphgen.fitting.dressed import are_primitives, stored_primitives, with_primitives
 from morphgen.fitting.parts import COLLISION
 from morphgen.fitting.robot import fit_links
-from morphgen.fitting.stored import read_stored, shapes_key
 from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
+from morphgen.formats.fits import read_stored, shapes_key
 from morphgen.formats.picture import render
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.geometry import Mesh, Rgba, Shape

@@ -134,7 +134,7 @@ class _Examination:
         made = self.found.sets.get((side, member.name))
         try:
             robot = member_body(member, self.library)
-            body = robot_hash(robot)
+            body = robot_hash(robot, visuals=False)
             with tempfile.TemporaryDirectory() as folder:
                 setting = setting_of(
                     robot,

@@ -108,7 +108,7 @@ def robot_goals(
         setting = setting_of(robot, task, recipe, obstacles=obstacles, cache=cache)
         goals = goals_of(setting)
         lines = unproven(goals, setting) if certified else None
-        return replace(made, goals=goals, body=robot_hash(robot), unproven=lines)
+        return replace(made, goals=goals, body=robot_hash(robot, visuals=False), unproven=lines)
     except MorphgenError as error:
         return replace(made, why=str(error))
 

@@ -33,7 +33,7 @@ from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
 
-FORMAT = 3
+FORMAT = 4
 """Of a stored set; a change of how sets are drawn needs another."""
 EXACT = 1e-6
 """Largest deviation of a goal from its witness's tool, metres and of a quaternion."""
@@ -95,12 +95,12 @@ def goal_set(
             f"{config.goals} goals with seed {seed}: at least one goal, and no negative seed"
         )
     shoulder(robot)  # refuses a robot whose tool does not move
-    body = robot_hash(robot)
+    body = robot_hash(robot, visuals=False)
     key = _key(robot, body, config, obstacles, seed, ground)
     if shipped is not None:
         require_own(shipped, key, robot.name)
         return shipped
-    folder = user_cache_path("morphgen") / "goals-3" if cache is None else cache
+    folder = user_cache_path("morphgen") / "goals-4" if cache is None else cache
     make = partial(_made, robot, body, config, obstacles, seed, ground)
     return cached(GoalSet, folder / f"{key}.npz", robot.name, make)
 

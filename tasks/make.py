@@ -61,8 +61,8 @@ def make_batch(
 
     Args:
         task: ``reach`` or ``push``; one for all robots, or one for each.
-        robots: Robots as they are, or what ``robot_of`` knows: words of ``morphgen compose``, a
-            bundle's folder or a URDF; their collision shapes are then the fitted primitives.
+        robots: Robots, or what ``robot_of`` knows: words of ``morphgen compose``, a bundle's folder
+            or a URDF. Their collision shapes are the fitted primitives, see ``as_primitives``.
         num_envs: How many environments, n.
         obstacles: Whether there are any; one for all robots, or one for each.
         goal_seed: Of goals, starts and obstacles, which are kept in a cache.
@@ -84,15 +84,13 @@ def make_batch(
     tasks: list[Task] = _one_each("task", task, robots)
     boxes: list[bool] = _one_each("obstacles", obstacles, robots)
     recipe = _recipe(goal_seed, options)
-    made: dict[str | Path, Robot] = {}
+    made: dict[Robot | str | Path, Robot] = {}
     settings = []
     for robot, does, has in zip(robots, tasks, boxes, strict=True):
-        if not isinstance(robot, Robot):
-            if robot not in made:
-                made[robot] = robot_of(robot, library=folders)
-            robot = made[robot]
         _require("task", does, TASKS)
-        settings.append(setting_of(robot, does, recipe, obstacles=has, cache=cache))
+        if robot not in made:
+            made[robot] = robot_of(robot, library=folders)
+        settings.append(setting_of(made[robot], does, recipe, obstacles=has, cache=cache))
     return batch_of(settings, num_envs, library=folders, **options)
 
 

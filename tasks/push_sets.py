@@ -27,7 +27,7 @@ from morphgen.tasks.sim.base import Block, Scene
 
 Array = NDArray[np.float64]
 
-FORMAT = 1
+FORMAT = 2
 """Of a stored set; a change of how sets are drawn needs another."""
 TRIES = 30
 """Places of the block tried for each start that is needed, before giving up."""
@@ -104,12 +104,12 @@ def push_set(
         MeshError: If a mesh cannot be read.
     """
     _require(config, seed)
-    body = robot_hash(robot)
+    body = robot_hash(robot, visuals=False)
     key = _key(robot, body, config, obstacles, seed, ground)
     if shipped is not None:
         require_own(shipped, key, robot.name)
         return shipped
-    folder = user_cache_path("morphgen") / "pushes-2" if cache is None else cache
+    folder = user_cache_path("morphgen") / "pushes-3" if cache is None else cache
     make = partial(_made, robot, body, config, obstacles, seed, ground)
     return cached(PushSet, folder / f"{key}.npz", robot.name, make)
 

@@ -33,8 +33,12 @@ def robot_of(
     by dashes, each of which goes where its kind belongs: ``ur5-plane`` is ``arm=ur5 ee=plane``,
     ``gantry-cube`` is ``base=gantry ee=cube``.
 
+    A robot is the same, with the same goals and scores, whatever names it: words, its bundle, the
+    bundle's URDF, or the robot itself as ``morphgen.compose`` makes it or ``morphgen.read`` reads
+    it.
+
     Args:
-        given: The robot, which is then returned as it is, or its name.
+        given: The robot, or its name.
         geometry: Its collision shapes: fitted boxes, cylinders and spheres, or as they are.
         library: Folders of your own parts.
 
@@ -43,10 +47,10 @@ def robot_of(
         FormatError: If the file is broken.
         MorphgenError: If the words name what does not exist or does not fit.
     """
-    if isinstance(given, Robot):
-        return given
     parts = default_library(library)
-    if isinstance(given, Path) or is_file(given):
+    if isinstance(given, Robot):
+        robot = given
+    elif isinstance(given, Path) or is_file(given):
         robot = _with_tool(read_robot(Path(given)))
     else:
         derivation, name = parse_words(_words(given, parts), parts)

@@ -17,9 +17,9 @@ from morphgen.benchmark.similarity import MEASURES, features
 from morphgen.benchmark.tokens import MAX_LINKS, tokens
 from morphgen.errors import MorphgenError
 from morphgen.fitting.dressed import are_primitives
-from morphgen.fitting.stored import read_stored, stored_fit
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
+from morphgen.formats.fits import read_stored, stored_fit
 from morphgen.grammar.library import Library
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Robot
@@ -152,11 +152,14 @@ def likeness(robots: Sequence[Robot], folders: Sequence[Path]) -> Likeness:
         MorphgenError: If a mesh cannot be read.
     """
     shapes = [token_shapes(as_in_library(robot, Library(folders)), folders) for robot in robots]
+    # What is compared here has no study around it; the largest robot says what fits.
     size = max(MAX_LINKS, *(len(robot.links) for robot in robots))
     tables = tuple(
         tokens(robot, each, max_links=size) for robot, each in zip(robots, shapes, strict=True)
     )
-    known = [features(robot, each) for robot, each in zip(robots, shapes, strict=True)]
+    known = [
+        features(robot, each, max_links=size) for robot, each in zip(robots, shapes, strict=True)
+    ]
     values = {
         name: np.array([[measure.function(a, b) for b in known] for a in known])
         for name, measure in MEASURES.items()

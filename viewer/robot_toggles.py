@@ -7,7 +7,7 @@ from collections.abc import Callable
 import viser
 
 from morphgen.fitting.dressed import as_primitives, stored_primitives
-from morphgen.fitting.stored import read_stored
+from morphgen.formats.fits import read_stored
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.viewer import overlays

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.audit import Audit, audited
-from morphgen.benchmark.similarity import MEASURES, Features, features
-from morphgen.benchmark.split import SIDES, Member, Split, robot_hash
+from morphgen.benchmark.similarity import MEASURES, Features
+from morphgen.benchmark.split import SIDES, Member, Split
 from morphgen.benchmark.statistics import summed_up
-from morphgen.benchmark.survey import Fault, Survey, Surveyed, facts_of
+from morphgen.benchmark.survey import Examined, Fault, Survey, Surveyed, examined
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
@@ -25,14 +24,6 @@ Array = NDArray[np.float64]
 
 LARGEST = 60
 """The most robots of which every pair is compared; a map of more could not be read."""
-
-
-@dataclass(frozen=True, eq=False)
-class Examined:
-    """A robot of a split."""
-
-    surveyed: Surveyed
-    features: Features
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +64,8 @@ def study(
             f"morphgen split audit and morphgen split stats take them all"
         )
     derivations = list(dict.fromkeys(member.derivation for member in members))
-    futures = [workers.submit(examine, derivation, folders) for derivation in derivations]
+    links = split.max_links
+    futures = [workers.submit(examine, text, folders, links) for text in derivations]
     found = {}
     for i, (derivation, future) in enumerate(zip(derivations, futures, strict=True)):
         found[derivation] = workers.result(future)
@@ -81,12 +73,11 @@ def study(
     return workers.result(workers.submit(conclude, split, found, folders))
 
 
-def examine(derivation: str, folders: tuple[Path, ...]) -> Examined | Fault:
+def examine(derivation: str, folders: tuple[Path, ...], max_links: int) -> Examined | Fault:
     """Compose and measure a robot."""
     try:
         robot = compose(parse_derivation(derivation), Library(folders), "robot")
-        surveyed = Surveyed(robot_hash(robot), facts_of(robot))
-        return Examined(surveyed, features(robot, token_shapes(robot, folders)))
+        return examined(robot, folders, max_links)
     except MorphgenError as error:
         return Fault("body-broken", str(error))
 

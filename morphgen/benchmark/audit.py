@@ -40,6 +40,7 @@ and unit quaternions, so it hardly tells sizes.
 
 _FIXES = {
     "part-missing": "name the folder of your parts with --library, or correct the derivation",
+    "links-many": "leave it out, or make the split with --max-links, the same for all robots",
     "body-broken": "correct the derivation, or the part",
     "body-changed": "use the morphgen that the split was made with, or make the split anew",
     "body-shared": "leave it out of one side",
@@ -101,8 +102,9 @@ def audit(
 ) -> Audit:
     """Look for leaks between train and test, and for rules of the regime that are broken.
 
-    Errors: ``part-missing`` and ``body-broken`` (a robot cannot be composed), ``body-changed`` (it
-    is not the one that the split names), ``body-shared`` (a test robot is trained at its task),
+    Errors: ``part-missing`` and ``body-broken`` (a robot cannot be composed), ``links-many`` (it
+    has more links than the split's ``max_links``), ``body-changed`` (it is not the one that the
+    split names), ``body-shared`` (a test robot is trained at its task),
     ``body-near`` (nearly so, see ``Near``), ``name-shared`` (by different bodies),
     ``similarity-bound`` (made with one that does not hold), and those of ``regime_findings``.
     Warnings: ``body-repeated`` (on one side, at one task),

@@ -11,6 +11,7 @@ import numpy as np
 
 from morphgen.benchmark.similarity import Features, features
 from morphgen.benchmark.split import COMPOSED, Member, Task, robot_hash
+from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
@@ -69,6 +70,8 @@ class Maker:
     """Of the library."""
     comparable: bool = False
     """Whether their features are wanted."""
+    max_links: int = MAX_LINKS
+    """The most links that a robot may have."""
 
     @cached_property
     def library(self) -> Library:
@@ -79,7 +82,8 @@ class Maker:
         """Make a robot.
 
         Raises:
-            BenchmarkError: If a composed one has an error of ``morphgen check``.
+            BenchmarkError: If a composed one has an error of ``morphgen check``, or a robot more
+                links than ``max_links``.
             SamplingError: If none can be drawn.
             MorphgenError: If the recipe names what does not exist or does not fit.
         """
@@ -102,9 +106,11 @@ class Maker:
         written = parse_derivation(str(derivation))
         if written != derivation:
             robot = compose(written, self.library, robot.name)
+        require_max_links(len(robot.links), f"robot {robot.name!r}", self.max_links)
         found = None
         if self.comparable:
-            found = features(robot, token_shapes(robot, self.folders))
+            shapes = token_shapes(robot, self.folders)
+            found = features(robot, shapes, max_links=self.max_links)
         return Body(robot.name, category, written, robot_hash(robot), found)
 
 

@@ -78,7 +78,8 @@ def composition(
         )
     chosen = [*train[: order.train[-1] if order.train else None], *test]
     unique = {cell.text: Composed(cell.words, cell.name) for cell in chosen}
-    made = make_all(list(unique.values()), Maker(library.folders), jobs=jobs, progress=progress)
+    maker = Maker(library.folders, max_links=order.max_links)
+    made = make_all(list(unique.values()), maker, jobs=jobs, progress=progress)
     bodies = dict(zip(unique, made, strict=True))
     robots = []
     for cell in chosen:

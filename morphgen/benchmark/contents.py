@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from morphgen.benchmark.built import BUNDLES, FORMAT, ROBOTS, SETTINGS, SPLIT, SUMS, TOKENS, Record
 from morphgen.benchmark.split import Member, Side, Split, split_id
 from morphgen.benchmark.survey import facts_of
-from morphgen.benchmark.token_layout import INDEX, LAYOUT, MAX_LINKS, PARENT, padded
+from morphgen.benchmark.token_layout import LAYOUT, padded
 from morphgen.benchmark.tokens import tokens
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
@@ -80,17 +80,21 @@ class Body:
 
     facts: Mapping[str, object]
     tokens: Array
-    """Indices are divided by the number of its links, shape (n_links, 48)."""
+    """Shape (n_links, 48)."""
 
 
-def body_of(robot: Robot, folders: Sequence[Path]) -> Body:
+def body_of(robot: Robot, folders: Sequence[Path], max_links: int) -> Body:
     """Measure a robot.
 
     Args:
         robot: The body.
         folders: Folders of parts, for their stored fits.
+        max_links: Of the split.
+
+    Raises:
+        BenchmarkError: If the robot has more links.
     """
-    table = tokens(robot, token_shapes(robot, folders), max_links=len(robot.links) + 1)
+    table = tokens(robot, token_shapes(robot, folders), max_links=max_links)
     return Body(facts_of(robot).as_dict(), table)
 
 
@@ -150,8 +154,7 @@ def records_text(split: Split, known: Mapping[str, Body]) -> str:
 def token_tables(split: Split, known: Mapping[str, Body]) -> tuple[Array, NDArray[np.bool_]]:
     """Tokens (n, max_links, 48) and mask (n, max_links) of all members."""
     tables = [known[member.body].tokens for _, member in sided(split)]
-    max_links = max(MAX_LINKS, *map(len, tables))
-    both = [padded(_reindexed(table, max_links), max_links) for table in tables]
+    both = [padded(table, split.max_links) for table in tables]
     return np.array([table for table, _ in both]), np.array([mask for _, mask in both])
 
 
@@ -209,11 +212,3 @@ def sided(split: Split) -> list[tuple[Side, Member]]:
     """Every member with its side, in the order of all files."""
     train: list[tuple[Side, Member]] = [("train", member) for member in split.train]
     return [*train, *(("test", member) for member in split.test)]
-
-
-def _reindexed(table: Array, max_links: int) -> Array:
-    """Tokens of ``Body`` with indices divided by one less than ``max_links``."""
-    made = table.copy()
-    for field in (INDEX, PARENT):
-        made[:, field.columns] = np.round(made[:, field.columns] * len(table)) / (max_links - 1)
-    return made

@@ -37,6 +37,7 @@ from morphgen.benchmark.contents import (
 from morphgen.benchmark.robot_folder import differences, hashes, is_current, write_robot
 from morphgen.benchmark.split import Member, Split, member_robot
 from morphgen.benchmark.split_file import split_text
+from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
 from morphgen.formats.data_files import read_json
@@ -92,7 +93,7 @@ def build(
         with alone(home):
             (home / SUMS).unlink(missing_ok=True)
             _sweep(home / BUNDLES)
-            maker = _Maker(library.folders, home, settings)
+            maker = _Maker(library.folders, home, settings, split.max_links)
             results = mapped(maker, firsts, jobs, progress)
             made = {member.body: one for member, one in zip(firsts, results, strict=True)}
             _finish(home, split, settings, made)
@@ -127,6 +128,7 @@ class _Maker:
     folders: tuple[Path, ...]
     home: Path
     settings: Settings
+    max_links: int
 
     @cached_property
     def library(self) -> Library:
@@ -134,6 +136,7 @@ class _Maker:
 
     def __call__(self, member: Member) -> _Made:
         robot = member_robot(member, self.library)
+        require_max_links(len(robot.links), f"robot {member.name!r}", self.max_links)
         folder = bundle_folder(self.home / BUNDLES, member.name)
         light, picture = self.settings.light, self.settings.picture
         is_kept = not differences(folder, robot, light=light) and is_current(
@@ -141,7 +144,7 @@ class _Maker:
         )
         if not is_kept:
             write_robot(robot, folder, light=light, picture=picture)
-        return _Made(not is_kept, body_of(robot, self.folders), hashes(folder))
+        return _Made(not is_kept, body_of(robot, self.folders, self.max_links), hashes(folder))
 
 
 def _prepare(home: Path, split: Split, settings: Settings) -> None:

@@ -90,7 +90,7 @@ def extrapolation(
         [Stream.of(grammar, grammar.name, order) for grammar in grammars]
         for grammars in (train_grammars, test_grammars)
     )
-    maker = Maker(library.folders, comparable=similarity is not None)
+    maker = Maker(library.folders, comparable=similarity is not None, max_links=order.max_links)
     turns = (divmod(i, len(trained)) for i in range(order.train[-1]))
     recipes = [trained[which].recipe(number) for number, which in turns]
     train = make_all(recipes, maker, jobs=jobs, progress=progress)

@@ -18,7 +18,8 @@ from morphgen.benchmark.bodies import (
     numbered,
     stream_seed,
 )
-from morphgen.benchmark.split import Member, Regime, Split, Task
+from morphgen.benchmark.split import MADE_MAX_LINKS, Member, Regime, Split, Task
+from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import EndlessError, Random, Recorded, derive
@@ -47,6 +48,8 @@ class Order:
     tasks: tuple[Task, ...] = ("reach",)
     obstacles: bool = False
     seed: int = 0
+    max_links: int = MAX_LINKS
+    """The most links that a robot may have; indices of tokens are divided by one less."""
 
     def __post_init__(self) -> None:
         sizes = ",".join(map(str, self.train))
@@ -55,6 +58,7 @@ class Order:
                 f"--train {sizes} --test {self.test} --seed {self.seed}: "
                 "--train and --test start at 1, --seed at 0"
             )
+        require_max_links(0, "an order", self.max_links)
         if list(self.train) != sorted(set(self.train)):
             raise BenchmarkError(f"--train {sizes}: expected sizes that grow, such as 10,30,100")
 
@@ -182,6 +186,7 @@ def assemble(
     """
     sizes = order.train or (len(train) // per_robot,)
     several = len(sizes) > 1
+    links = {} if order.max_links == MAX_LINKS else {MADE_MAX_LINKS: order.max_links}
     return tuple(
         Split(
             f"{order.name}-train{n}" if several else order.name,
@@ -194,6 +199,7 @@ def assemble(
                 "train": n,
                 **({"nested": list(sizes)} if several else {}),
                 "test": order.test,
+                **links,
                 **made,
             },
         )

@@ -52,7 +52,7 @@ def interpolation(
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
     trained = Stream.of(grammar, grammar.name, order)
     tested = Stream.of(grammar, f"{grammar.name}-test", order)
-    maker = Maker(library.folders)
+    maker = Maker(library.folders, max_links=order.max_links)
     recipes = [trained.recipe(i) for i in range(order.train[-1])]
     train = make_all(recipes, maker, jobs=jobs, progress=progress)
     wanted = _Wanted(train, order.train[0], hull, library)

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.token_layout import INDEX, MAX_LINKS, PARENT, POSITION
+from morphgen.benchmark.token_layout import MAX_LINKS, POSITION
 from morphgen.benchmark.tokens import tokens
 from morphgen.benchmark.tree_distance import KinematicTree, kinematic_tree, normalised_distance
 from morphgen.benchmark.workspace import Workspace, overlap, workspace
@@ -26,8 +26,7 @@ class Features:
 
     name: str
     tokens: Array
-    """Without the encoding of q, shape (n_links, 32). Indices are divided by 22 whatever the size
-    of the body, so that robots of every size can be compared; a longer one has some above 1."""
+    """Without the encoding of q, shape (n_links, 32)."""
     tree: KinematicTree
     workspace: Workspace
 
@@ -43,18 +42,21 @@ class Measure:
     meaning: str
 
 
-def features(robot: Robot, shapes: Mapping[str, Shape]) -> Features:
+def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS) -> Features:
     """What comparing needs of a robot.
 
     Args:
         robot: The body.
         shapes: The primitive of every link that has geometry, as ``token_shapes`` gives them.
+        max_links: What indices of tokens are divided by, less one: the same for all robots that are
+            compared.
 
     Raises:
-        BenchmarkError: If the robot has no tool or no joint that moves it, or no tokens.
+        BenchmarkError: If the robot has no tool or no joint that moves it, no tokens, or more links
+            than ``max_links``.
         RobotError: If an axis is zero.
     """
-    table = _tokens(robot, shapes)
+    table = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
     space = workspace(robot)
     return Features(robot.name, table, kinematic_tree(robot, shapes, space.reach), space)
 
@@ -144,11 +146,3 @@ def measure_named(name: str) -> Measure:
     if name not in MEASURES:
         raise BenchmarkError(f"no measure {name!r}{nearest(name, MEASURES)}")
     return MEASURES[name]
-
-
-def _tokens(robot: Robot, shapes: Mapping[str, Shape]) -> Array:
-    max_links = max(MAX_LINKS, len(robot.links))
-    made = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
-    for field in (INDEX, PARENT):
-        made[:, field.columns] *= (max_links - 1) / (MAX_LINKS - 1)
-    return made

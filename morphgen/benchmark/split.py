@@ -10,11 +10,12 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import BenchmarkError, MeshError
 from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.compose import compose
@@ -42,6 +43,8 @@ SIDES: tuple[Side, ...] = ("train", "test")
 FORMAT = 1
 COMPOSED = "composed"
 """Category of a robot that was drawn from no grammar."""
+MADE_MAX_LINKS = "max_links"
+"""Key in ``made`` of the most links of a robot, if they are not the paper's."""
 HASH_LENGTH = 32
 """Letters of the hash of a body and of the id of a split: 128 bits."""
 
@@ -89,6 +92,21 @@ class Split:
     statistics: Mapping[str, object] = field(default_factory=dict)
     """Figures about its robots, for readers; nothing depends on them."""
 
+    @property
+    def max_links(self) -> int:
+        """The most links that a robot may have, by which indices of tokens are scaled.
+
+        Raises:
+            BenchmarkError: If the split was made with another than a whole number from 2 on.
+        """
+        given = self.made.get(MADE_MAX_LINKS, MAX_LINKS)
+        if type(given) is not int or given < 2:
+            raise BenchmarkError(
+                f"split {self.name!r}: made: {MADE_MAX_LINKS}: {given!r}; expected a whole number, "
+                "2 or more"
+            )
+        return given
+
     def side(self, side: Side) -> tuple[Member, ...]:
         """The members of a side."""
         return self.train if side == "train" else self.test
@@ -130,7 +148,7 @@ def member_robot(member: Member, library: Library) -> Robot:
     return robot
 
 
-def robot_hash(robot: Robot) -> str:
+def robot_hash(robot: Robot, *, visuals: bool = True) -> str:
     """A hash of the body: 32 hexadecimal digits of a SHA-256.
 
     It tells links, joints and home: what is where, how heavy, how far and how strongly it moves,
@@ -139,13 +157,19 @@ def robot_hash(robot: Robot) -> str:
     labels has the same hash. Numbers count to 1e-7 (m, rad, kg ...), so the last bits, which
     differ between machines, do not.
 
+    Args:
+        robot: The body.
+        visuals: Whether what is only seen counts. Without, and with primitives as its collision
+            shapes, a robot has the same hash however its meshes are stored.
+
     Raises:
         MeshError: If a mesh file cannot be read.
     """
     tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
     where = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]
     joints = [_joint(joint, robot) for joint in robot.joints]
-    return _digest([[_link(link) for link in robot.links], joints, _grid(robot.home), where])
+    links = [_link(link if visuals else replace(link, visuals=())) for link in robot.links]
+    return _digest([links, joints, _grid(robot.home), where])
 
 
 def _digest(data: object) -> str:

@@ -53,7 +53,8 @@ class Fault:
     """Why a robot of a split cannot be had."""
 
     code: str
-    """``part-missing`` if the library lacks a part, else ``body-broken``."""
+    """``part-missing`` if the library lacks a part, ``links-many`` if the robot has more than its
+    split allows, else ``body-broken``."""
     why: str
 
 
@@ -64,6 +65,14 @@ class Surveyed:
     body: str
     """Its hash."""
     facts: Facts
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """What is known of a robot of a split."""
+
+    surveyed: Surveyed
+    features: Features
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +104,24 @@ def facts_of(robot: Robot) -> Facts:
     )
 
 
+def examined(robot: Robot, folders: Sequence[Path], max_links: int) -> Examined | Fault:
+    """Measure a robot, unless it has more links than its split allows.
+
+    Args:
+        robot: The body.
+        folders: Folders of parts, for their stored fits.
+        max_links: Of the split.
+
+    Raises:
+        MorphgenError: If it has no tokens, or no tool that moves.
+    """
+    if len(robot.links) > max_links:
+        why = f"it has {len(robot.links)} links, more than max_links {max_links}"
+        return Fault("links-many", why)
+    surveyed = Surveyed(robot_hash(robot), facts_of(robot))
+    return Examined(surveyed, features(robot, token_shapes(robot, folders), max_links=max_links))
+
+
 def survey(split: Split, library: Library, *, jobs: int = 1, progress: Progress = unseen) -> Survey:
     """Compose, measure and compare a split's robots; what is named twice is composed once a side.
 
@@ -105,14 +132,13 @@ def survey(split: Split, library: Library, *, jobs: int = 1, progress: Progress 
         progress: Told how many robots are done, again and again.
 
     Raises:
-        BenchmarkError: If ``jobs`` is below 1.
+        BenchmarkError: If ``jobs`` is below 1, or what the split says of its making is malformed.
     """
     trains, tests = _firsts(split.train), _firsts(split.test)
     total = len(trains) + len(tests)
-    tested = list(
-        mapped(_Examination(library.folders), tests, jobs, lambda done, _: progress(done, total))
-    )
-    look = _Comparison(library.folders, tuple(map(_features_of, tested)))
+    examination = _Examination(library.folders, split.max_links)
+    tested = list(mapped(examination, tests, jobs, lambda done, _: progress(done, total)))
+    look = _Comparison(examination, tuple(map(_features_of, tested)))
     trained = list(mapped(look, trains, jobs, lambda done, _: progress(len(tests) + done, total)))
     rows, columns = _places(split.train, trains), _places(split.test, tests)
     shape = (len(trains), len(tests), len(MEASURES))
@@ -137,22 +163,17 @@ def _places(members: Sequence[Member], firsts: Sequence[Member]) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Examined:
-    surveyed: Surveyed
-    features: Features
-
-
-@dataclass(frozen=True, eq=False)
 class _Examination:
     """How a worker sees to a robot."""
 
     folders: tuple[Path, ...]
+    max_links: int
 
     @cached_property
     def library(self) -> Library:
         return Library(self.folders)
 
-    def __call__(self, member: Member) -> _Examined | Fault:
+    def __call__(self, member: Member) -> Examined | Fault:
         try:
             parsed = parse_derivation(member.derivation)
             missing = {node.part for node in parsed.walk()} - self.library.paths.keys()
@@ -160,9 +181,7 @@ class _Examination:
                 hints = (f"{part!r}{nearest(part, self.library.paths)}" for part in sorted(missing))
                 return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
             robot = compose(parsed, self.library, member.name)
-            shapes = token_shapes(robot, self.folders)
-            surveyed = Surveyed(robot_hash(robot), facts_of(robot))
-            return _Examined(surveyed, features(robot, shapes))
+            return examined(robot, self.folders, self.max_links)
         except MorphgenError as error:
             return Fault("body-broken", str(error))
 
@@ -171,12 +190,8 @@ class _Examination:
 class _Comparison:
     """How a worker compares a robot with the test robots."""
 
-    folders: tuple[Path, ...]
+    examination: _Examination
     tests: tuple[Features | None, ...]
-
-    @cached_property
-    def examination(self) -> _Examination:
-        return _Examination(self.folders)
 
     def __call__(self, member: Member) -> tuple[Surveyed | Fault, Array]:
         found = self.examination(member)
@@ -189,9 +204,9 @@ class _Comparison:
         return found.surveyed, values
 
 
-def _surveyed(found: _Examined | Fault) -> Surveyed | Fault:
-    return found.surveyed if isinstance(found, _Examined) else found
+def _surveyed(found: Examined | Fault) -> Surveyed | Fault:
+    return found.surveyed if isinstance(found, Examined) else found
 
 
-def _features_of(found: _Examined | Fault) -> Features | None:
-    return found.features if isinstance(found, _Examined) else None
+def _features_of(found: Examined | Fault) -> Features | None:
+    return found.features if isinstance(found, Examined) else None

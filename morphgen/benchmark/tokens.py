@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from morphgen.benchmark import token_layout as layout
 from morphgen.benchmark.token_layout import LAYOUT, MAX_LINKS, TOKEN_SIZE, Field, npz, padded
 from morphgen.errors import BenchmarkError, nearest
+from morphgen.formats.rounding import as_written
 from morphgen.model.geometry import IDENTITY, Shape
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import TOOL, Frame, Joint, Link, Robot
@@ -65,6 +66,7 @@ def tokens(
                 f"robot {robot.name!r}: a shape is for {name!r}, no link"
                 + nearest(name, robot.link_index)
             )
+    robot = as_written(robot)  # one robot has one token matrix, composed or read back
     codes = joint_codes(robot, robot.home if q is None else q)
     tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
     body = np.zeros((len(robot.links), TOKEN_SIZE))

@@ -95,7 +95,9 @@ def verify(
     if is_built:
         found += _built_differences(folder, read.split, library, jobs, progress)
     else:
-        seen = _seen(read.split, _Examination(library.folders), jobs, progress)
+        seen = _seen(
+            read.split, _Examination(library.folders, read.split.max_links), jobs, progress
+        )
         found += _robot_differences(read.split, seen)
     return Verified(read.split, own, tuple(found))
 
@@ -113,6 +115,7 @@ class _Examination:
     """How a worker composes a robot, and looks at its folder in a built split if there is one."""
 
     folders: tuple[Path, ...]
+    max_links: int
     built: Path | None = None
     light: bool = False
     paths: Mapping[str, str] = field(default_factory=dict)
@@ -129,7 +132,7 @@ class _Examination:
             folder = self.built / self.paths[member.body]
             named_so = folder.name == member.name
             whys = differences(folder, robot, light=self.light) if named_so else []
-            return _Seen(tuple(whys), body_of(robot, self.folders))
+            return _Seen(tuple(whys), body_of(robot, self.folders, self.max_links))
         except MorphgenError as error:
             return _Seen((str(error),))
 
@@ -163,7 +166,7 @@ def _built_differences(
         return
     files = list(_file_differences(folder))
     yield from files
-    look = _Examination(library.folders, folder, light, paths)
+    look = _Examination(library.folders, split.max_links, folder, light, paths)
     seen = _seen(split, look, jobs, progress)
     told = {difference.where for difference in files}
     yield from (each for each in _robot_differences(split, seen) if each.where not in told)

@@ -140,7 +140,9 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
     from dataclasses import replace
 
     from morphgen.fitting.agreement import agreement
-    from morphgen.fitting.dressed import with_primitives
+    from morphgen.fitting.dressed import with_fits, with_primitives
+    from morphgen.fitting.parts import fits_of
+    from morphgen.formats.fits import read_stored
 
     robot, is_part = _target(args)
     folder = _folder(args, is_part) if args.out else None
@@ -150,8 +152,9 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
         _print_report(report)
     if folder is not None:
         primitives = {row.link: row.fit.primitives for row in report.links}
+        fits = fits_of(robot, report, read_stored(library_of(args).folders))
         made = replace(
-            with_primitives(robot, primitives, visual=args.visual),
+            with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
             name=folder.name,
             provenance={**robot.provenance, "primitives": report.without_times()},
         )

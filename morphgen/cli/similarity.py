@@ -9,7 +9,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, add_root, library_of
+from morphgen.cli.options import (
+    Subparsers,
+    add_json,
+    add_library,
+    add_max_links,
+    add_root,
+    library_of,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,6 +62,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     parser.add_argument("--csv", metavar="FILE", type=Path, help="write a line a pair")
     add_root(parser)
+    add_max_links(parser)
     add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
@@ -71,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     places = list(dict.fromkeys(p for path in args.paths for p in _places(path)))
     if len(places) < 2:
         raise BenchmarkError(f"{places[0]} is one robot; name others to compare it with")
-    robots = _features(places, library, args.root, quiet=args.json)
+    robots = _features(places, library, args)
     names = _names(robots, places)
     matrices = _matrices(robots, measures, quiet=args.json)
     written = _write(args, names, matrices)
@@ -149,21 +157,22 @@ def _read(path: Path, library: Library, root: Path | None) -> Robot:
     return compose(derivation, library, path.resolve().name)
 
 
-def _features(
-    places: Sequence[Path], library: Library, root: Path | None, *, quiet: bool
-) -> list[Features]:
+def _features(places: Sequence[Path], library: Library, args: argparse.Namespace) -> list[Features]:
     from tqdm import tqdm
 
     from morphgen.benchmark.similarity import features
+    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.errors import BenchmarkError
     from morphgen.fitting.token_shapes import token_shapes
 
     made = []
-    bar = tqdm(places, unit="robot", file=sys.stderr, disable=quiet or None, leave=False)
+    max_links = MAX_LINKS if args.max_links is None else args.max_links
+    bar = tqdm(places, unit="robot", file=sys.stderr, disable=args.json or None, leave=False)
     for path in bar:
-        robot = _read(path, library, root)
+        robot = _read(path, library, args.root)
         try:
-            made.append(features(robot, token_shapes(robot, library.folders)))
+            shapes = token_shapes(robot, library.folders)
+            made.append(features(robot, shapes, max_links=max_links))
         except BenchmarkError as error:
             raise BenchmarkError(f"{path}: {error}") from error
     return made

@@ -10,7 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
+from morphgen.cli.options import (
+    Subparsers,
+    add_jobs,
+    add_json,
+    add_library,
+    add_max_links,
+    library_of,
+)
 
 if TYPE_CHECKING:
     from morphgen.benchmark.generate import Order
@@ -123,6 +130,7 @@ def _add_order(parser: argparse.ArgumentParser, train: str, default: str = "") -
     )
     parser.add_argument("--obstacles", action="store_true", help="tasks have obstacles")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    add_max_links(parser)
     parser.add_argument("--name", help="of the split (default: from the other options)")
     parser.add_argument(
         "--out",
@@ -212,6 +220,7 @@ def _subject(args: argparse.Namespace) -> str:
 def _order(args: argparse.Namespace) -> Order:
     from morphgen.benchmark.generate import Order
     from morphgen.benchmark.split import TASKS
+    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.errors import BenchmarkError, nearest
 
     tasks: list[Task] = []
@@ -230,7 +239,8 @@ def _order(args: argparse.Namespace) -> Order:
     regime = args.generate.__name__.removeprefix("_")
     words = [regime, _subject(args), *tasks, *(["obstacles"] if args.obstacles else [])]
     name = args.name or "-".join([*words, f"seed{args.seed}"])
-    return Order(name, train, args.test, tuple(tasks), args.obstacles, args.seed)
+    links = MAX_LINKS if args.max_links is None else args.max_links
+    return Order(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)
 
 
 def _grammars(names: Sequence[str], library: Library) -> list[Grammar]:

@@ -11,11 +11,8 @@ from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, sampled
 from morphgen.fitting.solid import Solid, solid_of
-from morphgen.fitting.stored import shape_data
+from morphgen.formats.fits import MOST_PRIMITIVES, shape_data
 from morphgen.model.geometry import Shape
-
-MOST_PRIMITIVES = 32
-"""The most primitives that a link may be given."""
 
 
 @dataclass(frozen=True)

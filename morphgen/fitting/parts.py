@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import quality
-from morphgen.fitting.robot import fit_links
+from morphgen.fitting.robot import FitReport, fit_links
 from morphgen.fitting.solid import solid_of
-from morphgen.fitting.stored import (
+from morphgen.formats.files import save
+from morphgen.formats.fits import (
     SUFFIX,
-    StoredFit,
+    fit_of,
+    has_meshes,
     read_stored,
     shapes_key,
     shapes_scale,
     stored_text,
 )
-from morphgen.formats.files import save
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Mesh, Shape
+from morphgen.model.fits import Stored, StoredFit
+from morphgen.model.geometry import Shape
+from morphgen.model.robot import Robot
 from morphgen.processes import mapped
 
 TOKEN = FitOptions(max_primitives=1)
@@ -30,7 +34,7 @@ COLLISION = FitOptions(max_primitives=4, iou=0.9)
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
-    """Parts that have meshes, but for those that are scaled ones of another.
+    """Parts that have meshes, templates among them, but for those that are scaled ones of another.
 
     Args:
         library: Where they are.
@@ -40,7 +44,7 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
     return [
         manifest
         for manifest in library.manifests()
-        if not manifest.is_template and not manifest.scaling and _keys(manifest) - stored.keys()
+        if not manifest.scaling and _keys(manifest) - stored.keys()
     ]
 
 
@@ -70,25 +74,52 @@ def store_part(manifest: Manifest) -> Path:
     fits = {}
     for row in fit_links(body, COLLISION).links:
         shapes = link_shapes(body.link(row.link))
-        fits[shapes_key(shapes)] = _stored(row.link, shapes, row.fit)
+        fits[shapes_key(shapes)] = stored_of(row.link, shapes, row.fit).scaled(
+            1 / shapes_scale(shapes)
+        )
     path = manifest.path.with_name(manifest.path.stem + SUFFIX)
     save(path, stored_text(fits))
     return path
 
 
-def _stored(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
+def fits_of(robot: Robot, report: FitReport, stored: Stored) -> dict[str, StoredFit]:
+    """The fits of a report by link; tokens are those of the robot, if fits of it are known.
+
+    Args:
+        robot: The robot that was fitted.
+        report: Its fits.
+        stored: What folders of parts store.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    found = {}
+    for row in report.links:
+        shapes, worth = link_shapes(robot.link(row.link)), row.fit.quality.iou
+        known = fit_of(shapes, robot, stored)
+        found[row.link] = (
+            replace(known, collision=row.fit.primitives, collision_iou=worth)
+            if known
+            else stored_of(row.link, shapes, row.fit)
+        )
+    return found
+
+
+def stored_of(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
+    """A link's fit with the one primitive for its token, which is sought if the fit has none.
+
+    Args:
+        link: The link.
+        shapes: What was fitted.
+        fit: The fit.
+    """
     solid = solid_of(shapes)
     single = fit.single or fit_shapes(shapes, TOKEN, solid=solid).primitives[0]
     token_iou = quality(solid, [single]).iou
-    found = StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)
-    return found.scaled(1 / shapes_scale(shapes))
+    return StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)
 
 
 def _keys(manifest: Manifest) -> set[str]:
     """Keys of links with meshes."""
     links = (link_shapes(link) for link in load_part(manifest).body.links)
-    return {
-        shapes_key(shapes)
-        for shapes in links
-        if any(isinstance(shape.geometry, Mesh) for shape in shapes)
-    }
+    return {shapes_key(shapes) for shapes in links if has_meshes(shapes)}

@@ -13,43 +13,45 @@ from platformdirs import user_cache_path
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.composite import composite
-from morphgen.fitting.dressed import are_primitives, link_shapes
-from morphgen.fitting.stored import (
+from morphgen.fitting.dressed import are_primitives
+from morphgen.formats.data_files import read_json
+from morphgen.formats.files import keep
+from morphgen.formats.fits import (
+    fit_of,
     read_stored,
     shape_data,
     shape_of,
     shapes_key,
     shapes_scale,
-    stored_fit,
 )
-from morphgen.formats.data_files import read_json
-from morphgen.formats.files import keep
+from morphgen.formats.rounding import rounded_shapes
 from morphgen.model.geometry import Shape
 from morphgen.model.inertia import union_moments
 from morphgen.model.robot import Robot
 from morphgen.model.scaling import scaled_shape
 
-_KEPT = "tokens-3"
+_KEPT = "tokens-4"
 """Folder in the user's cache; the number rises when the same shapes are given another primitive."""
 NEARLY = 0.95
 """Share of a link's volume from which its largest primitive stands for it; this is the IoU, too."""
 
 
 def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]:
-    """The box, cylinder or sphere that overlaps each link most.
+    """The box, cylinder or sphere that overlaps the collision shapes of each link most.
 
-    A link that is a primitive, or nearly is (``NEARLY``), keeps it in its canonical pose; for
-    meshes of the library's parts the stored fit is taken; others are fitted, about a second a
-    link, and kept in the user's cache. What is fitted to primitives is the same on every machine
-    (``composite``); of meshes that nothing is stored for the last bits may differ, and with them
-    the fit.
+    A token describes what collides: a link that is only seen, such as a rail or a mast, has no
+    primitive. A fit that the robot brings or that is stored in the folders is taken. A link that is
+    a primitive, or nearly is (``NEARLY``), keeps it in its canonical pose; others are fitted,
+    about a second a link, and kept in the user's cache. What is fitted to primitives is the same on
+    every machine (``composite``); of meshes that nothing is stored for the last bits may differ,
+    and with them the fit.
 
     Args:
         robot: The body.
         folders: Folders of parts, for their stored fits.
 
     Returns:
-        By link; links without shapes, and those without volume, are not in it.
+        By link; links without collision shapes, and those without volume, are not in it.
 
     Raises:
         FormatError: If a stored fit is malformed.
@@ -58,13 +60,13 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
     stored = read_stored(folders)
     found = {}
     for link in robot.links:
-        shapes = link_shapes(link)
-        if not shapes:
+        if not link.collisions:
             continue
-        if main := _main_primitive(shapes):
-            found[link.name] = canonical(replace(main, rgba=None))
-        elif fit := stored_fit(shapes, stored):
+        shapes = rounded_shapes(link.collisions)
+        if fit := fit_of(link.collisions, robot, stored):
             found[link.name] = fit.token
+        elif main := _main_primitive(shapes):
+            found[link.name] = canonical(replace(main, rgba=None))
         elif shape := _cached_fit(shapes):
             found[link.name] = shape
     return found

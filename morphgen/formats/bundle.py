@@ -18,12 +18,14 @@ from morphgen.errors import FormatError
 from morphgen.formats.card import apply_card, card_frames, card_of, card_text
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
+from morphgen.formats.fits import FITS, fit_of, read_fits, shapes_key, stored_text
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import own_frames, read_urdf, with_frames
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
+from morphgen.model.fits import Stored
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts
 from morphgen.model.robot import Link, Robot
@@ -86,6 +88,7 @@ def write_bundle(
         files = _write_meshes(robot, partial / MESHES)
         (partial / URDF).write_text(urdf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
         (partial / MJCF).write_text(mjcf_text(robot, lambda mesh: files[mesh]), encoding="utf-8")
+        _write_fits(robot, partial)
         hashes = {
             path.relative_to(partial).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in sorted(partial.rglob("*"))
@@ -111,8 +114,18 @@ def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     """
     card = _read_card(folder)
     place = str(folder / CARD)
-    robot = read_urdf(folder / URDF, finder=default_finder(root=root))
-    return apply_card(with_frames(robot, card_frames(card, place)), card, place)
+    robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
+    robot = with_frames(robot, card_frames(card, place))
+    return replace(apply_card(robot, card, place), fits=_read_fits(folder))
+
+
+def _read_fits(folder: Path) -> Stored:
+    path = folder / FITS
+    if not path.exists():
+        return {}
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise FormatError(f"{path}: is a link that leaves the bundle; replace it by the file")
+    return read_fits(path)
 
 
 def _read_card(folder: Path) -> dict[str, Any]:
@@ -224,6 +237,23 @@ def _write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
             (folder / name).write_bytes(data)
             files[mesh] = f"{MESHES}/{name}"
     return files
+
+
+def _write_fits(robot: Robot, folder: Path) -> None:
+    """Write what is known of the collision shapes, under the keys that these have once read back.
+
+    Meshes are rewritten, so that the keys of the robot's own fits do not find them any more.
+    """
+    if not robot.fits:
+        return
+    written = read_urdf(folder / URDF, keep_order=True)
+    fits = {}
+    for link in robot.links:
+        if fit := fit_of(link.collisions, robot, {}):
+            shapes = written.link(link.name).collisions
+            fits[shapes_key(shapes)] = replace(fit, link=link.name)
+    if fits:
+        (folder / FITS).write_text(stored_text(fits), encoding="utf-8")
 
 
 def _mesh_bytes(mesh: trimesh.Trimesh) -> tuple[bytes, str]:

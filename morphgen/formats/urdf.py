@@ -36,7 +36,11 @@ class UnsoundError(FormatError):
 
 
 def read_urdf(
-    path: Path, args: Mapping[str, str] | None = None, finder: PackageFinder | None = None
+    path: Path,
+    args: Mapping[str, str] | None = None,
+    finder: PackageFinder | None = None,
+    *,
+    keep_order: bool = False,
 ) -> Robot:
     """Read a URDF, or a xacro (by its suffix), with every mesh reference resolved.
 
@@ -45,6 +49,8 @@ def read_urdf(
         args: xacro arguments.
         finder: Where ROS packages are looked for; by default around ``path``, in ROS's own
             environment and in the installed data packages.
+        keep_order: Whether links stay in the order of the file's joints, if parents are first
+            there; otherwise the tree is walked depth first.
 
     Returns:
         The robot, without frames; its home is that of a file of morphgen's own, else zero, or the
@@ -67,11 +73,16 @@ def read_urdf(
         raise FormatError(f"{path}: xacro arguments {', '.join(args)} for a file that is no xacro")
     else:
         data = read_bytes(path, LARGEST_DESCRIPTION)
-    return robot_from_xml(data, path, finder)
+    return robot_from_xml(data, path, finder, keep_order=keep_order)
 
 
 def robot_from_xml(
-    data: bytes, path: Path, finder: PackageFinder, *, trusted: bool = False
+    data: bytes,
+    path: Path,
+    finder: PackageFinder,
+    *,
+    trusted: bool = False,
+    keep_order: bool = False,
 ) -> Robot:
     """Read URDF text.
 
@@ -80,6 +91,7 @@ def robot_from_xml(
         path: Where it comes from, for messages and relative mesh paths.
         finder: Where ``package://`` is looked for.
         trusted: Whether a document of the same structure has been examined before.
+        keep_order: See ``read_urdf``.
 
     Raises:
         UnsoundError: If the tree is broken or a mesh is not found.
@@ -97,7 +109,9 @@ def robot_from_xml(
     colours = {m.get("name", ""): read_colour(m) for m in root.iterfind("material")}
     found = (read_link(element, meshes, colours) for element in root.iterfind("link"))
     links = {link.name: link for link in found}
-    joints = _topological(_joints(root), links)
+    joints = _joints(root)
+    if not (keep_order and _parents_first(joints, links)):
+        joints = _topological(joints, links)
     order = [_root_name(links, joints), *(joint.child for joint in joints)]
     positions = _told_home(root, str(path))
     home = tuple(positions.get(j.name, _rest(j)) for j in joints if j.is_independent)
@@ -181,6 +195,15 @@ def _joints(root: etree._Element) -> list[Joint]:
         joint if joint.mimic is None or joint.mimic.joint in names else replace(joint, mimic=None)
         for joint in joints
     ]
+
+
+def _parents_first(joints: Sequence[Joint], links: Mapping[str, Link]) -> bool:
+    known = {_root_name(links, joints)}
+    for joint in joints:
+        if joint.parent not in known:
+            return False
+        known.add(joint.child)
+    return True
 
 
 def _topological(joints: list[Joint], links: Mapping[str, Link]) -> list[Joint]:

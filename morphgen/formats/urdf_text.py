@@ -8,7 +8,14 @@ from lxml import etree
 
 from morphgen.errors import FormatError
 from morphgen.formats.mujoco_urdf import MUJOCO_COMPILER_ATTRIBUTES
-from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
+from morphgen.formats.rounding import (
+    inertia_number,
+    number,
+    rounded_axis,
+    rounded_pose,
+    urdf_pieces,
+)
+from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Sphere
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
@@ -17,6 +24,8 @@ from morphgen.model.robot import (
     Link,
     Robot,
 )
+
+__all__ = ["OWN", "MeshUri", "number", "urdf_text"]
 
 OWN = "morphgen"
 """Element of a URDF with what only morphgen reads."""
@@ -71,11 +80,6 @@ def _write_own(root: etree._Element, robot: Robot) -> None:
         etree.SubElement(own, "frame", name=frame.name)
 
 
-def number(value: float) -> str:
-    """A number with 12 significant digits; what is smaller than 1e-12 is zero."""
-    return "0" if abs(value) < 1e-12 else f"{value:.12g}"
-
-
 def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     element = etree.SubElement(root, "link", name=link.name)
     body = link.inertial or Inertial(0.0)
@@ -83,10 +87,10 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     _write_origin(inertial, Pose(body.com))
     etree.SubElement(inertial, "mass", value=number(body.mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    values = {name: _inertia_number(v) for name, v in zip(names, body.inertia, strict=True)}
+    values = {name: inertia_number(v) for name, v in zip(names, body.inertia, strict=True)}
     etree.SubElement(inertial, "inertia", values)
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
-        for i, shape in enumerate(piece for whole in shapes for piece in _urdf_pieces(whole)):
+        for i, shape in enumerate(piece for whole in shapes for piece in urdf_pieces(whole)):
             holder = etree.SubElement(element, kind, name=f"{link.name}_{kind}_{i}")
             _write_origin(holder, shape.T_link_shape)
             _write_geometry(etree.SubElement(holder, "geometry"), shape.geometry, mesh_uri)
@@ -96,27 +100,9 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
                 etree.SubElement(material, "color", rgba=colour)
 
 
-def _urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
-    """A capsule as a cylinder and two spheres; any other shape as itself."""
-    if not isinstance(shape.geometry, Capsule):
-        return (shape,)
-    radius, length = shape.geometry.radius, shape.geometry.length
-    T = shape.T_link_shape
-    return (
-        Shape(Cylinder(radius, length), T, shape.rgba),
-        Shape(Sphere(radius), T @ Pose((0.0, 0.0, length / 2)), shape.rgba),
-        Shape(Sphere(radius), T @ Pose((0.0, 0.0, -length / 2)), shape.rgba),
-    )
-
-
-def _inertia_number(value: float) -> str:
-    """Inertias of finger-sized bodies are far below ``number``'s zero."""
-    return f"{value:.12g}" if abs(value) > 1e-18 else "0"
-
-
 def _write_origin(element: etree._Element, pose: Pose) -> None:
     xyz = " ".join(number(value) for value in pose.position)
-    rpy = " ".join(number(value) for value in pose.rpy)
+    rpy = " ".join(number(value) for value in rounded_pose(pose).rpy)
     if (xyz, rpy) != ("0 0 0", "0 0 0"):
         etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
 
@@ -143,7 +129,7 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     etree.SubElement(element, "child", link=joint.child)
     if not joint.is_movable:
         return
-    etree.SubElement(element, "axis", xyz=" ".join(number(value) for value in joint.unit_axis))
+    etree.SubElement(element, "axis", xyz=" ".join(number(value) for value in rounded_axis(joint)))
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
     limit = {"effort": number(effort), "velocity": number(velocity)}

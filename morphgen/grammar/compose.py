@@ -8,6 +8,7 @@ from functools import lru_cache
 
 from morphgen.checks.self_collision import Survey, ignore_pairs, survey
 from morphgen.errors import CompositionError, nearest
+from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.parameters import MOUNT_YAW
@@ -34,7 +35,7 @@ class Placed:
 
 
 def compose(derivation: Derivation, library: Library, name: str) -> Robot:
-    """Build the robot of a derivation, with its self-collision pairs to ignore.
+    """Build the robot of a derivation, with its self-collision pairs to ignore and stored fits.
 
     Args:
         derivation: Parts, parameters and attachments.
@@ -44,9 +45,9 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
     Raises:
         CompositionError: If a part has no such port, or names clash.
         PartError: If a part or parameter is unknown or wrong.
-        FormatError: If a part's source cannot be read.
+        FormatError: If a part's source or stored fits cannot be read.
     """
-    robot = join(derivation, library, name)
+    robot = with_stored_fits(join(derivation, library, name), library.folders)
     return replace(robot, ignore_pairs=survey_of(robot, derivation, library).ignored)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.card import rounded
+from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.compose import TOUCH, join, survey_of
 from morphgen.grammar.conditions import Properties, clauses, holds
 from morphgen.grammar.derivation import Derivation
@@ -130,7 +131,7 @@ def build(
     contacts = survey_of(robot, derivation, library)
     if any(depth > TOUCH for depth in contacts.at_home.values()):
         return "links overlap at home"
-    robot = replace(robot, ignore_pairs=contacts.ignored)
+    robot = with_stored_fits(replace(robot, ignore_pairs=contacts.ignored), library.folders)
     findings = check(robot, home_tested=True)
     for finding in findings:
         if finding.severity != "info":

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from morphgen.errors import RobotError, nearest
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import IDENTITY, Pose, Shape
 from morphgen.model.rotation import Vec3
+
+if TYPE_CHECKING:
+    from morphgen.model.fits import Stored
 
 JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "continuous", "prismatic", "fixed")
@@ -160,6 +163,8 @@ class Robot:
     """Where the body comes from, ready for its card: derivation, parts, licences."""
     source_findings: tuple[Finding, ...] = ()
     """What was suspicious, mended or left out when the robot's file was read."""
+    fits: Stored = field(default_factory=dict)
+    """Primitives that are known of its links' collision shapes, by the content of these."""
 
     def __post_init__(self) -> None:
         if not self.links:

@@ -8,7 +8,8 @@ Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
-_GIMBAL = 1e-9
+_GIMBAL, _NEAR_GIMBAL = 1e-12, 1e-3
+"""Cosines of the pitch from which on yaw is zero, and roll and yaw depend on each other."""
 
 
 def normalized(q: Quat) -> Quat:
@@ -101,9 +102,12 @@ def from_rpy(rpy: Vec3) -> Quat:
 
 def to_rpy(q: Quat) -> Vec3:
     """Roll, pitch, yaw of a unit quaternion; at the gimbal lock yaw is zero."""
-    (a, b, _), (d, e, _), (g, h, i) = to_matrix(q)
+    (a, b, c), (d, e, f), (g, h, i) = to_matrix(q)
     cos_pitch = math.hypot(a, d)
     pitch = math.atan2(-g, cos_pitch)
-    if cos_pitch > _GIMBAL:
+    if cos_pitch > _NEAR_GIMBAL:
         return (math.atan2(h, i), pitch, math.atan2(d, a))
-    return (math.copysign(1.0, -g) * math.atan2(b, e), pitch, 0.0)
+    # The yaw is uncertain here, as are h and i; the roll is what is left when that yaw is undone.
+    yaw = math.atan2(d, a) if cos_pitch > _GIMBAL else 0.0
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return (math.atan2(sy * c - cy * f, cy * e - sy * b), pitch, yaw)

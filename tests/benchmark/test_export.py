@@ -94,8 +94,16 @@ def test_tokens_are_those_of_the_robots(whole, made):
             np.testing.assert_array_equal(data["mask"][i], mask)
 
 
-def test_a_larger_robot_widens_all_tokens(tmp_path):
+def test_a_robot_with_more_links_than_the_split_allows_is_not_built(tmp_path):
     made = split(["chain beads=7"], ["base=gantry ee=cube"])
+    with pytest.raises(
+        BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_links 23"
+    ):
+        build(made, tmp_path, LIBRARY, settings=LIGHT)
+
+
+def test_max_links_of_a_split_widens_all_tokens(tmp_path):
+    made = split(["chain beads=7"], ["base=gantry ee=cube"], made={"max_links": 25})
     built = load_built(build(made, tmp_path, LIBRARY, settings=LIGHT).folder)
     assert built.tokens.shape == (2, 25, 48)
     for one, table in zip((*made.train, *made.test), built.tokens, strict=True):

@@ -9,6 +9,7 @@ from scipy.spatial import Delaunay
 import morphgen
 from grammars import grammar, shipped
 from morphgen.benchmark import bodies, generate
+from morphgen.benchmark.audit import audit
 from morphgen.benchmark.bodies import Composed, Drawn, Maker, make_all
 from morphgen.benchmark.composition import composition, expand
 from morphgen.benchmark.extrapolation import Bound, extrapolation, parse_bound
@@ -206,14 +207,19 @@ def cosines(split):
     rows = []
     for side in (split.test, split.train):
         made = [member_robot(member, LIBRARY) for member in side]
-        rows.append([features(robot, token_shapes(robot, LIBRARY.folders)) for robot in made])
+        rows.append(
+            [
+                features(robot, token_shapes(robot, LIBRARY.folders), max_links=split.max_links)
+                for robot in made
+            ]
+        )
     return np.array([[cosine(test, train) for train in rows[1]] for test in rows[0]])
 
 
 @pytest.mark.parametrize(("bound", "holds"), [("<0.55", np.less), (" > .55 ", np.greater)])
 def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
     splits = extrapolation(
-        order(3, 9, test=2),
+        replace(order(3, 9, test=2), max_links=25),
         grammars(*CATEGORIES),
         grammars("chain"),
         LIBRARY,
@@ -223,6 +229,30 @@ def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
         nearest = cosines(split).max(axis=1)
         assert holds(nearest, 0.55).all()
         assert split.made["similarity"] == f"{bound.strip()[0]}0.55"
+
+
+def test_a_robot_with_too_many_links_is_told_unless_all_have_room():
+    wanted = order(2, test=6)
+    with pytest.raises(
+        BenchmarkError, match=r"robot 'chain-\d+' has 25 links, more than max_links 23"
+    ):
+        extrapolation(wanted, grammars("stick"), grammars("chain"), LIBRARY)
+    wide = replace(wanted, max_links=25)
+    (made,) = extrapolation(wide, grammars("stick"), grammars("chain"), LIBRARY)
+    assert made.made["max_links"] == made.max_links == 25
+    assert "links-many" not in {each.code for each in audit(made, LIBRARY).findings}
+    narrow = replace(made, made={k: v for k, v in made.made.items() if k != "max_links"})
+    told = [each for each in audit(narrow, LIBRARY).findings if each.code == "links-many"]
+    assert told
+    assert {each.why for each in told} == {"it has 25 links, more than max_links 23"}
+    assert all("--max-links" in each.fix for each in told)
+
+
+@pytest.mark.parametrize("given", ["many", 1, 2.5, True, None, [25]])
+def test_a_split_that_says_no_number_of_links_is_refused(given):
+    (made,) = extrapolation(order(1), grammars("stick"), grammars("cubes"), LIBRARY)
+    with pytest.raises(BenchmarkError, match=r"made: max_links: .*; expected a whole number"):
+        audit(replace(made, made={**made.made, "max_links": given}), LIBRARY)
 
 
 def test_a_bound_that_nothing_meets_is_told_with_the_nearest(monkeypatch):

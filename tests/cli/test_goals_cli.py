@@ -57,7 +57,7 @@ def test_a_row_a_robot_says_what_its_goals_are(run, path, cache):
     ]
     assert [row.split()[5] for row in rows] == ["0", "0", "3"]
     assert last == "3 of 3 goal sets are there, seed 0"
-    assert len(list((cache / "goals-3").iterdir())) == 3
+    assert len(list((cache / "goals-4").iterdir())) == 3
 
 
 def test_certificates_are_asked_for(run, path):

@@ -8,7 +8,9 @@ import trimesh
 
 import morphgen
 from morphgen.checks.self_collision import SelfCollision
+from morphgen.cli import main
 from morphgen.errors import FitError
+from morphgen.fitting import token_shapes as token_shapes_module
 from morphgen.fitting.agreement import agreement
 from morphgen.fitting.dressed import (
     as_primitives,
@@ -21,7 +23,9 @@ from morphgen.fitting.parts import COLLISION, TOKEN, parts_with_meshes, store_pa
 from morphgen.fitting.quality import quality, signed_distance
 from morphgen.fitting.robot import fit_links
 from morphgen.fitting.solid import solid_of
-from morphgen.fitting.stored import SUFFIX, read_stored, shapes_key
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.fits import SUFFIX, read_stored, shapes_key
+from morphgen.formats.rounding import as_written
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import IDENTITY, Box, Mesh, Pose, Shape, Sphere
@@ -145,8 +149,9 @@ def test_options_out_of_range_are_refused(options, message):
 def test_a_robot_in_primitives_keeps_its_masses_and_joints():
     meshes = morphgen.compose("arm=ur5 ee=plane")
     made = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
-    assert made.joints == meshes.joints
-    assert [link.inertial for link in made.links] == [link.inertial for link in meshes.links]
+    written = as_written(meshes)
+    assert made.joints == written.joints
+    assert [link.inertial for link in made.links] == [link.inertial for link in written.links]
     assert [link.visuals for link in made.links] == [link.visuals for link in meshes.links]
     assert not any(isinstance(s.geometry, Mesh) for link in made.links for s in link.collisions)
     assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
@@ -212,6 +217,59 @@ def test_a_user_s_part_is_stored_beside_its_manifest(tmp_path):
     (manifest,) = parts_with_meshes(library, missing=True)
     assert store_part(manifest) == tmp_path / f"my_jaw{SUFFIX}"
     assert parts_with_meshes(library, missing=True) == []
+
+
+TEMPLATE = """\
+name: my_wedge
+kind: ee
+summary: A wedge on a link, of one's own mesh.
+file: my_wedge.xacro
+root: wedge
+licence: CC0-1.0
+tool: {link: wedge, xyz: [0, 0, 0.1]}
+"""
+XACRO = """\
+<robot name="my_wedge" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <link name="wedge">
+    <inertial>
+      <mass value="0.1"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <visual><geometry><mesh filename="my_wedge.stl"/></geometry></visual>
+    <collision><geometry><mesh filename="my_wedge.stl"/></geometry></collision>
+  </link>
+</robot>
+"""
+
+
+@pytest.fixture
+def own_parts(tmp_path, monkeypatch):
+    """A folder with a part of one's own, a template with a mesh; no cache of fits."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "my_wedge.yaml").write_text(TEMPLATE)
+    (folder / "my_wedge.xacro").write_text(XACRO)
+    mesh = trimesh.creation.box((0.04, 0.06, 0.1))
+    mesh.apply_translation((0.0, 0.0, 0.05))
+    mesh.export(folder / "my_wedge.stl")
+    monkeypatch.setattr(token_shapes_module, "user_cache_path", lambda name: tmp_path / "cache")
+    return folder
+
+
+def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch, capsys):
+    assert main(["fit", "--all", "--missing", "--library", str(own_parts)]) == 0
+    stored = own_parts / f"my_wedge{SUFFIX}"
+    assert [path.name for path in own_parts.glob(f"*{SUFFIX}")] == [stored.name]
+    monkeypatch.setattr(
+        token_shapes_module, "_fitted", lambda shapes: pytest.fail("a fit was searched for")
+    )
+    robot = morphgen.compose("base=fixed ee=my_wedge", library=[own_parts])
+    (token,) = token_shapes(robot).values()
+    assert token.geometry.size == pytest.approx((0.04, 0.06, 0.1), abs=2e-3)
+    assert as_primitives(robot, ()).link("ee_wedge").collisions
+    before = stored.stat().st_mtime_ns
+    assert main(["fit", "--all", "--missing", "--library", str(own_parts)]) == 0
+    assert stored.stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from morphgen.errors import FormatError
-from morphgen.fitting.stored import (
+from morphgen.formats.fits import (
     SUFFIX,
     VERSION,
     StoredFit,
@@ -150,6 +150,15 @@ MALFORMED = {
     "nan": changed(token=shape(cylinder=[0.1, math.nan])),
     "negative": changed(token=shape(cylinder=[0.1, -1.0])),
     "quaternion zero": changed(token=shape(quaternion=[0, 0, 0, 0])),
+    "endless": changed(token=shape(cylinder=[0.1, math.inf])),
+    "too large": changed(token=shape(cylinder=[0.1, 10**400])),
+    "two kinds": changed(token=shape(sphere=[0.1])),
+    "long": changed(token=dict.fromkeys(map(str, range(10_000)), 0)),
+    "no primitives": changed(collision=[]),
+    "many primitives": changed(collision=[shape()] * 33),
+    "overlap above one": changed(token_iou=1.5),
+    "overlap a word": changed(collision_iou="much"),
+    "overlap nan": changed(collision_iou=math.nan),
 }
 
 
@@ -160,6 +169,7 @@ def test_a_malformed_file_is_named_in_one_line(tmp_path, fault):
         read_stored([tmp_path])
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 300
 
 
 def test_a_file_that_is_no_text_is_named(tmp_path):

@@ -41,6 +41,22 @@ def test_a_link_that_is_one_primitive_keeps_it(no_search):
     assert token_shapes(robot_of(can)) == {"body": Shape(can.geometry, can.T_link_shape)}
 
 
+def test_a_link_that_only_shows_has_no_primitive(no_search):
+    can = Shape(Cylinder(0.1, 0.2))
+    links = (Link("base", visuals=(can,)), Link("body", visuals=(can,), collisions=(can,)))
+    robot = Robot("r", links, (Joint("j", "fixed", "base", "body"),))
+    assert token_shapes(robot).keys() == {"body"}
+
+
+@pytest.mark.parametrize("words", ["prims", "stick", "chain", "tongs"])
+def test_rails_and_masts_of_bodies_are_scenery(words):
+    robot = morphgen.compose(words)
+    shapes = token_shapes(robot)
+    seen = {link.name for link in robot.links if link.visuals and not link.collisions}
+    assert seen
+    assert shapes.keys() == {link.name for link in robot.links if link.collisions}
+
+
 def test_a_primitive_that_others_hardly_add_to_stands_for_the_link(no_search):
     disc, lug = Shape(Cylinder(0.07, 0.05)), Shape(Box((0.02, 0.005, 0.03)), Pose((0.0, 0.0, 0.02)))
     assert token_shapes(robot_of(lug, disc)) == {"body": disc}

@@ -1,5 +1,6 @@
 """The audit finds goals that leak, and sets that are not those of the split's robots."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -186,7 +187,7 @@ def test_a_block_in_an_obstacle_is_found(cache):
     inside = (replace(box, pose=replace(box.pose, position=at)), *goals.obstacles[1:])
     told = audit_goals(which, changed(sets, REACH, {"obstacles": inside}), LIBRARY)
     (unproven,) = [each.why for each in told if each.code == "goals-unproven"]
-    assert unproven.startswith("start 1: the block is in an obstacle or the base")
+    assert re.match(r"start \d: the block is in an obstacle or the base", unproven)
 
 
 def test_a_member_without_a_set_and_a_set_without_a_member_are_found(sets):

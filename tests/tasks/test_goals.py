@@ -283,7 +283,7 @@ def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
 def test_the_users_cache_is_the_default(body, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / name)
     found = made(body, None)
-    assert (tmp_path / "morphgen" / "goals-3" / f"{found.key}.npz").is_file()
+    assert (tmp_path / "morphgen" / "goals-4" / f"{found.key}.npz").is_file()
 
 
 def test_a_certificate_names_every_fault(body, cache):

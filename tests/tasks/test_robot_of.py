@@ -31,9 +31,10 @@ def test_names_are_words_of_compose(given, words):
     assert robot_hash(robot_of(given)) == robot_hash(expected)
 
 
-def test_a_robot_is_itself():
-    robot = arm()
-    assert robot_of(robot) is robot
+def test_a_robot_is_itself_but_for_its_collision_shapes():
+    robot = morphgen.compose("arm=ur5 ee=plane")
+    assert robot_of(robot, geometry="mesh") is robot
+    assert robot_hash(robot_of(robot)) == robot_hash(robot_of("arm=ur5 ee=plane"))
 
 
 def test_collision_shapes_are_primitives_unless_meshes_are_asked_for():

@@ -1,7 +1,8 @@
-"""Fitted primitives on disk: beside every real part's manifest, by the content of its meshes.
+"""Fitted primitives on disk: beside every real part's manifest, and in every bundle with meshes.
 
-Primitives grow with the shapes that they stand for, so they are kept for shapes at unit scale, and
-serve links that are scaled as a whole.
+Fits are found by the content of the shapes that they stand for, so that an edited mesh is never
+given the fit of the one before. Primitives grow with these shapes, so they are kept for shapes at
+unit scale, and serve links that are scaled as a whole.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,37 +20,21 @@ from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import number
+from morphgen.model.fits import Stored, StoredFit
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
+from morphgen.model.robot import Robot
 from morphgen.model.scaling import scaled_shape
 
 SUFFIX = ".primitives.json"
+"""Of the file beside a part's manifest."""
+FITS = "primitives.json"
+"""The file in a bundle."""
+MOST_PRIMITIVES = 32
+"""The most primitives that a link may be given."""
 VERSION = 2
 """Rises when the fitter gives other primitives for the same meshes."""
-
-
-@dataclass(frozen=True)
-class StoredFit:
-    """What is kept of a link's fit: of its shapes at unit scale."""
-
-    link: str
-    token: Shape
-    """The one primitive that overlaps most."""
-    collision: tuple[Shape, ...]
-    """A few, for physics."""
-    token_iou: float
-    collision_iou: float
-
-    def scaled(self, factor: float) -> StoredFit:
-        """The fit of the shapes, larger or smaller."""
-        return replace(
-            self,
-            token=scaled_shape(self.token, factor),
-            collision=tuple(scaled_shape(shape, factor) for shape in self.collision),
-        )
-
-
-Stored = Mapping[str, StoredFit]
-"""Fits by ``shapes_key``."""
+_LONGEST = 200
+"""Letters of a malformed entry that an error shows."""
 
 
 def stored_fit(shapes: Sequence[Shape], stored: Stored) -> StoredFit | None:
@@ -60,6 +45,18 @@ def stored_fit(shapes: Sequence[Shape], stored: Stored) -> StoredFit | None:
     """
     fit = stored.get(shapes_key(shapes))
     return fit and fit.scaled(shapes_scale(shapes))
+
+
+def fit_of(shapes: Sequence[Shape], robot: Robot, stored: Stored) -> StoredFit | None:
+    """The fit of a link's collision shapes: what its robot brings, or for meshes what is stored.
+
+    Raises:
+        FormatError: If a mesh file cannot be read.
+    """
+    if not shapes:
+        return None
+    fit = stored_fit(shapes, robot.fits)
+    return stored_fit(shapes, stored) if fit is None and has_meshes(shapes) else fit
 
 
 def shapes_scale(shapes: Sequence[Shape]) -> float:
@@ -84,6 +81,11 @@ def shapes_key(shapes: Sequence[Shape]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
+def has_meshes(shapes: Iterable[Shape]) -> bool:
+    """Whether any shape is a mesh."""
+    return any(isinstance(shape.geometry, Mesh) for shape in shapes)
+
+
 def read_stored(folders: Iterable[Path]) -> dict[str, StoredFit]:
     """All fits in folders of parts, but for those of another version of the fitter.
 
@@ -93,8 +95,35 @@ def read_stored(folders: Iterable[Path]) -> dict[str, StoredFit]:
     found: dict[str, StoredFit] = {}
     for folder in folders:
         for path in sorted(folder.rglob(f"*{SUFFIX}")):
-            found |= _read(path.absolute(), file_stamp(path))
+            found |= read_fits(path)
     return found
+
+
+def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
+    """The robot with what folders of parts store of its collision meshes.
+
+    Raises:
+        FormatError: If a file of fits is malformed, or a mesh file cannot be read.
+    """
+    meshed = [link.collisions for link in robot.links if has_meshes(link.collisions)]
+    if not meshed:
+        return robot
+    stored = read_stored(folders)
+    keys = map(shapes_key, meshed)
+    return replace(robot, fits={key: stored[key] for key in keys if key in stored})
+
+
+def read_fits(path: Path) -> dict[str, StoredFit]:
+    """The fits of one file; none if it was written by another version of the fitter.
+
+    Raises:
+        FormatError: If it cannot be read or is malformed.
+    """
+    try:
+        return dict(_read(path.absolute(), file_stamp(path)))
+    except (KeyError, OSError, OverflowError, RecursionError, TypeError, ValueError) as error:
+        why = f"lacks {error}" if isinstance(error, KeyError) else str(error)[:_LONGEST]
+        raise FormatError(f"{path}: no file of fitted primitives: {why}") from error
 
 
 def stored_text(fits: Mapping[str, StoredFit]) -> str:
@@ -137,7 +166,10 @@ def shape_of(data: dict[str, Any]) -> Shape:
         KeyError, TypeError, ValueError: If it is none.
     """
     geometry: Geometry
-    (kind,) = {"box", "cylinder", "sphere"} & {*data}
+    kinds = {"box", "cylinder", "sphere"} & {*data}
+    if len(kinds) != 1:
+        raise ValueError(f"{data} is no box, cylinder or sphere")
+    (kind,) = kinds
     size = [float(value) for value in data[kind]]
     x, y, z = (float(value) for value in data["xyz"])
     w, a, b, c = (float(value) for value in data["quaternion"])
@@ -158,22 +190,21 @@ def shape_of(data: dict[str, Any]) -> Shape:
 def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
     """The fits of a file as it is at its stamp."""
     del stamp
-    try:
-        data = read_json(path)
-        if data["fitter"] != VERSION:
-            return {}
-        return {
-            link["shapes"]: StoredFit(
-                link["link"],
-                shape_of(link["token"]),
-                tuple(shape_of(shape) for shape in link["collision"]),
-                link["token_iou"],
-                link["collision_iou"],
-            )
-            for link in data["links"]
-        }
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: no file of fitted primitives: {error!r}") from error
+    data = read_json(path)
+    if data["fitter"] != VERSION:
+        return {}
+    return {str(link["shapes"]): _fit_of(link) for link in data["links"]}
+
+
+def _fit_of(data: dict[str, Any]) -> StoredFit:
+    """The entry of a link."""
+    collision = tuple(shape_of(shape) for shape in data["collision"])
+    if not 1 <= len(collision) <= MOST_PRIMITIVES:
+        raise ValueError(f"{len(collision)} primitives: expected 1 to {MOST_PRIMITIVES}")
+    ious = float(data["token_iou"]), float(data["collision_iou"])
+    if not all(0 <= iou <= 1 for iou in ious):
+        raise ValueError(f"IoU {ious[0]:g} and {ious[1]:g}: expected 0 to 1")
+    return StoredFit(str(data["link"]), shape_of(data["token"]), collision, *ious)
 
 
 def _shape_text(shape: Shape) -> str:

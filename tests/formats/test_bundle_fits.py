@@ -1,0 +1,121 @@
+"""Fits travel with the bundle, and are believed only where they fit."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import trimesh
+
+import morphgen
+from morphgen.cli import main
+from morphgen.errors import FormatError
+from morphgen.fitting import token_shapes as module
+from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.fits import FITS
+
+WORDS = "arm=ur5 ee=plane"
+
+
+@pytest.fixture(autouse=True)
+def no_search(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / "cache" / name)
+    monkeypatch.setattr(module, "_fitted", lambda shapes: pytest.fail("a fit was searched for"))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The UR5's bundle."""
+    return write_bundle(
+        morphgen.compose(WORDS), tmp_path_factory.mktemp("r") / "ur5", picture=False
+    )
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "ur5")
+
+
+def test_a_bundle_brings_the_fits_of_its_parts(folder):
+    robot, back = morphgen.compose(WORDS), read_bundle(folder)
+    assert token_shapes(back) == token_shapes(robot)
+    ours, theirs = (
+        [link.collisions for link in as_primitives(each, ()).links] for each in (robot, back)
+    )
+    assert ours == theirs
+
+
+def test_one_robot_has_one_token_a_link_whatever_its_geometry(tmp_path):
+    robot = morphgen.compose(WORDS)
+    made = morphgen.compose(WORDS, geometry="primitive")
+    back = read_bundle(write_bundle(made, tmp_path / "prims", picture=False))
+    assert token_shapes(made) == token_shapes(back) == token_shapes(robot)
+    assert token_shapes(robot)["arm_upper_arm_link"].geometry.radius == pytest.approx(
+        0.0545, abs=1e-4
+    )
+
+
+def test_fits_survive_a_second_bundle(folder, tmp_path):
+    again = write_bundle(read_bundle(folder), tmp_path / "again", picture=False)
+    assert (again / FITS).read_bytes() == (folder / FITS).read_bytes()
+
+
+def test_a_robot_without_meshes_has_no_file_of_fits(tmp_path):
+    folder = write_bundle(morphgen.compose("prims"), tmp_path / "prims", picture=False)
+    assert not (folder / FITS).exists()
+
+
+def test_an_edited_mesh_is_not_given_the_fit_of_the_one_before(folder):
+    link = read_bundle(folder).link("arm_forearm_link")
+    path = link.collisions[0].geometry.path
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
+    with pytest.raises(pytest.fail.Exception, match="searched"):
+        token_shapes(read_bundle(folder))
+
+
+def test_fits_of_another_fitter_are_left_alone(folder):
+    data = json.loads((folder / FITS).read_text())
+    (folder / FITS).write_text(json.dumps(data | {"fitter": 1}))
+    assert read_bundle(folder).fits == {}
+
+
+def foreign(folder, change):
+    data = json.loads((folder / FITS).read_text())
+    change(data["links"][0])
+    (folder / FITS).write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda link: link["token"].update(cylinder=[0.1, -0.2]), "out of range"),
+        (lambda link: link["token"].update(xyz=[float("nan"), 0, 0]), "out of range"),
+        (lambda link: link.update(collision=[]), "0 primitives: expected 1 to 32"),
+        (lambda link: link.pop("shapes"), "lacks 'shapes'"),
+        (lambda link: link.update(token_iou=7), "expected 0 to 1"),
+    ],
+)
+def test_a_stranger_s_fits_are_refused_in_one_line(folder, capsys, change, why):
+    foreign(folder, change)
+    assert main(["tokens", str(folder)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert str(folder / FITS) in error
+    assert why in error
+    assert "\n" not in error
+
+
+def test_fits_outside_of_the_bundle_are_not_read(folder, tmp_path):
+    (folder / FITS).rename(tmp_path / "elsewhere.json")
+    (folder / FITS).symlink_to(tmp_path / "elsewhere.json")
+    with pytest.raises(FormatError, match="leaves the bundle"):
+        read_bundle(folder)
+
+
+def test_fits_do_not_outlive_the_shapes(folder):
+    robot = read_bundle(folder)
+    link = robot.link("arm_forearm_link")
+    changed = replace(link, collisions=robot.link("arm_upper_arm_link").collisions)
+    shapes = token_shapes(robot.with_links([changed]))
+    assert shapes["arm_forearm_link"] == shapes["arm_upper_arm_link"]

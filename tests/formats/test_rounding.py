@@ -1,0 +1,90 @@
+"""A robot's numbers are the same whether it was composed or read back."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import morphgen
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.rounding import as_written, rounded_pose
+from morphgen.formats.urdf_text import number
+from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Robot
+from morphgen.model.rotation import to_matrix
+from robots import arm
+
+RNG = np.random.default_rng(0)
+NEAR_GIMBAL = [
+    (a, s * (math.pi / 2 - off), b)
+    for a in (0.0, 1.1)
+    for b in (-2.3, 0.4)
+    for s in (1, -1)
+    for off in (0.0, 1e-13, 1e-10, 1e-8, 3.7e-6, 1e-4, 1e-2)
+]
+HALF_TURNS = [(math.pi, 0.0, 0.3), (0.7, math.pi, 0.0), (math.pi, 0.2, math.pi)]
+TINY = [(1e-5, 3e-9, -2e-11), (4e-12, 1.0, 7e-13)]
+RANDOM = RNG.uniform(-math.pi, math.pi, (200, 3)).tolist()
+
+
+def from_file(pose):
+    """A pose as a URDF gives it back."""
+    xyz, rpy = ([float(number(value)) for value in triple] for triple in (pose.position, pose.rpy))
+    return Pose.from_xyz_rpy(xyz, rpy)
+
+
+@pytest.mark.parametrize("rpy", [*NEAR_GIMBAL, *HALF_TURNS, *TINY, *RANDOM])
+def test_a_pose_that_was_written_and_read_is_the_same_once_rounded(rpy):
+    pose = Pose.from_xyz_rpy(tuple(RNG.normal(size=3)), rpy)
+    rounded = rounded_pose(pose)
+    assert rounded_pose(rounded) == rounded
+    assert rounded_pose(from_file(rounded)) == rounded
+    turned = np.array(to_matrix(rounded.quaternion)) - to_matrix(pose.quaternion)
+    assert np.abs(turned).max() < 1e-9
+
+
+def tilted(rng):
+    return Pose.from_xyz_rpy(tuple(rng.normal(size=3)), tuple(rng.uniform(-3, 3, 3)))
+
+
+def odd_robot(seed):
+    """A tree with all that a file says otherwise: joints half described, capsules, long numbers."""
+    rng = np.random.default_rng(seed)
+    limits = tuple(sorted(rng.normal(size=2)))
+    can = Shape(Capsule(0.1 / 3, 0.7 / 3), tilted(rng))
+    body = Inertial(1 / 3, tuple(rng.normal(size=3)), (1e-5 / 3, 1e-9 / 3, 0.0, 2e-5 / 3, 0, 2e-5))
+    links = (
+        Link("root"),
+        Link("a", body, collisions=(can, Shape(Box((0.1 / 3, 0.1, 0.1)), tilted(rng)))),
+        Link("b", Inertial(0.0), collisions=(Shape(Cylinder(1 / 7, 1 / 9), tilted(rng)),)),
+        Link("c"),
+    )
+    axis = tuple(rng.normal(size=3))
+    joints = (
+        Joint("j0", "revolute", "root", "a", tilted(rng), axis, velocity=2 / 3),
+        Joint("j1", "prismatic", "root", "b", tilted(rng), axis, limits, effort=10 / 3),
+        Joint("j2", "fixed", "a", "c", tilted(rng), limits=(0.0, 1.0), damping=1.0),
+    )
+    tool = Frame("tool", "c", tilted(rng))
+    return Robot("odd", links, joints, (tool,), home=(1 / 3, 2 / 3))
+
+
+@pytest.mark.parametrize("robot", [arm(), *map(odd_robot, range(10))])
+def test_a_robot_that_was_written_and_read_is_the_same_once_rounded(tmp_path, robot):
+    here = as_written(robot)
+    there = as_written(read_bundle(write_bundle(robot, tmp_path / "r", picture=False)))
+    assert as_written(here).joints == here.joints
+    for name in ("joints", "frames", "home"):
+        assert getattr(there, name) == getattr(here, name)
+    for link, other in zip(here.links, there.links, strict=True):
+        bare = replace(other, visuals=link.visuals)
+        assert bare == replace(link, collisions=bare.collisions)
+        shapes = [[replace(s, rgba=None) for s in each.collisions] for each in (link, other)]
+        assert shapes[0] == shapes[1]
+
+
+def test_links_stay_in_their_order(tmp_path):
+    robot = morphgen.compose("arm=yumi left.ee=plane right.ee=yumi_gripper")
+    back = read_bundle(write_bundle(robot, tmp_path / "r", picture=False))
+    assert [link.name for link in back.links] == [link.name for link in robot.links]

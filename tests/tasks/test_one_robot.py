@@ -1,0 +1,117 @@
+"""One robot, one set of shapes, one key, one set of goals and one score, whatever names it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import morphgen
+from morphgen.benchmark.split import robot_hash
+from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.make import make_batch, make_split_batch
+from morphgen.tasks.robots import robot_of
+from splits import member, split
+
+WORDS = "arm=ur5 ee=stick"
+CONFIG = ReachConfig(goals=8)
+STEPS = 40
+NAMES = ("words", "bundle", "urdf", "robot", "read", "primitives", "bundle of primitives", "member")
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory):
+    """The robot by every name but that of a split's member."""
+    folder = tmp_path_factory.mktemp("robots")
+    robot = morphgen.compose(WORDS)
+    primitives = morphgen.compose(WORDS, name="primitives", geometry="primitive")
+    bundle = morphgen.write(robot, folder, picture=False)
+    other = morphgen.write(primitives, folder, picture=False)
+    return {
+        "words": WORDS,
+        "bundle": bundle,
+        "urdf": str(bundle / "robot.urdf"),
+        "robot": robot,
+        "read": morphgen.read(bundle),
+        "primitives": primitives,
+        "bundle of primitives": other,
+    }
+
+
+@pytest.fixture(scope="module")
+def batches(named, tmp_path_factory):
+    """An environment of each, with goals that are drawn anew."""
+
+    def options(name):
+        cache = tmp_path_factory.mktemp(name.replace(" ", "-"))
+        return {"sim": "mujoco", "seed": 0, "reach": CONFIG, "cache": cache}
+
+    made = {
+        name: make_batch("reach", [robot], 1, obstacles=True, **options(name))
+        for name, robot in named.items()
+    }
+    one = split([member(WORDS, task="reach", obstacles=True)], [member("prims", task="reach")])
+    made["member"] = make_split_batch(one, "train", 1, **options("member"))
+    yield made
+    for batch in made.values():
+        batch.close()
+
+
+@pytest.fixture(scope="module")
+def scores(batches):
+    """Rewards of all steps, by name, of the same actions."""
+    found = {}
+    for name, batch in batches.items():
+        rng = np.random.default_rng(0)
+        batch.reset(0)
+        found[name] = [
+            float(batch.step(batch.mask * float(rng.uniform(-1, 1))).reward[0])
+            for _ in range(STEPS)
+        ]
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_and_key_are_the_same(batches, name):
+    ours, theirs = (batches[each].settings[0].robot for each in ("words", name))
+    assert [link.collisions for link in theirs.links] == [link.collisions for link in ours.links]
+    assert theirs.joints == ours.joints
+    assert theirs.home == ours.home
+    assert theirs.ignore_pairs == ours.ignore_pairs
+    assert robot_hash(theirs, visuals=False) == robot_hash(ours, visuals=False)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_goals_are_the_same(batches, name):
+    ours, theirs = (batches[each].settings[0].goals for each in ("words", name))
+    assert theirs.key == ours.key
+    assert theirs.tried == ours.tried
+    assert theirs.obstacles == ours.obstacles
+    np.testing.assert_array_equal(theirs.q, ours.q)
+    np.testing.assert_array_equal(theirs.poses, ours.poses)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tokens_are_the_same(batches, name):
+    ours, theirs = (batches[each].bodies.tokens for each in ("words", name))
+    assert (theirs == ours).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_score_is_the_same(scores, name):
+    assert scores[name] == scores["words"]
+    assert len(set(scores[name])) > STEPS / 2
+
+
+def test_what_is_only_seen_does_not_count():
+    robot = robot_of("arm=ur5 ee=stick")
+    bare = robot.with_links([replace(link, visuals=()) for link in robot.links])
+    assert robot_hash(bare, visuals=False) == robot_hash(robot, visuals=False)
+    assert robot_hash(bare) != robot_hash(robot)
+
+
+def test_what_it_is_made_of_stays():
+    once = robot_of("arm=ur5 ee=stick")
+    twice = robot_of(once)
+    assert [link.collisions for link in twice.links] == [link.collisions for link in once.links]
+    assert twice.fits == once.fits
+    assert twice.ignore_pairs == once.ignore_pairs
