@@ -176,7 +176,8 @@ def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) ->
     Raises:
         TaskError: If one does not; it says in what.
     """
-    first, *others = [_flat(run.interface) for run in runs]
+    interfaces = [asdict(run.interface) for run in runs]
+    first, *others = [{**each.pop("channels"), **each} for each in interfaces]
     for path, other in zip(paths[1:], others, strict=True):
         wrong = [
             f"{key} {other[key]}, not {first[key]}" for key in first if other[key] != first[key]
@@ -186,11 +187,6 @@ def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) ->
                 f"{path}: its policy is for other observations or actions than that of "
                 f"{paths[0]}: {'; '.join(wrong)}; evaluate it on its own"
             )
-
-
-def _flat(wanted: Interface) -> dict[str, Any]:
-    numbers = asdict(wanted)
-    return {**numbers, **numbers.pop("channels")}
 
 
 def _of_same(one: Source, whole: Source) -> bool:

@@ -19,6 +19,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.gae import gae, next_values
+from morphgen.rl.learning_rates import learning_rate, next_share
 from morphgen.rl.policies import (
     layout_from,
     layout_of,
@@ -37,12 +38,6 @@ TOLD = ("reward", "score", "success", "terminated", "truncated", "unstable")
 LOSSES = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
 LEARNED = (*LOSSES, "actor_gradient", "critic_gradient")
 """What is reported of gradient steps; see ``Report``."""
-KL_FACTOR = 1.2
-"""Between the actor's learning rates of two updates, where they follow ``target_kl``."""
-LEAST_SHARE = 0.01
-"""Least share of the learning rate that the actor keeps, as in rsl_rl (1e-5 of 1e-3).
-
-Without it, a share that fell for long needs as many updates to rise again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,26 +368,6 @@ def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float) -
     """The clipped objective (Schulman et al. 2017, equation 7), negative; all shapes (m,)."""
     ratio = log_ratio.exp()
     return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
-
-
-def learning_rate(config: PPOConfig, update: int, updates: int) -> float:
-    """That of an update, counted from 0, of so many: a line that ends at zero after the last."""
-    return config.learning_rate * (1 - update / updates)
-
-
-def next_share(config: PPOConfig, share: float, kl: float) -> float:
-    """The actor's share of the learning rate in the next update, ``LEAST_SHARE`` to 1.
-
-    Args:
-        config: The algorithm; without a ``target_kl`` it is 1.
-        share: In the last update.
-        kl: Divergence of the last update, nats, the mean over its gradient steps.
-    """
-    if not config.target_kl:
-        return 1.0
-    if kl > config.target_kl:
-        return max(share / KL_FACTOR, LEAST_SHARE)
-    return min(share * KL_FACTOR, 1.0)
 
 
 @torch.no_grad()

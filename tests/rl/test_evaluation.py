@@ -191,12 +191,14 @@ def test_policies_for_other_observations_or_actions_are_not_evaluated_together(r
     for name, changed in {
         "wider": replace(config, max_links=30),
         "continuous": replace(config, policy=replace(config.policy, discrete=False)),
+        "tool": replace(config, policy=replace(config.policy, tool_position=True)),
     }.items():
         write_checkpoint(tmp_path, changed, learner)
         other = (tmp_path / "checkpoint.pt").rename(tmp_path / f"{name}.pt")
         difference = {
             "wider": "max_links 30, not 23",
             "continuous": "kind continuous, not discrete",
+            "tool": "tool True, not False",
         }
         message = rf"^{other}: its policy .* than that of {run}: {difference[name]}; evaluate it on"
         with pytest.raises(TaskError, match=message):

@@ -11,15 +11,8 @@ import torch
 from learners import SMALL, equal, learner, weights
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.ppo import (
-    KL_FACTOR,
-    LEAST_SHARE,
-    Learner,
-    follow,
-    learning_rate,
-    next_share,
-    policy_loss,
-)
+from morphgen.rl.learning_rates import KL_FACTOR, LEAST_SHARE, learning_rate, next_share
+from morphgen.rl.ppo import Learner, follow, policy_loss
 from morphgen.rl.report import explained_variance, outcome
 from morphgen.rl.symlog import symlog
 from on_a_line import OnALine
