@@ -21,7 +21,7 @@ MAX_NESTING = 100
 MAX_FAULTS = 20
 """Faults of items that are reported at once."""
 COUNT_DIGITS = 100
-MAX_COUNT = 10**COUNT_DIGITS
+MAX_COUNT: int = 10**COUNT_DIGITS
 """Structures beyond which they are not counted exactly."""
 MAX_SEARCH = 20_000
 """Parts that are placed in search of one more structure before the search is given up."""
