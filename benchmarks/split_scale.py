@@ -47,7 +47,7 @@ def main() -> int:
     parser.add_argument("--light", action="store_true", help="build URDF and derivation only")
     args = parser.parse_args()
     sizes = tuple(int(text) for text in args.train.split(","))
-    order = Order("scaled", sizes, args.test, seed=args.seed)
+    order = Order("scaled", sizes, args.test, seed=args.seed, max_links=25)  # of the longest chain
     library = default_library()
     train, test = ([load_grammar(find_grammar(name)) for name in names] for names in (TRAIN, TEST))
     seconds, splits = _timed(lambda: extrapolation(order, train, test, library, jobs=args.jobs))
