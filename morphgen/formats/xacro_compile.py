@@ -23,7 +23,7 @@ from morphgen.formats.resolve import PackageFinder, is_installed
 from morphgen.formats.xacro import Expansion
 from morphgen.formats.xacro_child import run_in_child
 from morphgen.formats.xacro_expressions import Expression
-from morphgen.formats.xacro_functions import Function
+from morphgen.formats.xacro_functions import Function, RefusedError
 
 _OPEN, _CLOSE = "\ue000", "\ue001"
 _MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
@@ -38,7 +38,15 @@ class UntraceableError(Exception):
     """A template does more with a parameter than arithmetic."""
 
 
-_UNTRACEABLE = (UntraceableError, FormatError, SyntaxError, NameError, TypeError, LookupError)
+_UNTRACEABLE = (
+    UntraceableError,
+    FormatError,
+    RefusedError,
+    SyntaxError,
+    NameError,
+    TypeError,
+    LookupError,
+)
 """What a template that does so makes the evaluator raise."""
 
 

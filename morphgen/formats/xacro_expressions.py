@@ -2,9 +2,8 @@
 
 An expression is parsed with ``ast`` and translated, node by node, into the functions of
 ``xacro_nodes``. A node that is not listed there is refused; nothing is ever given to ``eval`` or
-``exec``.
-Names stand for the document's own values and for the functions of ``xacro_functions``; a dot
-reaches entries of dictionaries and xacro's namespaces, and a few methods of texts, lists and
+``exec``. Names stand for the document's own values and for the functions of ``xacro_functions``; a
+dot reaches entries of dictionaries and xacro's namespaces, and a few methods of texts, lists and
 dictionaries, but no attribute of a Python object.
 
 The packages ``asteval`` and ``simpleeval`` do not fit: both let a dot read attributes of objects
@@ -15,6 +14,7 @@ size of results in all the operations below.
 from __future__ import annotations
 
 import ast
+import warnings
 from collections.abc import Mapping
 from functools import lru_cache
 
@@ -23,6 +23,11 @@ from morphgen.formats.xacro_nodes import Scope, Translation
 
 MAX_LENGTH = 10_000
 """Longest expression [characters]."""
+
+_ORIGIN = "<expression>"
+# Python would print what it finds odd about an expression, such as ``2if x else 3``.
+warnings.filterwarnings("ignore", category=SyntaxWarning, module=_ORIGIN)
+warnings.filterwarnings("ignore", category=DeprecationWarning, module=_ORIGIN)
 
 
 class Expression:
@@ -38,7 +43,7 @@ class Expression:
         if len(text) > MAX_LENGTH:
             raise RefusedError(f"an expression is longer than {MAX_LENGTH} characters")
         try:
-            tree = ast.parse(text, "<expression>", "eval")
+            tree = ast.parse(text, _ORIGIN, "eval")
             self._node = Translation(text).of(tree.body)
         except (MemoryError, RecursionError) as error:
             raise RefusedError("an expression is nested too deeply") from error

@@ -299,7 +299,6 @@ def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatc
     for body, reason in (
         (link(CALL), "name 'vars' is not defined"),
         (link("load_yaml('/etc/passwd')"), "is not in"),
-        ('<link name="\ue000().__class__.__bases__\ue001"/>', "no link 'a'"),
         (ENDLESS, "its expansion takes more than 2 s of CPU time"),
     ):
         (library / "trap.xacro").write_text(f"{HEAD}{argument}{body}</robot>")

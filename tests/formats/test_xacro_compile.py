@@ -9,7 +9,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf_text import number
 from morphgen.formats.xacro import expand
-from morphgen.formats.xacro_compile import compile_xacro
+from morphgen.formats.xacro_compile import compile_xacro, trace
 from morphgen.grammar.library import default_library
 
 TEMPLATES = [manifest for manifest in default_library().manifests() if manifest.is_template]
@@ -123,6 +123,15 @@ def test_what_cannot_be_expanded_is_left_to_the_expansion_to_tell(write, body):
     assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
     with pytest.raises(FormatError, match=r"x\.xacro"):
         expand(path, {"x": "0.3"}, FINDER)
+
+
+@pytest.mark.parametrize("expression", ["().__class__", "2", "p_x", "lambda: 0", "1" * 20_000])
+def test_the_marks_of_expressions_in_a_document_are_text(write, expression):
+    path = write(f'<a v="\ue000{expression}\ue001"/>')
+    for trusted in (False, True):
+        assert trace(path, {}, {"x": "0.3"}, FINDER, installed_only=trusted) is None
+    assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
+    assert f"\ue000{expression}\ue001" in expand(path, {"x": "0.3"}, FINDER).decode()
 
 
 def test_a_value_for_which_an_expression_fails_is_told(write):

@@ -3,6 +3,8 @@
 import ast
 import math
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -194,3 +196,12 @@ def test_the_page_names_every_function_and_bound():
         f"{xacro_child.MEMORY_LIMIT >> 30} GiB of memory",
     )
     assert [bound for bound in bounds if bound not in page] == []
+
+
+def test_python_prints_nothing_about_an_odd_expression():
+    code = (
+        "from morphgen.formats.xacro import evaluate; "
+        r"print(evaluate('${2if 1 else 3}', {}), evaluate('${len(\'\\d\')}', {}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("2.0 2.0\n", "")
