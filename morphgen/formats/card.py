@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
@@ -107,11 +108,15 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
         FormatError: If the card lacks a key, or a value is of the wrong type.
     """
     keys = ("derivation", "source", "choices", "repairs", "parts", "accepted", "primitives")
+    _require_kinds(card, origin)
     try:
         home = card["home"]
+        positions = tuple(float(home[robot.joints[k].name]) for k in robot.independent)
+        if not all(map(math.isfinite, positions)):
+            raise ValueError("a position at home is not finite")
         return replace(
             robot,
-            home=tuple(float(home[robot.joints[k].name]) for k in robot.independent),
+            home=positions,
             ignore_pairs=tuple((str(a), str(b)) for a, b in card["ignore_pairs"]),
             provenance={key: card[key] for key in keys if key in card},
         )
@@ -119,6 +124,21 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
         raise FormatError(f"{origin}: has no {error}") from error
     except (TypeError, ValueError) as error:
         raise FormatError(f"{origin}: home or ignore_pairs: {error}") from error
+
+
+def _require_kinds(card: Mapping[str, Any], origin: str) -> None:
+    """Require that what pages and checks take from a card is of the kind that they expect."""
+    parts, accepted = card.get("parts", []), card.get("accepted", {})
+    if not isinstance(card.get("derivation", ""), str):
+        raise FormatError(f"{origin}: derivation: expected a text")
+    if not isinstance(parts, list) or not all(
+        isinstance(part, dict) and {"label", "part"} <= part.keys() for part in parts
+    ):
+        raise FormatError(f"{origin}: parts: expected objects with label and part")
+    if not isinstance(accepted, dict) or not all(
+        isinstance(whys, dict) for whys in accepted.values()
+    ):
+        raise FormatError(f"{origin}: accepted: expected an object of objects")
 
 
 def rounded(value: float | None) -> float | None:
