@@ -171,7 +171,7 @@ def open_page(session: Session) -> None:
 
 def _show_fault(session: Session, title: str, text: str) -> None:
     """A page that says why there is no other."""
-    gui = session.client.gui
+    gui, session.status = session.client.gui, None
     gui.reset()
     session.client.scene.reset()
     gui.set_panel_label("morphgen")

@@ -94,7 +94,8 @@ class Places:
         text = str(error).replace(f"{self.uploads}/", UPLOAD).replace(str(self.uploads), UPLOAD)
         text = _TEMPORARY.sub("", text)
         for root in self.roots:
-            text = text.replace(f"{root}/", "")
+            text = re.sub(rf"{re.escape(str(root))}/(?=\w)", "", text)
+            text = re.sub(rf"{re.escape(str(root))}(?![\w.-])", ".", text)
         return shortened(text, LONGEST_TOLD)
 
 
@@ -121,6 +122,13 @@ def read_place(place: str, places: Places) -> Robot:
         UnsoundError: If its structure is broken; the findings say how.
         MorphgenError: If there is none, or it cannot be read or composed.
     """
+    try:
+        return _read(place, places)
+    except RecursionError:
+        raise PlaceError(f"{shortened(place)}: is nested too deeply") from None
+
+
+def _read(place: str, places: Places) -> Robot:
     if place.startswith(MEMBER):
         return member_robot(member_at(place, places), places.library)
     if derivation := derivation_at(place, places):
@@ -182,7 +190,7 @@ def as_in_library(robot: Robot, library: Library) -> Robot:
         return robot
     try:
         made = compose(parse_derivation(str(text)), library, robot.name)
-    except MorphgenError:
+    except (MorphgenError, RecursionError):
         return robot  # its parts are not here, so no fits of them are
     return made if _nameless(made) == _nameless(robot) else robot
 

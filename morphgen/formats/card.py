@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
@@ -120,11 +121,17 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
     for key, value in provenance.items():
         if not _is_of(_PROVENANCE[key], value):
             raise FormatError(f"{origin}: {key}: not what a card holds there: {_shown(value)}")
+    for part in provenance.get("parts", []):
+        if not {"label", "part"} <= part.keys():
+            raise FormatError(f"{origin}: parts: expected objects with label and part")
     try:
         home = card["home"]
+        positions = tuple(float(home[robot.joints[k].name]) for k in robot.independent)
+        if not all(map(math.isfinite, positions)):
+            raise ValueError("a position at home is not finite")
         return replace(
             robot,
-            home=tuple(float(home[robot.joints[k].name]) for k in robot.independent),
+            home=positions,
             ignore_pairs=tuple((str(a), str(b)) for a, b in card["ignore_pairs"]),
             provenance=provenance,
         )

@@ -131,3 +131,45 @@ def test_a_file_that_was_changed_or_lost_is_told(tmp_path):
     (folder / "robot.xml").unlink()
     found = {finding.code: finding.where for finding in file_findings(folder)}
     assert found == {"file-changed": "file robot.urdf", "file-missing": "file robot.xml"}
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../other", "meshes/../../x"])
+def test_a_card_that_names_a_file_outside_is_refused(tmp_path, name):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    card = json.loads((folder / "card.json").read_text())
+    (folder / "card.json").write_text(json.dumps({**card, "hashes": {name: "0"}}))
+    with pytest.raises(FormatError, match=f"hashes: '{name}' leads out of the folder"):
+        file_findings(folder)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a" * 300])
+def test_a_card_that_names_what_no_file_is_called_tells_so(tmp_path, name):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    card = json.loads((folder / "card.json").read_text())
+    (folder / "card.json").write_text(json.dumps({**card, "hashes": {name: "0"}}))
+    assert [finding.code for finding in file_findings(folder)] == ["file-missing"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"derivation": {"a": 1}},
+        {"parts": 3},
+        {"parts": [3]},
+        {"parts": [{"label": "a"}]},
+        {"accepted": [1]},
+        {"accepted": {"a": 3}},
+        {"home": [1]},
+        {"home": {"shoulder": 0, "elbow": float("nan"), "extend": 0, "left": 0}},
+        {"ignore_pairs": 3},
+        {"ignore_pairs": [["a"]]},
+        {"frames": {"nowhere": {}}},
+    ],
+    ids=str,
+)
+def test_a_card_of_the_wrong_kind_is_refused(tmp_path, change):
+    folder = write_bundle(arm(), tmp_path / "arm", picture=False)
+    card = json.loads((folder / "card.json").read_text())
+    (folder / "card.json").write_text(json.dumps({**card, **change}))
+    with pytest.raises(FormatError):
+        read_bundle(folder)

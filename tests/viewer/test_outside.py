@@ -13,6 +13,7 @@ from plain_client import PlainClient
 from robots import arm
 
 WORD = "tellnobody"
+DEEP = "a=b[c:" * 1000 + "a=b" + "]" * 1000
 NOTHING = "There is nothing to see here"
 
 
@@ -87,7 +88,9 @@ def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, quer
         ("?play=reach&policy=%00", "no checkpoint, and no policy"),
         ("?play=reach&policy=ikk", "did you mean 'ik'"),
         ("?play=reach&seed=" + "9" * 5000, "seed '9+.*: expected a whole number"),
-        ("?robot=derivation:" + "a=b[c:" * 1000 + "a=b" + "]" * 1000, "nested too deeply|unknown"),
+        ("?robot=derivation:" + DEEP, "nested too deeply|unknown"),
+        ("?play=reach&robot=derivation:" + DEEP, "nested too deeply|unknown"),
+        ("?compare=derivation:" + DEEP, "nested too deeply|unknown"),
         ("?robot=" + "&robot=".join("a" * 50), "no such file or folder"),
         ("?" + "&".join(f"k{i}=1" for i in range(1000)), "names no page"),
     ],

@@ -1,5 +1,8 @@
 """Robots are found at their places, and nowhere else."""
 
+import tempfile
+from pathlib import Path
+
 import pytest
 
 from morphgen.benchmark.split import robot_hash
@@ -115,6 +118,27 @@ def test_a_key_changes_with_the_file(places):
     assert content_key("robots/one", places) != before
     words = content_key("words:base=planar ee=cube", places)
     assert words == content_key("derivation:" + str(_derivation(places)), places)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{uploads}/ab/a.urdf:3: bad", "upload:ab/a.urdf:3: bad"),
+        ("{uploads}: bad", "upload:: bad"),
+        ("{root}/robots/a: bad", "robots/a: bad"),
+        ("{root} is no bundle", ". is no bundle"),
+        ("{temporary}/tmpa1_b2/robot/robot.urdf: bad", "robot.urdf: bad"),
+        ("{temporary}/tmpa1_b2/episode.mp4: bad", "episode.mp4: bad"),
+        ("{temporary}/morphgen-uploads-x/a: bad", "a: bad"),
+        ("x" * 2000, "x" * 1000 + "..."),
+        ("a\0b\nc", "a\\x00b\\nc"),
+    ],
+)
+def test_a_page_tells_no_folder_of_the_machine(text, told):
+    root, temporary = Path("/home/me/work"), tempfile.gettempdir()
+    places = Places((), (root,), Path(temporary) / "morphgen-uploads-1")
+    given = text.format(uploads=places.uploads, root=root, temporary=temporary)
+    assert places.told(given) == told
 
 
 def _derivation(places):

@@ -1,5 +1,6 @@
 """Uploads are kept only if they are robots that keep to their folder."""
 
+import html
 import io
 import stat
 import tempfile
@@ -351,3 +352,23 @@ def test_an_error_tells_no_temporary_path(viewer, capfd):
         f"{tempfile.gettempdir()}/tmpab12/robot/x",
     ):
         assert tempfile.gettempdir() not in on.places.told(text)
+
+
+def test_names_of_an_upload_are_text_on_the_page(viewer):
+    name = "&lt;img src=x onerror=alert()&gt;"
+    text = f"""<robot name="{name}"><link name="{name}"><visual name="{name}"><geometry>
+    <sphere radius="0.1"/></geometry></visual></link><link name="tool"/><joint name="{name}"
+    type="revolute"><parent link="{name}"/><child link="tool"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+    on = viewer()
+    with PlainClient(on.port) as client:
+        client.upload("a.urdf", text.encode())
+        query = client.sent_to()
+    with PlainClient(on.port, query) as client:
+        client.change(client.control("Dropdown", "Link"), html.unescape(name))
+        client.until(lambda: "inertial-missing" in client.text or "no findings" in client.text
+                     or "tag warning" in client.text)  # fmt: skip
+        shown = [m["props"]["content"] for m in client.messages if m["type"] == "GuiHtmlMessage"]
+        shown += [m["updates"].get("content", "") for m in client.messages if "updates" in m]
+        assert name in "".join(shown)
+        assert "<img src=x" not in "".join(shown)
