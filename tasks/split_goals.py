@@ -158,7 +158,9 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
         ) from error
     except OSError as error:
         raise BenchmarkError(f"{error.filename}: cannot be read: {error.strerror}") from error
-    except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise BenchmarkError(f"{path}: no index of goal sets: {error!r}") from error
 
 
