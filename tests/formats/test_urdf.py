@@ -77,7 +77,12 @@ def test_home_is_in_the_middle_of_a_range_without_zero(tmp_path):
 def test_a_urdf_alone_has_its_tool_and_home(tmp_path):
     path = written(arm(), tmp_path)
     alone = read_robot(path)
-    assert (alone.home, alone.frames) == (arm().home, arm().frames)
+    assert alone.home == arm().home
+    (tool,), (expected,) = alone.frames, arm().frames
+    assert (tool.name, tool.link) == (expected.name, expected.link)
+    np.testing.assert_allclose(
+        tool.T_link_frame.matrix, expected.T_link_frame.matrix, rtol=0, atol=1e-9
+    )
     assert [link.name for link in alone.links] == [link.name for link in arm().links]
 
 
