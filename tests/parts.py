@@ -56,6 +56,7 @@ MANIFEST = {
     "tool": {"link": "palm", "xyz": [0, 0, "${length + 0.05}"]},
     "home": {"left_slide": 0.01, "wheel": 0.5},
     "density": 1000,
+    "accepted": {name: {"links-apart": "it hovers"} for name in ("left", "right", "disc")},
     "parameters": {"length": {"default": 0.2, "min": 0.1, "max": 0.5, "unit": "m"}},
     "accepted": {
         name: {"links-apart": "drawn without what holds it to the palm"}
