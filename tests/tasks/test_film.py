@@ -137,9 +137,9 @@ def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(on):
 
 
 def test_a_scene_without_anything_else_can_be_drawn(on):
-    block = Block((0.2, 0.2, 0.2), Pose((0.5, 0.0, 0.1)), 0.1)
+    block = Block((0.2, 0.2, 0.2), Pose((0.2, -0.5, 0.1)), 0.1)
     stage = on(Setting(arm(), "push", Scene(arm(), block=block)))
-    with_block = stage.frame(arm().home, block=(0.5, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0))
+    with_block = stage.frame(arm().home, block=(0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0))
     assert changed(with_block, stage.frame(arm().home)).sum() > 50
 
 
