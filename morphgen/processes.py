@@ -6,13 +6,14 @@ import itertools
 import os
 import signal
 import socket
+import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
-from threading import Thread
+from ctypes import c_byte
+from multiprocessing import get_context, parent_process, resource_tracker
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -30,6 +31,8 @@ PATIENCE = 5.0
 """Seconds to wait for an answer from a Ray cluster's address; Ray itself waits for minutes."""
 
 _work: Callable[[Any], object] | None = None
+_stopped: c_byte | None = None
+"""Whether the parent has stopped; in memory of all its processes."""
 
 
 def unseen(done: int, total: int) -> None:
@@ -66,18 +69,27 @@ def mapped(
 
 
 def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,))
+    context = get_context("spawn")
+    stopped = context.RawValue("b", 0)
+    pool = ProcessPoolExecutor(jobs, context, _start, (work, stopped))
     waiting = iter(chunks)
     try:
-        running: deque[Future[list[R]]] = deque(
-            pool.submit(_do, chunk) for chunk in itertools.islice(waiting, 2 * jobs)
-        )
+        running = deque(_submitted(pool, itertools.islice(waiting, 2 * jobs)))
         while running:
-            done = _result(running.popleft())
-            running.extend(pool.submit(_do, chunk) for chunk in itertools.islice(waiting, 1))
+            done: list[R] = _result(running.popleft())
+            running.extend(_submitted(pool, itertools.islice(waiting, 1)))
             yield from done
     finally:
+        stopped.value = 1
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _submitted(
+    pool: ProcessPoolExecutor, chunks: Iterable[Sequence[Any]]
+) -> list[Future[list[Any]]]:
+    """Submit chunks, for which the pool may start processes."""
+    with ctrl_c_held():
+        return [pool.submit(_do, chunk) for chunk in chunks]
 
 
 def _result(future: Future[list[R]]) -> list[R]:
@@ -90,17 +102,43 @@ def _result(future: Future[list[R]]) -> list[R]:
         ) from error
 
 
+@contextmanager
+def ctrl_c_held() -> Iterator[None]:
+    """Start processes in this block: Ctrl-C is not for them, from their first moment on.
+
+    They inherit a mask that blocks it. For this process it counts at the end of the block; the mask
+    alone would not do, as another thread may take the signal, which then interrupts this one.
+    """
+    noted: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT)
+    if is_main:
+        signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
+    try:
+        resource_tracker.ensure_running()  # its start would end the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    finally:
+        if is_main:
+            signal.signal(signal.SIGINT, handler or signal.SIG_DFL)
+        if noted:
+            signal.raise_signal(signal.SIGINT)
+
+
 def prepare_worker() -> None:
     """Prepare a worker: Ctrl-C is for the parent, and without it the worker ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _start(work: Callable[[Any], object]) -> None:
-    """Prepare a worker, which the parent lets finish its chunk."""
-    global _work
+def _start(work: Callable[[Any], object], stopped: c_byte) -> None:
+    """Prepare a worker, which the parent lets finish the thing that it does."""
+    global _work, _stopped
     prepare_worker()
-    _work = work
+    _work, _stopped = work, stopped
 
 
 def _end_with_parent() -> None:
@@ -112,9 +150,14 @@ def _end_with_parent() -> None:
 
 
 def _do(things: Sequence[Any]) -> list[Any]:
-    if _work is None:
+    if _work is None or _stopped is None:
         raise RuntimeError("the worker was not prepared")
-    return [_work(thing) for thing in things]
+    results: list[Any] = []
+    for thing in things:
+        if _stopped.value:  # nobody waits for the results any more
+            break
+        results.append(_work(thing))
+    return results
 
 
 def require_ray() -> ModuleType:

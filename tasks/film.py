@@ -211,9 +211,9 @@ def _append(writer: Any, frame: Frame) -> None:  # noqa: ANN401
     except OSError as error:
         if error.errno is not None:
             raise
-        log = str(error).rpartition("FFMPEG STDERR OUTPUT:")[2].strip()
-        reason = log.splitlines()[-1] if log else "it ended early"
-        raise FilmError(f"ffmpeg failed: {reason}") from error
+        raise FilmError(
+            "ffmpeg ended early; does it have the codec libx264, and is there room on the disk?"
+        ) from error
     except RuntimeError as error:
         raise FilmError(str(error)) from error
 
@@ -245,6 +245,7 @@ def _writing(suffix: str, fps: float) -> dict[str, Any]:
         "fps": fps,
         "codec": "libx264",
         "quality": 8,
+        "ffmpeg_log_level": "quiet",
         "macro_block_size": 2,
         "output_params": ["-fflags", "+bitexact", "-flags:v", "+bitexact"],
     }

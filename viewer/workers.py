@@ -10,7 +10,7 @@ from multiprocessing import get_context
 from typing import TypeVar
 
 from morphgen.errors import MorphgenError
-from morphgen.processes import prepare_worker
+from morphgen.processes import ctrl_c_held, prepare_worker
 
 T = TypeVar("T")
 
@@ -31,7 +31,7 @@ class Workers:
 
     def submit(self, work: Callable[..., T], *arguments: object) -> Future[T]:
         """Have something done."""
-        with self._lock:
+        with self._lock, ctrl_c_held():
             try:
                 return self._pool.submit(work, *arguments)
             except BrokenProcessPool:

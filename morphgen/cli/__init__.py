@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 
 from morphgen.cli import (
     check,
@@ -106,17 +110,47 @@ def _run(argv: Sequence[str] | None) -> int:
     if args.command is None:
         parser.print_help()
         return 2
+    with _ctrl_c_noted() as noted:
+        try:
+            return int(args.run(args))
+        except KeyboardInterrupt as interrupt:
+            return _interrupted(interrupt)
+        except Exception as error:
+            if noted:  # a package that was being imported made something else of Ctrl-C
+                return _interrupted(KeyboardInterrupt())
+            if isinstance(error, MorphgenError):
+                return _refused(error, str(error), args)
+            if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
+                raise
+            return _refused(error, f"{error.filename or 'output'}: {error.strerror}", args)
+
+
+@contextmanager
+def _ctrl_c_noted() -> Iterator[list[int]]:
+    """Raise ``KeyboardInterrupt`` on Ctrl-C as always, and note it in the list that is given."""
+    noted: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        signal.default_int_handler(number, frame)
+
+    before = signal.getsignal(signal.SIGINT)
+    is_main = threading.current_thread() is threading.main_thread()
+    if before is not signal.default_int_handler or not is_main:  # somebody else's, or ignored
+        yield noted
+        return
+    signal.signal(signal.SIGINT, note)
     try:
-        return int(args.run(args))
-    except MorphgenError as error:
-        return _refused(error, str(error), args)
-    except KeyboardInterrupt:
-        print("morphgen: interrupted; nothing half-written is left", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        return _refused(error, f"{error.filename or 'output'}: {error.strerror}", args)
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupted(interrupt: KeyboardInterrupt) -> int:
+    """Say in one line that the command was interrupted; return the exit code."""
+    text = str(interrupt) or "nothing half-written is left"
+    print(f"morphgen: interrupted; {text}", file=sys.stderr)
+    return 130
 
 
 def _refused(error: Exception, text: str, args: argparse.Namespace) -> int:

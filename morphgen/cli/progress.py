@@ -29,13 +29,9 @@ def shown(again: str = "with --resume") -> Iterator[Shower]:
     shower = Shower()
     try:
         yield shower
-    except KeyboardInterrupt:
-        shower.close()
-        print(
-            f"morphgen: it goes on from its last checkpoint, if it has one, {again}",
-            file=sys.stderr,
-        )
-        raise
+    except KeyboardInterrupt as interrupt:
+        text = f"it goes on from its last checkpoint, if it has one, {again}"
+        raise KeyboardInterrupt(text) from interrupt
     finally:
         shower.close()
 

@@ -157,7 +157,7 @@ def _sequences(alternative: Alternative, counts: Mapping[str, int]) -> int:
 
 
 def _bounded(number: int) -> int:
-    return min(number, MAX_COUNT + 1)
+    return number if number <= MAX_COUNT else MAX_COUNT + 1
 
 
 def _possible(grammar: Grammar) -> dict[str, list[Alternative]]:

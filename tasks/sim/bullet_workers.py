@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
+from morphgen.processes import ctrl_c_held
 from morphgen.tasks.sim.base import Contacts, Scene
 from morphgen.tasks.sim.bullet_batch import BulletBatch, Exported, Float32, Rows
 
@@ -96,7 +97,8 @@ def start(number: int, share: Share, arrays: SharedArrays) -> Worker:
     process = _CONTEXT.Process(target=_serve, args=(theirs, arrays), name=str(number), daemon=True)
     worker = Worker(process, ours, np.array(share.envs))
     try:
-        process.start()
+        with ctrl_c_held():
+            process.start()
         theirs.close()
         send(worker, pickle.dumps(share))
     except BaseException:

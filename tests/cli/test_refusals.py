@@ -11,6 +11,7 @@ import pytest
 from commands import start, tree
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
+from morphgen.grammar import library
 from parts import write_part
 from robots import arm
 
@@ -195,6 +196,20 @@ def test_an_interrupted_run_leaves_no_half_bundle(run, tmp_path, monkeypatch, st
     assert (code, out) == (130, "")
     assert err == "morphgen: interrupted; nothing half-written is left\n"
     assert tree(tmp_path / "out") == {}
+
+
+def test_ctrl_c_that_a_package_makes_another_error_of_is_ctrl_c(run, monkeypatch):
+    def swallow(*_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except BaseException:
+            raise TypeError("unsupported operand")  # noqa: B904
+
+    monkeypatch.setattr(library, "default_library", swallow)
+    code, out, err = run("list")
+    assert (code, out) == (130, "")
+    assert err == "morphgen: interrupted; nothing half-written is left\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize("move", [1, 2])

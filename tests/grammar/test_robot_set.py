@@ -1,6 +1,7 @@
 """A set on disk has the same bytes however it was made, and however often it was interrupted."""
 
 import json
+import math
 import shutil
 import signal
 import time
@@ -299,3 +300,43 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path):
 
     make_set(made, 2, work)
     assert len(read_index(made.folder)) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "../../etc"},
+        {"name": "/etc"},
+        {"name": ".."},
+        {"name": 5},
+        {"index": "0"},
+        {"choices": {"a": "b"}},
+        {"choices": {"a": math.nan}},
+        {"rejected": [1]},
+    ],
+)
+def test_a_line_of_an_index_that_morphgen_did_not_write_is_refused(whole, change):
+    lines = (whole / INDEX).read_text().splitlines()
+    lines[1] = json.dumps(json.loads(lines[1]) | change)
+    (whole / INDEX).write_text("\n".join(lines))
+    with pytest.raises(
+        FormatError, match=r"index.jsonl:2: not a line of an index of morphgen samp"
+    ):
+        read_index(whole)
+
+
+@pytest.mark.parametrize("line", ["[" * 100_000, "[]", "null", "5", "{}"])
+def test_a_journal_of_anything_else_is_passed_over(whole, line):
+    (whole / JOURNAL).write_text(line + "\n")
+    assert make_set(plan(whole), 9, make_serially).made == 1
+    assert len(read_index(whole)) == 9
+    (whole / INDEX).write_text(line + "\n")
+    with pytest.raises(FormatError, match=r"index.jsonl:1: not a line of an index"):
+        read_index(whole)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "{", '{"grammar": 5}', "\0"])
+def test_settings_that_are_none_are_refused(whole, text):
+    (whole / SETTINGS).write_text(text)
+    with pytest.raises(FormatError, match=r"set.json: (no valid JSON|expected the settings)"):
+        make_set(plan(whole), 9, make_serially)

@@ -1,5 +1,6 @@
 """Pictures show what there is, from a camera that has all of it in view, and films are whole."""
 
+import resource
 from dataclasses import replace
 
 import imageio.v2 as imageio
@@ -228,3 +229,44 @@ def test_where_no_film_can_be_written_is_said_at_once(tmp_path, name, says):
     with pytest.raises(FormatError, match=says):
         write_film(FRAMES, tmp_path / name, fps=25)
     assert list(tmp_path.iterdir()) == []
+
+
+NOISE = np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def full_disk():
+    """No file may become larger than 20 kB, neither of this process nor of ffmpeg."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
+def test_a_film_that_the_disk_has_no_room_for_is_an_error(tmp_path, full_disk, name):
+    with pytest.raises(FormatError, match=rf"cannot write .*{name}: (ffmpeg .* full, or|File too)"):
+        write_film(NOISE, tmp_path / name, fps=25)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        ("exit 0", "ffmpeg ended early"),
+        ("head -c 100000 >/dev/null; kill -9 $$", "ffmpeg ended early"),
+        ("cat >/dev/null; exit 1", "No such file|ffmpeg left a film that cannot be read"),
+        (None, "No such file or directory"),
+    ],
+)
+def test_a_film_of_a_failing_or_missing_ffmpeg_is_an_error(tmp_path, monkeypatch, script, says):
+    program = tmp_path / "ffmpeg"
+    if script:
+        program.write_text(f"#!/bin/sh\n{script}\n")
+        program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    (tmp_path / "films").mkdir()
+    with pytest.raises(FormatError, match=rf"cannot write .*film.mp4: ({says})") as refused:
+        write_film(NOISE, tmp_path / "films" / "film.mp4", fps=25)
+    assert "\n" not in str(refused.value)
+    assert list((tmp_path / "films").iterdir()) == []

@@ -1,0 +1,88 @@
+"""Ctrl-C while workers start is one line, and leaves neither a process nor half a file."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from commands import heed_ctrl_c
+from morphgen.benchmark.split_file import split_text
+from small_runs import small_split
+
+COMMANDS = {
+    "sample": ["sample", "chain", "-n", 40, "--jobs", 2, "--light", "--out", "out"],
+    "train": [
+        *["train", "planar-cube", "task=reach", "--agent", "me-mlp", "--envs", 4, "--steps", 2048],
+        *["--workers", 2, "--out", "out"],
+    ],
+    "goals": ["goals", "split.yaml", "--jobs", 2],
+    "split": [
+        *["split", "new", "interpolation", "--grammar", "chain", "--train", 20, "--test", 20],
+        *["--task", "reach", "--jobs", 2, "--out", "out.yaml"],
+    ],
+    "eval": ["eval", "ik", "--split", "split.yaml", "--sim", "pybullet", "--workers", 2],
+}
+PATIENCE = 120.0
+"""Seconds to wait for a worker, and then for the end."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("later", [0.0, 0.3])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_ctrl_c_while_workers_start_is_one_line(tmp_path, name, later):
+    check(tmp_path, name, later)
+
+
+def test_ctrl_c_as_the_first_worker_starts_is_one_line(tmp_path):
+    check(tmp_path, "sample", 0.0)
+
+
+def check(tmp_path, name, later):
+    (tmp_path / "split.yaml").write_text(split_text(small_split()))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "morphgen.cli", *map(str, COMMANDS[name])],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=heed_ctrl_c,
+        env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not any("spawn_main" in words for words in group(process.pid).values()):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        time.sleep(later)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        out, err = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, out) == (130, "")
+        assert err.startswith("morphgen: interrupted; ")
+        assert err.index("\n") == len(err) - 1
+        while group(process.pid) and time.monotonic() < deadline + PATIENCE:
+            time.sleep(0.05)  # the keeper of shared memory ends after the others
+        assert group(process.pid) == {}
+    finally:
+        for left in group(process.pid):
+            os.kill(left, signal.SIGKILL)
+    assert [path for path in tmp_path.rglob(".*") if path.name != ".journal.jsonl"] == []
+
+
+def group(leader):
+    """Command lines of the living processes of a group, by number."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            state, _, number = (folder / "stat").read_text().rpartition(")")[2].split()[:3]
+            words = (folder / "cmdline").read_text()
+        except OSError:  # it ended meanwhile
+            continue
+        if int(number) == leader and state != "Z":
+            found[int(folder.name)] = words
+    return found
