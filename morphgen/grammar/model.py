@@ -212,21 +212,24 @@ class _Reader:
         return text
 
     def _included(self, include: Include, path: Path) -> Path:
-        target = path.parent / include.target
-        try:
-            is_there = target.suffix == SUFFIX and target.is_file()
-        except (OSError, ValueError) as error:  # a name that no file system takes
-            raise GrammarError(f"{include.place}: include: no such file: {error}") from error
-        if not is_there:
+        if not (include.target.endswith(SUFFIX) or "/" in include.target):
             try:
-                target = find_grammar(include.target, self._folders)
+                return find_grammar(include.target, self._folders)
             except GrammarError as error:
                 raise GrammarError(f"{include.place}: {error}") from error
-        if not any(target.resolve().is_relative_to(root) for root in self._roots):
+        target = path.parent / include.target
+        try:
+            inside = any(target.resolve().is_relative_to(root) for root in self._roots)
+            is_there = inside and target.is_file()
+        except (OSError, ValueError):  # a name that no file system takes
+            inside, is_there = True, False
+        if not inside:
             raise GrammarError(
                 f"{include.place}: include {include.target!r} leads outside of {self._roots[0]}; "
                 "an include stays in the folder of its grammar or in a library (--library DIR)"
             )
+        if not is_there:
+            raise GrammarError(f"{include.place}: include {include.target!r}: no such file")
         return target
 
 

@@ -206,10 +206,13 @@ def test_ctrl_c_that_a_package_makes_another_error_of_is_ctrl_c(run, monkeypatch
             raise TypeError("unsupported operand")  # noqa: B904
 
     monkeypatch.setattr(library, "default_library", swallow)
+    # What is started in a shell's background ignores Ctrl-C, and so would this process.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     code, out, err = run("list")
     assert (code, out) == (130, "")
     assert err == "morphgen: interrupted; nothing half-written is left\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("move", [1, 2])
