@@ -1,0 +1,297 @@
+"""Whatever a file holds: no traceback, no hang, no more than a gigabyte, and one line if refused.
+
+The examples are the same in every run.
+"""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import morphgen
+from fuzzing import MEMORY_MIB, Runner
+from morphgen.grammar.model import grammar_names
+
+TEMPLATES = Path(morphgen.__file__).parents[1] / "templates"
+
+ROBOT = """<?xml version="1.0"?>
+<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+  <link name="base">
+    <inertial>
+      <origin xyz="0 0 0.1" rpy="0 0 0"/><mass value="1.5"/>
+      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
+    </inertial>
+    <visual><geometry><box size="0.1 0.2 0.3"/></geometry><material name="grey"/></visual>
+    <collision><geometry><cylinder radius="0.1" length="0.2"/></geometry></collision>
+  </link>
+  <joint name="turn" type="revolute">
+    <parent link="base"/><child link="tip"/><origin xyz="0 0 0.3" rpy="0 1.57 0"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="10" velocity="2"/>
+  </joint>
+  <link name="tip">
+    <collision><geometry><sphere radius="0.05"/></geometry></collision>
+    <collision><geometry><mesh filename="meshes/none.stl"/></geometry></collision>
+  </link>
+  <joint name="finger" type="prismatic">
+    <parent link="tip"/><child link="nail"/><limit lower="0" upper="0.1" effort="1" velocity="1"/>
+    <mimic joint="turn" multiplier="2"/>
+  </joint>
+  <link name="nail"/>
+</robot>
+"""
+
+STRANGE = [
+    "",
+    "0",
+    "-1",
+    "nan",
+    "inf",
+    "-0",
+    "1e308",
+    "1e-320",
+    "9" * 400,
+    "1 2",
+    "1 2 3",
+    "0 0 0",
+    "base",
+    "tip",
+    "${1/0}",
+    "../../x",
+    "/dev/zero",
+    "\u0000",
+    "\n",
+    "\u202e",
+    "é",
+    "floating",
+    "continuous",
+    "A" * 3000,
+]
+
+ATOMS = [
+    "1",
+    "0",
+    "2.5",
+    "-1",
+    "10**9",
+    "1e308",
+    "'a'",
+    "''",
+    "[]",
+    "[1, 2]",
+    "{}",
+    "{'a': 1}",
+    "()",
+    "True",
+    "None",
+    "pi",
+    "x",
+    "math",
+    "math.pi",
+    "xacro",
+    "xacro.load_yaml",
+    "python",
+    "python.type",
+    "__import__",
+    "load_yaml('x.yaml')",
+    "'%s'",
+    "'{0.__class__}'",
+    "lambda: 1",
+    "...",
+    "open",
+    "range(3)",
+]
+CALLS = [
+    "len",
+    "str",
+    "int",
+    "float",
+    "list",
+    "tuple",
+    "dict",
+    "range",
+    "sum",
+    "max",
+    "abs",
+    "round",
+    "sin",
+    "sqrt",
+    "math.factorial",
+    "math.pow",
+    "radians",
+    "eval",
+    "getattr",
+    "type",
+    "python.vars",
+    "xacro.load_yaml",
+    "xacro.fatal",
+    "sorted",
+    "map",
+    "print",
+]
+BINARY = ["+", "-", "*", "/", "//", "%", "**", "<<", "@", "==", "<", " and ", " in ", " if x else "]
+ATTRIBUTES = ["__class__", "format", "upper", "join", "a", "mro", "gi_frame", "real", "__globals__"]
+
+
+def wider(inner):
+    return st.one_of(
+        st.builds("({}{}{})".format, inner, st.sampled_from(BINARY), inner),
+        st.builds("{}({})".format, st.sampled_from(CALLS), inner),
+        st.builds("{}({}, {})".format, st.sampled_from(CALLS), inner, inner),
+        st.builds("{}[{}]".format, inner, inner),
+        st.builds("{}.{}".format, inner, st.sampled_from(ATTRIBUTES)),
+        st.builds("{}.{}({})".format, inner, st.sampled_from(ATTRIBUTES), inner),
+        st.builds("[{} for y in {}]".format, inner, inner),
+        st.builds("f'{{{}}}'".format, inner),
+        st.builds("-{}".format, inner),
+    )
+
+
+expressions = st.one_of(
+    st.recursive(st.sampled_from(ATOMS), wider, max_leaves=12),
+    st.text(alphabet="${}()[]'\"\\.+-*/%<>=!,:x1_ \n", max_size=60),
+)
+
+
+@st.composite
+def mutated(draw, text, tokens):
+    """A text with some of its parts cut, doubled, moved or replaced."""
+    for _ in range(draw(st.integers(1, 5))):
+        size = len(text)
+        start = draw(st.integers(0, size))
+        end = min(size, start + draw(st.integers(0, 40)))
+        match draw(st.sampled_from(["cut", "token", "double", "many", "move"])):
+            case "cut":
+                text = text[:start] + text[end:]
+            case "token":
+                text = text[:start] + draw(st.sampled_from(tokens)) + text[end:]
+            case "double":
+                text = text[:end] + text[start:]
+            case "many":
+                text = text[:start] + text[start:end] * draw(st.integers(2, 3000)) + text[end:]
+            case "move":
+                place = draw(st.integers(0, size))
+                text = text[:place] + text[start:end] + text[place:]
+    return text
+
+
+@st.composite
+def broken_urdf(draw):
+    """A description with strange values, broken tags and broken bytes."""
+    text = ROBOT
+    for _ in range(draw(st.integers(0, 3))):
+        values = [i for i, letter in enumerate(text) if letter == '"']
+        first = 2 * draw(st.integers(0, len(values) // 2 - 1))
+        start, end = values[first] + 1, values[first + 1]
+        text = text[:start] + draw(st.sampled_from(STRANGE)) + text[end:]
+    if draw(st.booleans()):
+        tags = [
+            "<",
+            ">",
+            "</link>",
+            "<!--",
+            "<![CDATA[",
+            '<!DOCTYPE r SYSTEM "x">',
+            "&a;",
+            "<a:b/>",
+        ]
+        text = draw(mutated(text, tags))
+    data = text.encode(draw(st.sampled_from(["utf-8", "utf-8", "utf-16", "utf-8-sig"])))
+    for _ in range(draw(st.integers(0, 3))):
+        where = draw(st.integers(0, len(data)))
+        data = data[:where] + draw(st.binary(max_size=4)) + data[where + draw(st.integers(0, 3)) :]
+    return data
+
+
+GRAMMARS = [
+    (TEMPLATES / "grammars" / f"{name}.grammar").read_text(encoding="utf-8")
+    for name in sorted(grammar_names())
+]
+WORDS = [
+    "{1,1000000000}",
+    "{999999999}",
+    "{0,0}",
+    "robot -> robot robot\n",
+    "| robot robot",
+    "not " * 50,
+    "(" * 2000,
+    "-" * 2000,
+    "1+" * 2000,
+    "1e400",
+    "9" * 5000,
+    "uniform(1, 0)",
+    "uniform(0, 1e308)",
+    "where ",
+    "let a = a\n",
+    'include "/etc/hostname"\n',
+    "include arm3\n",
+    "@weight(0)",
+    "ur5",
+    "plane",
+    "\x00",
+    "->",
+    "\n",
+    "mount_yaw=1",
+]
+grammars = st.sampled_from(GRAMMARS).flatmap(lambda text: mutated(text, WORDS))
+
+
+@pytest.fixture(scope="module")
+def runner(tmp_path_factory):
+    made = Runner(tmp_path_factory.mktemp("fuzz"))
+    yield made
+    made.close()
+
+
+def require_good_manners(answer, context):
+    assert answer["code"] in (0, 1, 2), (context, answer["err"])
+    assert "Traceback" not in answer["err"], (context, answer["err"])
+    assert answer["mib"] < MEMORY_MIB, context
+    if answer["code"] == 2:
+        assert answer["err"].count("\n") == 1, (context, answer["err"])
+        assert answer["err"].startswith("morphgen: "), (context, answer["err"])
+
+
+def manners(max_examples):
+    return settings(
+        max_examples=max_examples,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+@pytest.mark.slow
+@manners(250)
+@given(expression=expressions)
+def test_xacro_expressions(runner, expression):
+    quoted = expression.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    path = runner.folder / "robot.urdf.xacro"
+    path.write_text(
+        '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:property name="x" value="3"/>'
+        f'<link name="a"/><xacro:if value="${{{quoted}}}"><link name="${{{quoted}}}"/></xacro:if>'
+        "</robot>",
+        encoding="utf-8",
+    )
+    require_good_manners(runner.run("check", path), expression)
+
+
+@pytest.mark.slow
+@manners(250)
+@given(data=broken_urdf(), command=st.sampled_from(["check", "show"]))
+def test_urdf_bytes(runner, data, command):
+    path = runner.folder / "robot.urdf"
+    path.write_bytes(data)
+    require_good_manners(runner.run(command, path), data)
+
+
+@pytest.mark.slow
+@manners(200)
+@given(text=grammars, command=st.sampled_from(["check", "count", "enumerate", "print"]))
+def test_grammar_text(runner, text, command):
+    path = runner.folder / "some.grammar"
+    path.write_text(text, encoding="utf-8")
+    require_good_manners(runner.run("grammar", command, path), text)
