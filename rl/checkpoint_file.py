@@ -60,8 +60,8 @@ def packed(content: Mapping[str, Any], where: str) -> bytes:
     return file.getvalue()
 
 
-def unpacked(file: Path) -> dict[str, Any]:
-    """The content of a checkpoint's file, without its hash.
+def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
+    """The content of a checkpoint's file without its hash, and whether it has one.
 
     Raises:
         TaskError: If it is no such file, is damaged or beyond a limit, or a number in it is not
@@ -92,18 +92,16 @@ def unpacked(file: Path) -> dict[str, Any]:
         raise TaskError(f"{file} is not a checkpoint of morphgen train")
     digest = data.pop(HASH, None)
     _require_plain(data, str(file))
-    if digest is None:
-        _warn_of_no_hash(file)
-    elif digest != _digest(data):
+    if digest is not None and digest != _digest(data):
         raise TaskError(
             f"{file} is damaged: its content does not have the hash that was stored with it; use "
             "another copy"
         )
-    return {key: _copied(value) for key, value in data.items()}
+    return {key: _copied(value) for key, value in data.items()}, digest is not None
 
 
 @cache
-def _warn_of_no_hash(file: Path) -> None:
+def warn_of_no_hash(file: Path) -> None:
     """Warn once a file."""
     _log.warning(
         "morphgen: %s has no hash, as those of older versions: damage to it would not be noticed",

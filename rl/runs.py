@@ -14,7 +14,7 @@ from morphgen.errors import FormatError, TaskError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_of, write_atomic
 from morphgen.rl.checkpoint_content import require_fields, require_learner
-from morphgen.rl.checkpoint_file import packed, unpacked
+from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.sources import Source, most_obstacles
 from morphgen.tasks.actions import ActionKind
@@ -211,7 +211,7 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
     file = path / CHECKPOINT if path.is_dir() else path
     if not file.is_file():
         raise TaskError(f"{file}: no such checkpoint")
-    data = unpacked(file)
+    data, is_hashed = unpacked(file)
     if data.keys() != {"format", "run", "learner"}:
         raise TaskError(f"{file} is not a checkpoint of morphgen train")
     _require_format(file, data)
@@ -220,6 +220,8 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
     except TaskError as error:
         raise TaskError(f"{file}: {error}") from error
     require_learner(data["learner"], str(file))
+    if not is_hashed:
+        warn_of_no_hash(file)
     return config, data["learner"]
 
 
