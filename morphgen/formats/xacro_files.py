@@ -11,6 +11,7 @@ from xml.sax.saxutils import escape, quoteattr
 import yaml
 
 from morphgen.errors import FormatError
+from morphgen.formats.data_files import read_bytes
 from morphgen.formats.xacro_functions import MAX_SIZE, RefusedError, size_of
 
 MAX_FILE = 16 * 2**20
@@ -33,16 +34,10 @@ def read_file(path: Path) -> bytes:
         OSError: If it cannot be read.
         RefusedError: If it is no regular file, or too large.
     """
-    status = path.stat()
-    if not path.is_file():
-        raise RefusedError(f"{path} is no regular file")
-    if status.st_size > MAX_FILE:
-        raise RefusedError(f"{path} is larger than {MAX_FILE >> 20} MiB")
-    with path.open("rb") as file:
-        data = file.read(MAX_FILE + 1)
-    if len(data) > MAX_FILE:
-        raise RefusedError(f"{path} is larger than {MAX_FILE >> 20} MiB")
-    return data
+    try:
+        return read_bytes(path, MAX_FILE)
+    except FormatError as error:
+        raise RefusedError(str(error)) from error
 
 
 def place_of(node: Untyped) -> str:
