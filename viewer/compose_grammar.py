@@ -10,9 +10,10 @@ from pathlib import Path
 import viser
 
 from morphgen.errors import GrammarError
+from morphgen.grammar.choosers import First
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, outline
-from morphgen.grammar.derive import First, derive
+from morphgen.grammar.derive import derive
 from morphgen.grammar.model import (
     SUFFIX,
     Grammar,

@@ -21,8 +21,9 @@ from morphgen.benchmark.bodies import (
 from morphgen.benchmark.split import MADE_MAX_LINKS, Member, Regime, Split, Task
 from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError
+from morphgen.grammar.choosers import Random, Recorded
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import EndlessError, Random, Recorded, derive
+from morphgen.grammar.derive import EndlessError, derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
 

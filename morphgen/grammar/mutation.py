@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from morphgen.errors import GrammarError
+from morphgen.grammar.choosers import Choices, Random, Recorded
 from morphgen.grammar.conditions import clauses
-from morphgen.grammar.derive import Choices, EndlessError, Random, Recorded, derive
+from morphgen.grammar.derive import EndlessError, derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.model import Grammar
 from morphgen.grammar.sampling import MAX_ATTEMPTS, TOO_LARGE, Sample, SamplingError, build

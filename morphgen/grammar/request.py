@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from morphgen.errors import CompositionError, nearest
+from morphgen.grammar.choosers import First
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import First, derive
+from morphgen.grammar.derive import derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Kind, Manifest
 from morphgen.grammar.model import find_grammar, grammar_names, load_grammar

@@ -12,10 +12,11 @@ from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.card import rounded
 from morphgen.formats.fits import with_stored_fits
+from morphgen.grammar.choosers import Random, Recorded
 from morphgen.grammar.compose import TOUCH, join, survey_of
 from morphgen.grammar.conditions import Properties, clauses, holds
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import EndlessError, Random, Recorded, derive
+from morphgen.grammar.derive import EndlessError, derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_PARTS
 from morphgen.grammar.model import Grammar

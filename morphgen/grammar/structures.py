@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 
 from morphgen.errors import GrammarError
+from morphgen.grammar.choosers import First
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import EndlessError, First, Known, derive, fewest_parts
+from morphgen.grammar.derive import EndlessError, Known, derive, fewest_parts
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_COUNT, MAX_PARTS, MAX_SEARCH
 from morphgen.grammar.model import Grammar

@@ -9,7 +9,8 @@ import pytest
 from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults, variables
-from morphgen.grammar.derive import Random, derive
+from morphgen.grammar.choosers import Random
+from morphgen.grammar.derive import derive
 from morphgen.grammar.structures import count, enumerate_structures
 
 

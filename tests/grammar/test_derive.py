@@ -7,7 +7,8 @@ import pytest
 
 from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.derive import EndlessError, First, Random, Recorded, derive
+from morphgen.grammar.choosers import First, Random, Recorded
+from morphgen.grammar.derive import EndlessError, derive
 from morphgen.grammar.limits import MAX_PARTS
 
 

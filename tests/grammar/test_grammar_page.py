@@ -8,8 +8,9 @@ import pytest
 from grammars import LIBRARY, shipped, unphysical
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults
+from morphgen.grammar.choosers import Random
 from morphgen.grammar.conditions import PROPERTIES
-from morphgen.grammar.derive import Random, derive
+from morphgen.grammar.derive import derive
 from morphgen.grammar.model import find_grammar, load_grammar
 from morphgen.grammar.parameters import UNITS
 from morphgen.grammar.pinning import pin

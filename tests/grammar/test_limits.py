@@ -9,8 +9,9 @@ import pytest
 from grammars import LIBRARY, grammar
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults
+from morphgen.grammar.choosers import First, Random
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.grammar.derive import First, Random, derive
+from morphgen.grammar.derive import derive
 from morphgen.grammar.limits import MAX_COUNT, MAX_NESTING, MAX_PARTS
 from morphgen.grammar.model import grammar_text, load_grammar
 from morphgen.grammar.structures import SearchError, count, enumerate_structures

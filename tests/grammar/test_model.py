@@ -4,7 +4,8 @@ import pytest
 
 from grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.derive import First, derive
+from morphgen.grammar.choosers import First
+from morphgen.grammar.derive import derive
 from morphgen.grammar.model import (
     find_grammar,
     grammar_from_text,

@@ -4,7 +4,8 @@ import pytest
 
 from grammars import LIBRARY, grammar, shipped
 from morphgen.errors import MorphgenError
-from morphgen.grammar.derive import First, derive
+from morphgen.grammar.choosers import First
+from morphgen.grammar.derive import derive
 from morphgen.grammar.pinning import pin
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import sample

@@ -13,7 +13,8 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar import sampling
 from morphgen.grammar.analysis import faults
-from morphgen.grammar.derive import Random, derive
+from morphgen.grammar.choosers import Random
+from morphgen.grammar.derive import derive
 from morphgen.grammar.model import grammar_from_text, grammar_text
 from morphgen.grammar.sampling import SamplingError, draw, robot_name, sample
 from morphgen.grammar.structures import count
