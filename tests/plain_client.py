@@ -1,5 +1,6 @@
 """A client of a viewer that is no browser: it speaks viser's protocol over a real websocket."""
 
+import contextlib
 import socket
 import time
 import uuid
@@ -88,7 +89,12 @@ class PlainClient:
             of_kind = [each for each in self.messages if each["type"] == f"Gui{kind}Message"]
             return next((m["uuid"] for m in of_kind if m["props"]["label"] == label), None)
 
-        return self.until(found)
+        identity = self.until(found)
+        # viser sends a control before it listens to it: what comes later, or silence, tells that
+        # it does. A browser is never that quick.
+        with contextlib.suppress(TimeoutError):
+            self._take(self.websocket.recv(timeout=0.5))
+        return identity
 
     def change(self, control, value):
         """Change a control's value."""
