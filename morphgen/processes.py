@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import _thread
 import itertools
 import os
 import signal
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -27,12 +29,15 @@ Progress = Callable[[int, int], None]
 
 CHUNK = 8
 """Things that a worker does before it reports, unless told otherwise."""
+POLL = 0.2
+"""Seconds between a worker's looks at whether the parent has stopped."""
 PATIENCE = 5.0
 """Seconds to wait for an answer from a Ray cluster's address; Ray itself waits for minutes."""
 
 _work: Callable[[Any], object] | None = None
 _stopped: c_byte | None = None
 """Whether the parent has stopped; in memory of all its processes."""
+_is_working = False
 
 
 def unseen(done: int, total: int) -> None:
@@ -135,10 +140,25 @@ def prepare_worker() -> None:
 
 
 def _start(work: Callable[[Any], object], stopped: c_byte) -> None:
-    """Prepare a worker, which the parent lets finish the thing that it does."""
+    """Prepare a worker, whose work is interrupted when the parent stops."""
     global _work, _stopped
     prepare_worker()
     _work, _stopped = work, stopped
+    signal.signal(signal.SIGTERM, _interrupt)
+    threading.Thread(target=_interrupt_when_stopped, daemon=True).start()
+
+
+def _interrupt(*_: object) -> None:
+    """Interrupt the work as Ctrl-C would, so that it tidies up; a worker that waits goes on."""
+    if _is_working:
+        raise KeyboardInterrupt
+
+
+def _interrupt_when_stopped() -> None:
+    """Wait until the parent has stopped: a fit may have minutes to go by then."""
+    while _stopped is not None and not _stopped.value:
+        time.sleep(POLL)
+    _thread.interrupt_main(signal.SIGTERM)
 
 
 def _end_with_parent() -> None:
@@ -150,14 +170,15 @@ def _end_with_parent() -> None:
 
 
 def _do(things: Sequence[Any]) -> list[Any]:
+    global _is_working
     if _work is None or _stopped is None:
         raise RuntimeError("the worker was not prepared")
-    results: list[Any] = []
-    for thing in things:
-        if _stopped.value:  # nobody waits for the results any more
-            break
-        results.append(_work(thing))
-    return results
+    _is_working = True
+    try:
+        # Once the parent has stopped, nobody waits for the results.
+        return [_work(thing) for thing in things if not _stopped.value]
+    finally:
+        _is_working = False
 
 
 def require_ray() -> ModuleType:

@@ -15,6 +15,8 @@ MAX_WIDTH = 8192
 """Numbers of a layer of a network; the weights between two such layers are 256 MiB."""
 MAX_LAYERS = 100
 """Layers of a network."""
+MAX_STEPS = 16_384
+"""Steps of every environment between updates, which are held in memory."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,8 @@ class PPOConfig:
         """
         for name in ("transitions", "steps", "epochs", "minibatches"):
             _at_least(name, getattr(self, name), 1)
+        if self.steps > MAX_STEPS:
+            raise TaskError(f"steps {self.steps}: expected at most {MAX_STEPS}")
         for name in ("clip", "learning_rate", "adam_epsilon", "gradient_clip"):
             if not getattr(self, name) > 0:
                 raise TaskError(f"{name} {getattr(self, name):g}: expected more than 0")

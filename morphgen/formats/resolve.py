@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from itertools import product
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
@@ -125,8 +126,9 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
     """Return the file that a URI inside a robot description means.
 
     Understood are ``package://`` and ``model://`` (looked up by the finder), ``file://``, absolute
-    and relative paths (from the description's folder). A name is tried as written, then with its
-    ``%`` escapes decoded; backslashes count as slashes; letter case matters.
+    and relative paths (from the description's folder, then from the finder's ``root``). A name is
+    tried as written, then with its ``%`` escapes decoded; backslashes count as slashes; letter case
+    matters.
 
     A description may name files of ROS packages and of its own tree, nothing else. Its tree is the
     nearest folder above it with a ``package.xml``, else the nearest named ``*_description`` or
@@ -158,10 +160,12 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         folder = boundary = finder.find(package, base)
     else:
         folder, boundary = base.parent, _tree(base)
+    # A root also takes the place of a search path: PyBullet's data names meshes from its top folder.
+    folders = (folder, finder.root) if not scheme and finder.root else (folder,)
     missing = []
-    for name in dict.fromkeys([rest, unquote(rest)]):
+    for near, name in product(folders, dict.fromkeys([rest, unquote(rest)])):
         absolute = scheme in ("file", "") and Path(name).is_absolute()
-        path = Path(os.path.normpath(name if absolute else folder / name.lstrip("/")))
+        path = Path(os.path.normpath(name if absolute else near / name.lstrip("/")))
         inside = path.is_relative_to(boundary) or _is_in(path, [finder.root])
         if not inside and not (absolute and _may_name(path, finder)):
             raise FormatError(

@@ -246,6 +246,9 @@ def test_a_root_widens_the_tree(tmp_path: Path) -> None:
     assert resolve_uri("../../meshes/a.stl", urdf, finder) == mesh
     assert resolve_uri("package://hand/b.stl", urdf, finder) == packaged
     assert "leaves" in failure("../../../c.stl", urdf, finder)
+    assert resolve_uri("meshes/a.stl", urdf, finder) == mesh, "a name from the root, too"
+    near = touch(urdf.parent / "meshes" / "a.stl")
+    assert resolve_uri("meshes/a.stl", urdf, finder) == near, "the own folder comes first"
     with pytest.raises(FormatError, match="there is no such folder"):
         default_finder(root=tmp_path / "nowhere")
 

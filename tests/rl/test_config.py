@@ -21,6 +21,7 @@ def test_transitions_are_rounded_up_to_whole_updates():
         (lambda: PolicyConfig(mlp_width=0), "mlp_width 0: expected 1 or more"),
         (lambda: PolicyConfig(logit_scale=0.0), "logit_scale 0: expected more than 0"),
         (lambda: PPOConfig(steps=0), "steps 0: expected 1 or more"),
+        (lambda: PPOConfig(steps=10**9), "steps 1000000000: expected at most 16384"),
         (lambda: PPOConfig(clip=0.0), "clip 0: expected more than 0"),
         (lambda: PPOConfig(learning_rate=math.nan), "learning_rate nan: expected more than 0"),
         (lambda: PPOConfig(gamma=1.5), "gamma 1.5: expected 0 to 1"),
