@@ -160,7 +160,7 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         folder = boundary = finder.find(package, base)
     else:
         folder, boundary = base.parent, _tree(base)
-    # A root also takes the place of a search path: PyBullet's data names meshes from its top folder.
+    # A root also replaces a search path: PyBullet's data names meshes from its top folder.
     folders = (folder, finder.root) if not scheme and finder.root else (folder,)
     missing = []
     for near, name in product(folders, dict.fromkeys([rest, unquote(rest)])):
