@@ -23,9 +23,6 @@ test-all: $(STAMP)
 check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	# The folders beside morphgen/ install as its sub-packages; mypy sees them so through links.
-	rm -rf build/types && mkdir -p build/types/morphgen
-	ln -s $(CURDIR)/morphgen/* $(CURDIR)/rl $(CURDIR)/tasks $(CURDIR)/viewer build/types/morphgen/
 	$(BIN)/mypy
 
 view: demo

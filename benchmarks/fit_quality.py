@@ -45,11 +45,10 @@ import trimesh
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, fit_solid
 from morphgen.fitting.quality import Array, quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
-from morphgen.formats.fits import shapes_key
+from morphgen.formats.fits import shapes_key, shapes_to_fit
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
@@ -132,12 +131,12 @@ def _print(found: Mapping[str, Sequence[dict[str, float]]], peer: bool) -> None:
 def link_tasks(only: set[str]) -> list[Task]:
     """The links with shapes of the real arms, of all of them if none is named."""
     return [
-        Task(manifest.name, link.name, link_shapes(link))
+        Task(manifest.name, link.name, shapes_to_fit(link))
         for manifest in default_library().manifests("arm")
         if not manifest.is_template and not manifest.scaling
         if not only or manifest.name in only
         for link in load_part(manifest).body.links
-        if link_shapes(link)
+        if shapes_to_fit(link)
     ]
 
 

@@ -24,11 +24,10 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.errors import MorphgenError
-from morphgen.fitting.dressed import are_primitives, link_shapes
 from morphgen.fitting.link import FitOptions, fit_solid
 from morphgen.fitting.solid import solid_of
 from morphgen.formats.bundle import read_robot
-from morphgen.formats.fits import shapes_key
+from morphgen.formats.fits import are_primitives, shapes_key, shapes_to_fit
 from morphgen.model.geometry import Shape
 
 QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
@@ -86,7 +85,7 @@ def _links(words: list[str]) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
             refused.append(f"{path.name}: {str(error).removeprefix(str(path))}")
             continue
         for link in robot.links:
-            shapes = link_shapes(link)
+            shapes = shapes_to_fit(link)
             if not are_primitives(shapes) and (key := shapes_key(shapes)) not in seen:
                 seen.add(key)
                 found[f"{path.stem}:{link.name}"] = shapes

@@ -9,7 +9,7 @@ learn from it. Equal in all rows of a simulator and number of threads:
 
 - the environments: reach of one robot, the same batch made anew, with its padding and with the
   share of their episodes that has passed when they begin; stable-baselines3 gets it as
-  ``morphgen.tasks.vector.sb3_vector`` makes it. Continuous actions.
+  ``morphgen.tasks.sb3.sb3_vector`` makes it. Continuous actions.
 - steps, environments, epochs, minibatches and their size, and so the number of gradient steps;
   clip range, discount, lambda, entropy weight, Adam; one value and one policy network, apart.
 - threads of torch, and as many workers of the simulator (processes of PyBullet, threads of MuJoCo).

@@ -39,8 +39,9 @@ from tqdm import tqdm
 
 import morphgen
 from morphgen.checks.self_collision import SelfCollision
-from morphgen.fitting.dressed import are_primitives, as_primitives, with_primitives
+from morphgen.fitting.replace_collision import as_primitives, with_primitives
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.fits import are_primitives
 from morphgen.formats.mjcf import to_spec
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.inertia import bounding_box

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from morphgen.benchmark.split import robots
 from morphgen.benchmark.split_file import read_split
-from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import default_library
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.make import SIMULATORS, make_batch

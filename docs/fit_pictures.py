@@ -20,11 +20,11 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 import morphgen
-from morphgen.fitting.dressed import are_primitives, stored_primitives, with_primitives
 from morphgen.fitting.parts import COLLISION
+from morphgen.fitting.replace_collision import stored_primitives, with_primitives
 from morphgen.fitting.robot import fit_links
 from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
-from morphgen.formats.fits import read_stored, shapes_key
+from morphgen.formats.fits import are_primitives, read_stored, shapes_key
 from morphgen.formats.picture import render
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.geometry import Mesh, Rgba, Shape

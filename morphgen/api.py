@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from morphgen.checks import check, fix
-from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition

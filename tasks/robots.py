@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from morphgen.errors import CompositionError, nearest
-from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import CARD, read_robot
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import Library, default_library

@@ -1,4 +1,4 @@
-"""A batch of bodies as a vectorised environment of stable-baselines3, which must be installed."""
+"""A task batch as a vectorised environment of stable-baselines3."""
 
 from __future__ import annotations
 
@@ -8,13 +8,27 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
-from morphgen.errors import TaskError
+from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.spaces import NumpyObservation
 from morphgen.tasks.vector import TaskVector
 
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ModuleNotFoundError as error:
+    if error.name != "stable_baselines3":
+        raise
+    raise MissingDependencyError(
+        "stable-baselines3 is not installed: pip install stable-baselines3"
+    ) from error
+
 Indices = int | Iterable[int] | None
+
+
+def sb3_vector(batch: TaskBatch) -> SB3Vector:
+    """Return the batch as a ``VecEnv``, such as for stable-baselines3's ``PPO``."""
+    return SB3Vector(TaskVector(batch))
 
 
 class SB3Vector(VecEnv):

@@ -12,7 +12,7 @@ import numpy as np
 
 from morphgen.benchmark.split import Member, Task, member_robot
 from morphgen.errors import TaskError
-from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics

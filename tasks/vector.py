@@ -1,10 +1,10 @@
-"""A batch of bodies as a Gymnasium vector environment, and as one of stable-baselines3."""
+"""A task batch as a Gymnasium vector environment."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,14 +13,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from morphgen.benchmark.split import Task
-from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.errors import TaskError
 from morphgen.model.robot import Robot
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.spaces import NumpyObservation, action_space, arrays, observation_space
-
-if TYPE_CHECKING:
-    from morphgen.tasks.sb3 import SB3Vector
 
 Array = NDArray[Any]
 _TOLD = ("success", "distance", "score", "unstable")
@@ -95,23 +92,6 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
     def _require_open(self) -> None:
         if self.closed:
             raise TaskError("these environments are closed")
-
-
-def sb3_vector(batch: TaskBatch) -> SB3Vector:
-    """A batch as stable-baselines3 takes it, such as for ``PPO("MultiInputPolicy", ...)``.
-
-    Raises:
-        MissingDependencyError: If stable-baselines3 is not installed.
-    """
-    try:
-        from morphgen.tasks.sb3 import SB3Vector
-    except ModuleNotFoundError as error:
-        if error.name != "stable_baselines3":
-            raise
-        raise MissingDependencyError(
-            "stable-baselines3 is not installed: pip install stable-baselines3"
-        ) from error
-    return SB3Vector(TaskVector(batch))
 
 
 def reach_vector(num_envs: int, **options: Any) -> TaskVector:  # noqa: ANN401

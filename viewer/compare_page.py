@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from morphgen.benchmark.similarity import MEASURES, features
 from morphgen.benchmark.tokens import MAX_LINKS, tokens
 from morphgen.errors import MorphgenError
-from morphgen.fitting.dressed import are_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
-from morphgen.formats.fits import read_stored, stored_fit
+from morphgen.formats.fits import are_primitives, read_stored, stored_fit
 from morphgen.grammar.library import Library
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Robot

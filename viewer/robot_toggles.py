@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import viser
 
-from morphgen.fitting.dressed import as_primitives, stored_primitives
+from morphgen.fitting.replace_collision import as_primitives, stored_primitives
 from morphgen.formats.fits import read_stored
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose

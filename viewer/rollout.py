@@ -13,7 +13,7 @@ import torch
 
 from morphgen.benchmark.split import Task
 from morphgen.errors import MorphgenError, TaskError, nearest
-from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.model import SUFFIX
 from morphgen.rl.names import REFERENCES, references_for

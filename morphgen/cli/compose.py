@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     derivation, name = parse_words(args.words, library)
     robot = compose(derivation, library, name if args.name is None else args.name)
     if args.geometry == "primitive":
-        from morphgen.fitting.dressed import as_primitives
+        from morphgen.fitting.replace_collision import as_primitives
 
         robot = as_primitives(robot, library.folders)
     return write_and_report(robot, args)

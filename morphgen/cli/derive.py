@@ -108,7 +108,7 @@ def _replay(args: argparse.Namespace, derivation: Derivation) -> int:
     import tempfile
 
     from morphgen.errors import FormatError
-    from morphgen.fitting.dressed import as_primitives
+    from morphgen.fitting.replace_collision import as_primitives
     from morphgen.formats.bundle import CARD, URDF, write_bundle
     from morphgen.grammar.compose import compose
     from morphgen.grammar.robot_set import light_urdf

@@ -140,8 +140,8 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
     from dataclasses import replace
 
     from morphgen.fitting.agreement import agreement
-    from morphgen.fitting.dressed import with_fits, with_primitives
     from morphgen.fitting.parts import fits_of
+    from morphgen.fitting.replace_collision import with_fits, with_primitives
     from morphgen.formats.fits import read_stored
 
     robot, is_part = _target(args)
@@ -213,10 +213,10 @@ def _fit(robot: Robot, options: FitOptions, args: argparse.Namespace) -> FitRepo
     from tqdm import tqdm
 
     from morphgen.errors import FitError
-    from morphgen.fitting.dressed import link_shapes
     from morphgen.fitting.robot import fit_links
+    from morphgen.formats.fits import shapes_to_fit
 
-    links = sum(1 for link in robot.links if link_shapes(link))
+    links = sum(1 for link in robot.links if shapes_to_fit(link))
     if not links:
         raise FitError(f"{args.target}: no link has a shape")
     quiet = args.json or None

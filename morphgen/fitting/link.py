@@ -6,12 +6,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
-from morphgen.fitting.dressed import are_primitives
 from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, sampled
 from morphgen.fitting.solid import Solid, solid_of
-from morphgen.formats.fits import MOST_PRIMITIVES, shape_data
+from morphgen.formats.fits import MOST_PRIMITIVES, are_primitives, shape_data
 from morphgen.model.geometry import Shape
 
 

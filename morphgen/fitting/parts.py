@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import quality
 from morphgen.fitting.robot import FitReport, fit_links
@@ -19,6 +18,7 @@ from morphgen.formats.fits import (
     read_stored,
     shapes_key,
     shapes_scale,
+    shapes_to_fit,
     stored_text,
 )
 from morphgen.grammar.library import Library
@@ -73,7 +73,7 @@ def store_part(manifest: Manifest) -> Path:
     body = load_part(manifest).body
     fits = {}
     for row in fit_links(body, COLLISION).links:
-        shapes = link_shapes(body.link(row.link))
+        shapes = shapes_to_fit(body.link(row.link))
         fits[shapes_key(shapes)] = stored_of(row.link, shapes, row.fit).scaled(
             1 / shapes_scale(shapes)
         )
@@ -95,7 +95,7 @@ def fits_of(robot: Robot, report: FitReport, stored: Stored) -> dict[str, Stored
     """
     found = {}
     for row in report.links:
-        shapes, worth = link_shapes(robot.link(row.link)), row.fit.quality.iou
+        shapes, worth = shapes_to_fit(robot.link(row.link)), row.fit.quality.iou
         known = fit_of(shapes, robot, stored)
         found[row.link] = (
             replace(known, collision=row.fit.primitives, collision_iou=worth)
@@ -121,5 +121,5 @@ def stored_of(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
 
 def _keys(manifest: Manifest) -> set[str]:
     """Keys of links with meshes."""
-    links = (link_shapes(link) for link in load_part(manifest).body.links)
+    links = (shapes_to_fit(link) for link in load_part(manifest).body.links)
     return {shapes_key(shapes) for shapes in links if has_meshes(shapes)}

@@ -11,10 +11,10 @@ import numpy as np
 
 from morphgen.errors import FitError
 from morphgen.fitting.congruence import moved, representatives
-from morphgen.fitting.dressed import link_shapes
 from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.solid import Solid, solid_of
+from morphgen.formats.fits import shapes_to_fit
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Link, Robot
@@ -105,7 +105,7 @@ def fit_links(
         MorphgenError: If a process died.
     """
     links = [
-        link for link in robot.links if link_shapes(link) and (only is None or link.name in only)
+        link for link in robot.links if shapes_to_fit(link) and (only is None or link.name in only)
     ]
     solids = {link.name: _try_solid(link) for link in links}
     found = [link for link in links if isinstance(solids[link.name], Solid)]
@@ -143,7 +143,7 @@ def _fit_all(
     jobs: int,
     progress: Progress,
 ) -> dict[str, Attempt]:
-    work = [(link_shapes(link), _solid(solids[link.name])) for link in links]
+    work = [(shapes_to_fit(link), _solid(solids[link.name])) for link in links]
     attempts = mapped(partial(_try_fit, options), work, jobs, chunk=1)
     fits: dict[str, Attempt] = {}
     for link, fit in zip(links, attempts, strict=True):
@@ -162,7 +162,7 @@ def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> Atte
 
 def _try_solid(link: Link) -> Solid | FitError:
     try:
-        return solid_of(link_shapes(link))
+        return solid_of(shapes_to_fit(link))
     except FitError as error:
         return error
 

@@ -13,10 +13,10 @@ from platformdirs import user_cache_path
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.composite import composite
-from morphgen.fitting.dressed import are_primitives
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import keep
 from morphgen.formats.fits import (
+    are_primitives,
     fit_of,
     read_stored,
     shape_data,
@@ -25,10 +25,9 @@ from morphgen.formats.fits import (
     shapes_scale,
 )
 from morphgen.formats.rounding import rounded_shapes
-from morphgen.model.geometry import Shape
+from morphgen.model.geometry import Shape, scaled_shape
 from morphgen.model.inertia import union_moments
 from morphgen.model.robot import Robot
-from morphgen.model.scaling import scaled_shape
 
 _KEPT = "tokens-4"
 """Folder in the user's cache; the number rises when the same shapes are given another primitive."""

@@ -21,9 +21,18 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import number
 from morphgen.model.fits import Stored, StoredFit
-from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
-from morphgen.model.robot import Robot
-from morphgen.model.scaling import scaled_shape
+from morphgen.model.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    Geometry,
+    Mesh,
+    Pose,
+    Shape,
+    Sphere,
+    scaled_shape,
+)
+from morphgen.model.robot import Link, Robot
 
 SUFFIX = ".primitives.json"
 """Of the file beside a part's manifest."""
@@ -82,8 +91,18 @@ def shapes_key(shapes: Sequence[Shape]) -> str:
 
 
 def has_meshes(shapes: Iterable[Shape]) -> bool:
-    """Whether any shape is a mesh."""
+    """Return whether any shape is a mesh."""
     return any(isinstance(shape.geometry, Mesh) for shape in shapes)
+
+
+def are_primitives(shapes: Iterable[Shape]) -> bool:
+    """Return whether all shapes are boxes, cylinders and spheres."""
+    return all(isinstance(shape.geometry, Box | Cylinder | Sphere) for shape in shapes)
+
+
+def shapes_to_fit(link: Link) -> tuple[Shape, ...]:
+    """Return the shapes that primitives are fitted to: collision shapes, else visuals."""
+    return link.collisions or link.visuals
 
 
 def read_stored(folders: Iterable[Path]) -> dict[str, StoredFit]:

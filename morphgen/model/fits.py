@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from morphgen.model.geometry import Shape
-from morphgen.model.scaling import scaled_shape
+from morphgen.model.geometry import Shape, scaled_shape
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -158,3 +158,36 @@ def dimensions(primitive: Primitive) -> tuple[float, ...]:
             return (radius,)
         case Cylinder(radius, length) | Capsule(radius, length):
             return (radius, length)
+
+
+def scaled_shape(shape: Shape, factor: float) -> Shape:
+    """Return the shape scaled uniformly about the origin of its link's frame."""
+    return replace(
+        shape,
+        geometry=_geometry(shape.geometry, factor),
+        T_link_shape=scaled_pose(shape.T_link_shape, factor),
+    )
+
+
+def _geometry(geometry: Geometry, factor: float) -> Geometry:
+    match geometry:
+        case Box(size):
+            return Box(scaled_vector(size, factor))
+        case Sphere(radius):
+            return Sphere(factor * radius)
+        case Cylinder(radius, length):
+            return Cylinder(factor * radius, factor * length)
+        case Capsule(radius, length):
+            return Capsule(factor * radius, factor * length)
+        case Mesh():
+            return replace(geometry, scale=scaled_vector(geometry.scale, factor))
+
+
+def scaled_pose(pose: Pose, factor: float) -> Pose:
+    """Return the pose with its position multiplied by a factor."""
+    return pose if factor == 1.0 else Pose(scaled_vector(pose.position, factor), pose.quaternion)
+
+
+def scaled_vector(vector: Vec3, factor: float) -> Vec3:
+    """Return the vector multiplied by a factor."""
+    return (factor * vector[0], factor * vector[1], factor * vector[2])

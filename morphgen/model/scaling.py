@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import Pose, scaled_pose, scaled_shape, scaled_vector
 from morphgen.model.robot import Inertial, Joint, Link, Robot
 from morphgen.model.rotation import Vec3, rotate
 
@@ -43,27 +43,18 @@ def scaled(
             for j in robot.joints
         ),
         frames=tuple(
-            replace(f, T_link_frame=_pose(f.T_link_frame, factors.get(f.link, 1.0)))
+            replace(f, T_link_frame=scaled_pose(f.T_link_frame, factors.get(f.link, 1.0)))
             for f in robot.frames
         ),
     )
 
 
-def scaled_shape(shape: Shape, factor: float) -> Shape:
-    """A shape larger or smaller in all directions, about the origin of its link."""
-    return replace(
-        shape,
-        geometry=_geometry(shape.geometry, factor),
-        T_link_shape=_pose(shape.T_link_shape, factor),
-    )
-
-
 def _joint(joint: Joint, parent: float, child: float, face: Vec3 | None) -> Joint:
     """The joint on a parent of that factor, with the child's face held to the parent's."""
-    pose = _pose(joint.T_parent_joint, parent)
+    pose = scaled_pose(joint.T_parent_joint, parent)
     if face is None or parent == child:
         return replace(joint, T_parent_joint=pose)
-    x, y, z = _vector(rotate(pose.quaternion, face), parent - child)
+    x, y, z = scaled_vector(rotate(pose.quaternion, face), parent - child)
     position = (pose.position[0] + x, pose.position[1] + y, pose.position[2] + z)
     return replace(joint, T_parent_joint=Pose(position, pose.quaternion))
 
@@ -81,26 +72,6 @@ def _link(link: Link, factor: float) -> Link:
 
 def _inertial(body: Inertial, factor: float) -> Inertial:
     xx, xy, xz, yy, yz, zz = (factor**5 * value for value in body.inertia)
-    return Inertial(factor**3 * body.mass, _vector(body.com, factor), (xx, xy, xz, yy, yz, zz))
-
-
-def _geometry(geometry: Geometry, factor: float) -> Geometry:
-    match geometry:
-        case Box(size):
-            return Box(_vector(size, factor))
-        case Sphere(radius):
-            return Sphere(factor * radius)
-        case Cylinder(radius, length):
-            return Cylinder(factor * radius, factor * length)
-        case Capsule(radius, length):
-            return Capsule(factor * radius, factor * length)
-        case Mesh():
-            return replace(geometry, scale=_vector(geometry.scale, factor))
-
-
-def _pose(pose: Pose, factor: float) -> Pose:
-    return pose if factor == 1.0 else Pose(_vector(pose.position, factor), pose.quaternion)
-
-
-def _vector(vector: Vec3, factor: float) -> Vec3:
-    return (factor * vector[0], factor * vector[1], factor * vector[2])
+    return Inertial(
+        factor**3 * body.mass, scaled_vector(body.com, factor), (xx, xy, xz, yy, yz, zz)
+    )

@@ -306,7 +306,7 @@ def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatc
 
 
 def test_the_child_writes_no_file(tmp_path):
-    code = "from morphgen.formats.xacro_child import _limit; _limit(9, 2**30); "
+    code = "from morphgen.formats.xacro_server import _limit; _limit(9, 2**30); "
     write = "file = open('written', 'w'); file.write('a'); file.close()"
     done = subprocess.run(
         [sys.executable, "-c", code + write], capture_output=True, text=True, check=False

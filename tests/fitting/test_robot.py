@@ -12,19 +12,14 @@ from morphgen.cli import main
 from morphgen.errors import FitError
 from morphgen.fitting import token_shapes as token_shapes_module
 from morphgen.fitting.agreement import agreement
-from morphgen.fitting.dressed import (
-    as_primitives,
-    link_shapes,
-    stored_primitives,
-    with_primitives,
-)
 from morphgen.fitting.link import FitOptions, fit_shapes
 from morphgen.fitting.parts import COLLISION, TOKEN, parts_with_meshes, store_part
 from morphgen.fitting.quality import quality, signed_distance
+from morphgen.fitting.replace_collision import as_primitives, stored_primitives, with_primitives
 from morphgen.fitting.robot import fit_links
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.formats.fits import SUFFIX, read_stored, shapes_key
+from morphgen.formats.fits import SUFFIX, read_stored, shapes_key, shapes_to_fit
 from morphgen.formats.rounding import as_written
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.part import load_part
@@ -286,7 +281,7 @@ def test_what_is_stored_reproduces(name, options):
     body = load_part(LIBRARY.manifest(name)).body
     stored = read_stored(LIBRARY.folders)
     for row in fit_links(body, options).links:
-        shapes = link_shapes(body.link(row.link))
+        shapes = shapes_to_fit(body.link(row.link))
         fit = stored[shapes_key(shapes)]
         kept = (fit.token,) if options == TOKEN else fit.collision
         assert quality(solid_of(shapes), kept).iou == pytest.approx(row.fit.quality.iou, abs=0.01)

@@ -22,8 +22,7 @@ from morphgen.formats.fits import (
     stored_fit,
     stored_text,
 )
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.scaling import scaled_shape
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, scaled_shape
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.25, 1 / 3), (0.3, -0.5, 2.0))
 CAN = Shape(Cylinder(0.05, 0.3), TILTED)

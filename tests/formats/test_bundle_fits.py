@@ -11,7 +11,7 @@ import morphgen
 from morphgen.cli import main
 from morphgen.errors import FormatError
 from morphgen.fitting import token_shapes as module
-from morphgen.fitting.dressed import as_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.fits import FITS

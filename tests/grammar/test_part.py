@@ -12,8 +12,7 @@ from morphgen.grammar import part as module
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Box
-from morphgen.model.scaling import scaled_shape
+from morphgen.model.geometry import Box, scaled_shape
 from parts import PINCER, write_part
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre

@@ -3,6 +3,7 @@
 import sys
 import warnings
 from contextlib import closing
+from importlib import import_module
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 from morphgen.errors import MissingDependencyError, TaskError
 from morphgen.tasks import make_batch, registration
 from morphgen.tasks.config import BINS, PushConfig, ReachConfig
-from morphgen.tasks.vector import TaskVector, sb3_vector
+from morphgen.tasks.sb3 import sb3_vector
+from morphgen.tasks.vector import TaskVector
 
 ROBOTS, TASKS = ["arm3-stick", "prims"], ["reach", "push"]
 REACH, PUSH = ReachConfig(steps=12, goals=5), PushConfig(steps=9, starts=5)
@@ -202,7 +204,7 @@ def test_without_stable_baselines3_the_error_says_what_to_install(batch_of, monk
 
     monkeypatch.setattr(sys, "meta_path", [Missing(), *sys.meta_path])
     with pytest.raises(MissingDependencyError, match="pip install stable-baselines3"):
-        sb3_vector(batch_of())
+        import_module("morphgen.tasks.sb3")
 
 
 def test_gymnasium_makes_vectors_of_several_robots(cache):

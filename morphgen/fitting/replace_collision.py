@@ -1,4 +1,4 @@
-"""A robot in other clothes: primitives in place of its meshes, and the fits that say so."""
+"""Replace the collision meshes of a robot by fitted primitives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from morphgen.errors import FitError
 from morphgen.formats.fits import VERSION, fit_of, has_meshes, read_stored, shapes_key
 from morphgen.formats.rounding import as_written
 from morphgen.model.fits import Stored, StoredFit
-from morphgen.model.geometry import Box, Cylinder, Shape, Sphere
+from morphgen.model.geometry import Shape
 from morphgen.model.robot import Link, Robot
 
 
@@ -37,8 +37,7 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
         link.name for link in robot.links if link.name not in fits and has_meshes(link.collisions)
     ]
     if missing:
-        # The search needs torch, which takes seconds to load.
-        from morphgen.fitting.parts import COLLISION, fits_of
+        from morphgen.fitting.parts import COLLISION, fits_of  # loads torch, which takes seconds
         from morphgen.fitting.robot import fit_links
 
         report = fit_links(robot, COLLISION, only=missing)
@@ -84,7 +83,7 @@ def with_primitives(
     Raises:
         RobotError: If an axis is zero.
     """
-    links = tuple(_dressed(link, primitives.get(link.name), visual) for link in robot.links)
+    links = tuple(_with_collision(link, primitives.get(link.name), visual) for link in robot.links)
     made = as_written(replace(robot, links=links, ignore_pairs=()))
     return replace(made, ignore_pairs=survey(made).ignored)
 
@@ -112,12 +111,7 @@ def _known_fits(robot: Robot, stored: Stored) -> dict[str, StoredFit]:
     return {name: fit for name, fit in found.items() if fit}
 
 
-def link_shapes(link: Link) -> tuple[Shape, ...]:
-    """What is fitted: the collision shapes, or visuals where there are no others."""
-    return link.collisions or link.visuals
-
-
-def _dressed(link: Link, shapes: Sequence[Shape] | None, visual: bool) -> Link:
+def _with_collision(link: Link, shapes: Sequence[Shape] | None, visual: bool) -> Link:
     if shapes is None:
         shapes = () if has_meshes(link.collisions) else link.collisions
     shown = link.visuals[0].rgba if link.visuals else None
@@ -127,8 +121,3 @@ def _dressed(link: Link, shapes: Sequence[Shape] | None, visual: bool) -> Link:
         collisions=tuple(shapes) if link.collisions else (),
         visuals=coloured if visual and link.visuals and shapes else link.visuals,
     )
-
-
-def are_primitives(shapes: Sequence[Shape]) -> bool:
-    """Whether all shapes are boxes, cylinders and spheres."""
-    return all(isinstance(shape.geometry, Box | Cylinder | Sphere) for shape in shapes)
