@@ -90,7 +90,7 @@ def _cold(text: str, scratch: str) -> float:
 
 
 def _process(arguments: list[str]) -> float:
-    command = [sys.executable, "-m", "morphgen.cli", *arguments]
+    command = [sys.executable, "-m", "morphgen", *arguments]
     return _median(lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 5)
 
 

@@ -148,10 +148,10 @@ def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool
 
 
 def _morphgen(words: list[str]) -> int:
-    """Run a command as ``python -m morphgen.cli`` does; return its exit code."""
+    """Run a command as ``python -m morphgen`` does; return its exit code."""
     sys.argv[1:] = words
     try:
-        runpy.run_module("morphgen.cli", run_name="__main__")
+        runpy.run_module("morphgen", run_name="__main__")
     except SystemExit as end:
         return int(end.code or 0)
     return 0

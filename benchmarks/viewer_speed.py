@@ -48,7 +48,7 @@ FIRST = 5
 """Moves that do not count: loading the page shows some, and what is used the first time is slow."""
 PANDA = "?robot=words:arm=panda ee=panda_hand"
 CARD = ".card img"
-MORPHGEN = (sys.executable, "-m", "morphgen.cli")
+MORPHGEN = (sys.executable, "-m", "morphgen")
 Row = tuple[str, str]
 
 

@@ -1,29 +1,52 @@
 """morphgen: procedural robot morphologies with embedded tasks.
 
-``compose``, ``sample``, ``read``, ``write``, ``check``, ``fix`` and the room ``tasks`` are loaded
-when first used, so that ``import morphgen`` costs nothing; it tells Gymnasium of the environments
-``morphgen/Reach-v0`` and ``morphgen/Push-v0``.
+The public functions and the package ``tasks`` are loaded when first used, so that
+``import morphgen`` costs nothing; it tells Gymnasium of the environments ``morphgen/Reach-v0`` and
+``morphgen/Push-v0``.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
+from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 from morphgen.tasks.registration import register as _register_environments
 
 if TYPE_CHECKING:
+    from morphgen import tasks
     from morphgen.api import check, compose, fix, read, sample, write
+    from morphgen.errors import MorphgenError
+    from morphgen.model.robot import Robot
 
-__all__ = ["check", "compose", "fix", "read", "sample", "tasks", "write"]
+    __version__: str
+
+__all__ = [
+    "MorphgenError",
+    "Robot",
+    "__version__",
+    "check",
+    "compose",
+    "fix",
+    "read",
+    "sample",
+    "tasks",
+    "write",
+]
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return _import_module("importlib.metadata").version("morphgen")
     if name == "tasks":
-        return import_module("morphgen.tasks")
-    if name in __all__:
-        return getattr(import_module("morphgen.api"), name)
-    raise AttributeError(f"module 'morphgen' has no attribute {name!r}")
+        return _import_module("morphgen.tasks")
+    if name not in __all__:
+        raise AttributeError(f"module 'morphgen' has no attribute {name!r}")
+    homes = {"MorphgenError": "morphgen.errors", "Robot": "morphgen.model.robot"}
+    return getattr(_import_module(homes.get(name, "morphgen.api")), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 _register_environments()

@@ -23,27 +23,32 @@ __all__ = ["check", "compose", "fix", "read", "sample", "write"]
 
 
 def compose(
-    request: str,
+    request: str = "",
     *,
     name: str | None = None,
     geometry: Literal["mesh", "primitive"] = "mesh",
     library: Iterable[Path] = (),
+    **words: str | float,
 ) -> Robot:
     """Join parts into a robot.
 
     Args:
-        request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``, or a grammar and
-            what is pinned in it, such as ``chain beads=5``.
+        request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``, parts joined by
+            dashes, such as ``ur5-plane``, or a grammar and what is pinned in it, such as
+            ``chain beads=5``.
         name: The robot's name; by default from its parts.
         geometry: Collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres.
         library: Folders of your own parts.
+        **words: More words of the request: ``compose(arm="ur5", ee="plane")``; keys with a point
+            as ``**{"ee.size": "80mm"}``.
 
     Raises:
         MorphgenError: If the request names what does not exist or does not fit; the message
             says what does.
     """
     parts = default_library(library)
-    derivation, own = parse_words(request.split(), parts)
+    request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
+    derivation, own = parse_words(request_words, parts)
     robot = compose_derivation(derivation, parts, name or own)
     return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 

@@ -13,8 +13,9 @@ from morphgen.benchmark.split_reader import parse_split
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
+from morphgen.grammar.robot_source import is_robot_file
 from morphgen.tasks.goal_npz import Goals
-from morphgen.tasks.robots import is_file, robot_of
+from morphgen.tasks.robots import robot_of
 from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
 from morphgen.tasks.split_goals import read_goals, shipped_set
 
@@ -78,7 +79,7 @@ def robot_source(
         MorphgenError: As ``robot_of``.
     """
     return Source(
-        str(Path(robot).resolve()) if is_file(robot) else robot,
+        str(Path(robot).resolve()) if is_robot_file(robot) else robot,
         task=task,
         obstacles=obstacles,
         body=robot_hash(robot_of(robot, library=library)),

@@ -17,7 +17,7 @@ def tree(folder):
 def start(*argv, **environment):
     """Start ``morphgen`` with words and environment variables; its output is piped."""
     return subprocess.Popen(
-        [sys.executable, "-m", "morphgen.cli", *map(str, argv)],
+        [sys.executable, "-m", "morphgen", *map(str, argv)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -19,6 +19,35 @@ def test_compose_write_read_and_check(tmp_path):
     assert [f for f in morphgen.check(back) if f.severity != "info"] == []
 
 
+@pytest.mark.parametrize(
+    ("request_text", "words"),
+    [
+        ("arm=lwr ee=plane ee.size=80mm", {"arm": "lwr", "ee": "plane", "ee.size": 0.08}),
+        ("lwr-plane", {"arm": "lwr", "ee": "plane"}),
+    ],
+)
+def test_parts_may_be_keywords_or_joined_by_dashes(request_text, words):
+    robot, same = morphgen.compose(request_text), morphgen.compose(**words)
+    assert (robot.name, robot.links, robot.joints) == (same.name, same.links, same.joints)
+
+
+def test_the_package_shows_what_is_public():
+    assert dir(morphgen) == sorted(morphgen.__all__)
+    assert {"Robot", "MorphgenError", "__version__", "compose", "tasks"} <= set(dir(morphgen))
+    assert all(getattr(morphgen, name) is not None for name in dir(morphgen))
+    assert morphgen.MorphgenError is MorphgenError
+    with pytest.raises(AttributeError, match="no attribute 'composed'"):
+        _ = morphgen.composed
+
+
+def test_a_robot_prints_as_one_line():
+    robot = morphgen.compose("lwr-plane")
+    assert (
+        repr(robot)
+        == f"Robot('lwr-plane': {len(robot.links)} links, 7 independent joints, 16.11 kg)"
+    )
+
+
 def test_a_mistake_is_one_clear_error():
     with pytest.raises(MorphgenError, match="did you mean 'lwr'"):
         morphgen.compose("arm=lwrr")

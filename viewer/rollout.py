@@ -16,6 +16,7 @@ from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.model import SUFFIX
+from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.play import controller, demands, require_policy
 from morphgen.rl.rollouts import Controller
@@ -26,7 +27,7 @@ from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import moment
 from morphgen.tasks.gym_env import PushEnv, ReachEnv, TaskEnv
 from morphgen.tasks.make import SIMULATORS, SimulatorName
-from morphgen.tasks.robots import is_file, robot_of
+from morphgen.tasks.robots import robot_of
 from morphgen.viewer.episode import Array, Episode, Track
 from morphgen.viewer.places import (
     CHECKPOINT,
@@ -208,7 +209,7 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
         named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]
         return rows[0].task, any(row.obstacles for row in rows), named
     words = source.name.split()
-    if is_file(source.name):
+    if is_robot_file(source.name):
         robot = read_place(source.name, places)
     elif words and words[0].endswith(SUFFIX):
         robot = read_place(WORDS + source.name, places)

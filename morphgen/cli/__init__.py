@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import NoReturn
 
 from morphgen.cli import (
     check,
@@ -62,9 +63,21 @@ COMMANDS = (
 )
 
 
+class UsageError(MorphgenError):
+    """The words of the command line are not what the command takes."""
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as all of morphgen's are."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a ``UsageError`` with what is wrong and where the usage is."""
+        raise UsageError(f"morphgen: {message}; see {self.prog} --help")
+
+
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of every command; each sets ``run``, which returns the exit code."""
-    parser = argparse.ArgumentParser(
+    """Return the parser of every command; each sets ``run``, which returns the exit code."""
+    parser = OneLineParser(
         prog="morphgen", description="Author robot morphologies and put them to work."
     )
     parser.add_argument("--version", action="store_true", help="print the version and stop")
@@ -97,9 +110,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     parser = build_parser()
-    args, words = parser.parse_known_args(argv)
-    if any(word.startswith("-") for word in words) or not (words == [] or hasattr(args, "words")):
-        parser.error(f"unrecognized arguments: {' '.join(words)}")
+    try:
+        args, words = parser.parse_known_args(argv)
+        is_option = any(word.startswith("-") for word in words)
+        if is_option or not (words == [] or hasattr(args, "words")):
+            parser.error(f"unknown arguments: {' '.join(words)}")
+    except UsageError as error:
+        print(one_line(str(error)), file=sys.stderr)
+        return 2
     if words:
         args.words += words
     if args.version:

@@ -7,10 +7,19 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_root
+from morphgen.cli.options import (
+    Subparsers,
+    add_json,
+    add_library,
+    add_robots,
+    add_root,
+    library_of,
+    sources_named,
+)
 from morphgen.errors import one_line
 
 if TYPE_CHECKING:
+    from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.findings import Finding
 
 
@@ -22,7 +31,7 @@ def add_parser(commands: Subparsers) -> None:
         description="Say what is wrong with robots. Exit code 1 if there is an error "
         "(with --strict: or a warning).",
     )
-    parser.add_argument("robots", nargs="+", type=Path, help="bundles' folders, URDFs or xacros")
+    add_robots(parser)
     parser.add_argument("--strict", action="store_true", help="warnings fail, too")
     parser.add_argument(
         "--fix",
@@ -31,6 +40,7 @@ def add_parser(commands: Subparsers) -> None:
         help="write bundles with the safe repairs applied to this folder",
     )
     add_root(parser)
+    add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -40,51 +50,53 @@ def run(args: argparse.Namespace) -> int:
     failing = ("error", "warning") if args.strict else ("error",)
     report: dict[str, dict[str, list[dict[str, object]]]] = {}
     failed = False
-    for path in args.robots:
-        findings, repaired = _checked(path, args.fix, args.root)
-        report[str(path)] = {
+    for source in sources_named(args):
+        findings, repaired = _checked(source, args)
+        report[source.label] = {
             "findings": [finding.as_dict() for finding in findings],
             "repaired": [finding.as_dict() | {"repair": finding.repair} for finding in repaired],
         }
         failed |= any(finding.severity in failing for finding in findings)
         if not args.json:
-            _print(path, findings, repaired)
+            _print(source.label, findings, repaired)
     if args.json:
         print(json.dumps(report, indent=2))
     return int(failed)
 
 
 def _checked(
-    path: Path, fix_into: Path | None, root: Path | None
+    source: RobotSource, args: argparse.Namespace
 ) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
-    """What is wrong with a robot, and what was before its repair into a folder, if any."""
+    """Return a robot's findings, and those that its repair into ``--fix`` removed."""
     from morphgen.checks import check, fix
-    from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_robot, write_bundle
+    from morphgen.formats.bundle import CARD, bundle_folder, file_findings, write_bundle
     from morphgen.formats.urdf import UnsoundError
+    from morphgen.grammar.robot_source import read_source
 
     try:
-        robot = read_robot(path, root=root)
+        robot = read_source(source, library_of(args), args.root)
     except UnsoundError as error:
         return error.findings, ()
-    is_bundle = (path / CARD).is_file() or (path.parent / CARD).is_file()
-    folder = path if path.is_dir() else path.parent
-    files = file_findings(folder) if is_bundle else ()
-    if fix_into is None:
-        return (*check(robot, tool_required=is_bundle), *files), ()
+    folder = source.path if source.path is None or source.path.is_dir() else source.path.parent
+    is_bundle = folder is not None and (folder / CARD).is_file()
+    files = file_findings(folder) if folder is not None and is_bundle else ()
+    tool_required = is_bundle or source.path is None
+    if args.fix is None:
+        return (*check(robot, tool_required=tool_required), *files), ()
     robot, repaired = fix(robot)
-    findings = check(robot, tool_required=is_bundle)
-    write_bundle(robot, bundle_folder(fix_into, robot.name), findings)
+    findings = check(robot, tool_required=tool_required)
+    write_bundle(robot, bundle_folder(args.fix, robot.name), findings)
     return findings, repaired
 
 
-def _print(path: Path, findings: tuple[Finding, ...], repaired: tuple[Finding, ...]) -> None:
+def _print(label: str, findings: tuple[Finding, ...], repaired: tuple[Finding, ...]) -> None:
     for finding in repaired:
-        print(one_line(f"{path}: repaired {finding.code} at {finding.where}: {finding.repair}"))
+        print(one_line(f"{label}: repaired {finding.code} at {finding.where}: {finding.repair}"))
     counts = {
         severity: sum(finding.severity == severity for finding in findings)
         for severity in ("error", "warning", "info")
     }
-    print(one_line(f"{path}: " + ", ".join(f"{n} {what}" for what, n in counts.items())))
+    print(one_line(f"{label}: " + ", ".join(f"{n} {what}" for what, n in counts.items())))
     for finding in findings:
         print(
             "  " + one_line(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")

@@ -6,21 +6,44 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json
+from morphgen.cli.options import (
+    Subparsers,
+    add_json,
+    add_library,
+    add_robots,
+    add_root,
+    library_of,
+    sources_named,
+    whole_number,
+)
+
+if TYPE_CHECKING:
+    from morphgen.checks.conformance import ConformanceReport
+    from morphgen.grammar.robot_source import RobotSource
 
 
 def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "conform",
-        help="load bundles in every simulator and compare joints, mass and tool pose",
-        description="Load bundles in yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio and "
+        help="load robots in every simulator and compare joints, mass and tool pose",
+        description="Load robots in yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio and "
         "compare joints, mass and tool pose. Exit code 1 if one disagrees.",
     )
-    parser.add_argument("bundles", nargs="+", type=Path, help="bundles' folders")
-    parser.add_argument("--samples", type=int, default=100, help="configurations (default: 100)")
-    parser.add_argument("--seed", type=int, default=0)
+    add_robots(parser)
+    parser.add_argument(
+        "--samples",
+        type=whole_number(1, 100_000),
+        default=100,
+        metavar="N",
+        help="configurations (default: 100)",
+    )
+    parser.add_argument("--seed", type=whole_number(0), default=0)
+    add_root(parser)
+    add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -28,22 +51,37 @@ def add_parser(commands: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print a row a bundle and loader."""
     from tabulate import tabulate
+    from tqdm import tqdm
 
-    from morphgen.checks.conformance import conformance
-    from morphgen.errors import MorphgenError
-
-    if not 1 <= args.samples <= 100_000:
-        raise MorphgenError(f"--samples {args.samples}: expected 1 to 100000")
-    if args.seed < 0:
-        raise MorphgenError(f"--seed {args.seed}: expected 0 or more")
-    reports = [conformance(path, args.samples, args.seed) for path in args.bundles]
+    reports = {
+        source.label: _report(source, args)
+        for source in tqdm(
+            sources_named(args), unit="robot", leave=False, disable=args.json or None
+        )
+    }
     if args.json:
-        print(json.dumps([asdict(report) for report in reports], indent=2, default=str))
+        print(json.dumps([asdict(report) for report in reports.values()], indent=2, default=str))
     else:
         rows = [
-            {"robot": path.name, **asdict(row)}
-            for path, report in zip(args.bundles, reports, strict=True)
+            {"robot": Path(label).name, **asdict(row)}
+            for label, report in reports.items()
             for row in report.rows
         ]
         print(tabulate(rows, headers="keys", floatfmt=".2g"))
-    return 0 if all(report.passed for report in reports) else 1
+    return 0 if all(report.passed for report in reports.values()) else 1
+
+
+def _report(source: RobotSource, args: argparse.Namespace) -> ConformanceReport:
+    """Load the bundle, or one that is written for it: loaders read files."""
+    from morphgen.checks import check
+    from morphgen.checks.conformance import conformance
+    from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
+    from morphgen.grammar.robot_source import read_source
+
+    if source.path is not None and (source.path / CARD).is_file():
+        return conformance(source.path, args.samples, args.seed)
+    robot = read_source(source, library_of(args), args.root)
+    with TemporaryDirectory() as folder:
+        bundle = bundle_folder(Path(folder), robot.name)
+        write_bundle(robot, bundle, check(robot), picture=False)
+        return conformance(bundle, args.samples, args.seed)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_json, add_library, library_of, whole_number
 
 if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
@@ -37,8 +37,8 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument(
         "robot", type=Path, help="a robot's folder in a set made by morphgen sample"
     )
-    parser.add_argument("-n", type=int, default=10, help="how many (default: 10)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("-n", type=whole_number(1), default=10, help="how many (default: 10)")
+    parser.add_argument("--seed", type=whole_number(0), default=0)
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: <set>-mutants")
     parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
     add_library(parser)

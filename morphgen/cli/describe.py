@@ -5,10 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_root
+from morphgen.cli.options import (
+    Subparsers,
+    add_json,
+    add_library,
+    add_robot,
+    add_root,
+    robot_named,
+)
 
 if TYPE_CHECKING:
     from morphgen.model.robot import Joint, Robot
@@ -21,17 +27,16 @@ def add_parser(commands: Subparsers) -> None:
         help="print a robot's link tree with joints, limits, masses and frames",
         description="Print a robot's link tree with joints, limits, masses and frames.",
     )
-    parser.add_argument("robot", type=Path, help="a bundle's folder, a URDF or a xacro")
+    add_robot(parser)
     add_root(parser)
+    add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the tree."""
-    from morphgen.formats.bundle import read_robot
-
-    robot = read_robot(args.robot, root=args.root)
+    robot = robot_named(args)
     print(json.dumps(_data(robot), indent=2) if args.json else _text(robot))
     return 0
 

@@ -9,7 +9,15 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, add_root, library_of
+from morphgen.cli.options import (
+    Subparsers,
+    add_jobs,
+    add_json,
+    add_library,
+    add_root,
+    library_of,
+    whole_number,
+)
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
@@ -71,14 +79,14 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
     parser.add_argument(
         "--configurations",
-        type=int,
+        type=whole_number(1),
         default=CONFIGURATIONS,
         metavar="N",
         help=f"compare collisions in so many configurations (default: {CONFIGURATIONS}; "
         "with --out)",
     )
     add_jobs(parser)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=whole_number(0), default=0)
     add_root(parser)
     add_library(parser)
     add_json(parser)
@@ -91,10 +99,6 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.fitting.link import FitOptions
     from morphgen.model.mesh import SUFFIXES
 
-    if args.jobs < 1 or args.configurations < 1:
-        raise MorphgenError(
-            f"--jobs {args.jobs} --configurations {args.configurations}: both start at 1"
-        )
     if args.all == bool(args.target):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     try:

@@ -8,7 +8,7 @@ import json
 import math
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_json, add_library, library_of, whole_number
 
 if TYPE_CHECKING:
     from morphgen.grammar.model import Grammar
@@ -30,18 +30,22 @@ def add_parser(commands: Subparsers) -> None:
         action = actions.add_parser(name, help=summary, description=summary)
         action.add_argument("grammar", help="a grammar's name or file")
         if name == "enumerate":
-            action.add_argument("--limit", type=int, default=50, help="default: 50")
+            action.add_argument(
+                "--limit", type=whole_number(0), default=50, metavar="N", help="default: 50"
+            )
         add_library(action)
         add_json(action)
         action.set_defaults(run=run)
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print the names."""
-    from morphgen.grammar.model import grammar_names
+    """Print the names and what their robots are."""
+    from tabulate import tabulate
 
-    names = grammar_names()
-    print(json.dumps(names) if args.json else "\n".join(names))
+    from morphgen.grammar.model import grammar_names, grammar_summary
+
+    rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
+    print(json.dumps(rows) if args.json else tabulate(rows, headers="keys"))
     return 0
 
 
@@ -87,11 +91,8 @@ def run_count(args: argparse.Namespace) -> int:
 
 def run_enumerate(args: argparse.Namespace) -> int:
     """Print a derivation a line."""
-    from morphgen.errors import GrammarError
     from morphgen.grammar.structures import enumerate_structures
 
-    if args.limit < 0:
-        raise GrammarError(f"--limit {args.limit}: expected 0 or more")
     structures = enumerate_structures(_load(args), library_of(args))
     texts = map(str, itertools.islice(structures, args.limit))
     if args.json:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
     from morphgen.grammar.library import Library
+    from morphgen.grammar.robot_source import RobotSource
+    from morphgen.model.robot import Robot
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -22,6 +25,44 @@ def add_library(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a folder of your own parts (also: MORPHGEN_LIBRARY); may be repeated",
     )
+
+
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Return a type for argparse: a whole number from ``least`` to ``most``.
+
+    Args:
+        least: The smallest valid number.
+        most: The largest; None for no limit.
+    """
+    valid = f"{least} or more" if most is None else f"{least} to {most}"
+
+    def parse(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = least - 1
+        if number < least or (most is not None and number > most):
+            raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
+        return number
+
+    return parse
+
+
+ROBOT_HELP = (
+    "a bundle's folder, a URDF or a xacro, parts such as ur5-plane, or words of morphgen compose, "
+    "such as arm=ur5 ee=plane"
+)
+ROBOTS_HELP = f"{ROBOT_HELP}; a set of morphgen sample or a folder of bundles is all its robots"
+
+
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Let the user name a robot."""
+    parser.add_argument("words", nargs="+", metavar="ROBOT", help=ROBOT_HELP)
+
+
+def add_robots(parser: argparse.ArgumentParser) -> None:
+    """Let the user name one or several robots."""
+    parser.add_argument("words", nargs="+", metavar="ROBOT", help=ROBOTS_HELP)
 
 
 def add_root(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +94,9 @@ def add_max_links(parser: argparse.ArgumentParser) -> None:
 
 def add_jobs(parser: argparse.ArgumentParser) -> None:
     """Let the user choose how many processes work."""
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    parser.add_argument(
+        "--jobs", type=whole_number(1), default=1, metavar="N", help="processes (default: 1)"
+    )
 
 
 def add_out(parser: argparse.ArgumentParser) -> None:
@@ -65,6 +108,43 @@ def add_out(parser: argparse.ArgumentParser) -> None:
         "--name", help="the robot's name and its folder's (default: from its parts)"
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
+
+
+def sources_named(args: argparse.Namespace) -> list[RobotSource]:
+    """Return the robots that the arguments name, one or several.
+
+    Raises:
+        MorphgenError: If a word names no robot.
+    """
+    from morphgen.grammar.robot_source import find_robots
+
+    sources = find_robots(args.words, library_of(args))
+    _require_files(sources, args)
+    return sources
+
+
+def robot_named(args: argparse.Namespace) -> Robot:
+    """Return the one robot that the arguments name.
+
+    Raises:
+        MorphgenError: If they name none or several, or it is broken.
+    """
+    from morphgen.grammar.robot_source import find_robot, read_source
+
+    library = library_of(args)
+    source = find_robot(" ".join(args.words), library)
+    _require_files([source], args)
+    return read_source(source, library, args.root)
+
+
+def _require_files(sources: list[RobotSource], args: argparse.Namespace) -> None:
+    from morphgen.errors import FormatError
+
+    if args.root is not None and (composed := [s for s in sources if s.path is None]):
+        raise FormatError(
+            f"--root {args.root}: {composed[0].label} is composed; expected a bundle, a URDF or a "
+            "xacro"
+        )
 
 
 def library_of(args: argparse.Namespace) -> Library:

@@ -6,7 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
+from morphgen.cli.options import (
+    Subparsers,
+    add_jobs,
+    add_json,
+    add_library,
+    library_of,
+    whole_number,
+)
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -18,8 +25,10 @@ def add_parser(commands: Subparsers) -> None:
         "was when run again; the same seed gives the same robots, with any --jobs.",
     )
     parser.add_argument("grammar", help="a grammar's name or file (see: morphgen grammar list)")
-    parser.add_argument("-n", type=int, default=10, help="how many robots (default: 10)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "-n", type=whole_number(1), default=10, help="how many robots (default: 10)"
+    )
+    parser.add_argument("--seed", type=whole_number(0), default=0)
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: robots/<grammar>")
     parser.add_argument(
         "--where",
@@ -59,11 +68,6 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.grammar.syntax import parse_condition
     from morphgen.grammar.workers import make_in_processes
 
-    if args.n < 1 or args.jobs < 1 or args.seed < 0:
-        raise GrammarError(
-            f"-n {args.n} --jobs {args.jobs} --seed {args.seed}: "
-            "-n and --jobs start at 1, --seed at 0"
-        )
     library = library_of(args)
     grammar = load_grammar(find_grammar(args.grammar, library.folders), library.folders)
     wrong = faults(grammar, library)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +14,10 @@ from morphgen.cli.options import (
     add_json,
     add_library,
     add_max_links,
+    add_robots,
     add_root,
     library_of,
+    sources_named,
 )
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
     from morphgen.benchmark.similarity import Features
     from morphgen.grammar.library import Library
-    from morphgen.model.robot import Robot
+    from morphgen.grammar.robot_source import RobotSource
 
     Matrices = dict[str, NDArray[np.float64]]
 
@@ -43,13 +45,7 @@ def add_parser(commands: Subparsers) -> None:
         epilog="examples: morphgen similarity robots/ur5-plane robots/panda-stick; "
         "morphgen similarity robots/arm3 --measure all --heatmap arm3.png",
     )
-    parser.add_argument(
-        "paths",
-        nargs="+",
-        type=Path,
-        metavar="PATH",
-        help="bundles' folders, URDFs, xacros, sets of morphgen sample, or folders of bundles",
-    )
+    add_robots(parser)
     parser.add_argument(
         "--measure",
         choices=MEASURES,
@@ -76,11 +72,11 @@ def run(args: argparse.Namespace) -> int:
     measures = MEASURES[:-1] if args.measure == "all" else (args.measure,)
     _require_writable(args)
     library = library_of(args)
-    places = list(dict.fromkeys(p for path in args.paths for p in _places(path)))
-    if len(places) < 2:
-        raise BenchmarkError(f"{places[0]} is one robot; name others to compare it with")
-    robots = _features(places, library, args)
-    names = _names(robots, places)
+    sources = sources_named(args)
+    if len(sources) < 2:
+        raise BenchmarkError(f"{sources[0].label} is one robot; name others to compare it with")
+    robots = _features(sources, library, args)
+    names = _names(robots, sources)
     matrices = _matrices(robots, measures, quiet=args.json)
     written = _write(args, names, matrices)
     if args.json:
@@ -113,75 +109,34 @@ def _require_writable(args: argparse.Namespace) -> None:
             raise BenchmarkError(f"{option} {path}: {why}")
 
 
-def _places(path: Path) -> Iterator[Path]:
-    """The robots that a path means: itself, or those of a set or folder."""
-    from morphgen.errors import FormatError
-    from morphgen.grammar.robot_set import INDEX, SETTINGS, read_index
-
-    if not path.exists():
-        raise FormatError(f"{path}: no such file or folder")
-    if path.is_file() or _is_robot(path):
-        yield path
-    elif (path / INDEX).is_file() or (path / SETTINGS).is_file():
-        yield from (path / record["name"] for record in read_index(path))
-    else:
-        found = sorted(folder for folder in path.iterdir() if _is_robot(folder))
-        if not found:
-            raise FormatError(
-                f"{path} holds no robot; name a bundle, a URDF, a set of morphgen sample, or a "
-                "folder of bundles"
-            )
-        yield from found
-
-
-def _is_robot(folder: Path) -> bool:
-    from morphgen.formats.bundle import CARD
-    from morphgen.grammar.robot_set import DERIVATION
-
-    return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
-
-
-def _read(path: Path, library: Library, root: Path | None) -> Robot:
-    """A robot; one of a light set from its derivation, because its URDF knows no home."""
-    from morphgen.formats.bundle import CARD, read_robot
-    from morphgen.formats.data_files import read_text
-    from morphgen.grammar.compose import compose
-    from morphgen.grammar.derivation import parse_derivation
-    from morphgen.grammar.limits import MAX_DERIVATION_TEXT
-    from morphgen.grammar.robot_set import DERIVATION
-
-    light = path / DERIVATION
-    if not light.is_file() or (path / CARD).is_file():
-        return read_robot(path, root=root)
-    derivation = parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
-    return compose(derivation, library, path.resolve().name)
-
-
-def _features(places: Sequence[Path], library: Library, args: argparse.Namespace) -> list[Features]:
+def _features(
+    sources: Sequence[RobotSource], library: Library, args: argparse.Namespace
+) -> list[Features]:
     from tqdm import tqdm
 
     from morphgen.benchmark.similarity import features
     from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.errors import BenchmarkError
     from morphgen.fitting.token_shapes import token_shapes
+    from morphgen.grammar.robot_source import read_source
 
     made = []
     max_links = MAX_LINKS if args.max_links is None else args.max_links
-    bar = tqdm(places, unit="robot", file=sys.stderr, disable=args.json or None, leave=False)
-    for path in bar:
-        robot = _read(path, library, args.root)
+    bar = tqdm(sources, unit="robot", file=sys.stderr, disable=args.json or None, leave=False)
+    for source in bar:
+        robot = read_source(source, library, args.root)
         try:
             shapes = token_shapes(robot, library.folders)
             made.append(features(robot, shapes, max_links=max_links))
         except BenchmarkError as error:
-            raise BenchmarkError(f"{path}: {error}") from error
+            raise BenchmarkError(f"{source.label}: {error}") from error
     return made
 
 
-def _names(robots: Sequence[Features], places: Sequence[Path]) -> list[str]:
-    """The robots' names; their paths if two have the same."""
+def _names(robots: Sequence[Features], sources: Sequence[RobotSource]) -> list[str]:
+    """Return the robots' names, or how the user named them if two names are the same."""
     names = [robot.name for robot in robots]
-    return names if len(set(names)) == len(names) else [str(path) for path in places]
+    return names if len(set(names)) == len(names) else [source.label for source in sources]
 
 
 def _matrices(robots: Sequence[Features], measures: Sequence[str], *, quiet: bool) -> Matrices:

@@ -10,17 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import (
+    ROBOT_HELP,
     Subparsers,
     add_json,
     add_library,
     add_max_links,
     add_root,
     library_of,
+    robot_named,
 )
 
 if TYPE_CHECKING:
     from morphgen.benchmark.token_layout import Array
-    from morphgen.grammar.library import Library
     from morphgen.model.geometry import Shape
     from morphgen.model.robot import Robot
 
@@ -52,8 +53,7 @@ def add_parser(commands: Subparsers) -> None:
         "words",
         nargs="*",
         metavar="ROBOT",
-        help="a bundle's folder, a URDF or a xacro, or words of morphgen compose, such as "
-        "arm=ur5 ee=plane",
+        help=ROBOT_HELP,
     )
     parser.add_argument("--layout", action="store_true", help="print the fields of a token")
     parser.add_argument(
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         raise BenchmarkError(f"--out {args.out}: expected a name that ends in .npz")
     library = library_of(args)
     max_links = MAX_LINKS if args.max_links is None else args.max_links
-    robot = _robot(args.words, library, args.root)
+    robot = robot_named(args)
     require_max_links(len(robot.links), f"robot {robot.name!r}", max_links)
     made = tokens(robot, token_shapes(robot, library.folders), max_links=max_links)
     if args.out:
@@ -97,26 +97,6 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         print(args.out)
     return 0
-
-
-def _robot(words: list[str], library: Library, root: Path | None) -> Robot:
-    """The robot that a path or words of a request name."""
-    from morphgen.errors import FormatError
-    from morphgen.formats.bundle import read_robot
-    from morphgen.grammar.compose import compose
-    from morphgen.grammar.model import SUFFIX
-    from morphgen.grammar.request import parse_words
-
-    path = Path(words[0])
-    if len(words) == 1 and "=" not in words[0] and path.suffix != SUFFIX:
-        if path.exists():
-            return read_robot(path, root=root)
-        if len(path.parts) > 1 or path.suffix:
-            raise FormatError(f"{path}: no such file or folder")
-    if root is not None:
-        raise FormatError(f"--root {root}: only with a bundle, a URDF or a xacro")
-    derivation, name = parse_words(words, library)
-    return compose(derivation, library, name)
 
 
 def _write(path: Path, tokens: Array, robot: Robot, max_links: int) -> None:

@@ -9,7 +9,7 @@ import time
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library
+from morphgen.cli.options import Subparsers, add_library, whole_number
 
 if TYPE_CHECKING:
     from morphgen.viewer.app import Viewer
@@ -44,7 +44,7 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to bind (default: this machine)"
     )
-    parser.add_argument("--port", type=int, default=8080)
+    parser.add_argument("--port", type=whole_number(1, 65535), default=8080)
     parser.add_argument(
         "--allow-origin",
         action="append",
@@ -59,11 +59,8 @@ def add_parser(commands: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted."""
-    from morphgen.errors import MorphgenError
     from morphgen.viewer.app import serve
 
-    if not 0 < args.port < 65536:
-        raise MorphgenError(f"--port {args.port}: expected 1 to 65535")
     for name in _ENDS:
         signal.signal(name, _interrupt)
     try:

@@ -55,6 +55,12 @@ def grammar_names() -> list[str]:
     return sorted(path.stem for path in _shipped().glob(f"*{SUFFIX}"))
 
 
+def grammar_summary(name: str) -> str:
+    """Return what the first comment of a grammar that comes with morphgen says of its robots."""
+    with (_shipped() / f"{name}{SUFFIX}").open(encoding="utf-8") as lines:
+        return lines.readline().partition(": ")[2].strip()
+
+
 def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
     """The file of a grammar.
 

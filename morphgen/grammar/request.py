@@ -11,7 +11,7 @@ from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import derive
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Kind, Manifest
-from morphgen.grammar.model import find_grammar, grammar_names, load_grammar
+from morphgen.grammar.model import SUFFIX, find_grammar, grammar_names, load_grammar
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
 from morphgen.grammar.pinning import pin
 
@@ -37,22 +37,58 @@ class _Slot:
 
 
 def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str]:
-    """Read words into a derivation and a name for its robot.
+    """Return the derivation that words describe, and a name for its robot.
 
-    The words are a request (see ``parse_request``), or a grammar's name and what is pinned in it
-    (see ``morphgen.grammar.pinning.pin``): then the grammar's first alternatives, smallest counts
-    and typical values are taken.
+    The words are one of: ``key=value`` words (see ``parse_request``); a grammar's name and what is
+    pinned in it (see ``morphgen.grammar.pinning.pin``), of which the first alternatives, smallest
+    counts and typical values are taken; or parts joined by dashes, each of which goes to the slot
+    of its kind: ``ur5-plane`` is ``arm=ur5 ee=plane``.
 
     Raises:
         MorphgenError: If the words name what does not exist or does not fit.
     """
-    is_part = words[0] in library.paths and words[0] not in grammar_names() if words else True
-    if is_part or "=" in words[0]:
-        derivation = parse_request(words, library)
-        return derivation, default_name(derivation, library)
-    grammar = load_grammar(find_grammar(words[0], library.folders), library.folders)
-    derivation = derive(pin(grammar, words[1:], library), library, First())
-    return derivation, "-".join([grammar.name, *([derivation.digest[:8]] if words[1:] else [])])
+    if not words:
+        raise CompositionError(
+            "no robot is named; expected one such as ur5-plane or arm=ur5 ee=plane"
+        )
+    first = words[0]
+    grammars = known_grammars(library)
+    if first in grammars or first.endswith(SUFFIX):
+        grammar = load_grammar(find_grammar(first, library.folders), library.folders)
+        derivation = derive(pin(grammar, words[1:], library), library, First())
+        return derivation, "-".join([grammar.name, *([derivation.digest[:8]] if words[1:] else [])])
+    if "=" not in first and len(words) > 1 and first not in library.paths:
+        raise CompositionError(
+            f"robot {' '.join(words)!r}: {first!r} is neither a grammar nor of the form key=value"
+            + nearest(first, grammars)
+        )
+    if "=" not in first and len(words) == 1:
+        words = [_slot_word(part, first, library) for part in first.split("-")]
+    derivation = parse_request(words, library)
+    return derivation, default_name(derivation, library)
+
+
+def known_grammars(library: Library) -> set[str]:
+    """Return the names of morphgen's grammars and of those in the user's folders."""
+    own = (path.stem for folder in library.folders for path in folder.rglob(f"*{SUFFIX}"))
+    return {*grammar_names(), *own}
+
+
+def _slot_word(part: str, text: str, library: Library) -> str:
+    """The part with its slot, such as ``arm=ur5``."""
+    if part not in library.paths:
+        names = {name for kind in SLOTS for name in library.names(kind)} | known_grammars(library)
+        raise CompositionError(
+            f"robot {text!r}: there is no such bundle or URDF, and {part!r} is no part"
+            + nearest(part, names)
+        )
+    kind = library.manifest(part).kind
+    if kind not in SLOTS:
+        raise CompositionError(
+            f"robot {text!r}: {part!r} is a {kind}, which only a grammar can place"
+            + nearest(part, known_grammars(library))
+        )
+    return f"{kind}={part}"
 
 
 def parse_request(words: Sequence[str], library: Library) -> Derivation:
@@ -130,11 +166,18 @@ def _slots(words: Sequence[str]) -> dict[str, _Slot]:
     for key, value in values.items():
         owner, _, name = key.rpartition(".")
         if owner not in slots:
-            raise CompositionError(
-                f"{key}={value}: no part is chosen for {owner or key!r}{nearest(owner, slots)}"
-            )
+            raise CompositionError(_unknown_key(key, value, owner, slots))
         slots[owner].values[name] = value
     return slots
+
+
+def _unknown_key(key: str, value: str, owner: str, slots: Mapping[str, _Slot]) -> str:
+    if owner:
+        return f"{key}={value}: no part is chosen for {owner!r}{nearest(owner, slots)}"
+    return (
+        f"{key}={value}: unknown key {key!r}; expected {', '.join(SLOTS)}, a limb such as left.arm "
+        "or left.ee, or a parameter of a part such as ee.size"
+    )
 
 
 def _limbs(

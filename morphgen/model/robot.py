@@ -166,6 +166,13 @@ class Robot:
     fits: Stored = field(default_factory=dict)
     """Primitives that are known of its links' collision shapes, by the content of these."""
 
+    def __repr__(self) -> str:
+        """Return one line; the fields would fill pages."""
+        return (
+            f"Robot({self.name!r}: {len(self.links)} links, {self.dof} independent joints, "
+            f"{self.mass:.4g} kg)"
+        )
+
     def __post_init__(self) -> None:
         if not self.links:
             raise RobotError(f"robot {self.name!r} has no links")

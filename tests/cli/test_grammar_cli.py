@@ -54,14 +54,12 @@ def test_sample_reads_a_grammar_file(run, mine):
     ]
 
 
-def test_where_a_light_robot_will_not_do_its_urdf_is_named(run, cubes):
-    code, out, err = run("show", cubes / "cubes-000001")
-    assert (code, out) == (2, "")
-    assert err == (
-        "morphgen: set/cubes-000001 is no bundle: it has no card.json; name its robot.urdf, "
-        "or make it again without --light\n"
-    )
-    assert run("show", cubes / "cubes-000001" / "robot.urdf")[0] == 0
+def test_robots_of_a_light_set_and_the_whole_set_are_robots_for_every_command(run, cubes):
+    for robot in (cubes / "cubes-000001", cubes / "cubes-000001" / "robot.urdf"):
+        assert run("show", robot)[1].startswith("cubes-000001: ")
+    code, out, _ = run("check", cubes)
+    assert code == 0
+    assert out.count(": 0 error, 0 warning") == len(list(cubes.glob("cubes-*")))
 
 
 def test_sample_writes_bundles_with_a_picture_unless_told_otherwise(run):
@@ -115,9 +113,9 @@ def test_several_conditions_all_hold(run):
     [
         ("sample cubse", "unknown grammar 'cubse'; did you mean 'cubes'? valid: arm3, arm5"),
         ("sample nowhere.grammar", "nowhere.grammar: no such file"),
-        ("sample cubes -n 0", "-n 0 --jobs 1 --seed 0: -n and --jobs start at 1, --seed at 0"),
-        ("sample cubes --jobs 0", "-n and --jobs start at 1"),
-        ("sample cubes --seed -1", "--seed at 0"),
+        ("sample cubes -n 0", "argument -n: 0: expected a whole number, 1 or more"),
+        ("sample cubes --jobs 0", "argument --jobs: 0: expected"),
+        ("sample cubes --seed -1", "argument --seed: -1: expected"),
         ("sample cubes --where mas<3", "--where:1:1: unknown property 'mas'; did you mean 'mass'"),
         ("sample cubes --where mass<", "--where:1:6: found the end, expected '('"),
         ("sample cubes --library nowhere", "nowhere does not exist"),
@@ -128,7 +126,10 @@ def test_several_conditions_all_hold(run):
         ("compose chain beads=9", "beads=9: expected 2 to 7"),
         ("compose chain baeds=5", "no symbol 'baeds'; did you mean 'beads'?"),
         ("compose chain bead.radius=2m", "bead.radius=2: out of range; expected 0.005 to 0.05 m"),
-        ("compose chian beads=5", "unknown grammar 'chian'; did you mean 'chain'?"),
+        (
+            "compose chian beads=5",
+            "'chian' is neither a grammar nor of the form key=value; did you mean",
+        ),
     ],
 )
 def test_a_mistake_is_refused_in_one_line(refused, words, message):
@@ -163,8 +164,11 @@ def test_ray_without_ray_is_refused(refused, monkeypatch):
 
 
 def test_grammar_list_names_the_categories(run):
-    assert run("grammar", "list") == (0, "".join(f"{name}\n" for name in CATEGORIES), "")
-    assert json.loads(run("grammar", "list", "--json")[1]) == CATEGORIES
+    rows = json.loads(run("grammar", "list", "--json")[1])
+    assert [row["name"] for row in rows] == CATEGORIES
+    listed = run("grammar", "list")[1].splitlines()[2:]
+    for line, row in zip(listed, rows, strict=True):
+        assert line.split(maxsplit=1) == [row["name"], row["robots"]]
 
 
 def test_grammar_check_says_sound_or_what_is_wrong(run, mine):
@@ -213,7 +217,8 @@ def test_a_huge_number_of_structures_is_counted_at_once(run, mine):
 
 def test_a_negative_limit_is_refused(run, mine):
     code, _, err = run("grammar", "enumerate", mine, "--limit", -1)
-    assert (code, err) == (2, "morphgen: --limit -1: expected 0 or more\n")
+    assert code == 2
+    assert err.startswith("morphgen: argument --limit: -1: expected a whole number, 0 or more;")
 
 
 def test_grammar_count_of_a_recursion(run, mine):

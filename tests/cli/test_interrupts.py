@@ -44,7 +44,7 @@ def test_ctrl_c_as_the_first_worker_starts_is_one_line(tmp_path):
 def check(tmp_path, name, later):
     (tmp_path / "split.yaml").write_text(split_text(small_split()))
     process = subprocess.Popen(
-        [sys.executable, "-m", "morphgen.cli", *map(str, COMMANDS[name])],
+        [sys.executable, "-m", "morphgen", *map(str, COMMANDS[name])],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

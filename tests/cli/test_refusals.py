@@ -42,7 +42,7 @@ BOMB = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "lol"}">' for i in
         ("base=gantry ee=plane ee.mount_yaw=1m", "wrong unit 'm'; expected"),
         ("base=gantry up.ee=plane", "'gantry' has no port 'up'"),
         ("base=gantry", "nothing to compose"),
-        ("ur5", "'ur5' is not of the form key=value, such as arm=ur5"),
+        ("ur5 x", "'ur5' is not of the form key=value, such as arm=ur5"),
         ("base=gantry ee=plane --library nowhere", "nowhere does not exist"),
     ],
 )
@@ -109,15 +109,16 @@ def test_check_refuses_what_is_no_xml(refused, urdf, xml):
     ("argv", "message"),
     [
         ("show nowhere.urdf", "nowhere.urdf: no such file"),
-        ("check nowhere", "nowhere: no such file"),
+        ("check nowhere", "'nowhere' is no part"),
+        ("check nowhere/", "nowhere: no such file"),
         ("import nowhere.xacro", "nowhere.xacro: no such file"),
-        ("conform .", "is no bundle: it has no card.json"),
-        ("show .", "is no bundle: it has no card.json"),
+        ("conform ./", ". holds no robot; expected a bundle"),
+        ("show ./", ". holds no robot; expected a bundle"),
         (f"show {'n' * 300}", "File name too long"),
         ("import x.xacro --arg length", "--arg length: expected NAME=VALUE"),
         ("import x.xacro --arg =1", "--arg =1: expected NAME=VALUE"),
-        ("conform . --samples 0", "--samples 0: expected 1 to 100000"),
-        ("conform . --seed -1", "--seed -1: expected 0 or more"),
+        ("conform . --samples 0", "argument --samples: 0: expected a whole number, 1 to 100000"),
+        ("conform . --seed -1", "argument --seed: -1: expected a whole number, 0 or more"),
     ],
 )
 def test_what_is_not_there_is_named(refused, argv, message):

@@ -120,9 +120,8 @@ def test_it_writes_a_file_the_same_bytes_each_time(run, bundle, tmp_path):
         ("robots/nowhere", "robots/nowhere: no such file or folder"),
         ("nowhere.urdf", "nowhere.urdf: no such file or folder"),
         ("nowhere.grammar", "nowhere.grammar: no such file"),
-        ("chian", "unknown grammar 'chian'; did you mean 'chain'?"),
-        ("ur5", "'ur5' is not of the form key=value, such as arm=ur5"),
-        ("folder.npz", "is no bundle"),
+        ("chian", "'chian' is no part; did you mean 'chain'?"),
+        ("./folder.npz", "folder.npz holds no robot"),
     ],
 )
 def test_what_it_cannot_do_is_refused(refused, tmp_path, argv, message):

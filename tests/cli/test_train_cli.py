@@ -10,7 +10,6 @@ import pytest
 
 from commands import start, tree
 from morphgen.benchmark.split_file import write_split
-from morphgen.cli import main
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.sources import settings_of
@@ -369,8 +368,5 @@ def test_folders_and_checkpoints_that_are_others_are_refused(run, refused, tmp_p
 
 
 @pytest.mark.parametrize("words", [("--steps", "1.5"), ("--steps", "inf"), ("--steps", "many")])
-def test_steps_are_whole_numbers(words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([*RUN, *words])
-    assert stop.value.code == 2
-    assert "argument --steps" in capsys.readouterr().err
+def test_steps_are_whole_numbers(words, refused):
+    assert "argument --steps" in refused(*RUN, *words)

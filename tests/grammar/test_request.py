@@ -77,7 +77,7 @@ def test_name_tells_that_a_parameter_was_changed(library):
         ("arm=ur5 ee=plane ee.size=9", "out of range"),
         ("arm=ur5 arm=ur3", "arm is given twice"),
         ("arm=ur5 ee.size=1", "no part is chosen for 'ee'"),
-        ("arm=ur5 legs=4", "no part is chosen for 'legs'"),
+        ("arm=ur5 legs=4", "legs=4: unknown key 'legs'; expected base, arm, ee"),
         ("arm", "not of the form key=value"),
         ("base=fixed", "nothing to compose"),
         ("up.arm=ur5", "'fixed' has no port 'up'"),

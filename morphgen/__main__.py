@@ -1,4 +1,4 @@
-"""``python -m morphgen.cli``."""
+"""``python -m morphgen``."""
 
 import sys
 

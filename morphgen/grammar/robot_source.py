@@ -1,0 +1,172 @@
+"""Find the robots that a user names: files, bundles, sets, or words of a request."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from morphgen.errors import CompositionError, FormatError
+from morphgen.formats.bundle import CARD, read_robot
+from morphgen.formats.data_files import read_text
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import Library
+from morphgen.grammar.limits import MAX_DERIVATION_TEXT
+from morphgen.grammar.model import SUFFIX as GRAMMAR_SUFFIX
+from morphgen.grammar.request import known_grammars, parse_words
+from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS, read_index
+from morphgen.model.robot import TOOL, Frame, Robot
+
+DESCRIPTION_SUFFIXES = (".urdf", ".xacro")
+"""File name suffixes of robot descriptions."""
+
+
+@dataclass(frozen=True)
+class RobotSource:
+    """Where a robot comes from: exactly one of a path and the words of a request."""
+
+    label: str
+    """The path or the words, as printed in messages and tables."""
+    path: Path | None = None
+    """A bundle's folder, a robot's folder in a light set, a URDF or a xacro."""
+    words: tuple[str, ...] = ()
+    """Words of ``morphgen compose``."""
+
+
+def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
+    """Return the robots that the words of a command line name, without reading them.
+
+    Each word is one of: a bundle's folder, a URDF or a xacro; a set of ``morphgen sample`` or a
+    folder of bundles, which stand for all their robots; parts joined by dashes, such as
+    ``ur5-plane``. Neighbouring words of the form ``key=value`` are one robot together, as in
+    ``arm=ur5 ee=plane``; a grammar's name begins a robot, too: ``chain beads=5``. A word with
+    spaces is a request of its own. Each robot is returned once.
+
+    Raises:
+        CompositionError: If a word names nothing.
+        FormatError: If a path does not exist, or a folder holds no robot.
+    """
+    sources: list[RobotSource] = []
+    request: list[str] = []
+    for word in words:
+        parts = word.split()
+        is_setting = "=" in word and not is_robot_file(word)
+        begins = len(parts) != 1 or not is_setting
+        if request and begins:
+            sources.append(_requested(request))
+            request = []
+        if len(parts) == 1 and (
+            is_setting or (not is_robot_file(word) and _is_grammar(word, library))
+        ):
+            request.append(word)
+        elif is_robot_file(word):
+            sources += (RobotSource(str(path), path) for path in _robots_at(Path(word)))
+        else:
+            sources.append(_requested(parts))
+    if request:
+        sources.append(_requested(request))
+    if not sources:
+        raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")
+    return list(dict.fromkeys(sources))
+
+
+def find_robot(text: str | Path, library: Library) -> RobotSource:
+    """Return the one robot that a text names; see ``find_robots``.
+
+    Raises:
+        CompositionError: If it names nothing, or several robots.
+        FormatError: If a path does not exist, or holds no robot.
+    """
+    if isinstance(text, Path):
+        sources = [RobotSource(str(path), path) for path in _robots_at(text)]
+    elif is_robot_file(text):
+        sources = [RobotSource(str(path), path) for path in _robots_at(Path(text))]
+    else:
+        sources = [_requested(text.split())]
+    if len(sources) > 1:
+        raise CompositionError(
+            f"{text} holds {len(sources)} robots; name one, such as {sources[0].label}"
+        )
+    return sources[0]
+
+
+def read_source(source: RobotSource, library: Library, root: Path | None = None) -> Robot:
+    """Return the robot: read from its file, or composed from its words.
+
+    A robot of a light set is composed from its derivation, since its URDF holds no home. In a
+    URDF, a link that is called ``tool`` becomes the frame ``tool``.
+
+    Args:
+        source: As ``find_robots`` returns it.
+        library: Where the parts are.
+        root: A folder that meshes, includes and YAML may come from, besides the description's own
+            folder and package.
+
+    Raises:
+        MorphgenError: If the file is broken, or the words name what does not exist or does not
+            fit.
+    """
+    path = source.path
+    if path is None:
+        derivation, name = parse_words(source.words, library)
+        return compose(derivation, library, name)
+    light = path / DERIVATION
+    if light.is_file() and not (path / CARD).is_file():
+        derivation = parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
+        return compose(derivation, library, path.resolve().name)
+    robot = read_robot(path, root=root)
+    if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
+        return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
+    return robot
+
+
+def is_robot_file(text: str) -> bool:
+    """Return whether a text names robots on disk rather than parts or a grammar.
+
+    A folder without robots does not hide a grammar or a part of the same name.
+    """
+    path = Path(text)
+    if (text.endswith(DESCRIPTION_SUFFIXES) and path.is_file()) or _holds_robots(path):
+        return True
+    if "=" in text or text.partition(" ")[0].endswith(GRAMMAR_SUFFIX):
+        return False
+    return "/" in text or text.endswith(DESCRIPTION_SUFFIXES)
+
+
+def _holds_robots(path: Path) -> bool:
+    return path.is_dir() and next(_robots_in(path), None) is not None
+
+
+def _robots_at(path: Path) -> list[Path]:
+    if not path.exists():
+        raise FormatError(f"{path}: no such file or folder")
+    robots = [path] if path.is_file() else list(_robots_in(path))
+    if not robots:
+        raise FormatError(
+            f"{path} holds no robot; expected a bundle, a URDF, a set of morphgen sample, or a "
+            "folder of bundles"
+        )
+    return robots
+
+
+def _robots_in(folder: Path) -> Iterator[Path]:
+    """Robots of a folder: itself, those of a set, or the bundles in it."""
+    if _is_robot(folder):
+        yield folder
+    elif (folder / INDEX).is_file() or (folder / SETTINGS).is_file():
+        yield from (folder / record["name"] for record in read_index(folder))
+    else:
+        yield from (child for child in sorted(folder.iterdir()) if _is_robot(child))
+
+
+def _is_robot(folder: Path) -> bool:
+    return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
+
+
+def _requested(words: Sequence[str]) -> RobotSource:
+    return RobotSource(" ".join(words), words=tuple(words))
+
+
+def _is_grammar(word: str, library: Library) -> bool:
+    return word.endswith(GRAMMAR_SUFFIX) or word in known_grammars(library)
