@@ -111,15 +111,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     parser = build_parser()
     try:
-        args, words = parser.parse_known_args(argv)
-        is_option = any(word.startswith("-") for word in words)
-        if is_option or not (words == [] or hasattr(args, "words")):
-            parser.error(f"unknown arguments: {' '.join(words)}")
+        args = _parsed(parser, argv)
     except UsageError as error:
         print(one_line(str(error)), file=sys.stderr)
         return 2
-    if words:
-        args.words += words
     if args.version:
         from importlib.metadata import version
 
@@ -141,6 +136,17 @@ def _run(argv: Sequence[str] | None) -> int:
             if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
                 raise
             return _refused(error, f"{error.filename or 'output'}: {error.strerror}", args)
+
+
+def _parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argparse.Namespace:
+    """The arguments; words of a request may stand before and after options."""
+    args, words = parser.parse_known_args(argv)
+    is_option = any(word.startswith("-") for word in words)
+    if is_option or not (words == [] or hasattr(args, "words")):
+        parser.error(f"unknown arguments: {' '.join(words)}")
+    if words:
+        args.words += words
+    return args
 
 
 @contextmanager

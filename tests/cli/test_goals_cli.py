@@ -164,7 +164,7 @@ def files(folder):
         ("arm=ur5 ee=plane", "arm=ur5 ee=plane: name one split, or say --task for a robot"),
         ("arm=ur5", "unknown split 'arm=ur5'"),
         ("some.yaml --seed -1", "goal seed -1: expected 0 or more"),
-        ("some.yaml --jobs 0", "0 jobs: expected 1 or more"),
+        ("some.yaml --jobs 0", "argument --jobs: 0: expected a whole number"),
         ("some.yaml --obstacles", "--obstacles goes with --task"),
         ("arm=ur6 --task reach", "unknown arm 'ur6'; did you mean"),
         ("nothing/there --task reach", "nothing/there"),

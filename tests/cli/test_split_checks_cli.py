@@ -200,7 +200,7 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
         ("audit some.yaml --near 1", "--near 1: expected a tree distance and a cosine, such as"),
         ("audit some.yaml --near a,b", "--near a,b: expected a tree distance and a cosine"),
         ("audit some.yaml --near 2,0.5", "--near 2,0.5: a tree distance is from 0 to 1"),
-        ("audit some.yaml --jobs 0", "0 jobs: expected 1 or more"),
+        ("audit some.yaml --jobs 0", "argument --jobs: 0: expected a whole number"),
         ("audit broken.yaml", "broken.yaml:"),
         ("build some.yaml --light --picture", "say --light or --picture"),
         ("build some.yaml --out file", "cannot write file/mine/some: Not a directory"),
