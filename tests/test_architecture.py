@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import morphgen
+from morphgen.cli import EXTRAS
 
 PACKAGE = Path(morphgen.__file__).parent
 PACKAGES = (
@@ -146,3 +147,59 @@ def test_processes_of_pybullet_load_little_else():
 @pytest.mark.parametrize("module", ["benchmark.export", "fitting.token_shapes", "tasks.goals"])
 def test_splits_and_goals_wait_for_no_torch(module):
     assert "torch" not in modules_after(f"import morphgen.{module}")
+
+
+WITHOUT_EXTRAS = """
+import sys
+from importlib.machinery import PathFinder
+
+class Without(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name in {extras} else PathFinder.find_spec(name, path, target)
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = Without
+from morphgen.cli import main
+sys.exit(main({words}))
+"""
+
+
+def run_without_extras(folder, *words):
+    extras = [*EXTRAS, "pinocchio", "pybullet", "yourdfpy", "ray"]
+    code = WITHOUT_EXTRAS.format(extras=extras, words=list(words))
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("compose", "ur5-plane"),
+        ("compose", "arm=ur5", "--geometry", "primitive"),
+        ("sample", "chain", "-n", "1"),
+        ("check", "arm3-stick"),
+        ("tokens", "ur5-plane"),
+        ("similarity", "prims", "stick"),
+        ("conform", "prims"),
+        ("split", "show", "interpolation/panda/reach"),
+    ],
+    ids=" ".join,
+)
+def test_the_core_needs_no_extra(words, tmp_path):
+    done = run_without_extras(tmp_path, *words)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (("fit", "ur5"), "fit"),
+        (("train", "interpolation/arm3/reach"), "rl"),
+        (("play", "reach", "prims"), "rl"),
+        (("view",), "viewer"),
+    ],
+)
+def test_a_missing_extra_is_one_line_that_says_how_to_install_it(words, extra, tmp_path):
+    done = run_without_extras(tmp_path, *words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"pip install 'morphgen[{extra}]'" in done.stderr
+    assert done.stderr.count("\n") == 1

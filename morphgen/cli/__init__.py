@@ -38,6 +38,18 @@ from morphgen.cli import (
 )
 from morphgen.errors import MorphgenError, one_line
 
+EXTRAS = {
+    "embreex": "fit",
+    "fast_simplification": "fit",
+    "gymnasium": "tasks",
+    "imageio": "tasks",
+    "msgspec": "viewer",
+    "tensorboard": "rl",
+    "torch": "rl",
+    "viser": "viewer",
+    "websockets": "viewer",
+}
+"""Optional packages by import name, and the extra of morphgen that brings each."""
 COMMANDS = (
     compose,
     sample,
@@ -133,6 +145,8 @@ def _run(argv: Sequence[str] | None) -> int:
                 return _interrupted(KeyboardInterrupt())
             if isinstance(error, MorphgenError):
                 return _refused(error, str(error), args)
+            if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
+                return _refused(error, _how_to_install(error.name), args)
             if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
                 raise
             return _refused(error, f"{error.filename or 'output'}: {error.strerror}", args)
@@ -168,6 +182,12 @@ def _ctrl_c_noted() -> Iterator[list[int]]:
         yield noted
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _how_to_install(package: str) -> str:
+    extra = f"pip install 'morphgen[{EXTRAS[package]}]'"
+    build = "; a small build without CUDA: https://pytorch.org/get-started/locally"
+    return f"the package {package} is not installed: {extra}{build if package == 'torch' else ''}"
 
 
 def _interrupted(interrupt: KeyboardInterrupt) -> int:
