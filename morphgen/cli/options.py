@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -88,7 +88,7 @@ def add_max_links(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="the most links that a robot of the study has; indices are divided by one less "
-        "(default: 23)",
+        "(default: 23, or as many as the largest robot has)",
     )
 
 
@@ -145,6 +145,24 @@ def _require_files(sources: list[RobotSource], args: argparse.Namespace) -> None
             f"--root {args.root}: {composed[0].label} is composed; expected a bundle, a URDF or a "
             "xacro"
         )
+
+
+def max_links_for(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
+    """Return the number of links that tokens are made for.
+
+    It is what ``--max-links`` says, else the benchmark's, or that of the largest robot if it has
+    more, such as a robot with two arms. All robots of a command have the same.
+
+    Raises:
+        BenchmarkError: If a robot has more links than ``--max-links``.
+    """
+    from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
+
+    if args.max_links is None:
+        return max(MAX_LINKS, *(len(robot.links) for robot in robots))
+    for robot in robots:
+        require_max_links(len(robot.links), f"robot {robot.name!r}", args.max_links)
+    return int(args.max_links)
 
 
 def library_of(args: argparse.Namespace) -> Library:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from morphgen.cli.options import (
     Subparsers,
@@ -17,6 +17,7 @@ from morphgen.cli.options import (
     add_robots,
     add_root,
     library_of,
+    max_links_for,
     sources_named,
 )
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from morphgen.grammar.robot_source import RobotSource
 
     Matrices = dict[str, NDArray[np.float64]]
+
+T = TypeVar("T")
 
 MEASURES = ("cosine", "tree", "workspace", "all")
 WHOLE = 20
@@ -115,16 +118,17 @@ def _features(
     from tqdm import tqdm
 
     from morphgen.benchmark.similarity import features
-    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.errors import BenchmarkError
     from morphgen.fitting.token_shapes import token_shapes
     from morphgen.grammar.robot_source import read_source
 
+    def bar(things: Sequence[T]) -> Iterable[T]:
+        return tqdm(things, unit="robot", file=sys.stderr, disable=args.json or None, leave=False)
+
+    robots = [read_source(source, library, args.root) for source in bar(sources)]
+    max_links = max_links_for(args, robots)
     made = []
-    max_links = MAX_LINKS if args.max_links is None else args.max_links
-    bar = tqdm(sources, unit="robot", file=sys.stderr, disable=args.json or None, leave=False)
-    for source in bar:
-        robot = read_source(source, library, args.root)
+    for source, robot in bar(list(zip(sources, robots, strict=True))):
         try:
             shapes = token_shapes(robot, library.folders)
             made.append(features(robot, shapes, max_links=max_links))

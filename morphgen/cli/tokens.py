@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import (
-    ROBOT_HELP,
+    ROBOTS_HELP,
     Subparsers,
     add_json,
     add_library,
     add_max_links,
     add_root,
     library_of,
-    robot_named,
+    max_links_for,
+    sources_named,
 )
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def add_parser(commands: Subparsers) -> None:
         "words",
         nargs="*",
         metavar="ROBOT",
-        help=ROBOT_HELP,
+        help=ROBOTS_HELP,
     )
     parser.add_argument("--layout", action="store_true", help="print the fields of a token")
     parser.add_argument(
@@ -68,34 +69,46 @@ def add_parser(commands: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print, write."""
-    from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
     from morphgen.benchmark.tokens import tokens
     from morphgen.errors import BenchmarkError
     from morphgen.fitting.token_shapes import token_shapes
+    from morphgen.grammar.robot_source import read_source
 
     if not args.words:
-        if not args.layout or args.out or args.max_links is not None:
-            raise BenchmarkError("name a robot, such as arm=ur5 ee=plane, or say --layout alone")
-        print(json.dumps(_layout_data()) if args.json else _layout_text())
-        return 0
+        return _run_layout(args)
     if args.out and args.out.suffix != ".npz":
         raise BenchmarkError(f"--out {args.out}: expected a name that ends in .npz")
     library = library_of(args)
-    max_links = MAX_LINKS if args.max_links is None else args.max_links
-    robot = robot_named(args)
-    require_max_links(len(robot.links), f"robot {robot.name!r}", max_links)
-    made = tokens(robot, token_shapes(robot, library.folders), max_links=max_links)
-    if args.out:
-        _write(args.out, made, robot, max_links)
+    robots = [read_source(source, library, args.root) for source in sources_named(args)]
+    if args.out and len(robots) > 1:
+        raise BenchmarkError(f"--out {args.out}: {len(robots)} robots are named; expected one")
+    max_links = max_links_for(args, robots)
+    data = []
+    for robot in robots:
+        made = tokens(robot, token_shapes(robot, library.folders), max_links=max_links)
+        data.append(_data(made, robot, max_links))
+        if args.out:
+            _write(args.out, made, robot, max_links)
+            data[-1]["file"] = str(args.out)
+        if not args.json:
+            print(_text(made, robot, max_links))
     if args.json:
-        written = {"file": str(args.out)} if args.out else {}
-        print(json.dumps(_data(made, robot, max_links) | written))
+        print(json.dumps(data[0] if len(data) == 1 else data))
         return 0
-    print(_text(made, robot, max_links))
     if args.layout:
         print(f"\n{_layout_text()}")
     if args.out:
         print(args.out)
+    return 0
+
+
+def _run_layout(args: argparse.Namespace) -> int:
+    """Print the layout alone."""
+    from morphgen.errors import BenchmarkError
+
+    if not args.layout or args.out or args.max_links is not None:
+        raise BenchmarkError("name a robot, such as arm=ur5 ee=plane, or say --layout alone")
+    print(json.dumps(_layout_data()) if args.json else _layout_text())
     return 0
 
 
