@@ -6,16 +6,19 @@ import argparse
 import json
 import sys
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import (
+    ROBOTS_HELP,
     Subparsers,
     add_jobs,
     add_json,
     add_library,
     add_root,
     library_of,
+    sources_named,
     whole_number,
 )
 
@@ -44,6 +47,18 @@ HEADERS = (
 )
 
 
+@dataclass(frozen=True)
+class Target:
+    """A robot or the body of a part, to which primitives are fitted."""
+
+    label: str
+    """How the user names it."""
+    robot: Robot
+    path: Path | None
+    """Its file or folder, if it has one of its own."""
+    is_part: bool
+
+
 def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
     parser = commands.add_parser(
@@ -56,7 +71,7 @@ def add_parser(commands: Subparsers) -> None:
         "--out robots/ur5-plane-prims; morphgen fit link.stl --max-primitives 3",
     )
     parser.add_argument(
-        "target", nargs="?", help="a part, a bundle's folder, a URDF or xacro, or a mesh file"
+        "words", nargs="*", metavar="ROBOT", help=f"a part, a mesh file, or {ROBOTS_HELP}"
     )
     parser.add_argument("--all", action="store_true", help="fit and store every part with meshes")
     parser.add_argument(
@@ -75,7 +90,12 @@ def add_parser(commands: Subparsers) -> None:
         "--enclose", action="store_true", help="hold every point of the link, for safe collisions"
     )
     parser.add_argument("--visual", action="store_true", help="replace the visuals, too")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="write the robot's bundle here")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="write the robot's bundle here; of several robots, one bundle each",
+    )
     parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
     parser.add_argument(
         "--configurations",
@@ -99,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.fitting.link import FitOptions
     from morphgen.model.mesh import SUFFIXES
 
-    if args.all == bool(args.target):
+    if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     try:
         most = 1 if args.max_primitives is None else args.max_primitives
@@ -113,9 +133,9 @@ def run(args: argparse.Namespace) -> int:
     given = {"--visual": args.visual, "--no-picture": args.no_picture}
     if idle := [name for name, value in given.items() if value and not args.out]:
         raise MorphgenError(f"{' '.join(idle)}: only with --out")
-    if Path(args.target).suffix.lower() in SUFFIXES:
+    if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in SUFFIXES:
         return _mesh(args, options)
-    return _robot(args, options)
+    return _robots(args, options)
 
 
 def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
@@ -123,7 +143,7 @@ def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
     from morphgen.fitting.link import fit_shapes
     from morphgen.model.geometry import Mesh, Shape
 
-    path = Path(args.target)
+    path = Path(args.words[0])
     if args.out:
         raise MorphgenError(f"--out writes a robot, and {path} is a mesh; use --json")
     try:
@@ -140,7 +160,24 @@ def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
     return 0
 
 
-def _robot(args: argparse.Namespace, options: FitOptions) -> int:
+def _robots(args: argparse.Namespace, options: FitOptions) -> int:
+    targets = _targets(args)
+    several = len(targets) > 1
+    data = []
+    for target in targets:
+        folder = _folder(args, target, several) if args.out else None
+        if several and not args.json:
+            print(f"{target.robot.name}:")
+        data.append(_robot(target, folder, options, args))
+    if args.json:
+        print(json.dumps(data if several else data[0]))
+    return 0
+
+
+def _robot(
+    target: Target, folder: Path | None, options: FitOptions, args: argparse.Namespace
+) -> dict[str, object]:
+    """Fit one robot, write its bundle if a folder is given, and return what ``--json`` prints."""
     from dataclasses import replace
 
     from morphgen.fitting.agreement import agreement
@@ -148,40 +185,39 @@ def _robot(args: argparse.Namespace, options: FitOptions) -> int:
     from morphgen.fitting.replace_collision import with_fits, with_primitives
     from morphgen.formats.fits import read_stored
 
-    robot, is_part = _target(args)
-    folder = _folder(args, is_part) if args.out else None
-    report = _fit(robot, options, args)
+    robot = target.robot
+    report = _fit(target, options, args)
     data = report.as_dict()
     if not args.json:
         _print_report(report)
-    if folder is not None:
-        primitives = {row.link: row.fit.primitives for row in report.links}
-        fits = fits_of(robot, report, read_stored(library_of(args).folders))
-        made = replace(
-            with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
-            name=folder.name,
-            provenance={**robot.provenance, "primitives": report.without_times()},
-        )
-        compared, hulls = agreement(robot, made, args.configurations, args.seed)
-        data |= {"agreement": compared.as_dict(), "agreement_of_hulls": hulls.as_dict()}
-        _write(made, folder, is_part, args)
-        if not args.json:
-            _print_agreement(compared, hulls, args.configurations)
-            print(folder)
-    if args.json:
-        print(json.dumps(data))
-    return 0
+    if folder is None:
+        return data
+    primitives = {row.link: row.fit.primitives for row in report.links}
+    fits = fits_of(robot, report, read_stored(library_of(args).folders))
+    made = replace(
+        with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
+        name=folder.name,
+        provenance={**robot.provenance, "primitives": report.without_times()},
+    )
+    compared, hulls = agreement(robot, made, args.configurations, args.seed)
+    _write(made, folder, target.is_part, args)
+    if not args.json:
+        _print_agreement(compared, hulls, args.configurations)
+        print(folder)
+    return data | {"agreement": compared.as_dict(), "agreement_of_hulls": hulls.as_dict()}
 
 
-def _folder(args: argparse.Namespace, is_part: bool) -> Path:
+def _folder(args: argparse.Namespace, target: Target, several: bool) -> Path:
     """Where the bundle goes; refused before the long work if it cannot go there."""
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import bundle_folder, require_replaceable
 
-    folder = bundle_folder(args.out.parent, args.out.name)
-    target = Path(args.target).resolve()
-    if not is_part and folder.resolve() in (target, *target.parents[:1]):
-        raise FormatError(f"--out {args.out} is the robot itself; name another folder")
+    parent, name = (args.out, target.robot.name) if several else (args.out.parent, args.out.name)
+    folder = bundle_folder(parent, name)
+    if target.path is not None:
+        source = target.path.resolve()
+        if folder.resolve() in (source, *source.parents[:1]):
+            raise FormatError(f"--out {args.out} is the robot itself; name another folder")
     require_replaceable(folder)
     return folder
 
@@ -194,38 +230,39 @@ def _write(robot: Robot, folder: Path, is_part: bool, args: argparse.Namespace) 
     write_bundle(robot, folder, findings, picture=not args.no_picture)
 
 
-def _target(args: argparse.Namespace) -> tuple[Robot, bool]:
-    """The robot that is meant, and whether it is a part."""
-    from morphgen.errors import FormatError, nearest
-    from morphgen.formats.bundle import read_robot
+def _targets(args: argparse.Namespace) -> list[Target]:
+    """Return what is to be fitted: a part by its name, or robots."""
+    from morphgen.errors import FormatError
     from morphgen.grammar.part import load_part
+    from morphgen.grammar.robot_source import read_source
 
-    path = Path(args.target)
-    if path.exists():
-        return read_robot(path, root=args.root), False
-    if args.root is not None:
-        raise FormatError(f"--root {args.root}: only with a bundle, a URDF or a xacro")
     library = library_of(args)
-    if args.target in library.paths:
-        return load_part(library.manifest(args.target)).body, True
-    raise FormatError(
-        f"{args.target!r} is no file, folder or part{nearest(args.target, library.paths)}"
-    )
+    word = args.words[0]
+    if len(args.words) == 1 and word in library.paths and not Path(word).exists():
+        if args.root is not None:
+            raise FormatError(f"--root {args.root}: only with a bundle, a URDF or a xacro")
+        return [Target(word, load_part(library.manifest(word)).body, None, is_part=True)]
+    return [
+        Target(source.label, read_source(source, library, args.root), source.path, is_part=False)
+        for source in sources_named(args)
+    ]
 
 
-def _fit(robot: Robot, options: FitOptions, args: argparse.Namespace) -> FitReport:
+def _fit(target: Target, options: FitOptions, args: argparse.Namespace) -> FitReport:
     from tqdm import tqdm
 
     from morphgen.errors import FitError
     from morphgen.fitting.robot import fit_links
     from morphgen.formats.fits import shapes_to_fit
 
-    links = sum(1 for link in robot.links if shapes_to_fit(link))
+    links = sum(1 for link in target.robot.links if shapes_to_fit(link))
     if not links:
-        raise FitError(f"{args.target}: no link has a shape")
+        raise FitError(f"{target.label}: no link has a shape")
     quiet = args.json or None
     with tqdm(total=links, unit="link", file=sys.stderr, disable=quiet, leave=False) as bar:
-        report = fit_links(robot, options, jobs=args.jobs, progress=lambda link: bar.update())
+        report = fit_links(
+            target.robot, options, jobs=args.jobs, progress=lambda link: bar.update()
+        )
     return report
 
 

@@ -131,7 +131,7 @@ def is_robot_file(text: str) -> bool:
         return True
     if "=" in text or text.partition(" ")[0].endswith(GRAMMAR_SUFFIX):
         return False
-    return "/" in text or text.endswith(DESCRIPTION_SUFFIXES)
+    return "/" in text or text in (".", "..") or text.endswith(DESCRIPTION_SUFFIXES)
 
 
 def _holds_robots(path: Path) -> bool:
