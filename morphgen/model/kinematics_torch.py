@@ -349,4 +349,5 @@ def _taken(poses: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
     """Return poses (n, K, 4, 4) by columns (n, W), shape (n, W, 4, 4)."""
     if poses.shape[1] == 1:
         return poses.expand(-1, columns.shape[1], -1, -1)
-    return torch.take_along_dim(poses, columns[..., None, None], dim=1)
+    # Indexing copies whole poses, which is twice as fast as take_along_dim, entry by entry.
+    return poses[torch.arange(len(poses), device=poses.device)[:, None], columns]
