@@ -33,13 +33,13 @@ from tqdm import tqdm
 from morphgen.benchmark.split import SIDES, Member
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
+from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import mapped
 from morphgen.rl.references import InverseKinematics, Random, Zero
 from morphgen.rl.rollouts import run_episodes
 from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.make import SIMULATORS, SimulatorName, batch_of
 from morphgen.tasks.settings import member_setting
 
@@ -138,11 +138,11 @@ def _members() -> Iterator[Member]:
 def _drift(batch: TaskBatch) -> float:
     """How far tools move within an episode without action, at most, millimetres."""
     batch.reset()
-    start = tool_positions(batch.bodies.chain, batch.body, batch.q)
+    start = frame_positions(batch.bodies.chain, batch.body, batch.q)
     acting, farthest = Zero(), 0.0
     for _ in range(int(batch.longest.min()) - 1):
         batch.step(acting.act(batch))
-        now = tool_positions(batch.bodies.chain, batch.body, batch.q)
+        now = frame_positions(batch.bodies.chain, batch.body, batch.q)
         farthest = max(farthest, float((now - start).norm(dim=1).max()))
     return 1000 * farthest
 

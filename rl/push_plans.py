@@ -9,13 +9,13 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.dynamics import actuation
+from morphgen.model.inverse_kinematics import solve_position_ik
 from morphgen.model.kinematics import frame_jacobian, unwound
 from morphgen.rl.cartesian import OneTool
 from morphgen.rl.free_ways import FreeWays, Price, Way
 from morphgen.rl.push_contacts import Poised, leaning, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.inverse_kinematics import bring_tool
 from morphgen.tasks.push_proofs import free_within
 from morphgen.tasks.settings import Setting
 from morphgen.tasks.sim.base import GRAVITY
@@ -257,7 +257,7 @@ class PushPlanner:
 
     def _free_behind(self, start: Array, goal: Array, block: Array) -> Array:
         """Configurations that are free with the tool at goals (n, 3), near others (n, dof)."""
-        found, error = bring_tool(self._robot, start, goal)
+        found, error = solve_position_ik(self._robot, start, goal)
         there = (np.abs(error[:, :2]) < _REACHED * self._edge).all(axis=1)
         found = found[there & (np.abs(error[:, 2]) < self._edge / 2)]
         return found[self._space.free(found, np.tile(block, (len(found), 1)))]

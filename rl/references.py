@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.model.inverse_kinematics_torch import solve_position_ik
 from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.scripted_push import ScriptedPush
@@ -16,7 +17,6 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.kinematics import tool_frames, tool_jacobians
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,9 @@ ROUNDS = 4
 """Times that these are others, as long as no free way is found."""
 ITERATIONS = 60
 DAMPING = 0.05
-"""Of the least squares, in units of joints over metres."""
+"""Damping of the least squares [joint units per metre]."""
+MAX_STEP = 0.5
+"""Largest change of a joint in one iteration, rad or m."""
 CLOSE = 0.003
 """Distance from a goal that counts as solved, metres."""
 
@@ -107,15 +109,26 @@ class InverseKinematics:
                 ways, q = self._ways_of(task, robot, starts[i])
                 nodes = ways.reached(q, STARTS, attempt=attempt)
                 tried[:, i, : len(q)] = torch.from_numpy(nodes)
-        found, left = solve(task.bodies, body, task.goal[envs, :3], tried)
+        rows = body.repeat(STARTS)
+        found, error = solve_position_ik(
+            task.bodies.chain,
+            rows,
+            tried.flatten(0, 1),
+            task.goal[envs, :3].repeat(STARTS, 1),
+            (task.bodies.lower[rows], task.bodies.upper[rows]),
+            iterations=ITERATIONS,
+            damping=DAMPING,
+            max_step=MAX_STEP,
+        )
+        found = found.view_as(tried)
+        left = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
         step = task.bodies.step[body].clamp(min=1e-9)
         far = ((found - starts) / step).abs().amax(dim=2)
         order = torch.where(left < CLOSE, far, 1e9 * (1 + left)).argsort(dim=0)
         count = (left < CLOSE).sum(dim=0).clamp(min=1).tolist()
-        rows = zip(order.T, count, body.tolist(), strict=True)
         return [
             _numbers(found[some[:k], i, : task.settings[robot].robot.dof])
-            for i, (some, k, robot) in enumerate(rows)
+            for i, (some, k, robot) in enumerate(zip(order.T, count, body.tolist(), strict=True))
         ]
 
     def _way(self, task: TaskBatch, env: int, ends: Array, attempt: int) -> Way | None:
@@ -148,39 +161,6 @@ def random_starts(
     drawn = torch.rand(STARTS - 1, *near.shape, generator=generator).to(near.device)
     starts = torch.cat([near[None], lower + (upper - lower) * drawn])
     return torch.where(bodies.moves_tool[body], starts, near)
-
-
-def solve(
-    bodies: Bodies, body: torch.Tensor, position: torch.Tensor, starts: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Configurations whose tools are at given positions.
-
-    Args:
-        bodies: The robots.
-        body: Which robot each row is, shape (n,), int64.
-        position: Where the tools are to be in the root frame, shape (n, 3), metres.
-        starts: Where to start from, shape (STARTS, n, J).
-
-    Returns:
-        Configurations within limits, shape (STARTS, n, J), and how far from their goals the tools
-        then are, shape (STARTS, n), metres.
-    """
-    _, n, joints = starts.shape
-    lower, upper = bodies.lower[body], bodies.upper[body]
-    moves = bodies.moves_tool[body]
-    q = starts.reshape(-1, joints)
-    rows = body.repeat(STARTS)
-    goal = position.repeat(STARTS, 1)
-    low, high, free = lower.repeat(STARTS, 1), upper.repeat(STARTS, 1), moves.repeat(STARTS, 1)
-    eye = DAMPING**2 * torch.eye(3, device=starts.device)
-    for _ in range(ITERATIONS):
-        error = goal - tool_frames(bodies.chain, rows, q)[:, -1, :3, 3]
-        J = tool_jacobians(bodies.chain, rows, q)[:, :3] * free[:, None]
-        lever = torch.linalg.solve(J @ J.transpose(1, 2) + eye, error[..., None])
-        q = torch.clamp(q + (J.transpose(1, 2) @ lever)[..., 0].clamp(-0.5, 0.5), low, high)
-    apart = goal - tool_frames(bodies.chain, rows, q)[:, -1, :3, 3]
-    left = torch.linalg.vector_norm(apart, dim=1)
-    return q.reshape(STARTS, n, joints), left.reshape(STARTS, n)
 
 
 def reference(name: str, batch: TaskBatch, seed: int) -> Controller:

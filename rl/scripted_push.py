@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from morphgen.rl.cartesian import towards
+from morphgen.model.inverse_kinematics_torch import step_to_pose
+from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.free_ways import Routes, shares_to
 from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import CONTROL_PERIOD
-from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.settings import Setting
 
 PLANS = 8
@@ -73,7 +73,7 @@ class ScriptedPush:
         if state is None or state.task is not task:
             state = self._state = _no_state(task)
         block = task.simulation.block_pose
-        tool = tool_positions(task.bodies.chain, task.body, task.q)
+        tool = frame_positions(task.bodies.chain, task.body, task.q)
         new = task.pushes & (task.elapsed == 0)
         state.plans[new] = 0
         failed = _watched(state, task, block, tool) | (task.pushes & ~state.active)
@@ -209,7 +209,7 @@ def _pushed(
     state: _State, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor
 ) -> torch.Tensor:
     """Targets whose tools are a bit farther on, and aside where the blocks are."""
-    goal = tool_positions(task.bodies.chain, task.body, task.targets)
+    goal = frame_positions(task.bodies.chain, task.body, task.targets)
     lead = goal[:, 1] - tool[:, 1]
     stands = task.simulation.block_velocity[:, 1] < MOVES
     more = state.pushing & stands & (lead > state.lead - SPEED)
@@ -218,8 +218,16 @@ def _pushed(
     on = torch.where(lead < state.lead, SPEED, 0.0)
     goal += torch.stack([aside.clamp(-SPEED, SPEED), on, torch.zeros_like(on)], dim=1)
     goal[:, 2] = state.height
-    wanted = towards(task.bodies, task.body, task.targets, goal, state.rotation, hasty=True)
-    missed = goal[:, 1] - tool_positions(task.bodies.chain, task.body, wanted)[:, 1]
+    wanted = step_to_pose(
+        task.bodies.chain,
+        task.body,
+        task.targets,
+        goal,
+        state.rotation,
+        (task.bodies.lower[task.body], task.bodies.upper[task.body]),
+        rotation_budget=task.bodies.step[task.body],
+    )
+    missed = goal[:, 1] - frame_positions(task.bodies.chain, task.body, wanted)[:, 1]
     stands = state.pushing & (on > 0) & (missed > 0.8 * SPEED)
     state.stuck = torch.where(stands, state.stuck + 1, 0)
     return wanted

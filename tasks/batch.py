@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from morphgen.errors import TaskError, UnstableError
+from morphgen.model.kinematics_torch import FramePositions
 from morphgen.tasks.actions import ActionKind, Targets, shares_of
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
 from morphgen.tasks.episodes import Push, Reach, State, Verdict, chosen
-from morphgen.tasks.kinematics import ToolPositions
 from morphgen.tasks.observation import LinkTokens, box_tokens, of_links
 from morphgen.tasks.points import PointClouds
 from morphgen.tasks.rewards import Terms, added, beyond_limits
@@ -150,7 +150,7 @@ class TaskBatch:
         self._lower, self._upper = bodies.lower[self.body], bodies.upper[self.body]
         self._channels = channels
         self._tokens = LinkTokens(bodies, self.body)
-        self._tools = ToolPositions(bodies.chain, self.body)
+        self._tools = FramePositions(bodies.chain, self.body)
         self._moved = Targets(bodies, self.body, self.mask)
         self._fixed = {
             "links": bodies.links[self.body],

@@ -15,6 +15,7 @@ from morphgen.benchmark.tokens import MAX_LINKS, padded, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import bounds, moved_by
+from morphgen.model.kinematics_torch import ToolChain, tool_chain
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
 
@@ -49,7 +50,8 @@ class Bodies:
     """Links whose position wraps, shape (R, L), bool."""
     moving: torch.Tensor
     """Links that a joint moves, mimic ones among them, shape (R, L), bool."""
-    chain: Chain
+    chain: ToolChain
+    """The joints between the root and the tool of each robot."""
 
     @property
     def device(self) -> torch.device:
@@ -75,40 +77,6 @@ class Bodies:
         joint = self.joint_of_link.clamp(min=0)
         mask = self.joint_of_link >= 0
         return mask if fingers else mask & torch.gather(self.moves_tool, 1, joint)
-
-
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """The joints from the root to each robot's tool, D, padded by joints that do not move."""
-
-    origin: torch.Tensor
-    """Pose of the joint in the frame of the one before, fixed joints folded in, (R, D + 1, 4, 4);
-    the last is the tool's."""
-    axis: torch.Tensor
-    """Unit axis in the joint frame, shape (R, D, 3)."""
-    slides: torch.Tensor
-    """Whether it slides, shape (R, D), bool."""
-    gain: torch.Tensor
-    """Positions are ``gain @ q + offset``: shape (R, D, J)."""
-    offset: torch.Tensor
-    """Shape (R, D)."""
-
-    @cached_property
-    def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """What a joint's motion adds to its origin, two of shape (R, D, 4, 4).
-
-        They count by the sine and one minus the cosine of an angle (Rodrigues' formula); the first
-        by the position of a slide.
-        """
-        x, y, z = self.axis.unbind(-1)
-        o = torch.zeros_like(x)
-        cross = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*x.shape, 3, 3)
-        turns = ~self.slides[..., None, None]
-        first, second = (torch.zeros_like(self.origin[:, :-1]) for _ in range(2))
-        first[..., :3, :3] = cross * turns
-        first[..., :3, 3] = self.axis * self.slides[..., None]
-        second[..., :3, :3] = cross @ cross * turns
-        return self.origin[:, :-1] @ first, self.origin[:, :-1] @ second
 
 
 def bodies_of(
@@ -138,17 +106,11 @@ def bodies_of(
             raise RobotError(f"robot {robot.name!r}: no joint moves")
     joints = max(robot.dof for robot in robots)
     rows = [_body(robot, folders, max_links, joints) for robot in robots]
-    depth = max(len(row["axis"]) for row in rows)
-    for row in rows:
-        _lengthen(row, depth)
     made = {
         name: torch.from_numpy(np.stack([row[name] for row in rows])).to(device) for name in rows[0]
     }
     made = {k: v.float() if v.is_floating_point() else v for k, v in made.items()}
-    chain = Chain(
-        **{name: made.pop(name) for name in ("origin", "axis", "slides", "gain", "offset")}
-    )
-    return Bodies(tuple(robots), chain=chain, **made)
+    return Bodies(tuple(robots), chain=tool_chain(robots, device=device), **made)
 
 
 def _body(
@@ -167,6 +129,8 @@ def _body(
     for i, k in enumerate(robot.independent):
         joint_of_link[k + 1] = i
         link_of_joint[i] = k + 1
+    moves_tool = np.zeros(joints, dtype=bool)
+    moves_tool[[*moved_by(robot, robot.joints_to(robot.frame(TOOL).link))]] = True
     return {
         "tokens": made,
         "links": links,
@@ -176,8 +140,8 @@ def _body(
         "upper": limits[:, 1],
         "step": _steps(robot, joints),
         "home": home,
+        "moves_tool": moves_tool,
         **_scales(robot, max_links, joints),
-        **_chain(robot, joints),
     }
 
 
@@ -206,48 +170,3 @@ def _scales(robot: Robot, max_links: int, joints: int) -> dict[str, np.ndarray]:
             joint.kind == "revolute" and joint.limits is None
         )
     return {"to_link": to_link, "at_link": at_link, "turns": turns, "moving": moving}
-
-
-def _chain(robot: Robot, joints: int) -> dict[str, np.ndarray]:
-    frame = robot.frame(TOOL)
-    matrix, offset = robot.mimic_map
-    row_of = {k: row for row, k in enumerate(robot.movable)}
-    T = np.eye(4)
-    origins, axes, slides, gains, offsets = [], [], [], [], []
-    moves_tool = np.zeros(joints, dtype=bool)
-    moves_tool[[*moved_by(robot, robot.joints_to(frame.link))]] = True
-    for k in robot.joints_to(frame.link):
-        joint = robot.joints[k]
-        T = T @ joint.T_parent_joint.matrix
-        if not joint.is_movable:
-            continue
-        gain = np.zeros(joints)
-        gain[: robot.dof] = matrix[row_of[k]]
-        origins.append(T)
-        axes.append(joint.unit_axis)
-        slides.append(joint.kind == "prismatic")
-        gains.append(gain)
-        offsets.append(offset[row_of[k]])
-        T = np.eye(4)
-    origins.append(T @ frame.T_link_frame.matrix)
-    depth = len(axes)
-    return {
-        "moves_tool": moves_tool,
-        "origin": np.array(origins),
-        "axis": np.array(axes).reshape(depth, 3),
-        "slides": np.array(slides, dtype=bool),
-        "gain": np.array(gains).reshape(depth, joints),
-        "offset": np.array(offsets),
-    }
-
-
-def _lengthen(row: dict[str, np.ndarray], depth: int) -> None:
-    """Pad a chain at its end with joints that do not move."""
-    more = depth - len(row["axis"])
-    tool = row["origin"][-1:]
-    still = np.tile(np.eye(4), (more, 1, 1))
-    row["origin"] = np.concatenate([row["origin"][:-1], tool, still])
-    row["axis"] = np.concatenate([row["axis"], np.tile((0.0, 0.0, 1.0), (more, 1))])
-    for name in ("slides", "gain", "offset"):
-        extra = np.zeros((more, *row[name].shape[1:]), dtype=row[name].dtype)
-        row[name] = np.concatenate([row[name], extra])

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
@@ -20,9 +19,9 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.split import robot_hash
 from morphgen.benchmark.workspace import shoulder
 from morphgen.errors import BenchmarkError
-from morphgen.formats.mjcf import to_spec
+from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, frame_pose, movable_positions
+from morphgen.model.kinematics import bounds, frame_pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.barriers import barriers, beyond
 from morphgen.tasks.config import ReachConfig
@@ -162,7 +161,7 @@ def certify(goals: GoalSet, robot: Robot, scene: Scene) -> list[str]:
         for k in np.flatnonzero(beyond(parted, goals.q[i])).tolist():
             a, b = parted[k].pairs[0]
             wrong.append(f"goal {i}: {a!r} and {b!r} touch on all ways to most others")
-    tools = _vectors(tools_in_mujoco(robot, goals.q[usable]))
+    tools = _vectors(MujocoKinematics(robot).frame_pose(goals.q[usable]))
     for i, tool in zip(usable.tolist(), tools, strict=True):
         away, turned = _deviation(goals.poses[i], tool)
         if not (away <= EXACT and turned <= EXACT):
@@ -186,21 +185,6 @@ def _deviation(a: Array, b: Array) -> tuple[float, float]:
     """Distance of two poses (7,), metres, and of their quaternions, whose sign means nothing."""
     turned = min(float(np.linalg.norm(a[3:] - sign * b[3:])) for sign in (1, -1))
     return float(np.linalg.norm(a[:3] - b[:3])), turned
-
-
-def tools_in_mujoco(robot: Robot, q: Array) -> Array:
-    """Pose of the tool in the root frame, as MuJoCo has it, shape (n, 4, 4)."""
-    bare = robot.with_links([replace(link, visuals=(), collisions=()) for link in robot.links])
-    model = to_spec(bare).compile()
-    data = mujoco.MjData(model)
-    at = [model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable]
-    T_root_tool = np.tile(np.eye(4), (len(q), 1, 1))
-    for T, positions in zip(T_root_tool, movable_positions(robot, q), strict=True):
-        data.qpos[at] = positions
-        mujoco.mj_kinematics(model, data)
-        T[:3, :3] = data.site(TOOL).xmat.reshape(3, 3)
-        T[:3, 3] = data.site(TOOL).xpos
-    return T_root_tool
 
 
 def _vectors(T: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.tasks.kinematics import quaternion_matrices
+from morphgen.model.rotation_torch import quaternion_matrices
 from morphgen.tasks.sim.base import Block, Scene
 
 NOISE = 0.005

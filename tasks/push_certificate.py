@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals import outside_limits, tools_in_mujoco
+from morphgen.tasks.goals import outside_limits
 from morphgen.tasks.push_proofs import CLOSE
 from morphgen.tasks.push_sets import PushSet
 from morphgen.tasks.sim.base import Scene
@@ -79,7 +80,8 @@ def _blocks(pushes: PushSet, space: FreeSpace) -> Iterator[str]:
 
 
 def _tools(pushes: PushSet, robot: Robot) -> Iterator[str]:
-    behind, across = (tools_in_mujoco(robot, q)[:, :3, 3] for q in (pushes.behind, pushes.across))
+    tool = MujocoKinematics(robot)
+    behind, across = (tool.frame_pose(q)[:, :3, 3] for q in (pushes.behind, pushes.across))
     for i, (back, front, block) in enumerate(zip(behind, across, pushes.blocks, strict=True)):
         if abs(back[0] - block[0]) > CLOSE or back[1] >= block[1]:
             yield f"start {i}: the tool of its proof is not behind the block"

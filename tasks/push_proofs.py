@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.workspace import tool_positions
-from morphgen.model.kinematics import random_configurations
+from morphgen.model.inverse_kinematics import solve_position_ik
+from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.inverse_kinematics import bring_tool
 from morphgen.tasks.push_region import Region
 from morphgen.tasks.push_ways import breadths, way_is_clear
 
@@ -97,7 +96,7 @@ class Prover:
         goals = np.concatenate(
             [np.repeat(places[rows], near, axis=0), self._ground + height[:, None]], axis=1
         )
-        q, error = bring_tool(self._robot, self._bank[start], goals)
+        q, error = solve_position_ik(self._robot, self._bank[start], goals)
         low = height - error[:, 2]
         there = (np.abs(error[:, :2]) < CLOSE).all(axis=1) & (low > 0) & (low < edge)
         tested = np.zeros(len(q), dtype=np.bool_)
@@ -127,7 +126,7 @@ def free_within(
     kept, where = np.zeros((0, robot.dof)), np.zeros((0, 3))
     for _ in range(_ROUNDS):
         q = random_configurations(robot, _DRAWN, rng)
-        tools = tool_positions(robot, np.ascontiguousarray(q.T)).T
+        tools = frame_positions(robot, np.ascontiguousarray(q.T)).T
         inside = np.flatnonzero(((tools > low) & (tools < high)).all(axis=1))[:_BANK]
         free = inside[space.free(q[inside])]
         kept, where = np.concatenate([kept, q[free]]), np.concatenate([where, tools[free]])

@@ -8,9 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.workspace import tool_positions, workspace
+from morphgen.benchmark.workspace import workspace
 from morphgen.errors import TaskError
-from morphgen.model.kinematics import forward_kinematics, random_configurations
+from morphgen.model.kinematics import (
+    forward_kinematics,
+    frame_positions,
+    joint_axes,
+    random_configurations,
+)
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import PushConfig
 
@@ -118,14 +123,14 @@ def _tools(robot: Robot, *, sliding: bool = True) -> Array:
     if not sliding:
         slides = [robot.joints[k].kind == "prismatic" for k in robot.independent]
         q[:, slides] = np.array(robot.home)[slides]
-    return tool_positions(robot, np.ascontiguousarray(q.T))
+    return frame_positions(robot, np.ascontiguousarray(q.T))
 
 
 def _directions(robot: Robot) -> int:
     """Along how many horizontal directions the tool slides, all else at home."""
-    T_root_link = forward_kinematics(robot, np.array(robot.home))
+    _, directions = joint_axes(robot, forward_kinematics(robot, np.array(robot.home)))
     axes = [
-        T_root_link[k + 1, :2, :3] @ np.array(robot.joints[k].unit_axis)
+        directions[k + 1, :2]
         for k in robot.joints_to(robot.frame(TOOL).link)
         if robot.joints[k].kind == "prismatic"
     ]

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.workspace import tool_positions
-from morphgen.model.kinematics import random_configurations
+from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import TOOL, Robot
 from morphgen.viewer.robot_view import RobotView, robot_extent
 
@@ -107,7 +106,7 @@ def show_ignored_pairs(overlays: Overlays) -> None:
 def workspace_points(robot: Robot) -> Array:
     """Where the tool goes, at configurations drawn uniformly, shape (n, 3), metres."""
     q = random_configurations(robot, POINTS, np.random.default_rng(0))
-    return tool_positions(robot, q.T).T
+    return frame_positions(robot, q.T).T
 
 
 def show_workspace(overlays: Overlays, points: Array) -> None:

@@ -9,9 +9,9 @@ import viser
 from morphgen.fitting.replace_collision import as_primitives, stored_primitives
 from morphgen.formats.fits import read_stored
 from morphgen.model.geometry import Pose
+from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.kinematics import frame_pose
 from morphgen.viewer import overlays
-from morphgen.viewer.inverse_kinematics import solve
 from morphgen.viewer.places import as_in_library
 from morphgen.viewer.robot_state import (
     RobotPage,
@@ -151,4 +151,4 @@ def _follow(page: RobotPage) -> None:
     w, x, y, z = (float(value) for value in page.gizmo.wxyz)
     px, py, pz = (float(value) for value in page.gizmo.position)
     goal = Pose((px, py, pz), (w, x, y, z)).matrix
-    set_configuration(page, solve(page.robot, goal, page.q))
+    set_configuration(page, solve_pose_ik(page.robot, goal, page.q))

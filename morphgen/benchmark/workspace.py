@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.model import rotation
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, forward_kinematics, reach
-from morphgen.model.robot import TOOL, Joint, Robot
-from morphgen.model.rotation import Quat, Vec3
+from morphgen.model.kinematics import (
+    bounds,
+    forward_kinematics,
+    frame_positions,
+    joint_axes,
+    reach,
+)
+from morphgen.model.robot import TOOL, Robot
+from morphgen.model.rotation import Vec3
 
 Array = NDArray[np.float64]
 
@@ -69,7 +74,7 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
             for joint in robot.joints
         ),
     )
-    points = tool_positions(about, _configurations(about, path, samples))
+    points = frame_positions(about, _configurations(about, path, samples))
     farthest = max(reach(about, TOOL), float(np.sqrt((points * points).sum(axis=0).max())))
     if farthest < _STILL:
         raise BenchmarkError(
@@ -106,11 +111,9 @@ def shoulder(robot: Robot) -> Vec3:
     T_root_link = forward_kinematics(robot, bounds(robot).mean(axis=1))
     tool = robot.frame(TOOL)
     T_root_tool = T_root_link[robot.link_index[tool.link]] @ tool.T_link_frame.matrix
+    anchors, directions = joint_axes(robot, T_root_link)
     axes = [
-        (
-            T_root_link[k + 1, :3, 3],
-            T_root_link[k + 1, :3, :3] @ np.array(robot.joints[k].unit_axis),
-        )
+        (anchors[k + 1], directions[k + 1])
         for k in path
         if robot.joints[k].kind in ("revolute", "continuous")
     ]
@@ -125,59 +128,6 @@ def shoulder(robot: Robot) -> Vec3:
             break
     along = (towards - origin) @ across / (direction @ across)
     return _vec3(origin + along * direction)
-
-
-def tool_positions(robot: Robot, q: Array) -> Array:
-    """Where the tool is, in the root frame.
-
-    The same as ``kinematics.frame_pose`` says, many times as fast: points are carried from the
-    tool to the root, joint by joint, each turned to its own z axis.
-
-    Args:
-        robot: The body.
-        q: Independent joint positions, a row a joint, shape (dof, n), rad or m.
-
-    Returns:
-        Positions, shape (3, n), metres.
-    """
-    gains, offsets = robot.mimic_map
-    row = {k: i for i, k in enumerate(robot.movable)}
-    points = np.zeros((3, q.shape[1]))
-    T_joint_point = robot.frame(TOOL).T_link_frame
-    for k in reversed(robot.joints_to(robot.frame(TOOL).link)):
-        joint = robot.joints[k]
-        if joint.is_movable:
-            gain, position = gains[row[k]], offsets[row[k]]
-            for column in gain.nonzero()[0]:
-                position = position + gain[column] * q[column]
-            T_joint_axis = Pose(quaternion=_turn_from_z(joint.unit_axis))
-            points = _carried(T_joint_axis.inverse() @ T_joint_point, points)
-            _move(points, joint, position)
-            T_joint_point = T_joint_axis
-        T_joint_point = joint.T_parent_joint @ T_joint_point
-    return _carried(T_joint_point, points)
-
-
-def _carried(T: Pose, points: Array) -> Array:
-    # einsum: a threaded matrix product costs more than it saves here
-    return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
-
-
-def _move(points: Array, joint: Joint, position: Array) -> None:
-    """Move points (3, n) by a joint along or about z, in place."""
-    if joint.kind == "prismatic":
-        points[2] += position
-        return
-    c, s = np.cos(position), np.sin(position)
-    points[0], points[1] = c * points[0] - s * points[1], s * points[0] + c * points[1]
-
-
-def _turn_from_z(axis: Vec3) -> Quat:
-    """A rotation that takes z to a unit axis."""
-    x, y, z = axis
-    if z < -0.5:  # near the opposite of z: half a turn about x first
-        return rotation.multiply((0.0, 1.0, 0.0, 0.0), _turn_from_z((x, -y, -z)))
-    return rotation.normalized((1 + z, -y, x, 0.0))
 
 
 def _tool_path(robot: Robot) -> tuple[int, ...]:

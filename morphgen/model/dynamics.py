@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.model.kinematics import forward_kinematics
+from morphgen.model.kinematics import forward_kinematics, link_jacobians
 from morphgen.model.robot import Robot
 
 Array = NDArray[np.float64]
@@ -59,26 +59,15 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
         Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
     """
     T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
-    jacobian = np.zeros((len(robot.links), 6, len(robot.movable)))
-    column = {k: i for i, k in enumerate(robot.movable)}
-    for k, joint in enumerate(robot.joints):
-        jacobian[k + 1] = jacobian[robot.parents[k + 1]]
-        if joint.is_movable:
-            axis = T_root_link[k + 1, :3, :3] @ np.array(joint.unit_axis)
-            origin = T_root_link[k + 1, :3, 3]
-            if joint.kind == "prismatic":
-                jacobian[k + 1, :3, column[k]] = axis
-            else:
-                jacobian[k + 1, :3, column[k]] = -np.cross(axis, origin)
-                jacobian[k + 1, 3:, column[k]] = axis
+    J_root_link = link_jacobians(robot, T_root_link)
     M = np.zeros((len(robot.movable),) * 2)
     for i, link in enumerate(robot.links):
         if link.inertial is None or link.inertial.mass == 0:
             continue
         R = T_root_link[i, :3, :3]
         com = T_root_link[i, :3, 3] + R @ np.array(link.inertial.com)
-        angular = jacobian[i, 3:]
-        linear = jacobian[i, :3] + np.cross(angular, com, axis=0)
+        angular = J_root_link[i, 3:]
+        linear = J_root_link[i, :3] + np.cross(angular, com, axis=0)
         M += link.inertial.mass * linear.T @ linear
         M += angular.T @ (R @ link.inertial.matrix @ R.T) @ angular
     matrix, _ = robot.mimic_map

@@ -1,4 +1,7 @@
-"""Batched forward kinematics in NumPy, and what follows from it."""
+"""Kinematics of one robot in NumPy: poses, joint axes, Jacobians and reach, in batches.
+
+``morphgen.model.kinematics_torch`` has the same for many robots in one batch of tensors.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,10 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from morphgen.model import rotation
+from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
+from morphgen.model.rotation import Quat, Vec3
 
 Array = NDArray[np.float64]
 
@@ -116,17 +122,38 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = "tool") -> Array:
     return np.asarray(T_root_link @ named.T_link_frame.matrix)
 
 
-def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Array, Array]:
-    """Pose of a named frame, and how independent joints move it, in the root frame.
+def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
+    """Return an anchor and the axis of the joint that moves each link, in the root frame.
 
     Args:
-        robot: The body.
+        robot: The robot.
+        T_root_link: Poses of all links, shape (..., n_links, 4, 4).
+
+    Returns:
+        Anchors [m] and unit axes, both (..., n_links, 3); zeros where no joint moves the link.
+    """
+    anchors, axes = np.zeros((2, *T_root_link.shape[:-2], 3))
+    for k in robot.movable:
+        anchors[..., k + 1, :] = T_root_link[..., k + 1, :3, 3]
+        axes[..., k + 1, :] = T_root_link[..., k + 1, :3, :3] @ robot.joints[k].unit_axis
+    return anchors, axes
+
+
+def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Array, Array]:
+    """Return the pose and the geometric Jacobian of a named frame in the root frame.
+
+    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
+    joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0).
+
+    Args:
+        robot: The robot.
         q: Independent joint positions, shape (..., dof), rad or m.
         frame: Name of the frame.
 
     Returns:
-        ``T_root_frame``, shape (..., 4, 4), and the Jacobian, shape (..., 6, dof): linear velocity
-        of the frame's origin, then angular velocity; mimic joints are folded into their leaders.
+        ``T_root_frame``, shape (..., 4, 4), and ``J_root_frame``, shape (..., 6, dof): linear
+        velocity of the frame's origin, then angular velocity; mimic joints are folded into their
+        leaders.
 
     Raises:
         RobotError: If there is no such frame.
@@ -134,21 +161,101 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Arr
     named = robot.frame(frame)
     T_root_link = forward_kinematics(robot, q)
     T_root_frame = T_root_link[..., robot.link_index[named.link], :, :] @ named.T_link_frame.matrix
+    anchors, axes = joint_axes(robot, T_root_link)
     matrix, _ = robot.mimic_map
     row = {k: i for i, k in enumerate(robot.movable)}
     jacobian = np.zeros((*T_root_frame.shape[:-2], 6, robot.dof))
     for k in robot.joints_to(named.link):
-        joint = robot.joints[k]
-        if not joint.is_movable:
+        if k not in row:
             continue
-        axis, by_leader = T_root_link[..., k + 1, :3, :3] @ joint.unit_axis, matrix[row[k]]
-        if joint.kind == "prismatic":
+        axis, by_leader = axes[..., k + 1, :], matrix[row[k]]
+        if robot.joints[k].kind == "prismatic":
             jacobian[..., :3, :] += axis[..., None] * by_leader
             continue
-        arm = T_root_frame[..., :3, 3] - T_root_link[..., k + 1, :3, 3]
+        arm = T_root_frame[..., :3, 3] - anchors[..., k + 1, :]
         jacobian[..., :3, :] += np.cross(axis, arm)[..., None] * by_leader
         jacobian[..., 3:, :] += axis[..., None] * by_leader
     return np.asarray(T_root_frame), jacobian
+
+
+def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
+    """Return the spatial Jacobian of every link in the root frame.
+
+    Linear velocities are those of the point of a link that is at the root's origin.
+
+    Args:
+        robot: The robot.
+        T_root_link: Poses of all links, shape (..., n_links, 4, 4).
+
+    Returns:
+        ``J_root_link``, shape (..., n_links, 6, n_movable): linear, then angular velocity by
+        movable joint, mimic joints as joints of their own.
+    """
+    anchors, axes = joint_axes(robot, T_root_link)
+    jacobians = np.zeros((*T_root_link.shape[:-2], 6, len(robot.movable)))
+    column = {k: i for i, k in enumerate(robot.movable)}
+    for k, joint in enumerate(robot.joints):
+        jacobians[..., k + 1, :, :] = jacobians[..., robot.parents[k + 1], :, :]
+        if joint.kind == "prismatic":
+            jacobians[..., k + 1, :3, column[k]] = axes[..., k + 1, :]
+        elif joint.is_movable:
+            turned = -np.cross(axes[..., k + 1, :], anchors[..., k + 1, :])
+            jacobians[..., k + 1, :3, column[k]] = turned
+            jacobians[..., k + 1, 3:, column[k]] = axes[..., k + 1, :]
+    return jacobians
+
+
+def frame_positions(robot: Robot, q: Array, frame: str = "tool") -> Array:
+    """Return positions of a named frame in the root frame, many times as fast as ``frame_pose``.
+
+    Points are carried from the frame to the root, joint by joint, each turned to its own z axis,
+    instead of multiplying poses.
+
+    Args:
+        robot: The robot.
+        q: Independent joint positions, a row per joint, shape (dof, n), rad or m.
+        frame: Name of the frame.
+
+    Returns:
+        Positions, shape (3, n), metres.
+
+    Raises:
+        RobotError: If there is no such frame.
+    """
+    gains, offsets = robot.mimic_map
+    row = {k: i for i, k in enumerate(robot.movable)}
+    points = np.zeros((3, q.shape[1]))
+    named = robot.frame(frame)
+    T_joint_point = named.T_link_frame
+    for k in reversed(robot.joints_to(named.link)):
+        joint = robot.joints[k]
+        if joint.is_movable:
+            gain, position = gains[row[k]], offsets[row[k]]
+            for column in gain.nonzero()[0]:
+                position = position + gain[column] * q[column]
+            T_joint_axis = Pose(quaternion=_turn_from_z(joint.unit_axis))
+            points = _carried(T_joint_axis.inverse() @ T_joint_point, points)
+            if joint.kind == "prismatic":
+                points[2] += position
+            else:
+                c, s, (x, y) = np.cos(position), np.sin(position), points[:2]
+                points[0], points[1] = c * x - s * y, s * x + c * y
+            T_joint_point = T_joint_axis
+        T_joint_point = joint.T_parent_joint @ T_joint_point
+    return _carried(T_joint_point, points)
+
+
+def _carried(T: Pose, points: Array) -> Array:
+    # einsum: a threaded matrix product costs more than it saves here
+    return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
+
+
+def _turn_from_z(axis: Vec3) -> Quat:
+    """Return a rotation that takes z to a unit axis."""
+    x, y, z = axis
+    if z < -0.5:  # near the opposite of z: half a turn about x first
+        return rotation.multiply((0.0, 1.0, 0.0, 0.0), _turn_from_z((x, -y, -z)))
+    return rotation.normalized((1 + z, -y, x, 0.0))
 
 
 def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6) -> float:
@@ -169,8 +276,7 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6
     rng = np.random.default_rng(0)
     limits = bounds(robot)
     q = random_configurations(robot, samples, rng)
-    path = _Path(robot, frame)
-    distance = path.distance(q)
+    distance = _distance(robot, q, frame)
     keep = np.argsort(-distance, kind="stable")[:8]
     q, distance = q[keep], distance[keep]
     width = limits[:, 1] - limits[:, 0]
@@ -178,7 +284,7 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6
         step = 0.3 * 0.5**i * width
         trial = q[:, None, :] + rng.uniform(-1, 1, (len(q), 16, robot.dof)) * step
         trial = np.clip(trial, limits[:, 0], limits[:, 1])
-        found = path.distance(trial)
+        found = _distance(robot, trial, frame)
         best = found.argmax(axis=1)
         rows = np.arange(len(q))
         better = found[rows, best] > distance
@@ -187,29 +293,22 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6
     return float(distance.max())
 
 
-class _Path:
-    """The joints from a frame up to the root, for its distance from the root's origin."""
+def _distance(robot: Robot, q: Array, frame: str) -> Array:
+    """Return distances of a frame from the root's origin at (..., dof), shape (...,), metres.
 
-    def __init__(self, robot: Robot, frame: str) -> None:
-        self._robot = robot
-        named = robot.frame(frame)
-        self._start = np.array(named.T_link_frame.position)
-        self._steps: list[tuple[int, int]] = []
-        column = {k: i for i, k in enumerate(robot.movable)}
-        for k in reversed(robot.joints_to(named.link)):
-            self._steps.append((k, column.get(k, -1)))
-
-    def distance(self, q: Array) -> Array:
-        """Distance at configurations (..., dof), shape (...,), metres."""
-        positions = movable_positions(self._robot, q)
-        point = np.broadcast_to(self._start, (*q.shape[:-1], 3))
-        for k, column in self._steps:
-            joint = self._robot.joints[k]
-            if column >= 0:
-                point = _moved(point, joint.kind, joint.unit_axis, positions[..., column, None])
-            T = joint.T_parent_joint.matrix
-            point = point @ T[:3, :3].T + T[:3, 3]
-        return np.asarray(np.sqrt((point * point).sum(axis=-1)))
+    Not by ``frame_positions``: the last bits of ``reach`` are in stored push sets.
+    """
+    positions = movable_positions(robot, q)
+    named = robot.frame(frame)
+    column = {k: i for i, k in enumerate(robot.movable)}
+    point = np.broadcast_to(np.array(named.T_link_frame.position), (*q.shape[:-1], 3))
+    for k in reversed(robot.joints_to(named.link)):
+        joint = robot.joints[k]
+        if joint.is_movable:
+            point = _moved(point, joint.kind, joint.unit_axis, positions[..., column[k], None])
+        T = joint.T_parent_joint.matrix
+        point = point @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(np.sqrt((point * point).sum(axis=-1)))
 
 
 def _moved(point: Array, kind: str, axis: tuple[float, float, float], position: Array) -> Array:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import morphgen
-from morphgen.benchmark.workspace import overlap, shoulder, tool_positions, workspace
+from morphgen.benchmark.workspace import overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, random_configurations, reach
+from morphgen.model.kinematics import frame_pose, frame_positions, random_configurations, reach
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.scaling import scaled
 from robots import arm
@@ -52,7 +52,7 @@ def led(robot):
 def test_tools_are_where_forward_kinematics_has_them(robot):
     q = random_configurations(robot, 100, np.random.default_rng(0))
     expected = frame_pose(robot, q)[:, :3, 3]
-    np.testing.assert_allclose(tool_positions(robot, q.T).T, expected, atol=1e-12)
+    np.testing.assert_allclose(frame_positions(robot, q.T).T, expected, atol=1e-12)
 
 
 def test_the_density_is_of_all_samples_and_the_same_every_time():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.push_plans import PushPlanner
 from morphgen.rl.scripted_push import PLANS, RISE, ScriptedPush
 from morphgen.tasks.config import PushConfig, ReachConfig
-from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.make import make_batch
 from scenes import robot
 
@@ -128,7 +128,7 @@ def test_a_tool_whose_arm_gets_into_something_rises(free, tmp_path, monkeypatch)
     while len(heights) < 12:
         acting = controller.act(task)
         if controller._state.pushing[0]:
-            heights.append(float(tool_positions(task.bodies.chain, task.body, task.targets)[0, 2]))
+            heights.append(float(frame_positions(task.bodies.chain, task.body, task.targets)[0, 2]))
         assert not task.step(acting).terminated.any()
     task.close()
     rise = 0.0 if free else RISE

@@ -10,11 +10,10 @@ from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Box, Shape
-from morphgen.model.kinematics import forward_kinematics, frame_pose, random_configurations
+from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
-from morphgen.tasks.kinematics import quaternions, tool_jacobians, tool_poses, tool_positions
 from morphgen.tasks.observation import LinkTokens
 
 FOLDERS = default_library(()).folders
@@ -39,45 +38,6 @@ def configurations(robots, bodies, n=20):
     for i, robot in enumerate(robots):
         q[body == i, : robot.dof] = torch.from_numpy(random_configurations(robot, n, rng))
     return body, q
-
-
-def test_tools_are_where_the_model_has_them(robots, bodies):
-    body, q = configurations(robots, bodies)
-    found = tool_poses(bodies.chain, body, q.float()).double().numpy()
-    positions = tool_positions(bodies.chain, body, q.float())
-    for i, robot in enumerate(robots):
-        T = frame_pose(robot, q[body == i, : robot.dof].numpy())
-        mine = found[body == i]
-        assert mine[:, :3] == pytest.approx(T[:, :3, 3], abs=1e-5)
-        assert positions[body == i].numpy() == pytest.approx(T[:, :3, 3], abs=1e-5)
-        assert (mine[:, 3] >= 0).all()
-        expected = quaternions(torch.from_numpy(T[:, :3, :3])).numpy()
-        assert np.abs((mine[:, 3:] * expected).sum(axis=1)) == pytest.approx(1, abs=1e-5)
-
-
-def test_jacobians_are_the_derivatives(robots, bodies):
-    body, q = configurations(robots, bodies, n=5)
-    jacobian = tool_jacobians(bodies.chain, body, q.float())
-    step = 1e-3
-    for j in range(bodies.max_joints):
-        ahead, behind = q.clone(), q.clone()
-        ahead[:, j] += step
-        behind[:, j] -= step
-        for i, robot in enumerate(robots):
-            rows = body == i
-            if j >= robot.dof:
-                assert (jacobian[rows, :, j] == 0).all()
-                continue
-            a, b = (
-                frame_pose(robot, x[rows, : robot.dof].numpy())[:, :3, 3] for x in (ahead, behind)
-            )
-            assert jacobian[rows, :3, j].numpy() == pytest.approx((a - b) / (2 * step), abs=2e-4)
-
-
-def test_quaternions_of_half_turns_too():
-    turns = np.array([np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1])])
-    found = quaternions(torch.from_numpy(turns.astype(float))).numpy()
-    assert np.abs(found) == pytest.approx(np.eye(4), abs=1e-9)
 
 
 def test_the_position_codes_are_those_of_the_tokens(robots, bodies):
@@ -135,10 +95,6 @@ def test_a_mimic_joint_follows_its_leader():
     )
     robot = Robot("r", links, joints, (Frame("tool", "c"),), (0.2,))
     bodies = bodies_of([robot])
-    q = torch.tensor([[0.5]])
-    pose = tool_poses(bodies.chain, torch.tensor([0]), q)
-    T = forward_kinematics(robot, [[0.5]])[0, 2]
-    assert pose[0, :3].numpy() == pytest.approx(T[:3, 3], abs=1e-6)
     assert bodies.action_mask(fingers=True)[0].sum() == 1
 
 

@@ -13,7 +13,6 @@ from morphgen.tasks import push_sets as module
 from morphgen.tasks import push_ways
 from morphgen.tasks.config import PushConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.inverse_kinematics import bring_tool
 from morphgen.tasks.push_proofs import CLOSE
 from morphgen.tasks.push_region import effective_reach, push_region
 from morphgen.tasks.push_sets import PushSet, push_set
@@ -237,12 +236,3 @@ def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path):
     with pytest.warns(UserWarning, match="cannot keep a PushSet"):
         found = made("prims", tmp_path / "file" / "pushes")
     assert len(found.q) == 5
-
-
-def test_tools_are_brought_where_they_can_be_and_their_distance_is_told():
-    body = robot("arm=ur5 ee=plane")
-    goals = np.array([[0.5, 0.2, 0.3], [9.0, 0.0, 0.0]])
-    q, error = bring_tool(body, np.tile(body.home, (2, 1)), goals)
-    assert frame_pose(body, q)[0, :3, 3] == pytest.approx(goals[0], abs=1e-4)
-    assert goals - error == pytest.approx(frame_pose(body, q)[:, :3, 3])
-    assert np.linalg.norm(error[1]) > 7

@@ -1,0 +1,114 @@
+"""The NumPy and the torch implementation of kinematics behind one interface, for tests of both."""
+
+from dataclasses import dataclass
+
+import torch
+
+from morphgen.model import inverse_kinematics, inverse_kinematics_torch, kinematics
+from morphgen.model import kinematics_torch as batched
+from morphgen.model.kinematics import bounds
+
+BACKENDS = ("numpy", "float64", "float32")
+
+
+class NumpyBackend:
+    """One robot at a time."""
+
+    tolerance = 1e-9
+
+    def __init__(self, robots):
+        self.robots = robots
+
+    def link_poses(self, index, q):
+        return kinematics.forward_kinematics(self.robots[index], q)
+
+    def joint_axes(self, index, q):
+        return kinematics.joint_axes(self.robots[index], self.link_poses(index, q))
+
+    def frame_pose(self, index, q):
+        return kinematics.frame_pose(self.robots[index], q)
+
+    def frame_jacobian(self, index, q):
+        return kinematics.frame_jacobian(self.robots[index], q)
+
+    def frame_positions(self, index, q):
+        return kinematics.frame_positions(self.robots[index], q.T).T
+
+    def dls_step(self, J, error, damping):
+        return inverse_kinematics.dls_step(J, error, damping)
+
+    def solve_position_ik(self, index, q, positions, **options):
+        robot = self.robots[index]
+        return inverse_kinematics.solve_position_ik(robot, q, positions, **options)
+
+
+@dataclass
+class TorchBackend:
+    """All robots in one padded batch, of which the rows of one robot are asked for."""
+
+    robots: list
+    dtype: torch.dtype
+
+    def __post_init__(self):
+        self.tolerance = 1e-9 if self.dtype == torch.float64 else 2e-5
+        self.tree = batched.kinematic_tree(self.robots, dtype=self.dtype)
+        self.chain = batched.tool_chain(self.robots, dtype=self.dtype)
+        self.joints = max(robot.dof for robot in self.robots)
+
+    def rows(self, index, q):
+        """Which robot each row is, and its padded joint positions: here padded with ones."""
+        padded = torch.ones(len(q), self.joints, dtype=self.dtype)
+        padded[:, : q.shape[1]] = torch.from_numpy(q)
+        return torch.full((len(q),), index), padded
+
+    def link_poses(self, index, q):
+        T = batched.forward_kinematics(self.tree, *self.rows(index, q))
+        assert T.dtype == self.dtype
+        padding = T[:, ~self.tree.is_link[index]]
+        assert (padding == torch.eye(4)).all()
+        return T[:, self.tree.is_link[index]].numpy()
+
+    def joint_axes(self, index, q):
+        rows = self.rows(index, q)
+        found = batched.joint_axes(self.tree, rows[0], batched.forward_kinematics(self.tree, *rows))
+        return [each[:, self.tree.is_link[index]].numpy() for each in found]
+
+    def frame_pose(self, index, q):
+        return batched.frame_pose(self.chain, *self.rows(index, q)).numpy()
+
+    def frame_jacobian(self, index, q):
+        T, J = batched.frame_jacobian(self.chain, *self.rows(index, q))
+        assert T.dtype == J.dtype == self.dtype
+        dof = self.robots[index].dof
+        assert (J[..., dof:] == 0).all()
+        return T.numpy(), J[..., :dof].numpy()
+
+    def frame_positions(self, index, q):
+        return batched.frame_positions(self.chain, *self.rows(index, q)).numpy()
+
+    def dls_step(self, J, error, damping):
+        tensors = (torch.from_numpy(each).to(self.dtype) for each in (J, error))
+        return inverse_kinematics_torch.dls_step(*tensors, damping).numpy()
+
+    def solve_position_ik(self, index, q, positions, **options):
+        robot_index, padded = self.rows(index, q)
+        goals = torch.from_numpy(positions).to(self.dtype)
+        limits = self.limits(robot_index)
+        found, error = inverse_kinematics_torch.solve_position_ik(
+            self.chain, robot_index, padded, goals, limits, **options
+        )
+        return found[:, : q.shape[1]].double().numpy(), error.numpy()
+
+    def limits(self, robot_index):
+        """Lower and upper limits of every row, each (n, J)."""
+        both = torch.zeros(2, len(self.robots), self.joints, dtype=self.dtype)
+        for r, robot in enumerate(self.robots):
+            both[:, r, : robot.dof] = torch.from_numpy(bounds(robot).T)
+        return both[0, robot_index], both[1, robot_index]
+
+
+def backend(name, robots):
+    """The implementation of a name in ``BACKENDS`` for some robots."""
+    if name == "numpy":
+        return NumpyBackend(robots)
+    return TorchBackend(robots, getattr(torch, name))

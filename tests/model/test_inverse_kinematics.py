@@ -1,0 +1,188 @@
+"""Damped least squares, NumPy and torch: tools are brought where they can be, within limits."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from kinematic_backends import BACKENDS, backend
+from morphgen.model.inverse_kinematics import solve_pose_ik
+from morphgen.model.inverse_kinematics_torch import solve_position_ik, step_to_pose
+from morphgen.model.kinematics import bounds, frame_pose, moved_by, random_configurations
+from morphgen.model.kinematics_torch import frame_pose as frame_poses
+from morphgen.model.rotation_torch import quaternion_matrices, quaternions, rotation_vectors
+from robots import arm
+from scenes import robot
+
+UR5, PANDA, GANTRY, CHAIN, CLAW = ROBOTS = [
+    robot(words)
+    for words in (
+        "arm=ur5 ee=plane",
+        "arm=panda ee=panda_hand",
+        "prims",
+        "nlink",
+        "arm=arm3 ee=claw",
+    )
+]
+QUARTER_TURN = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+
+
+@pytest.fixture(params=BACKENDS)
+def kinematics(request):
+    return backend(request.param, ROBOTS)
+
+
+def test_a_step_solves_the_damped_normal_equations(kinematics):
+    rng = np.random.default_rng(0)
+    J, error = rng.normal(size=(5, 6, 7)), rng.normal(size=(5, 6))
+    expected = np.linalg.solve(
+        J.swapaxes(1, 2) @ J + 0.09 * np.eye(7), (J.swapaxes(1, 2) @ error[..., None])
+    )
+    found = kinematics.dls_step(J, error, 0.3)
+    np.testing.assert_allclose(found, expected[..., 0], atol=10 * kinematics.tolerance)
+
+
+@pytest.mark.parametrize("index", range(len(ROBOTS)))
+def test_tools_get_to_positions_within_limits(kinematics, index):
+    body, rng = ROBOTS[index], np.random.default_rng(index)
+    low, high = bounds(body).T
+    q = 0.5 * (low + high) + 0.25 * rng.uniform(-1, 1, (6, body.dof)) * (high - low)
+    goals = frame_pose(body, np.clip(q + rng.uniform(-0.2, 0.2, q.shape), low, high))[:, :3, 3]
+    found, error = kinematics.solve_position_ik(index, q, goals)
+    slack = 1e-6 if kinematics.tolerance > 1e-6 else 0
+    assert ((low - slack <= found) & (found <= high + slack)).all()
+    left = goals - frame_pose(body, found)[:, :3, 3]
+    np.testing.assert_allclose(error, left, atol=kinematics.tolerance)
+    assert np.median(np.linalg.norm(left, axis=1)) < 1e-3
+    idle = np.setdiff1d(range(body.dof), moved_by(body, body.joints_to(body.frame("tool").link)))
+    np.testing.assert_allclose(found[:, idle], q[:, idle], atol=kinematics.tolerance)
+
+
+def test_what_is_out_of_reach_is_reported(kinematics):
+    goals = np.array([[0.5, 0.2, 0.3], [9.0, 0.0, 0.0]])
+    q, error = kinematics.solve_position_ik(0, np.tile(UR5.home, (2, 1)), goals)
+    assert np.abs(error[0]).max() < 1e-4
+    assert goals - error == pytest.approx(frame_pose(UR5, q)[:, :3, 3], abs=1e-5)
+    assert np.linalg.norm(error[1]) > 7
+
+
+def test_numpy_and_torch_take_the_same_steps():
+    q = random_configurations(PANDA, 20, np.random.default_rng(0))
+    goals = frame_pose(PANDA, q[::-1])[:, :3, 3]
+    ours, batched = (
+        backend(name, ROBOTS).solve_position_ik(1, q, goals, iterations=3, damping=0.1)[0]
+        for name in ("numpy", "float64")
+    )
+    np.testing.assert_allclose(batched, ours, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_near_pose_is_reached(seed):
+    q = np.array(UR5.home)
+    goal = frame_pose(UR5, q + np.random.default_rng(seed).uniform(-0.4, 0.4, UR5.dof))
+    assert frame_pose(UR5, solve_pose_ik(UR5, goal, q)) == pytest.approx(goal, abs=2e-3)
+
+
+def test_a_pose_out_of_reach_is_approached_within_the_limits():
+    goal = np.eye(4)
+    goal[:3, 3] = (0.0, 0.0, 5.0)
+    found = solve_pose_ik(arm(), goal, arm().home, rotation_weight=0.0)
+    low, high = bounds(arm()).T
+    assert ((low <= found) & (found <= high)).all()
+    assert frame_pose(arm(), found)[2, 3] > frame_pose(arm(), arm().home)[2, 3]
+
+
+class Stepper:
+    """Steps to poses for rows of ``ROBOTS``."""
+
+    def __init__(self, *rows):
+        batch = backend("float32", ROBOTS)
+        self.chain, self.robot_index = batch.chain, torch.tensor(rows)
+        self.limits = batch.limits(self.robot_index)
+        self.home = torch.zeros(len(rows), batch.joints)
+        for q, row in zip(self.home, rows, strict=True):
+            q[: ROBOTS[row].dof] = torch.tensor(ROBOTS[row].home)
+
+    def poses(self, q):
+        T = frame_poses(self.chain, self.robot_index, q)
+        return T[:, :3, 3], T[:, :3, :3]
+
+    def __call__(self, q, positions, rotations, **options):
+        return step_to_pose(
+            self.chain, self.robot_index, q, positions, rotations, self.limits, **options
+        )
+
+
+def test_tools_are_moved_first_and_turned_with_what_is_left():
+    step = Stepper(1, 2, 3)
+    q = step.home + 0.2 * (step.limits[1] - step.home).clamp(max=1.0)
+    positions, rotations = step.poses(q)
+    goals = positions + torch.tensor([[0.0, 0.05, 0.02], [0.0, 0.05, -0.02], [-0.05, 0.05, 0.0]])
+    for _ in range(30):
+        q = step(q, goals, rotations)
+    found, turned = step.poses(q)
+    assert (found - goals).abs().max() < 5e-3
+    off = (turned - rotations).abs().amax(dim=(1, 2))
+    assert off[:2].max() < 0.02
+    assert off[2] > 0.1, "two hinges have nothing left"
+
+
+def test_joints_at_their_limits_leave_it_to_the_others():
+    step = Stepper(0)
+    q, (low, high) = step.home, step.limits
+    positions, rotations = step.poses(q)
+    for _ in range(100):
+        q = step(q, positions + 9.0, rotations)
+        assert ((low <= q) & (q <= high)).all()
+
+
+def test_no_joint_turns_the_tool_beyond_its_budget():
+    step = Stepper(1)
+    q, budget = step.home, torch.full_like(step.home, 0.05)
+    positions, rotations = step.poses(q)
+    goals, turned = positions + torch.tensor([[0.0, 0.004, 0.0]]), QUARTER_TURN @ rotations
+    free = step(q, goals, turned) - q
+    within = step(q, goals, turned, rotation_budget=budget) - q
+    assert (free.abs() > budget).any()
+    assert (within.abs() <= budget).all()
+    assert step.poses(q + within)[0].numpy() == pytest.approx(goals.numpy(), abs=5e-4)
+    both = [step(q, goals, rotations, rotation_budget=each) for each in (None, budget)]
+    assert torch.equal(*both), "where all joints stay within it nothing is given up"
+
+
+def test_solutions_are_differentiable_in_their_goals():
+    step = Stepper(0, 1)
+    goals = (step.poses(step.home)[0] - 0.05).requires_grad_()
+    found, _ = solve_position_ik(step.chain, step.robot_index, step.home, goals, step.limits)
+    tools = step.poses(found)[0]
+    (gradient,) = torch.autograd.grad(tools.sum(), goals)
+    torch.testing.assert_close(gradient, torch.ones_like(goals), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-3, 0.5, 1.5, 2.9, 3.0, 3.1415, math.pi])
+def test_rotation_vectors_are_the_logarithms_of_rotations(angle):
+    axes = np.random.default_rng(0).normal(size=(200, 3))
+    axes[:3] = np.eye(3)
+    wanted = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    R = torch.from_numpy(Rotation.from_rotvec(wanted).as_matrix()).float()
+    found = rotation_vectors(R).double().numpy()
+    if angle > 3.1415:  # there are two, and which it is depends on the last bit
+        found *= np.sign((found * wanted).sum(axis=1, keepdims=True))
+    assert np.abs(found - wanted).max() < 3e-6 * max(angle, 1e-3)
+
+
+def test_quaternions_are_those_of_scipy_and_back():
+    turns = Rotation.random(200, rng=np.random.default_rng(0))
+    R = torch.from_numpy(turns.as_matrix())
+    expected = turns.as_quat(canonical=True, scalar_first=True)
+    found = quaternions(R)
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+    torch.testing.assert_close(quaternion_matrices(found), R, atol=1e-12, rtol=0)
+
+
+def test_quaternions_of_half_turns_too():
+    turns = np.array([np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1])])
+    found = quaternions(torch.from_numpy(turns.astype(float))).numpy()
+    assert np.abs(found) == pytest.approx(np.eye(4), abs=1e-9)

@@ -1,0 +1,212 @@
+"""NumPy and torch kinematics agree with MuJoCo and Pinocchio for robots of every structure."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import morphgen
+from kinematic_backends import BACKENDS, TorchBackend, backend
+from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.formats.urdf_text import urdf_text
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
+from morphgen.model.kinematics_torch import (
+    forward_kinematics,
+    frame_jacobian,
+    kinematic_tree,
+    tool_chain,
+)
+from morphgen.model.robot import Frame, Link, Mimic, Robot
+from robots import arm
+
+WORDS = (
+    "arm=ur5 ee=plane",
+    "arm=panda ee=panda_hand",
+    "base=gantry arm=ur5 ee=stick",
+    "arm=lwr ee=claw",
+    "chain beads=2",
+    "arm3",
+)
+
+
+def tool_on_a_mimic_finger():
+    """The arm with its tool on a finger that follows a slide of another branch, with an offset."""
+    *joints, last = arm().joints
+    joints.append(replace(last, mimic=Mimic("left", -0.5, 0.1)))
+    frame = Frame("tool", "right", Pose.from_xyz_rpy((0.01, 0.02, 0.03), (0.3, 0.2, 0.1)))
+    return replace(arm(), name="mimic", joints=tuple(joints), frames=(frame,))
+
+
+def two_leaders():
+    """The arm whose slide follows its shoulder, so that one leader moves the tool by two joints."""
+    shoulder, elbow, slide, *fingers = arm().joints
+    slide = replace(slide, mimic=Mimic("shoulder", 0.02, 0.03))
+    home = (arm().home[0], arm().home[1], arm().home[3])
+    return replace(arm(), name="led", joints=(shoulder, elbow, slide, *fingers), home=home)
+
+
+ROBOTS = [
+    *(morphgen.compose(words, geometry="primitive") for words in WORDS),
+    arm(),
+    tool_on_a_mimic_finger(),
+    two_leaders(),
+]
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def kinematics(request):
+    return backend(request.param, ROBOTS)
+
+
+@pytest.fixture(params=range(len(ROBOTS)), ids=[robot.name for robot in ROBOTS])
+def index(request):
+    return request.param
+
+
+def drawn(index, n=8):
+    return random_configurations(ROBOTS[index], n, np.random.default_rng(index))
+
+
+def test_links_are_where_mujoco_has_them(kinematics, index):
+    robot, q = ROBOTS[index], drawn(index)
+    expected = MujocoKinematics(robot)
+    T_root_link = kinematics.link_poses(index, q)
+    assert T_root_link.shape == (len(q), len(robot.links), 4, 4)
+    for i, link in enumerate(robot.links):
+        np.testing.assert_allclose(
+            T_root_link[:, i], expected.link_pose(q, link.name), atol=kinematics.tolerance
+        )
+
+
+def test_axes_and_anchors_are_those_of_mujoco(kinematics, index):
+    robot, q = ROBOTS[index], drawn(index, 1)
+    expected = MujocoKinematics(robot)
+    expected.frame_pose(q)
+    anchors, axes = (each[0] for each in kinematics.joint_axes(index, q))
+    for k, joint in enumerate(robot.joints):
+        if not joint.is_movable:
+            assert not axes[k + 1].any()
+            assert not anchors[k + 1].any()
+            continue
+        view = expected.data.joint(joint.name)
+        np.testing.assert_allclose(axes[k + 1], view.xaxis, atol=kinematics.tolerance)
+        apart = anchors[k + 1] - view.xanchor
+        if joint.kind == "prismatic":  # MuJoCo's anchor stays behind when the joint slides
+            apart = np.cross(apart, view.xaxis)
+        np.testing.assert_allclose(apart, 0, atol=kinematics.tolerance)
+    assert not axes[0].any()
+
+
+def test_tool_jacobians_are_those_of_mujoco(kinematics, index):
+    robot, q = ROBOTS[index], drawn(index)
+    expected = MujocoKinematics(robot)
+    model, data = expected.model, expected.data
+    dofs = [model.joint(robot.joints[k].name).dofadr[0] for k in robot.movable]
+    T, J = kinematics.frame_jacobian(index, q)
+    np.testing.assert_allclose(T, expected.frame_pose(q), atol=kinematics.tolerance)
+    np.testing.assert_allclose(kinematics.frame_pose(index, q), T, atol=1e-12)
+    np.testing.assert_allclose(
+        kinematics.frame_positions(index, q), T[:, :3, 3], atol=kinematics.tolerance
+    )
+    for row, J_root_tool in zip(q, J, strict=True):
+        expected.frame_pose(row[None])
+        mujoco.mj_comPos(model, data)
+        both = np.zeros((2, 3, model.nv))
+        mujoco.mj_jacSite(model, data, *both, model.site("tool").id)
+        folded = both.reshape(6, -1)[:, dofs] @ robot.mimic_map[0]
+        np.testing.assert_allclose(J_root_tool, folded, atol=kinematics.tolerance)
+
+
+def test_tool_jacobians_are_those_of_pinocchio(kinematics, index):
+    pinocchio = pytest.importorskip("pinocchio")
+    robot, q = ROBOTS[index], drawn(index)
+    bare = [replace(link, visuals=(), collisions=()) for link in robot.links]
+    model = pinocchio.buildModelFromXML(urdf_text(robot.with_links(bare), str))
+    data, tool = model.createData(), robot.frame("tool")
+    names = [robot.joints[k].name for k in robot.movable]
+    columns = [model.idx_vs[model.getJointId(name)] for name in names]
+    link = model.getFrameId(tool.link, pinocchio.FrameType.BODY)
+    frame = model.addFrame(
+        pinocchio.Frame(
+            "our tool",
+            model.frames[link].parentJoint,
+            model.frames[link].placement * pinocchio.SE3(tool.T_link_frame.matrix),
+            pinocchio.FrameType.OP_FRAME,
+        )
+    )
+    data = model.createData()
+    T, J = kinematics.frame_jacobian(index, q)
+    for i, positions in enumerate(movable_positions(robot, q)):
+        v = np.zeros(model.nv)
+        v[columns] = positions
+        configuration = pinocchio.integrate(model, pinocchio.neutral(model), v)
+        own = pinocchio.computeFrameJacobian(
+            model, data, configuration, frame, pinocchio.LOCAL_WORLD_ALIGNED
+        )
+        folded = own[:, columns] @ robot.mimic_map[0]
+        np.testing.assert_allclose(T[i], data.oMf[frame].homogeneous, atol=kinematics.tolerance)
+        np.testing.assert_allclose(J[i], folded, atol=kinematics.tolerance)
+
+
+def test_rows_of_different_robots_do_not_touch_each_other():
+    kinematics = TorchBackend(ROBOTS, torch.float64)
+    rows = [kinematics.rows(index, drawn(index)) for index in range(len(ROBOTS))]
+    robot_index, q = (torch.cat(each) for each in zip(*rows, strict=True))
+    order = torch.randperm(len(q), generator=torch.Generator().manual_seed(0))
+    T_root_link = forward_kinematics(kinematics.tree, robot_index[order], q[order])
+    T_root_tool, J_root_tool = frame_jacobian(kinematics.chain, robot_index[order], q[order])
+    for index in range(len(ROBOTS)):
+        own = order[robot_index[order] == index] - 8 * index
+        T, J = kinematics.frame_jacobian(index, drawn(index))
+        here = robot_index[order] == index
+        alone = kinematics.link_poses(index, drawn(index))[own]
+        together = T_root_link[here][:, kinematics.tree.is_link[index]].numpy()
+        np.testing.assert_allclose(together, alone, atol=1e-14)
+        np.testing.assert_allclose(T_root_tool[here].numpy(), T[own], atol=1e-14)
+        dof = ROBOTS[index].dof
+        np.testing.assert_allclose(J_root_tool[here][..., :dof].numpy(), J[own], atol=1e-14)
+
+
+def test_derivatives_of_poses_are_the_jacobians():
+    kinematics = TorchBackend(ROBOTS, torch.float64)
+    for index, robot in enumerate(ROBOTS):
+        robot_index, q = kinematics.rows(index, drawn(index, 2))
+        _, J = frame_jacobian(kinematics.chain, robot_index, q)
+        tool = robot.frame("tool")
+        link = robot.link_index[tool.link]
+        T_link_tool = torch.tensor(tool.T_link_frame.matrix)
+
+        def position(q, robot_index=robot_index, link=link, T_link_tool=T_link_tool):
+            T = forward_kinematics(kinematics.tree, robot_index, q)[:, link] @ T_link_tool
+            return T[:, :3, 3].sum(dim=0)
+
+        derivative = torch.autograd.functional.jacobian(position, q).transpose(0, 1)
+        torch.testing.assert_close(J[:, :3], derivative, atol=1e-12, rtol=0)
+
+
+def test_a_tree_may_have_room_for_more_links():
+    tree = kinematic_tree([arm()], max_links=9)
+    assert tree.is_link.tolist() == [[True] * 6 + [False] * 3]
+    T = forward_kinematics(tree, torch.tensor([0]), torch.tensor([arm().home]))
+    assert T.shape == (1, 9, 4, 4)
+    assert (T[:, 6:] == torch.eye(4)).all()
+    with pytest.raises(ValueError, match="max_links is 3; expected at least 6"):
+        kinematic_tree([arm()], max_links=3)
+
+
+def test_a_tool_that_nothing_moves_has_a_pose_and_no_velocity():
+    fixed = replace(arm(), name="fixed", frames=(Frame("tool", "base", Pose((1.0, 2.0, 3.0))),))
+    chain = tool_chain([fixed], dtype=torch.float64)
+    T, J = frame_jacobian(chain, torch.tensor([0]), torch.tensor([fixed.home]).double())
+    np.testing.assert_array_equal(T[0].numpy(), frame_pose(fixed, fixed.home))
+    assert not J.any()
+
+
+def test_a_robot_of_one_link_has_a_root_alone():
+    robot = Robot("stone", (Link("a"),))
+    T = forward_kinematics(kinematic_tree([robot]), torch.tensor([0, 0]), torch.zeros(2, 0))
+    assert (torch.eye(4) == T).all()
+    assert T.shape == (2, 1, 4, 4)
