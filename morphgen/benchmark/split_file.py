@@ -58,7 +58,9 @@ def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
             found = folder / f"{name}{SUFFIX}"
             if found.is_file():
                 return found
-    raise BenchmarkError(f"unknown split {name!r}{nearest(name, split_names())}")
+    raise BenchmarkError(
+        f"{name}: no such file, and no split of this name{nearest(name, split_names())}"
+    )
 
 
 def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:

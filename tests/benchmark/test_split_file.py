@@ -213,8 +213,8 @@ def test_splits_are_found_by_name_or_path(written, tmp_path, monkeypatch):
     [
         ("interpolation/arm3/reech", "did you mean 'interpolation/arm3/reach'?"),
         ("nowhere.yaml", "nowhere.yaml: no such file"),
-        ("../../split", "unknown split '../../split'"),
-        ("", "unknown split ''"),
+        ("../../split", "../../split: no such file, and no split of this name"),
+        ("", ": no such file, and no split of this name"),
     ],
 )
 def test_a_split_that_is_not_there_names_the_nearest(name, message):

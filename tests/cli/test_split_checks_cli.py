@@ -196,7 +196,7 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
     ("argv", "message"),
     [
         ("audit nowhere.yaml", "nowhere.yaml: no such file"),
-        ("audit composition/ee-tsk", "unknown split 'composition/ee-tsk'; did you mean"),
+        ("audit composition/ee-tsk", "composition/ee-tsk: no such file, and no split of this name; did you mean"),
         ("audit some.yaml --near 1", "--near 1: expected a tree distance and a cosine, such as"),
         ("audit some.yaml --near a,b", "--near a,b: expected a tree distance and a cosine"),
         ("audit some.yaml --near 2,0.5", "--near 2,0.5: a tree distance is from 0 to 1"),
@@ -206,9 +206,9 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
         ("build some.yaml --out file", "cannot write file/mine/some: Not a directory"),
         ("build wrong.yaml --out out", "unknown part 'cubw'; did you mean 'cube'?"),
         ("verify folder", "folder is no built split: it has no build.json; morphgen split build"),
-        ("verify nowhere", "unknown split 'nowhere'"),
+        ("verify nowhere", "nowhere: no such file, and no split of this name"),
         ("stats wrong.yaml", "robot 'planar-cube': the library has no part 'cubw'"),
-        ("stats nowhere", "unknown split 'nowhere'"),
+        ("stats nowhere", "nowhere: no such file, and no split of this name"),
     ],
 )
 def test_what_they_cannot_do_is_refused_in_a_line(run, write, tmp_path, argv, message):
