@@ -160,7 +160,7 @@ def files(folder):
     ("argv", "message"),
     [
         ("nowhere.yaml", "nowhere.yaml: no such file"),
-        ("no split of this name; did you mean"),
+        ("extrapolation/arms/raech", "no split of this name; did you mean"),
         ("arm=ur5 ee=plane", "arm=ur5 ee=plane: name one split, or say --task for a robot"),
         ("arm=ur5", "arm=ur5: no such file, and no split of this name"),
         ("some.yaml --seed -1", "goal seed -1: expected 0 or more"),
