@@ -107,14 +107,14 @@ class InverseKinematics:
                 ways, q = self._ways_of(task, robot, starts[i])
                 nodes = ways.reached(q, STARTS, attempt=attempt)
                 tried[:, i, : len(q)] = torch.from_numpy(nodes)
-        found, left = solve(task.bodies, body, task.goal[envs, :3], tried)
+        found, left = solve(task.bodies, body, task.field("goal")[envs, :3], tried)
         step = task.bodies.step[body].clamp(min=1e-9)
         far = ((found - starts) / step).abs().amax(dim=2)
         order = torch.where(left < CLOSE, far, 1e9 * (1 + left)).argsort(dim=0)
         count = (left < CLOSE).sum(dim=0).clamp(min=1).tolist()
         rows = zip(order.T, count, body.tolist(), strict=True)
         return [
-            _numbers(found[some[:k], i, : task.settings[robot].robot.dof])
+            _numbers(found[some[:k], i, : task.specs[robot].robot.dof])
             for i, (some, k, robot) in enumerate(rows)
         ]
 
@@ -131,7 +131,7 @@ class InverseKinematics:
 
     def _ways_of(self, task: TaskBatch, robot: int, q: torch.Tensor) -> tuple[FreeWays, Array]:
         """The ways of a robot, and where its joints are, from (J,) to (dof,)."""
-        dof = task.settings[robot].robot.dof
+        dof = task.specs[robot].robot.dof
         if robot not in self._ways:
             step, moves = task.bodies.step[robot, :dof], task.bodies.moves_tool[robot, :dof]
             rng = np.random.default_rng([self._seed, robot])
@@ -190,7 +190,7 @@ def reference(name: str, batch: TaskBatch, seed: int) -> Controller:
         BenchmarkError: If a robot has hardly a free configuration.
     """
     if name == "ik":
-        return InverseKinematics(seed, [FreeSpace(setting.scene) for setting in batch.settings])
+        return InverseKinematics(seed, [FreeSpace(spec.scene) for spec in batch.specs])
     if name == "scripted":
         return ScriptedPush(seed)
     return Random(seed) if name == "random" else Zero()

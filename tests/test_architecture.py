@@ -139,6 +139,6 @@ def test_processes_of_pybullet_load_little_else():
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "scipy", "lxml"} - {"pybullet"})
 
 
-@pytest.mark.parametrize("module", ["benchmark.export", "fitting.token_shapes", "tasks.goals"])
+@pytest.mark.parametrize("module", ["benchmark.export", "fitting.token_shapes", "tasks.env_specs"])
 def test_splits_and_goals_wait_for_no_torch(module):
     assert "torch" not in modules_after(f"import morphgen.{module}")

@@ -15,10 +15,12 @@ from morphgen.rl.references import STARTS, InverseKinematics, random_starts, sol
 from morphgen.rl.rollouts import run_episodes
 from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.actions import actions_of
-from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
+from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematics import tool_positions
 from morphgen.tasks.make import make_batch
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
 from scenes import robot
 
@@ -31,7 +33,7 @@ def made(tmp_path):
     opened = []
 
     def make(words, n, task="reach", **options):
-        given = {"cache": tmp_path, "reach": REACH, "push": PUSH, "sim": "mujoco", **options}
+        given = {"cache": tmp_path, "configs": (REACH, PUSH), "sim": "mujoco", **options}
         opened.append(make_batch(task, [robot(words)], n, **given))
         opened[-1].reset()
         return opened[-1]
@@ -42,7 +44,7 @@ def made(tmp_path):
 
 
 def spaces(batch):
-    return [FreeSpace(setting.scene) for setting in batch.settings]
+    return [FreeSpace(setting.scene) for setting in batch.specs]
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
@@ -51,7 +53,7 @@ def test_a_robot_gets_past_a_stop(made, kind):
     batch = made("prims", 1, kind=kind)
     routes = Routes(batch)
     start = batch.targets[0].numpy().astype(np.float64)
-    low, high = bounds(batch.settings[0].robot).T
+    low, high = bounds(batch.specs[0].robot).T
     stop, end = 0.6 * start + 0.4 * low, 0.6 * start + 0.4 * high
     routes.take(0, [stop, end])
     for _ in range(200):
@@ -126,11 +128,13 @@ def test_tools_are_brought_to_their_goals_and_fingers_are_left_alone(made):
     near = batch.targets.clone()
     starts = random_starts(batch.bodies, batch.body, near, torch.Generator().manual_seed(0))
     assert torch.equal(starts[0], near)
-    found, left = solve(batch.bodies, batch.body, batch.goal[:, :3], starts)
+    found, left = solve(batch.bodies, batch.body, batch.field("goal")[:, :3], starts)
     assert (left.amin(dim=0) < 0.003).all()
     best = found[left.argmin(dim=0), torch.arange(6)]
     tools = tool_positions(batch.bodies.chain, batch.body, best)
-    assert torch.allclose((tools - batch.goal[:, :3]).norm(dim=1), left.amin(dim=0), atol=1e-6)
+    assert torch.allclose(
+        (tools - batch.field("goal")[:, :3]).norm(dim=1), left.amin(dim=0), atol=1e-6
+    )
     idle = ~batch.bodies.moves_tool[0]
     assert idle.any()
     assert torch.equal(found[..., idle], near[:, idle].expand(STARTS, -1, -1))
