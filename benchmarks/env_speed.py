@@ -48,16 +48,15 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.benchmark.split import Task
-from morphgen.tasks.config import ReachConfig
-from morphgen.tasks.make import SimulatorName, make_batch
+from morphgen.tasks.make import make_batch
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
 from morphgen.tasks.speed import measure, random_actions
 
 Rate = Callable[[float], float]
 """Environment steps a second, measured for so many seconds at least."""
-CASES: tuple[tuple[Task, str, str], ...] = (
+CASES: tuple[tuple[str, str, str], ...] = (
     ("reach", "arm=panda ee=panda_hand", "PandaReachJoints-v3"),
     ("push", "arm=panda ee=panda_hand", "PandaPushJoints-v3"),
     ("reach", "arm=ur5 ee=plane", ""),
@@ -108,9 +107,9 @@ def main() -> int:
     return 0
 
 
-def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
+def _rows(task: str, robot: str, peer: str, envs: int) -> list[Row]:
     case = f"{task} {robot}"
-    ours: list[tuple[str, SimulatorName, int]] = [
+    ours: list[tuple[str, str, int]] = [
         ("morphgen, PyBullet, 1 process", "pybullet", 1),
         ("morphgen, PyBullet, 2 processes", "pybullet", 2),
         ("morphgen, MuJoCo, 1 thread", "mujoco", 1),
@@ -146,11 +145,11 @@ def _rows(task: Task, robot: str, peer: str, envs: int) -> list[Row]:
 
 
 def _ours(
-    task: Task,
+    task: str,
     robot: str,
     envs: int,
     seconds: float,
-    sim: SimulatorName = "pybullet",
+    sim: str = "pybullet",
     workers: int = 1,
     contacts: Contacts | None = None,
 ) -> float:
@@ -169,7 +168,7 @@ def _hasty(rate: Rate, seconds: float) -> float:
         bullet_scene.ITERATIONS = iterations
 
 
-def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
+def _raw(task: str, robot: str, envs: int, seconds: float) -> float:
     """Of the calls of ``stepSimulation`` that the same environments make."""
     spent, calls = 0.0, 0
     with closing(make_batch(task, [robot], envs)) as batch:
@@ -196,8 +195,8 @@ def _raw(task: Task, robot: str, envs: int, seconds: float) -> float:
 
 
 def _twice(
-    one: Callable[[Task, str, int, float], float],
-    task: Task,
+    one: Callable[[str, str, int, float], float],
+    task: str,
     robot: str,
     envs: int,
     seconds: float,

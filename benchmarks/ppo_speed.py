@@ -61,8 +61,9 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.heads import START
 from morphgen.rl.policies import MLP, layout_of
 from morphgen.rl.ppo import Learner
-from morphgen.tasks.batch import Observation, Step, TaskBatch
+from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.config import BINS
+from morphgen.tasks.observation import Observation
 
 Update = Callable[[], tuple[float, float]]
 """Makes an update; returns the seconds of collection and of learning."""

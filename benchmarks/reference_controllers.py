@@ -35,13 +35,13 @@ from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import mapped
-from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.names import references_for
+from morphgen.rl.references import Random, Zero, reference
 from morphgen.rl.rollouts import run_episodes
-from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.make import SIMULATORS, SimulatorName, batch_of
-from morphgen.tasks.settings import member_setting
+from morphgen.tasks.env_specs import member_spec
+from morphgen.tasks.make import batch_of
+from morphgen.tasks.registry import SIMULATORS, TASKS
 
 Row = dict[str, float | str]
 
@@ -50,7 +50,7 @@ Row = dict[str, float | str]
 class Measuring:
     """What every process does to a robot."""
 
-    sims: tuple[SimulatorName, ...]
+    sims: tuple[str, ...]
     envs: int
     episodes: int
     obstacles: bool
@@ -63,16 +63,12 @@ class Measuring:
     def __call__(self, member: Member) -> Row:
         """Measure one robot at one task."""
         torch.set_num_threads(1)
-        setting = member_setting(replace(member, obstacles=self.obstacles), self.library)
+        spec = member_spec(replace(member, obstacles=self.obstacles), self.library)
         row: Row = {"robot": member.name, "task": member.task}
         for sim in self.sims:
-            with closing(batch_of([setting], self.envs, sim=sim)) as batch:
-                if member.task == "reach":
-                    spaces = [FreeSpace(setting.scene)]
-                    acting = InverseKinematics(0, spaces)
-                    good = run_episodes(batch, acting, self.episodes)
-                else:
-                    good = run_episodes(batch, ScriptedPush(0), self.episodes)
+            with closing(batch_of([spec], self.envs, sim=sim)) as batch:
+                acting = reference(references_for(member.task)[0], batch, 0)
+                good = run_episodes(batch, acting, self.episodes)
                 chance = run_episodes(batch, Random(0), self.episodes)
                 row[f"{sim} reference"] = mean(episode.success for episode in good)
                 row[f"{sim} random"] = mean(episode.success for episode in chance)
@@ -83,7 +79,7 @@ class Measuring:
 def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", choices=["reach", "push"])
+    parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--only", default="", help="robots whose name matches this expression")
     parser.add_argument("--envs", type=int, default=8)
     parser.add_argument("--episodes", type=int, default=2, help="of each environment")
@@ -103,7 +99,7 @@ def main() -> int:
     for row in tqdm(mapped(work, members, args.jobs, chunk=1), total=len(members), unit="robot"):
         rows.append(row)
         _write(args.json, rows)
-    for task in ("reach", "push"):
+    for task in TASKS:
         of_task = [row for row in rows if row["task"] == task]
         if of_task:
             numbers = [key for key in of_task[0] if key not in ("robot", "task")]

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from morphgen.benchmark.split import TASKS, Task
+from morphgen.rl.names import references_for
 from morphgen.rl.play import controller, play
-from morphgen.tasks.gym_env import PushEnv, ReachEnv
+from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.registry import TASKS
 
 ROBOTS = ("ur5-plane", "prims", "chain beads=3")
 MOMENTS = 5
@@ -33,7 +34,7 @@ def main() -> int:
     )
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    for task in TASKS:
+    for task in TASKS.builtin:
         rows = [_row(task, robot, args.seed) for robot in ROBOTS]
         path = args.out / f"{task}.png"
         Image.fromarray(np.concatenate(rows)).save(path)
@@ -41,13 +42,12 @@ def main() -> int:
     return 0
 
 
-def _row(task: Task, robot: str, seed: int) -> np.ndarray:
-    made, policy = {"reach": (ReachEnv, "ik"), "push": (PushEnv, "scripted")}[task]
-    with closing(made(robot, render_mode="rgb_array", size=SIZE)) as env:
-        acting = controller(policy, env, seed)
+def _row(task: str, robot: str, seed: int) -> np.ndarray:
+    with closing(TaskEnv(task, robot, render_mode="rgb_array", size=SIZE)) as env:
+        acting = controller(references_for(task)[0], env, seed)
         frames = list(play(env, acting, 1, seed, lambda episode: print(robot, episode)))
-    # A reach is over long before its time is.
-    last = len(frames) // 4 if task == "reach" else len(frames)
+    # An episode that success does not end is over long before its time is.
+    last = len(frames) if TASKS[task].target == "line" else len(frames) // 4
     chosen = np.linspace(0, last - 1, MOMENTS).round().astype(int)
     return np.concatenate([frames[i] for i in chosen], axis=1)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.benchmark.split import Side, Task
+from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics import reach
 from morphgen.rl.intervals import mean_interval
@@ -19,20 +19,19 @@ from morphgen.rl.names import REFERENCES
 from morphgen.rl.references import Random, reference
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
-from morphgen.rl.sources import Source, members, other_side, settings_of
+from morphgen.rl.sources import Source, members, other_side, specs_of
 from morphgen.rl.trained import Mode, Policy
 from morphgen.rl.training import checkpoints
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import PushConfig, ReachConfig
-from morphgen.tasks.make import SimulatorName, batch_of
-from morphgen.tasks.settings import Recipe, Setting
+from morphgen.tasks.env_specs import GoalConfig, default_configs
+from morphgen.tasks.make import batch_of
+from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.task import EnvSpec, TaskConfig
 
 STEPS = 10_000
 """Control steps of an evaluation, a robot (paper)."""
 AT_ONCE = 34
 """Environments of a robot at most: with these, 10,000 steps are one episode in each."""
-AT_MOST: dict[SimulatorName, int] = {"pybullet": 128, "mujoco": 1024}
-"""Environments of all robots at once, if these are fewer: one of PyBullet takes 36 MB."""
 SALT = 0x5C0_4E5
 """So that an evaluation's episodes are not those of the training with the same seed."""
 
@@ -59,11 +58,17 @@ class Exam:
 
     episodes: int = 34
     """Of each robot at least; all episodes of a robot count, from their starts to their ends."""
-    sim: SimulatorName = "pybullet"
+    sim: str = "pybullet"
     seed: int = 0
     workers: int = 1
-    reach: ReachConfig = field(default_factory=ReachConfig)
-    push: PushConfig = field(default_factory=PushConfig)
+    tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
+    """Constants of tasks; others have their defaults."""
+
+    def as_data(self) -> dict[str, Any]:
+        """Return plain data for JSON, with the constants of each task under its name."""
+        data = asdict(self)
+        del data["tasks"]
+        return data | GoalConfig(tasks=self.tasks).as_data()
 
     def __post_init__(self) -> None:
         """Check.
@@ -84,16 +89,16 @@ class Score:
 
     robot: str
     side: Side
-    task: Task
+    task: str
     episodes: int
     steps: int
     score: float
-    """Reach: ``raw`` above chance. Push: the success rate (paper)."""
+    """``raw``, for some tasks above that of the random policy; see ``Task.relative_to_random``."""
     low: float
     high: float
     """Of the score: 95% bootstrap interval over episodes; nan if there is one episode."""
     raw: float
-    """Reach: mean of ``anybody_score`` over all steps. Push: the success rate."""
+    """Mean score of episodes; see ``Task.episode_score``."""
     random: float
     """The same of the random controller."""
     success: float
@@ -102,7 +107,7 @@ class Score:
     distance: float
     """From success at the end, metres, mean."""
     relative_distance: float
-    """Reach: the same over the robot's reach; nan for push."""
+    """The same over the robot's reach; nan for tasks where this means nothing."""
     unstable: int = 0
     """How many episodes ended because their simulation became unstable."""
 
@@ -239,7 +244,7 @@ def evaluate(
     exam: Exam,
     wanted: Interface,
     *,
-    tasks: Sequence[Task] = ("reach", "push"),
+    tasks: Sequence[str] | None = None,
     tell: Tell = silent,
 ) -> list[Score]:
     """Scores of the robots of a source, in order; the random controller has the same episodes.
@@ -249,27 +254,28 @@ def evaluate(
         source: The robots.
         exam: How.
         wanted: What those that act see and do.
-        tasks: Robots at other tasks are left out.
+        tasks: Robots at other tasks are left out, if tasks are named.
         tell: Told how far those that act are, and not the random controller.
 
     Raises:
         TaskError: If no robot is left.
         MorphgenError: If a robot or simulator cannot be made.
     """
-    recipe = Recipe(reach=exam.reach, push=exam.push)
-    settings = [each for each in settings_of(source, recipe) if each.task in tasks]
-    if not settings:
-        raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
+    specs = specs_of(source, GoalConfig(tasks=exam.tasks))
+    if tasks is not None:
+        specs = [each for each in specs if each.task in tasks]
+        if not specs:
+            raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
     folders = tuple(map(Path, source.library))
-    played: list[list[Episode]] = [[] for _ in settings]
+    played: list[list[Episode]] = [[] for _ in specs]
     for i, one in enumerate(acting):
-        found = _played(one, settings, exam, wanted, folders, partial(_of, i, len(acting), tell))
+        found = _played(one, specs, exam, wanted, folders, partial(_of, i, len(acting), tell))
         for all_own, own in zip(played, found, strict=True):
             all_own.extend(own)
-    chance = _chance(source, exam, tuple(tasks), settings, folders)
+    chance = _chance(source, exam, None if tasks is None else tuple(tasks), specs, folders)
     return [
-        _score(setting, source.side, own, other)
-        for setting, own, other in zip(settings, played, chance, strict=True)
+        _score(spec, source.side, own, other)
+        for spec, own, other in zip(specs, played, chance, strict=True)
     ]
 
 
@@ -279,20 +285,20 @@ _known: dict[object, list[list[Episode]]] = {}
 def _chance(
     source: Source,
     exam: Exam,
-    tasks: tuple[Task, ...],
-    settings: Sequence[Setting],
+    tasks: tuple[str, ...] | None,
+    specs: Sequence[EnvSpec],
     folders: tuple[Path, ...],
 ) -> list[list[Episode]]:
     """Episodes of the random controller; played once in a process."""
     key = (source, replace(exam, workers=1), tasks)
     if key not in _known:
-        _known[key] = _played(lambda batch: Random(exam.seed), settings, exam, Interface(), folders)
+        _known[key] = _played(lambda batch: Random(exam.seed), specs, exam, Interface(), folders)
     return _known[key]
 
 
 def _played(
     acting: Acting,
-    settings: Sequence[Setting],
+    specs: Sequence[EnvSpec],
     exam: Exam,
     wanted: Interface,
     folders: tuple[Path, ...],
@@ -301,13 +307,13 @@ def _played(
     """Episodes by robot, in as many batches as it takes; what acts is made for the first."""
     rounds = -(-exam.episodes // AT_ONCE)
     each = -(-exam.episodes // rounds)
-    most = max(AT_MOST[exam.sim] // len(settings), 1)
-    found: list[list[Episode]] = [[] for _ in settings]
+    most = max(SIMULATORS[exam.sim].max_envs // len(specs), 1)
+    found: list[list[Episode]] = [[] for _ in specs]
     controller: Controller | None = None
-    whole = each * rounds * len(settings)
+    whole = each * rounds * len(specs)
     for begin in range(0, each, most):
-        before = begin * rounds * len(settings)
-        batch = _batch(range(begin, min(begin + most, each)), settings, exam, wanted, folders)
+        before = begin * rounds * len(specs)
+        batch = _batch(range(begin, min(begin + most, each)), specs, exam, wanted, folders)
         try:
             controller = controller or acting(batch)
             now = partial(_in, before, whole, tell)
@@ -330,40 +336,36 @@ def _of(before: int, parts: int, tell: Tell, done: float, own: int) -> None:
 
 def _batch(
     own: range,
-    settings: Sequence[Setting],
+    specs: Sequence[EnvSpec],
     exam: Exam,
     wanted: Interface,
     folders: tuple[Path, ...],
 ) -> TaskBatch:
     """Some of the environments of each robot."""
     return batch_of(
-        settings,
-        len(own) * len(settings),
-        first=own.start * len(settings),
+        specs,
+        len(own) * len(specs),
+        first=own.start * len(specs),
         sim=exam.sim,
         seed=int(np.random.SeedSequence([SALT, exam.seed]).generate_state(1)[0]),
         kind=wanted.kind,
-        channels=wanted.channels,
+        observe=wanted.channels,
         workers=exam.workers,
-        reach=exam.reach,
-        push=exam.push,
         max_links=wanted.max_links,
         library=folders,
     )
 
 
-def _score(
-    setting: Setting, side: Side, own: Sequence[Episode], chance: Sequence[Episode]
-) -> Score:
+def _score(spec: EnvSpec, side: Side, own: Sequence[Episode], chance: Sequence[Episode]) -> Score:
     raw, random = (np.array([each.score for each in found]) for found in (own, chance))
-    reaches = setting.task == "reach"
-    above = raw - np.resize(random, len(raw)) if reaches else raw
+    task = TASKS[spec.task]
+    above = raw - np.resize(random, len(raw)) if task.relative_to_random else raw
     interval = mean_interval(above)
     distance = float(np.mean([episode.distance for episode in own]))
     return Score(
-        robot=setting.robot.name,
+        robot=spec.robot.name,
         side=side,
-        task=setting.task,
+        task=spec.task,
         episodes=len(own),
         steps=sum(episode.steps for episode in own),
         score=interval.value,
@@ -374,7 +376,7 @@ def _score(
         success=float(np.mean([episode.success for episode in own])),
         random_success=float(np.mean([episode.success for episode in chance])),
         distance=distance,
-        relative_distance=distance / reach(setting.robot) if reaches else math.nan,
+        relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,
         unstable=sum(episode.unstable for episode in own),
     )
 
@@ -386,8 +388,7 @@ def exam_of(config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1
         config.sim,
         seed,
         workers,
-        replace(config.reach, goals=ReachConfig().goals),
-        replace(config.push, starts=PushConfig().starts),
+        tuple(each.with_num_goals(type(each)().num_goals) for each in config.tasks),
     )
 
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
-if TYPE_CHECKING:
-    from morphgen.benchmark.split import Task
-
-REFERENCES: dict[str, tuple[Task, ...]] = {
-    "random": ("reach", "push"),
-    "zero": ("reach", "push"),
+REFERENCES: dict[str, tuple[str, ...] | None] = {
+    "random": None,
+    "zero": None,
     "ik": ("reach",),
     "scripted": ("push",),
 }
-"""Their names, and the tasks that they are for; whoever does a task comes after who does not."""
+"""Their names, and the tasks that they are for, None for all; those that solve a task come last."""
 
 
-def references_for(task: Task) -> tuple[str, ...]:
-    """Those for a task, the one that does it first."""
-    return tuple(name for name in reversed(REFERENCES) if task in REFERENCES[name])
+def references_for(task: str) -> tuple[str, ...]:
+    """Return the names of those for a task, the one that solves it first."""
+    return tuple(name for name in reversed(REFERENCES) if is_for(name, (task,)))
+
+
+def is_for(name: str, tasks: Iterable[str]) -> bool:
+    """Return whether a controller is for any of some tasks."""
+    own = REFERENCES[name]
+    return own is None or bool(set(own) & set(tasks))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.names import REFERENCES, references_for
 from morphgen.rl.references import reference
@@ -13,9 +12,9 @@ from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
 from morphgen.rl.trained import Policy
 from morphgen.tasks.config import CONTROL_PERIOD
-from morphgen.tasks.film import Frame
 from morphgen.tasks.gym_env import TaskEnv
-from morphgen.tasks.rewards import episode_score
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.renderer import Frame
 
 STRIDE = 2
 """Control steps between two pictures."""
@@ -23,18 +22,18 @@ FPS = 1 / (STRIDE * CONTROL_PERIOD)
 """Pictures a second, so that films run as fast as what they show: 25."""
 
 
-def require_policy(name: str, task: Task) -> None:
+def require_policy(name: str, task: str) -> None:
     """Require that there is such a controller for a task.
 
     Raises:
-        TaskError: If there is none, or it is for the other task.
+        TaskError: If there is none, or it is for other tasks.
     """
     if _is_file(name):
         return
     valid = references_for(task)
     if name in REFERENCES and name not in valid:
         raise TaskError(
-            f"policy {name!r} is for {REFERENCES[name][0]}, not for {task}; "
+            f"policy {name!r} is for {' or '.join(REFERENCES[name] or ())}, not for {task}; "
             f"valid: {', '.join(valid)}"
         )
     if name not in REFERENCES:
@@ -113,7 +112,7 @@ def play(
             over = terminated or truncated
             if over or len(scores) % STRIDE == 0:
                 yield from _shown(env)
-        score = episode_score(env.task == "push", sum(scores), scores[-1], len(scores))
+        score = TASKS[env.task].episode_score(sum(scores), scores[-1], len(scores))
         facts = info["success"], info["distance"], score, len(scores), info["unstable"]
         report(Episode(0, 0, *facts))
 

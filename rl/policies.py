@@ -19,8 +19,8 @@ from morphgen.errors import TaskError
 from morphgen.rl.attention import Block
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.heads import REST, Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
-from morphgen.tasks.batch import Observation
 from morphgen.tasks.config import BINS
+from morphgen.tasks.observation import Observation
 
 CHANNELS = ("velocity", "previous_action")
 """Numbers of a link that an observation may have beside its token, in order."""

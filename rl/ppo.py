@@ -31,7 +31,8 @@ from morphgen.rl.policies import (
 )
 from morphgen.rl.report import Numbers, Report, explained_variance, outcome
 from morphgen.rl.symlog import half_square, matching_loss, symexp
-from morphgen.tasks.batch import Observation, TaskBatch
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.observation import Observation
 
 TOLD = ("reward", "score", "success", "terminated", "truncated", "unstable")
 """What of every step is kept besides observations and actions."""

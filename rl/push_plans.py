@@ -16,9 +16,10 @@ from morphgen.rl.free_ways import FreeWays, Price, Way
 from morphgen.rl.push_contacts import Poised, leaning, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push_proofs import free_within
-from morphgen.tasks.settings import Setting
+from morphgen.tasks.push.feasibility import free_within
+from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import GRAVITY
+from morphgen.tasks.task import EnvSpec
 
 Array = NDArray[np.float64]
 
@@ -117,29 +118,27 @@ class Plan:
 class PushPlanner:
     """Plans for one robot and its block."""
 
-    def __init__(
-        self, setting: Setting, bodies: Bodies, index: int, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, spec: EnvSpec, bodies: Bodies, index: int, rng: np.random.Generator) -> None:
         """Collect free configurations that are low and where the block is pushed.
 
         Args:
-            setting: A push.
+            spec: A robot that pushes.
             bodies: Robots.
-            index: Which of them the setting is of.
+            index: Which of them the specification is of.
             rng: Where configurations come from.
 
         Raises:
-            ValueError: If the setting is no push.
+            ValueError: If the robot does not push.
         """
-        pushes, robot = setting.pushes, setting.robot
-        if pushes is None:
+        pushes, robot = spec.goals, spec.robot
+        if not isinstance(pushes, PushStartSet):
             raise ValueError(f"{robot.name} does not push")
         self._robot, self._tool = robot, OneTool(bodies, index)
         self._edge, self._line, self._ground = pushes.block.size[0], pushes.line, pushes.ground
         self._friction = pushes.block.friction * pushes.block.mass * GRAVITY
         self._stiffness = np.array([gain.stiffness for gain in actuation(robot)])
         self._others = ~bodies.moves_tool[index, : robot.dof].cpu().numpy()
-        self._space = FreeSpace(setting.scene)
+        self._space = FreeSpace(spec.scene)
         step = bodies.step[index, : robot.dof].double().cpu().numpy()
         self._ways = FreeWays(self._space, step, rng)
         edge, first, last = self._edge, pushes.blocks.min(axis=0), pushes.blocks.max(axis=0)

@@ -120,7 +120,7 @@ class WeightsAndBiases:
                 id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
                 resume="allow",
                 dir=folder,
-                config=asdict(config),
+                config=config.as_data(),
             )
         except wandb.errors.Error as error:
             raise TaskError(f"--wandb: {error}") from error

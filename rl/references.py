@@ -114,7 +114,7 @@ class InverseKinematics:
             task.bodies.chain,
             rows,
             tried.flatten(0, 1),
-            task.goal[envs, :3].repeat(STARTS, 1),
+            task.field("goal")[envs, :3].repeat(STARTS, 1),
             (task.bodies.lower[rows], task.bodies.upper[rows]),
             iterations=ITERATIONS,
             damping=DAMPING,
@@ -127,7 +127,7 @@ class InverseKinematics:
         order = torch.where(left < CLOSE, far, 1e9 * (1 + left)).argsort(dim=0)
         count = (left < CLOSE).sum(dim=0).clamp(min=1).tolist()
         return [
-            _numbers(found[some[:k], i, : task.settings[robot].robot.dof])
+            _numbers(found[some[:k], i, : task.specs[robot].robot.dof])
             for i, (some, k, robot) in enumerate(zip(order.T, count, body.tolist(), strict=True))
         ]
 
@@ -144,7 +144,7 @@ class InverseKinematics:
 
     def _ways_of(self, task: TaskBatch, robot: int, q: torch.Tensor) -> tuple[FreeWays, Array]:
         """The ways of a robot, and where its joints are, from (J,) to (dof,)."""
-        dof = task.settings[robot].robot.dof
+        dof = task.specs[robot].robot.dof
         if robot not in self._ways:
             step, moves = task.bodies.step[robot, :dof], task.bodies.moves_tool[robot, :dof]
             rng = np.random.default_rng([self._seed, robot])
@@ -170,7 +170,7 @@ def reference(name: str, batch: TaskBatch, seed: int) -> Controller:
         BenchmarkError: If a robot has hardly a free configuration.
     """
     if name == "ik":
-        return InverseKinematics(seed, [FreeSpace(setting.scene) for setting in batch.settings])
+        return InverseKinematics(seed, [FreeSpace(spec.scene) for spec in batch.specs])
     if name == "scripted":
         return ScriptedPush(seed)
     return Random(seed) if name == "random" else Zero()

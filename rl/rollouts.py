@@ -10,7 +10,7 @@ import torch
 
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import CONTROL_PERIOD
-from morphgen.tasks.rewards import episode_score
+from morphgen.tasks.registry import TASKS
 
 
 class Controller(Protocol):
@@ -32,7 +32,7 @@ class Episode:
     distance: float
     """From success then, metres; see ``Step``."""
     score: float
-    """See ``episode_score``."""
+    """See ``Task.episode_score``."""
     steps: int
     unstable: bool
     """Whether it ended because the simulation became unstable; see ``Step``."""
@@ -86,7 +86,7 @@ def run_episodes(
                         bodies[env],
                         bool(step.success[env]),
                         float(step.distance[env]),
-                        episode_score(bool(batch.pushes[env]), *numbers),
+                        TASKS[batch.specs[bodies[env]].task].episode_score(*numbers),
                         int(steps[env]),
                         bool(step.unstable[env]),
                     )

@@ -18,9 +18,10 @@ from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.sources import Source, most_obstacles
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.batch import Channels
-from morphgen.tasks.config import PushConfig, ReachConfig
-from morphgen.tasks.make import SimulatorName
+from morphgen.tasks.env_specs import GoalConfig, default_configs, task_configs
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import TaskConfig
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
 FORMAT = 2
@@ -35,7 +36,7 @@ class Interface:
     kind: ActionKind = "continuous"
     max_links: int | None = None
     """Links that observations and actions are padded to, as ``batch_of`` has it."""
-    channels: Channels = field(default_factory=Channels)
+    channels: ObservationConfig = field(default_factory=ObservationConfig)
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class RunConfig:
     ppo: PPOConfig
     seed: int = 0
     """Of weights, actions, minibatches and episodes."""
-    sim: SimulatorName = "pybullet"
+    sim: str = "pybullet"
     envs: int = 128
     device: str = "cpu"
     """Of networks and rollouts."""
@@ -58,8 +59,8 @@ class RunConfig:
     the robots share them, as those of an agent of many robots do."""
     max_links: int = MAX_LINKS
     """Links that observations and actions are padded to; no robot may have more."""
-    reach: ReachConfig = field(default_factory=ReachConfig)
-    push: PushConfig = field(default_factory=PushConfig)
+    tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
+    """Constants of tasks; in files each has an entry of its own, under the name of its task."""
 
     def __post_init__(self) -> None:
         """Check.
@@ -83,9 +84,15 @@ class RunConfig:
     @property
     def interface(self) -> Interface:
         """Of its policy."""
-        obstacles = most_obstacles(self.source, self.reach.obstacles, self.push.obstacles)
-        channels = Channels(tool=self.policy.tool_position, obstacles=obstacles)
+        obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
+        channels = ObservationConfig(tool=self.policy.tool_position, obstacles=obstacles)
         return Interface(self.policy.kind, self.max_links, channels)
+
+    def as_data(self) -> dict[str, Any]:
+        """Return plain data for JSON, which ``config_from`` reads."""
+        data = asdict(self)
+        del data["tasks"]
+        return data | GoalConfig(tasks=self.tasks).as_data()
 
 
 def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
@@ -101,7 +108,7 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
     path = folder / CONFIG
     if _has_learned(folder):
         return
-    data = {"format": FORMAT, "morphgen": version("morphgen"), **asdict(config)}
+    data = {"format": FORMAT, "morphgen": version("morphgen"), **config.as_data()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(path, json.dumps(data, indent=2) + "\n")
@@ -164,20 +171,24 @@ def config_from(data: object) -> RunConfig:
     if not isinstance(data, Mapping):
         raise TaskError("run: expected a table")
     own = {key: value for key, value in data.items() if key not in ("format", "morphgen")}
+    constants = {name: own.pop(name) for name in list(own) if name in TASKS}
     require_fields(RunConfig, own, "run")
+    for name in TASKS.builtin:
+        if name not in constants:
+            raise TaskError(f"run: no {name}")
+    for name, values in constants.items():
+        require_fields(TASKS[name].config_type, values, name)
     made = {"source": Source, "policy": PolicyConfig, "ppo": PPOConfig}
-    for name, kind in {**made, "reach": ReachConfig, "push": PushConfig}.items():
+    for name, kind in made.items():
         if name not in own:
             raise TaskError(f"run: no {name}")
         require_fields(kind, own[name], name)
     source = _tuples(own.pop("source"))
-    tasks = {name: _tuples(own.pop(name)) for name in ("reach", "push")}
     return RunConfig(
         Source(**source),
         PolicyConfig(**own.pop("policy")),
         PPOConfig(**own.pop("ppo")),
-        reach=ReachConfig(**tasks["reach"]),
-        push=PushConfig(**tasks["push"]),
+        tasks=task_configs(constants),
         **own,
     )
 
@@ -190,7 +201,7 @@ def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]
         TaskError: If a number is not finite; the last checkpoint stays.
     """
     path = folder / CHECKPOINT
-    data = {"format": FORMAT, "run": asdict(config), "learner": dict(learner)}
+    data = {"format": FORMAT, "run": config.as_data(), "learner": dict(learner)}
     content = packed(data, f"{path} is not replaced")
     try:
         write_atomic(path, content)
@@ -238,13 +249,13 @@ def _tuples(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _require_same(folder: Path, stored: RunConfig, asked: RunConfig) -> None:
-    theirs, ours = _flat(asdict(stored)), _flat(asdict(asked))
+    theirs, ours = _flat(stored.as_data()), _flat(asked.as_data())
     for each in (theirs, ours):  # which GPU it is makes no other run
         each["device"] = each["device"].partition(":")[0]
     wrong = [
-        f"{name} {_short(theirs[name])}, not {_short(ours[name])}"
+        f"{name} {_short(theirs.get(name))}, not {_short(ours[name])}"
         for name in ours
-        if theirs[name] != ours[name]
+        if theirs.get(name) != ours[name]
     ]
     if wrong:
         raise TaskError(f"{folder} has another run: {'; '.join(wrong)}")

@@ -15,7 +15,8 @@ from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import CONTROL_PERIOD
-from morphgen.tasks.settings import Setting
+from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.task import EnvSpec
 
 PLANS = 8
 """Plans of an episode at most."""
@@ -61,22 +62,23 @@ class ScriptedPush:
                 its push set, and where robot and block are.
         """
         self._seed = seed
-        self._settings: Sequence[Setting] = ()
+        self._specs: Sequence[EnvSpec] = ()
         self._planners: dict[int, PushPlanner] = {}
         self._state: _State | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """A step along the way behind the block, or of the push; shape (n, L)."""
-        if self._settings is not task.settings:
-            self._settings, self._planners, self._state = task.settings, {}, None
+        if self._specs is not task.specs:
+            self._specs, self._planners, self._state = task.specs, {}, None
         state = self._state
         if state is None or state.task is not task:
             state = self._state = _no_state(task)
         block = task.simulation.block_pose
         tool = frame_positions(task.bodies.chain, task.body, task.q)
-        new = task.pushes & (task.elapsed == 0)
+        pushes = task.does("push")
+        new = pushes & (task.elapsed == 0)
         state.plans[new] = 0
-        failed = _watched(state, task, block, tool) | (task.pushes & ~state.active)
+        failed = _watched(state, task, block, tool) | (pushes & ~state.active)
         for env in torch.nonzero(new | (failed & (state.plans < PLANS)))[:, 0].tolist():
             self._plan(state, task, env, block[env])
         state.height += torch.where(self._blocked(state, task), RISE, 0.0)
@@ -90,7 +92,7 @@ class ScriptedPush:
         found = torch.zeros_like(state.active)
         for index, planner in self._planners.items():
             rows = torch.nonzero(state.active & state.pushing & (task.body == index))[:, 0]
-            dof = task.settings[index].robot.dof
+            dof = task.specs[index].robot.dof
             q = task.targets[rows, :dof].double().cpu().numpy()
             found[rows] = ~torch.from_numpy(planner.free(q)).to(found.device)
         return found
@@ -99,8 +101,8 @@ class ScriptedPush:
         index = int(task.body[env])
         if index not in self._planners:
             rng = np.random.default_rng([self._seed, index])
-            self._planners[index] = PushPlanner(task.settings[index], task.bodies, index, rng)
-        q = task.targets[env, : task.settings[index].robot.dof].double().cpu().numpy()
+            self._planners[index] = PushPlanner(task.specs[index], task.bodies, index, rng)
+        q = task.targets[env, : task.specs[index].robot.dof].double().cpu().numpy()
         attempt = int(state.plans[env])
         left = int(task.longest[env] - task.elapsed[env])
         plan = self._planners[index].plan(q, block.double().cpu().numpy(), attempt, left)
@@ -155,8 +157,8 @@ class _State:
 def _no_state(task: TaskBatch) -> _State:
     """No plans."""
     n, device = task.num_envs, task.device
-    sets = [task.settings[i].pushes for i in task.body.tolist()]
-    edges = [1.0 if each is None else each.block.size[0] for each in sets]
+    sets = [task.specs[i].goals for i in task.body.tolist()]
+    edges = [each.block.size[0] if isinstance(each, PushStartSet) else 1.0 for each in sets]
 
     def count() -> torch.Tensor:
         return torch.zeros(n, dtype=torch.int64, device=device)

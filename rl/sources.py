@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from morphgen.benchmark.split import Member, Side, Split, Task, member_robot, robot_hash
+from morphgen.benchmark.split import Member, Side, Split, member_robot, robot_hash
 from morphgen.benchmark.split_file import split_text
 from morphgen.benchmark.split_reader import parse_split
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.tasks.goal_npz import Goals
+from morphgen.tasks.env_specs import GoalConfig, env_spec, member_spec
 from morphgen.tasks.robots import robot_of
-from morphgen.tasks.settings import Recipe, Setting, member_setting, setting_of
 from morphgen.tasks.split_goals import read_goals, shipped_set
+from morphgen.tasks.task import EnvSpec, GoalSet
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Source:
     """Of the split, or words of the robot, or the path of its file."""
     split: str = ""
     """Text of the split's file; empty for one robot."""
-    task: Task | None = None
+    task: str | None = None
     """Of the one robot; a split says it of each."""
     obstacles: bool = False
     """Of the one robot."""
@@ -67,7 +67,7 @@ def split_source(
 
 def robot_source(
     robot: str,
-    task: Task,
+    task: str,
     *,
     obstacles: bool = False,
     goal_seed: int = 0,
@@ -108,7 +108,7 @@ def members(source: Source) -> tuple[Member, ...]:
     return tuple(member for member in side if member.name == source.only)
 
 
-def tasks_of(source: Source) -> tuple[Task, ...]:
+def tasks_of(source: Source) -> tuple[str, ...]:
     """The tasks of its robots, without repetition."""
     if source.task is not None:
         return (source.task,)
@@ -135,20 +135,18 @@ def other_side(source: Source, side: Side) -> Source:
 
 
 @lru_cache(maxsize=64)
-def most_obstacles(source: Source, reach: int, push: int) -> int:
-    """How many obstacles the one robot has, or at most a robot of the split, on whichever side.
+def most_obstacles(source: Source, config: GoalConfig) -> int:
+    """Return how many obstacles the one robot has, or at most a robot of the split, either side.
 
     Args:
-        source: Of the robot or split.
-        reach: How many there are where robots reach among obstacles.
-        push: The same where they push.
+        source: The robot or split.
+        config: Constants of the tasks.
     """
-    each = {"reach": reach, "push": push}
     if source.task is not None:
-        return each[source.task] if source.obstacles else 0
+        return config.of(source.task).obstacles if source.obstacles else 0
     sides: tuple[Side, ...] = ("train", "test")
     both = (member for side in sides for member in members(other_side(source, side)))
-    return max((each[member.task] for member in both if member.obstacles), default=0)
+    return max((config.of(member.task).obstacles for member in both if member.obstacles), default=0)
 
 
 def require_links(source: Source, max_links: int) -> None:
@@ -167,36 +165,36 @@ def require_links(source: Source, max_links: int) -> None:
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
-def settings_of(source: Source, recipe: Recipe) -> list[Setting]:
+def specs_of(source: Source, config: GoalConfig) -> list[EnvSpec]:
     """The robots at their tasks; they are made once in a process.
 
     Args:
         source: Which.
-        recipe: Constants of the tasks; the seed is the source's.
+        config: Constants of the tasks; the seed is the source's.
 
     Raises:
         MorphgenError: If a robot cannot be made, is not the split's, or cannot do its task.
     """
-    recipe = replace(recipe, seed=source.goal_seed)
+    config = replace(config, seed=source.goal_seed)
     if source.split:
         own = replace(source, split="", only=None)
-        return [_of_member(member, own, recipe) for member in members(source)]
+        return [_of_member(member, own, config) for member in members(source)]
     if source.task is None:
         raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
     robot = robot_of(source.name, library=map(Path, source.library))
     if source.body not in ("", robot_hash(robot)):
         raise TaskError(f"{source.name}: it is not the body that it was when the run began")
-    return [setting_of(robot, source.task, recipe, obstacles=source.obstacles)]
+    return [env_spec(robot, source.task, config, obstacles=source.obstacles)]
 
 
 @lru_cache(maxsize=64)
-def _of_member(member: Member, source: Source, recipe: Recipe) -> Setting:
+def _of_member(member: Member, source: Source, config: GoalConfig) -> EnvSpec:
     sets = _shipped(source.goals, source.side) if source.goals else None
     shipped = shipped_set(sets, member.name, source.goals)
     library = default_library(tuple(map(Path, source.library)))
-    return member_setting(member, library, recipe, shipped=shipped)
+    return member_spec(member, library, config, shipped=shipped)
 
 
 @lru_cache(maxsize=2)
-def _shipped(folder: str, side: Side) -> dict[str, Goals]:
+def _shipped(folder: str, side: Side) -> dict[str, GoalSet]:
     return read_goals(folder, side)

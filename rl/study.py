@@ -30,7 +30,7 @@ from morphgen.rl.evaluation import (
     evaluate_run,
     uncounted,
 )
-from morphgen.rl.names import REFERENCES
+from morphgen.rl.names import REFERENCES, is_for
 from morphgen.rl.runs import RunConfig, require_open
 from morphgen.rl.sources import Source, members, other_side, tasks_of
 from morphgen.rl.trained import MODES, Mode
@@ -79,8 +79,8 @@ def reference_cells(folder: Path, source: Source, exam: Exam) -> list[Cell]:
     tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
     return [
         Cell(folder / source.name / name, source.name, name, None, source, _plain(exam))
-        for name, own in REFERENCES.items()
-        if tasks & set(own)
+        for name in REFERENCES
+        if is_for(name, tasks)
     ]
 
 
@@ -120,7 +120,7 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
         made_with = data["exam"], data["source"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: not the scores of a cell: {error}") from error
-    wanted = json.loads(json.dumps([asdict(cell.exam), asdict(cell.source)]))
+    wanted = json.loads(json.dumps([cell.exam.as_data(), asdict(cell.source)]))
     for what, theirs, ours in zip(("evaluation", "set of robots"), made_with, wanted, strict=True):
         if theirs != ours:
             raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
@@ -160,7 +160,7 @@ def do(
         train(cell.folder, cell.config, resume=True, way=way, show=show, hold=_held)
         found = {mode: _trained(cell, cell.config, exam, mode, count) for mode in MODES}
     data = {
-        "exam": asdict(cell.exam),
+        "exam": cell.exam.as_data(),
         "source": asdict(cell.source),
         "scores": {mode: as_data(scores) for mode, scores in found.items()},
     }
@@ -276,7 +276,7 @@ def _reference(cell: Cell, exam: Exam, count: Count) -> list[Score]:
     found = []
     for side in cell.sides:
         source = other_side(cell.source, side)
-        if set(tasks_of(source)) & set(REFERENCES[cell.agent]):
+        if is_for(cell.agent, tasks_of(source)):
             tell = count(f"{cell.agent} on {side}")
             found += evaluate_reference(cell.agent, source, exam, tell=tell)
     return found

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from tabulate import tabulate
 
-from morphgen.benchmark.split import SIDES, Side, Task
+from morphgen.benchmark.split import SIDES, Side
 from morphgen.formats.files import save
 from morphgen.rl.evaluation import Score, as_data
 from morphgen.rl.intervals import Interval, iqm_interval
 from morphgen.rl.recorders import read_metrics
 from morphgen.rl.score_tables import UNSTABLE
+from morphgen.rl.sources import tasks_of
 from morphgen.rl.study import Cell, as_record
 from morphgen.rl.training import parts_of
 
@@ -66,7 +67,7 @@ class Row:
     """An agent on the robots of a split that are at one task."""
 
     split: str
-    task: Task
+    task: str
     agent: str
     mode: str
     """Empty if nothing is there to know it by."""
@@ -91,9 +92,10 @@ def rows(results: Results) -> list[Row]:
         first = next(iter(own))
         every = [s for scores in there.values() for each in scores.values() for s in each]
         modes = dict.fromkeys(mode for scores in there.values() for mode in scores)
-        tasks: list[Task] = list(dict.fromkeys(score.task for score in every))
+        tasks: list[str] = list(dict.fromkeys(score.task for score in every))
         if not there:
-            found.append(Row(split, "reach", agent, "", (), missing, {}, first.sides))
+            task = next(iter(tasks_of(first.source)), "")
+            found.append(Row(split, task, agent, "", (), missing, {}, first.sides))
         for task in tasks:
             for mode in modes:
                 groups = _groups(there, task, mode)
@@ -195,7 +197,7 @@ def _curve(cell: Cell) -> Curve | None:
 
 
 def _groups(
-    there: Mapping[Cell, Mapping[str, Sequence[Score]]], task: Task, mode: str
+    there: Mapping[Cell, Mapping[str, Sequence[Score]]], task: str, mode: str
 ) -> dict[Side, Group]:
     found: dict[Side, Group] = {}
     for side in SIDES:

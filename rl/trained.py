@@ -16,7 +16,8 @@ from morphgen.rl.policies import (
     with_all_rows,
     with_rows,
 )
-from morphgen.tasks.batch import Observation, TaskBatch
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.observation import Observation
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")

@@ -24,9 +24,9 @@ from morphgen.rl.runs import (
     require_open,
     write_checkpoint,
 )
-from morphgen.rl.sources import apart, members, require_links, settings_of
+from morphgen.rl.sources import apart, members, require_links, specs_of
+from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.make import batch_of
-from morphgen.tasks.settings import Recipe
 
 LEAST, MOST = 1500, 3000
 """Control steps of an environment between checkpoints: five and ten of the tasks' episodes.
@@ -219,17 +219,15 @@ def updates_between(config: RunConfig) -> int:
 def _learner(part: Part, way: Way) -> Iterator[Learner]:
     """The learner of a part, as far as it got."""
     config, wanted = part.config, part.config.interface
-    settings = settings_of(config.source, Recipe(reach=config.reach, push=config.push))
+    specs = specs_of(config.source, GoalConfig(tasks=config.tasks))
     batch = batch_of(
-        settings,
+        specs,
         config.envs,
         sim=config.sim,
         seed=config.seed,
         kind=wanted.kind,
-        channels=wanted.channels,
+        observe=wanted.channels,
         workers=way.workers,
-        reach=config.reach,
-        push=config.push,
         max_links=wanted.max_links,
         library=map(Path, config.source.library),
     )

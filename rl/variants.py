@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from morphgen.benchmark.split import Side, Task
+from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.config import AGENTS, AgentName, PolicyConfig, PPOConfig
+from morphgen.tasks.registry import TASKS
 
 OF_POLICY = ("discrete", "fixed-deviation", "mask-morphology", "tool-position")
 OF_PPO = ("symlog", "slow-critic", "task-reweighting", "curriculum")
@@ -90,11 +91,11 @@ def parse_agents(text: str) -> list[tuple[str, Variant, Side]]:
 
 
 def settle(
-    variant: Variant, tasks: Sequence[Task], changes: Mapping[str, Any], transitions: int
+    variant: Variant, tasks: Sequence[str], changes: Mapping[str, Any], transitions: int
 ) -> tuple[PolicyConfig, PPOConfig]:
     """Networks and algorithm of a variant.
 
-    Actions are discrete if all tasks are reach, else continuous (paper), unless the variant says.
+    Actions are discrete if all tasks have it so (reach, in the paper), unless the variant says.
 
     Args:
         variant: The agent.
@@ -105,7 +106,9 @@ def settle(
     Raises:
         TaskError: If a constant is unknown or out of its range.
     """
-    policy = PolicyConfig(variant.agent, discrete=set(tasks) == {"reach"})
+    policy = PolicyConfig(
+        variant.agent, discrete=all(TASKS[task].discrete_actions for task in tasks)
+    )
     ppo = PPOConfig(transitions=transitions)
     switches = {name.replace("-", "_"): on for name, on in variant.switches.items()}
     every = {**changes, **switches}

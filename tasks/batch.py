@@ -1,4 +1,4 @@
-"""A batch of bodies at their tasks: actions, physics, rewards and new episodes, in torch."""
+"""A batch of robots at their tasks: actions, physics, rewards and new episodes, in torch."""
 
 from __future__ import annotations
 
@@ -13,35 +13,19 @@ from morphgen.errors import TaskError, UnstableError
 from morphgen.model.kinematics_torch import FramePositions
 from morphgen.tasks.actions import ActionKind, Targets, shares_of
 from morphgen.tasks.bodies import Bodies
-from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
-from morphgen.tasks.episodes import Push, Reach, State, Verdict, chosen
-from morphgen.tasks.observation import LinkTokens, box_tokens, of_links
+from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.observation import (
+    LinkTokens,
+    Observation,
+    ObservationConfig,
+    obstacle_tokens,
+    of_links,
+)
 from morphgen.tasks.points import PointClouds
-from morphgen.tasks.rewards import Terms, added, beyond_limits
-from morphgen.tasks.settings import Setting
+from morphgen.tasks.rows import limit_violation, row_sums
 from morphgen.tasks.sim.base import Simulation
-
-Observation = dict[str, torch.Tensor]
-"""``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``goal`` (n, 7) and ``goal_mask``
-(n,) bool for reach; ``object`` (n, 13), ``object_mask`` (n,) bool and ``line`` (n, 1) for push;
-``obstacles`` (n, O, 13) and ``obstacle_mask`` (n, O) bool. If asked for, ``velocity`` (n, L),
-``previous_action`` (n, L), ``tool`` (n, 3), ``points`` (n, P, 3) and ``point_mask`` (n, P) bool."""
-
-
-@dataclass(frozen=True)
-class Channels:
-    """What an observation also has; the paper has none of it but the points."""
-
-    velocity: bool = False
-    """Velocities of the links' independent joints, rad/s or m/s."""
-    previous_action: bool = False
-    """The action before, as shares of the joints' steps."""
-    tool: bool = False
-    """Where the tool is in the world, metres."""
-    points: int = 0
-    """Points of a point cloud of block and obstacles."""
-    obstacles: int = 0
-    """Rows for obstacles, if more than there are: for policies that meet more elsewhere."""
+from morphgen.tasks.task import EnvSpec, TaskState
+from morphgen.tasks.task_groups import StepRows, TaskGroups
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +49,14 @@ class Step:
     final_observation: Observation
     """After the action, whatever followed: to bootstrap from where time ran out."""
     success: torch.Tensor
-    """Whether the tool is near its goal, or the block across the line, shape (n,), bool; never
-    where the simulation became unstable."""
+    """Whether the task is fulfilled now, shape (n,), bool; never where the simulation became
+    unstable."""
     distance: torch.Tensor
-    """Metres from success: of tool and goal, or of block and line, shape (n,)."""
+    """Distance from success, such as of tool and goal, shape (n,), metres."""
     score: torch.Tensor
-    """See ``Verdict``, shape (n,)."""
-    terms: Terms
-    """What the reward is the sum of."""
+    """Score of the step, shape (n,); see ``Task.episode_score``."""
+    terms: dict[str, torch.Tensor]
+    """Reward terms by name, each of shape (n,), zero where a task has no such term."""
     q: torch.Tensor
     """Joint positions after the action, whatever followed, shape (n, J)."""
     block_pose: torch.Tensor
@@ -88,14 +72,12 @@ class TaskBatch:
     def __init__(
         self,
         bodies: Bodies,
-        settings: Sequence[Setting],
+        specs: Sequence[EnvSpec],
         body: Sequence[int],
         simulation: Simulation,
         *,
-        reach: ReachConfig | None = None,
-        push: PushConfig | None = None,
         kind: ActionKind = "continuous",
-        channels: Channels | None = None,
+        observe: ObservationConfig | None = None,
         seed: int = 0,
         first: int = 0,
     ) -> None:
@@ -103,44 +85,33 @@ class TaskBatch:
 
         Args:
             bodies: The robots.
-            settings: Of each of the robots.
-            body: Which robot each environment holds.
-            simulation: Of the environments, with the settings' scenes.
-            reach: Constants of reach.
-            push: Constants of push.
-            kind: Of actions.
-            channels: What is observed besides.
-            seed: Of all episodes.
+            specs: Specification of each of the robots' environments.
+            body: Index of each environment's robot and specification.
+            simulation: Simulation of the environments, with the scenes of their specifications.
+            kind: Kind of the actions.
+            observe: Entries of observations that are not there by default.
+            seed: Seed of all episodes.
             first: Number of the first environment: the same number and seed give the same episodes,
                 in whichever batch.
 
         Raises:
-            TaskError: If a robot has fewer than two goals.
+            TaskError: If a task is unknown, has different constants, or too few goals of a robot.
         """
-        self.bodies, self.settings, self.kind = bodies, tuple(settings), kind
+        self.bodies, self.specs, self.kind = bodies, tuple(specs), kind
         self.simulation, self.device = simulation, bodies.device
-        reach, push = reach or ReachConfig(), push or PushConfig()
-        channels = channels or Channels()
+        observe = observe or ObservationConfig()
         n, joints, device = len(body), bodies.max_joints, self.device
         self.body = torch.tensor(list(body), device=device)
-        own = [self.settings[i] for i in body]
-        self.pushes = torch.tensor([each.task == "push" for each in own], device=device)
-        fingers = self.pushes[:, None]
+        self.groups = TaskGroups(self.specs, self.body, joints)
+        own = [self.specs[i] for i in body]
         self.mask = torch.where(
-            fingers,
+            self.groups.moves_fingers[:, None],
             bodies.action_mask(fingers=True)[self.body],
             bodies.action_mask(fingers=False)[self.body],
         )
         self._numbers = range(first, first + n)
         self._streams = _streams(seed, self._numbers)
-        self._reach = Reach(self.settings, self.body, reach, joints)
-        self._push = Push(self.settings, self.body, push, joints)
-        self._tasks: list[tuple[Reach | Push, torch.Tensor]] = [
-            (task, does)
-            for task, does in ((self._reach, ~self.pushes), (self._push, self.pushes))
-            if does.any()
-        ]
-        self.longest = torch.where(self.pushes, push.steps, reach.steps)
+        self.longest = self.groups.longest
         """Control steps of an episode at most, shape (n,)."""
         self._joints = simulation.q.shape[1]
         self.targets = torch.zeros(n, joints, device=device)
@@ -148,20 +119,19 @@ class TaskBatch:
         self._qd = torch.zeros(n, joints, device=device)
         self._shares = torch.zeros(n, bodies.max_links, device=device)
         self._lower, self._upper = bodies.lower[self.body], bodies.upper[self.body]
-        self._channels = channels
+        self._config = observe
         self._tokens = LinkTokens(bodies, self.body)
         self._tools = FramePositions(bodies.chain, self.body)
         self._moved = Targets(bodies, self.body, self.mask)
         self._fixed = {
             "links": bodies.links[self.body],
             "actions": self.mask,
-            "goal_mask": ~self.pushes,
-            "object_mask": self.pushes,
-            **_obstacles(own, channels.obstacles, device),
+            **self.groups.masks,
+            **obstacle_tokens([each.scene for each in own], observe.obstacles, device),
         }
         self._points: PointClouds | None = None
-        if channels.points:
-            self._points = PointClouds([each.scene for each in own], channels.points, device)
+        if observe.points:
+            self._points = PointClouds([each.scene for each in own], observe.points, device)
             self._fixed["point_mask"] = self._points.mask
 
     @property
@@ -174,20 +144,13 @@ class TaskBatch:
         """Positions of the independent joints, shape (n, J), rad or m; J is that of ``bodies``."""
         return self._q.clone()
 
-    @property
-    def goal(self) -> torch.Tensor:
-        """Wanted pose of the tool, shape (n, 7); zeros for push."""
-        return self._reach.goal.clone()
+    def does(self, task: str) -> torch.Tensor:
+        """Return which environments are at a task, shape (n,), bool."""
+        return self.groups.does(task)
 
-    @property
-    def witness(self) -> torch.Tensor:
-        """Joint positions that bring the tool to its goal, shape (n, J); zeros for push."""
-        return self._reach.witness.clone()
-
-    @property
-    def line(self) -> torch.Tensor:
-        """Where the block must cross now, y of its centre, shape (n,), metres; zeros for reach."""
-        return self._push.line.clone()
+    def field(self, name: str) -> torch.Tensor:
+        """Return an observation field of the tasks as it is now, shape (n, size); see ``Task``."""
+        return self.groups.fields(self.simulation.block_pose)[name]
 
     def reset(self, seed: int | None = None, *, spread: bool = False) -> Observation:
         """Begin an episode everywhere.
@@ -219,24 +182,24 @@ class TaskBatch:
         self._act(actions)
         unstable = self._move()
         self.elapsed += 1
-        verdict = self._judge(unstable)
-        truncated = ((self.elapsed >= self.longest) | unstable) & ~verdict.terminated
+        result = self._evaluate(unstable)
+        truncated = ((self.elapsed >= self.longest) | unstable) & ~result.terminated
         final = self.observe()
         q, block_pose = self.q, self.simulation.block_pose.clone()
-        over = torch.nonzero(truncated | verdict.terminated)[:, 0]
+        over = torch.nonzero(truncated | result.terminated)[:, 0]
         if len(over):
             self._begin(over)
         return Step(
             observation=self.observe() if len(over) else _copied(final),
-            reward=torch.stack(list(verdict.terms.values())).sum(dim=0),
-            terminated=verdict.terminated,
+            reward=result.reward,
+            terminated=result.terminated,
             truncated=truncated,
             unstable=unstable,
             final_observation=final,
-            success=verdict.success,
-            distance=verdict.distance,
-            score=verdict.score,
-            terms=verdict.terms,
+            success=result.success,
+            distance=result.distance,
+            score=result.score,
+            terms=result.terms,
             q=q,
             block_pose=block_pose,
         )
@@ -245,38 +208,35 @@ class TaskBatch:
         """Return what agents see now, in tensors that belong to the caller."""
         seen = {
             "tokens": self._tokens(self._q),
-            "goal": self._reach.goal.clone(),
-            "object": box_tokens(self.simulation.block_pose, self._push.size)
-            * self.pushes[:, None],
-            "line": self._push.line[:, None].clone(),
+            **self.groups.fields(self.simulation.block_pose),
             **_copied(self._fixed),
         }
-        if self._channels.velocity:
+        if self._config.velocity:
             qd = self._widened(self.simulation.qd)
             seen["velocity"] = of_links(self.bodies, self.body, qd)
-        if self._channels.previous_action:
+        if self._config.previous_action:
             seen["previous_action"] = self._shares.clone()
-        if self._channels.tool:
+        if self._config.tool:
             seen["tool"] = self._tools(self._q)
         if self._points is not None:
             seen["points"] = self._points(self.simulation.block_pose)
         return seen
 
     def advance(self, progress: float) -> None:
-        """Move the line that blocks must cross, as the curriculum of push has it.
+        """Follow the curricula of the tasks that have one.
 
         Args:
-            progress: Of the training, 0 to 1. Until this is called the line is in its place.
+            progress: Progress of the training, 0 to 1. Until this is called, all is as at the end.
         """
-        self._push.advance(progress)
+        self.groups.advance(progress)
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next ``reset`` follows from: the streams of random numbers, and the line."""
+        """Return what the next ``reset`` follows from: random streams, and states of the tasks."""
         states = {
             name: [stream.bit_generator.state for stream in streams]
             for name, streams in self._streams.items()
         }
-        return {**states, "line": self._push.line.clone()}
+        return {**states, **self.groups.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on as a batch of the same environments would; ``reset`` must follow.
@@ -293,7 +253,7 @@ class TaskBatch:
         for name, streams in self._streams.items():
             for stream, saved in zip(streams, state[name], strict=True):
                 stream.bit_generator.state = saved
-        self._push.line = state["line"].to(self.device, copy=True)
+        self.groups.load_state_dict(state)
 
     def close(self) -> None:
         """Free the simulation."""
@@ -306,7 +266,7 @@ class TaskBatch:
 
     def _move(self) -> torch.Tensor:
         """Let physics go on; what became unstable is put back to where it was, (n,) bool."""
-        unstable = torch.zeros_like(self.pushes)
+        unstable = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
         try:
             self.simulation.step(self.targets[:, : self._joints].contiguous())
@@ -317,28 +277,23 @@ class TaskBatch:
             self._qd[envs] = 0
         return unstable
 
-    def _judge(self, unstable: torch.Tensor) -> Verdict:
+    def _evaluate(self, unstable: torch.Tensor) -> StepRows:
         q, qd = self._q, self._widened(self.simulation.qd)
-        state = State(
+        state = TaskState(
             tool=self._tools(q),
-            block=self.simulation.block_pose[:, :3],
-            beyond=beyond_limits(q, self._lower, self._upper),
-            acceleration=added((qd - self._qd).abs()) / CONTROL_PERIOD,
+            block_pose=self.simulation.block_pose,
+            limit_violation=limit_violation(q, self._lower, self._upper),
+            acceleration=row_sums((qd - self._qd).abs()) / CONTROL_PERIOD,
             unstable=unstable,
         )
         self._qd = qd.clone()
-        if len(self._tasks) == 1:
-            return self._tasks[0][0].judge(state)
-        return chosen(self.pushes, self._reach.judge(state), self._push.judge(state))
+        return self.groups.evaluate(state)
 
     def _begin(self, envs: torch.Tensor) -> None:
         starts = torch.zeros(len(envs), self.bodies.max_joints, device=self.device)
         blocks = torch.zeros(len(envs), 7, device=self.device)
-        for task, does in self._tasks:
-            rows = torch.nonzero(does[envs])[:, 0]
-            if len(rows):
-                own = [self._streams["random"][i] for i in envs[rows].tolist()]
-                starts[rows], blocks[rows] = task.begin(envs[rows], own)
+        for rows, (q, block) in self.groups.begin(envs, self._streams["random"]):
+            starts[rows], blocks[rows] = q, block
         if self._points is not None:
             for env in envs.tolist():
                 self._points.begin(env, self._streams["points"][env])
@@ -371,17 +326,3 @@ def _streams(seed: int, numbers: Sequence[int]) -> dict[str, list[np.random.Gene
         return [np.random.default_rng(sequence) for sequence in own]
 
     return {"random": drawn(), "points": drawn(0)}
-
-
-def _obstacles(settings: Sequence[Setting], least: int, device: torch.device) -> Observation:
-    """Tokens of every environment's obstacles, (n, O, 13), and which there are, (n, O)."""
-    most = max(least, *(len(each.scene.obstacles) for each in settings))
-    pose, size = torch.zeros(len(settings), most, 7), torch.zeros(len(settings), most, 3)
-    mask = torch.zeros(len(settings), most, dtype=torch.bool)
-    for i, each in enumerate(settings):
-        for k, block in enumerate(each.scene.obstacles):
-            pose[i, k] = torch.tensor([*block.pose.position, *block.pose.quaternion])
-            size[i, k] = torch.tensor(block.size)
-            mask[i, k] = True
-    found = box_tokens(pose, size) * mask[..., None]
-    return {"obstacles": found.to(device), "obstacle_mask": mask.to(device)}

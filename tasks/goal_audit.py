@@ -19,12 +19,11 @@ from morphgen.errors import MorphgenError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, mapped, unseen
+from morphgen.tasks.env_specs import GoalConfig, env_spec, member_with_primitives
 from morphgen.tasks.goal_leaks import repeated, shared
-from morphgen.tasks.goal_making import Made, SplitGoals, goals_of, unproven
-from morphgen.tasks.goal_npz import Goals
-from morphgen.tasks.goals import EXACT
-from morphgen.tasks.set_files import arrays_of
-from morphgen.tasks.settings import Recipe, member_body, setting_of
+from morphgen.tasks.goal_making import Made, SplitGoals, unproven
+from morphgen.tasks.goal_sets import arrays_of
+from morphgen.tasks.task import GoalSet
 
 _FIXES = {
     "goals-missing": "leave the robot out, or build again: morphgen split build --goals",
@@ -39,8 +38,8 @@ _FIXES = {
 }
 CODES = frozenset(_FIXES)
 
-_FREE = frozenset(("robot", "behind", "across"))
-"""Fields that are not compared with those of a set drawn anew."""
+_EXACT = 1e-6
+"""Largest difference of numbers of a set from those of a set drawn anew."""
 
 
 def audit_goals(
@@ -53,7 +52,7 @@ def audit_goals(
 ) -> tuple[Finding, ...]:
     """Look for goals that leak, and for sets that are not those of the split's robots.
 
-    Every set is drawn anew for comparison, and every goal tested with its witness. Errors:
+    Every set is drawn anew for comparison, and every goal tested with its configuration. Errors:
     ``goals-missing`` (a member has no set, or none can be drawn), ``goals-unknown`` (a set of no
     member), ``goals-body`` (of another body), ``goals-seed`` and ``goals-config`` (made with
     another seed or other constants than those of the split's sets), ``goals-changed`` (not what is
@@ -133,37 +132,37 @@ class _Examination:
         side, member = sided_member
         made = self.found.sets.get((side, member.name))
         try:
-            robot = member_body(member, self.library)
+            robot = member_with_primitives(member, self.library)
             body = robot_hash(robot, visuals=False)
             with tempfile.TemporaryDirectory() as folder:
-                setting = setting_of(
+                spec = env_spec(
                     robot,
                     member.task,
-                    self.found.recipe,
+                    self.found.config,
                     obstacles=member.obstacles,
                     cache=Path(folder),
                 )
-            drawn = goals_of(setting)
+            drawn = spec.goals
             if made is None or made.goals is None:
                 return _Seen(drawn.key, body)
-            lines = () if made.body != body else unproven(made.goals, setting)
+            lines = () if made.body != body else unproven(made.goals, spec)
             return _Seen(drawn.key, body, "", _same(made.goals, drawn), lines)
         except MorphgenError as error:
             return _Seen(why=str(error))
 
 
-def _same(a: Goals, b: Goals) -> bool:
+def _same(a: GoalSet, b: GoalSet) -> bool:
     """Whether two sets are the same but for rounding; proofs of pushes are tested on their own."""
     if type(a) is not type(b):
         return False
     ours, theirs = arrays_of(a), arrays_of(b)
-    return all(_close(ours[name], theirs[name]) for name in ours.keys() - _FREE)
+    return all(_close(ours[name], theirs[name]) for name in ours.keys() - a.not_compared)
 
 
 def _close(a: NDArray[Any], b: NDArray[Any]) -> bool:
     if a.shape != b.shape or a.dtype.kind != b.dtype.kind:
         return False
-    return bool(np.allclose(a, b, 0, EXACT) if a.dtype.kind == "f" else (a == b).all())
+    return bool(np.allclose(a, b, 0, _EXACT) if a.dtype.kind == "f" else (a == b).all())
 
 
 def _set_findings(
@@ -184,7 +183,7 @@ def _set_findings(
             why = one.why or "there is no set of it"
             yield _finding("goals-missing", side, member.name, why)
             continue
-        told = _foreign(made, made.goals, member, one, owners, found.recipe)
+        told = _foreign(made, made.goals, member, one, owners, found.config)
         if told:
             yield _finding(told[0], side, member.name, told[1])
         if one.unproven:
@@ -197,24 +196,24 @@ def _set_findings(
 
 def _foreign(
     made: Made,
-    goals: Goals,
+    goals: GoalSet,
     member: Member,
     seen: _Seen,
     owners: Mapping[str, str],
-    recipe: Recipe,
+    config: GoalConfig,
 ) -> tuple[str, str] | None:
     """Code and reason if a set is not the one that is drawn for its member."""
     if goals.key == seen.key and made.body == seen.body:
-        changed = f"its goals are not those that seed {recipe.seed} gives"
+        changed = f"its goals are not those that seed {config.seed} gives"
         return None if seen.is_same else ("goals-changed", changed)
     if goals.key != seen.key and goals.key in owners:
         return "goals-body", f"its set is that of {owners[goals.key]}"
     if made.body != seen.body:
         return "goals-body", f"its set is of body {made.body}, not of {seen.body}"
-    if goals.seed != recipe.seed:
+    if goals.seed != config.seed:
         return (
             "goals-seed",
-            f"its set was made with seed {goals.seed}, the split's with {recipe.seed}",
+            f"its set was made with seed {goals.seed}, the split's with {config.seed}",
         )
     if (made.task, bool(goals.obstacles)) != (member.task, member.obstacles):
         wanted = _task_text(member.task, member.obstacles)

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from morphgen.benchmark.contents import sided
 from morphgen.benchmark.split import Side, Split
 from morphgen.tasks.goal_making import SplitGoals
-from morphgen.tasks.goal_npz import Goals, poses_of
-from morphgen.tasks.goals import GoalSet
+from morphgen.tasks.task import GoalSet
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -56,12 +55,12 @@ def shared(split: Split, found: SplitGoals) -> Iterator[Told]:
             yield "test", member.name, why
 
 
-def _common(test: Goals, train: Goals, same_body: bool) -> tuple[int, str]:
+def _common(test: GoalSet, train: GoalSet, same_body: bool) -> tuple[int, str]:
     """How many goals of a test set leaked into a train set, and what they are; see the module."""
     same_q = _near_joints(test.q, train.q)
-    same_pose = _near(poses_of(test), poses_of(train))
+    same_pose = _near(test.goal_poses, train.goal_poses)
     if same_body:
-        same = same_pose if isinstance(test, GoalSet) else same_pose & same_q
+        same = same_pose & same_q if test.start_belongs_to_goal else same_pose
         return int(same.any(axis=1).sum()), "goals"
     counts = {"goals": same_pose, "configurations": same_q}
     what, same = max(counts.items(), key=lambda each: each[1].any(axis=1).sum())
@@ -75,8 +74,8 @@ def repeated(split: Split, found: SplitGoals) -> Iterator[Told]:
         goals = found.of(side, member.name)
         if goals is None:
             continue
-        same = _near(poses_of(goals), poses_of(goals))
-        if not isinstance(goals, GoalSet):
+        same = _near(goals.goal_poses, goals.goal_poses)
+        if goals.start_belongs_to_goal:
             same &= _near_joints(goals.q, goals.q)
         pairs = np.argwhere(np.triu(same, 1)).tolist()
         if pairs:

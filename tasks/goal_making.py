@@ -13,15 +13,14 @@ from functools import cached_property
 from pathlib import Path
 
 from morphgen.benchmark.contents import sided
-from morphgen.benchmark.split import Member, Side, Split, Task, robot_hash
+from morphgen.benchmark.split import Member, Side, Split, robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.processes import Progress, mapped, unseen
-from morphgen.tasks.goal_npz import Goals
-from morphgen.tasks.goals import GoalSet, certify
-from morphgen.tasks.push_certificate import certify_pushes
-from morphgen.tasks.settings import BENCHMARK, Recipe, Setting, member_body, setting_of
+from morphgen.tasks.env_specs import BENCHMARK, GoalConfig, env_spec, member_with_primitives
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import EnvSpec, GoalSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +30,9 @@ class Made:
     robot: str
     side: Side | None
     """None for a robot of no split."""
-    task: Task
+    task: str
     obstacles: bool
-    goals: Goals | None = None
+    goals: GoalSet | None = None
     body: str = ""
     """Hash of the body with the shapes that the set was made for."""
     why: str = ""
@@ -51,43 +50,33 @@ class Made:
 class SplitGoals:
     """Goal sets of a split."""
 
-    recipe: Recipe
+    config: GoalConfig
     sets: Mapping[tuple[Side, str], Made]
     """By side and name of the member; those that there are."""
 
-    def of(self, side: Side, name: str) -> Goals | None:
+    def of(self, side: Side, name: str) -> GoalSet | None:
         """A member's set, if there is one."""
         made = self.sets.get((side, name))
         return made.goals if made else None
 
 
-def gathered(made: Sequence[Made], recipe: Recipe) -> SplitGoals:
+def gathered(made: Sequence[Made], config: GoalConfig) -> SplitGoals:
     """What was made of a split; robots without a set are left out."""
     return SplitGoals(
-        recipe, {(one.side, one.robot): one for one in made if one.side and one.goals}
+        config, {(one.side, one.robot): one for one in made if one.side and one.goals}
     )
 
 
-def goals_of(setting: Setting) -> Goals:
-    """The set of a setting, whichever its task."""
-    goals = setting.goals if setting.task == "reach" else setting.pushes
-    if goals is None:
-        raise ValueError(f"the setting of {setting.robot.name} has no set for {setting.task}")
-    return goals
-
-
-def unproven(goals: Goals, setting: Setting) -> tuple[str, ...]:
-    """What is wrong with goals among their own obstacles, a line each; see ``certify``."""
-    scene = replace(setting.scene, obstacles=goals.obstacles)
-    if isinstance(goals, GoalSet):
-        return tuple(certify(goals, setting.robot, scene))
-    return tuple(certify_pushes(goals, setting.robot, scene))
+def unproven(goals: GoalSet, spec: EnvSpec) -> tuple[str, ...]:
+    """Return what is wrong with goals among their own obstacles, a line each."""
+    scene = replace(spec.scene, obstacles=goals.obstacles)
+    return tuple(TASKS[spec.task].certify(goals, spec.robot, scene))
 
 
 def robot_goals(
     robot: Robot,
-    task: Task,
-    recipe: Recipe = BENCHMARK,
+    task: str,
+    config: GoalConfig = BENCHMARK,
     *,
     obstacles: bool,
     certified: bool = False,
@@ -98,17 +87,18 @@ def robot_goals(
     Args:
         robot: The body.
         task: What it does.
-        recipe: Seed and constants.
+        config: Seed and constants.
         obstacles: Whether there are any.
-        certified: Whether every goal is tested with its witness.
+        certified: Whether every goal is tested with its configuration.
         cache: Folder of stored sets; by default the user's.
     """
     made = Made(robot.name, None, task, obstacles)
     try:
-        setting = setting_of(robot, task, recipe, obstacles=obstacles, cache=cache)
-        goals = goals_of(setting)
-        lines = unproven(goals, setting) if certified else None
-        return replace(made, goals=goals, body=robot_hash(robot, visuals=False), unproven=lines)
+        spec = env_spec(robot, task, config, obstacles=obstacles, cache=cache)
+        lines = unproven(spec.goals, spec) if certified else None
+        return replace(
+            made, goals=spec.goals, body=robot_hash(robot, visuals=False), unproven=lines
+        )
     except MorphgenError as error:
         return replace(made, why=str(error))
 
@@ -116,7 +106,7 @@ def robot_goals(
 def split_goals(
     split: Split,
     library: Library,
-    recipe: Recipe = BENCHMARK,
+    config: GoalConfig = BENCHMARK,
     *,
     jobs: int = 1,
     certified: bool = False,
@@ -131,16 +121,16 @@ def split_goals(
     Args:
         split: The split.
         library: Where its parts are.
-        recipe: Seed and constants.
+        config: Seed and constants.
         jobs: Processes.
-        certified: Whether every goal is tested with its witness.
+        certified: Whether every goal is tested with its configuration.
         cache: Folder of stored sets; by default the user's.
         progress: Told how many robots are done, again and again.
 
     Raises:
         MorphgenError: If ``jobs`` is below 1, or a process died.
     """
-    maker = _Maker(library.folders, recipe, certified, cache)
+    maker = _Maker(library.folders, config, certified, cache)
     return list(mapped(maker, sided(split), jobs, progress, chunk=1))
 
 
@@ -149,7 +139,7 @@ class _Maker:
     """How a worker makes a set."""
 
     folders: tuple[Path, ...]
-    recipe: Recipe
+    config: GoalConfig
     certified: bool
     cache: Path | None
 
@@ -160,13 +150,13 @@ class _Maker:
     def __call__(self, sided_member: tuple[Side, Member]) -> Made:
         side, member = sided_member
         try:
-            robot = member_body(member, self.library)
+            robot = member_with_primitives(member, self.library)
         except MorphgenError as error:
             return Made(member.name, side, member.task, member.obstacles, why=str(error))
         made = robot_goals(
             robot,
             member.task,
-            self.recipe,
+            self.config,
             obstacles=member.obstacles,
             certified=self.certified,
             cache=self.cache,

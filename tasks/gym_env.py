@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,27 +12,28 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import Task
 from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.batch import Channels, Observation, Step
-from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
-from morphgen.tasks.film import SIZE, Frame, Stage, moment
-from morphgen.tasks.make import BatchOptions, SimulatorName, make_batch
+from morphgen.tasks.batch import Step
+from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.make import make_batch
+from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.renderer import SIZE, Frame, Moment, Renderer, moment
 from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.spaces import NumpyObservation, action_space, arrays, observation_space
+from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
 
 RENDER_MODES = ("rgb_array",)
-_OF_OTHERS = {"reach": {"object", "line"}, "push": {"goal"}}
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
-    """A robot at a task; see ``ReachEnv`` and ``PushEnv``.
+    """A robot at a task; ``gymnasium.make("morphgen/Reach-v0")`` makes one, and so for each task.
 
-    Observations are those of ``TaskBatch`` without what only a batch of several bodies needs: no
-    padding, no masks, and nothing of the other task. Tokens are (links, 48).
+    Observations are those of ``TaskBatch`` without what only a batch of several robots needs: no
+    padding, no masks, and no fields of other tasks. Tokens are (links, 48).
 
     An action is a number for each joint that the task moves, in the order of their links: for reach
     the joints on the way to the tool, for push fingers too. ``action_joints`` has their names,
@@ -48,18 +50,18 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         "render_modes": list(RENDER_MODES),
         "render_fps": round(1 / CONTROL_PERIOD),
     }
-    task: Task
 
     def __init__(
         self,
+        task: str,
         robot: str | Path | Robot = "ur5-plane",
         *,
-        sim: SimulatorName = "pybullet",
+        sim: str = "pybullet",
         obstacles: bool = False,
         kind: ActionKind = "continuous",
-        channels: Channels | None = None,
+        observe: ObservationConfig | None = None,
         contacts: Contacts | None = None,
-        config: ReachConfig | PushConfig | None = None,
+        config: TaskConfig | None = None,
         goal_seed: int = 0,
         cache: Path | None = None,
         library: Iterable[Path] = (),
@@ -70,12 +72,13 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         """Set up.
 
         Args:
+            task: Name of a task, such as ``reach`` or ``push``.
             robot: A robot, or what ``robot_of`` knows: ``ur5-plane``, words of ``morphgen
                 compose``, a bundle's folder or a URDF, with fitted primitives as collision shapes.
-            sim: ``pybullet`` or ``mujoco``.
+            sim: Name of a simulator, such as ``pybullet`` or ``mujoco``.
             obstacles: Whether there are any.
             kind: Actions are ``continuous`` or ``discrete``.
-            channels: What is observed besides.
+            observe: Entries of observations that are not there by default.
             contacts: What may touch what; by default everything.
             config: Constants of the task.
             goal_seed: Of goals, starts and obstacles.
@@ -94,32 +97,38 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             hint = nearest(render_mode, RENDER_MODES)
             raise TaskError(f"unknown render mode {render_mode!r}{hint}")
         self._contacts = contacts or Contacts()
-        options: BatchOptions = {
-            "sim": sim,
-            "kind": kind,
-            "channels": channels,
-            "contacts": self._contacts,
-            "max_links": max_links,
-            **_constants(self.task, config),
-        }
+        kind_of_config = TASKS[task].config_type
+        if config is not None and not isinstance(config, kind_of_config):
+            raise TaskError(
+                f"{type(config).__name__} is not the config of {task}: expected "
+                f"{kind_of_config.__name__}"
+            )
+        self.task = task
         self.render_mode, self._size = render_mode, size
-        self._stage: Stage | None = None
+        self._renderer: Renderer | None = None
         self.batch = make_batch(
             self.task,
             [robot],
             1,
             obstacles=obstacles,
             goal_seed=goal_seed,
+            configs=() if config is None else (config,),
             cache=cache,
             library=library,
-            **options,
+            sim=sim,
+            kind=kind,
+            observe=observe,
+            contacts=self._contacts,
+            max_links=max_links,
         )
-        self.setting = self.batch.settings[0]
-        own = self.setting.robot
+        self.env_spec = self.batch.specs[0]
+        own = self.env_spec.robot
+        other_fields = set(STANDARD_FIELDS) - set(TASKS[task].fields)
+        self._hidden = {field.name for field in other_fields}
         self.action_links: tuple[int, ...] = tuple(torch.nonzero(self.batch.mask[0])[:, 0].tolist())
         self.action_joints = tuple(own.joints[link - 1].name for link in self.action_links)
         self._running = self._closed = self._was_reset = False
-        self._last: dict[str, Any] | None = None
+        self._last: Moment | None = None
         seen = self._seen(self.batch.observe())
         self.observation_space = cast(
             gym.Space[NumpyObservation], observation_space({k: v[None] for k, v in seen.items()})
@@ -169,16 +178,16 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
                 'nothing is rendered: make the environment with render_mode="rgb_array"'
             )
             return None
-        if self._stage is None:
-            self._stage = Stage(self.setting, self._size)
-        return self._stage.frame(**(self._last or moment(self.batch)))
+        if self._renderer is None:
+            self._renderer = Renderer.of_spec(self.env_spec, self._size)
+        return self._renderer.frame(self._last or moment(self.batch))
 
     def close(self) -> None:
         """Free everything; a second time does nothing."""
         self._closed = True
         self.batch.close()
-        if self._stage is not None:
-            self._stage.close()
+        if self._renderer is not None:
+            self._renderer.close()
 
     def _require_open(self) -> None:
         if self._closed:
@@ -197,13 +206,13 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
 
     def _seen(self, observation: Observation) -> NumpyObservation:
         """What is seen of a batch of one."""
-        links = slice(len(self.setting.robot.links))
+        links = slice(len(self.env_spec.robot.links))
         rows: dict[str, Any] = {"tokens": links, "velocity": links}
         rows["previous_action"] = list(self.action_links)
         return {
             name: np.array(values[0][rows.get(name, slice(None))])
             for name, values in arrays(observation).items()
-            if values.dtype == np.float32 and name not in _OF_OTHERS[self.task]
+            if values.dtype == np.float32 and name not in self._hidden
         }
 
     def _info(self, step: Step) -> dict[str, Any]:
@@ -217,29 +226,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         }
 
 
-class ReachEnv(TaskEnv):
-    """Bring the tool to a goal, and keep it there for 6 s; ``morphgen/Reach-v0``."""
-
-    task = "reach"
-
-
-class PushEnv(TaskEnv):
-    """Push a block across a line within 6 s; ``morphgen/Push-v0``."""
-
-    task = "push"
-
-
-def _constants(task: Task, config: ReachConfig | PushConfig | None) -> BatchOptions:
-    if config is None:
-        return {}
-    if task == "reach" and isinstance(config, ReachConfig):
-        return {"reach": config}
-    if task == "push" and isinstance(config, PushConfig):
-        return {"push": config}
-    raise TaskError(f"{type(config).__name__} is not the config of {task}")
-
-
-def _moved(before: dict[str, Any], step: Step) -> dict[str, Any]:
-    """A ``film.moment`` after a step, whatever episode has begun since."""
-    now = before | {"q": step.q[0, : len(before["q"])].cpu().numpy()}
-    return now | ({"block": step.block_pose[0].cpu().numpy()} if "block" in before else {})
+def _moved(before: Moment, step: Step) -> Moment:
+    """Return the moment after a step, whatever episode has begun since."""
+    block = None if before.block is None else step.block_pose[0].cpu().numpy()
+    return replace(before, q=step.q[0, : len(before.q)].cpu().numpy(), block=block)

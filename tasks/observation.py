@@ -1,11 +1,38 @@
-"""What an agent sees: tokens of links, the goal, the block and obstacles, with masks."""
+"""Observations: what they have besides the fields of tasks, and tokens of links and boxes."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
 from morphgen.tasks.bodies import Bodies
+from morphgen.tasks.sim.base import Scene
+
+Observation = dict[str, torch.Tensor]
+"""``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``obstacles`` (n, O, 13) and
+``obstacle_mask`` (n, O) bool; the fields of tasks with their masks: of ``task.STANDARD_FIELDS``
+``goal`` (n, 7), ``object`` (n, 13) and ``line`` (n, 1), ``goal_mask`` and ``object_mask`` (n,)
+bool. If asked for, ``velocity`` (n, L), ``previous_action`` (n, L), ``tool`` (n, 3), ``points``
+(n, P, 3) and ``point_mask`` (n, P) bool."""
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """Entries of an observation that are not there by default; the paper has only the points."""
+
+    velocity: bool = False
+    """Velocities of the links' independent joints, rad/s or m/s."""
+    previous_action: bool = False
+    """The action before, as shares of the joints' largest steps."""
+    tool: bool = False
+    """Position of the tool in the world, metres."""
+    points: int = 0
+    """Number of points of a point cloud of block and obstacles."""
+    obstacles: int = 0
+    """Least number of rows for obstacles: for policies that meet more of them elsewhere."""
 
 
 class LinkTokens:
@@ -54,3 +81,23 @@ def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
     shape = torch.zeros_like(size)
     shape[..., 2] = 1
     return torch.cat([pose, shape, size], dim=-1)
+
+
+def obstacle_tokens(scenes: Sequence[Scene], least: int, device: torch.device) -> Observation:
+    """Return tokens of the obstacles in scenes, (n, O, 13), and which there are, (n, O).
+
+    Args:
+        scenes: One for each environment.
+        least: Least number of rows, O.
+        device: Device of the tensors.
+    """
+    most = max(least, *(len(scene.obstacles) for scene in scenes))
+    pose, size = torch.zeros(len(scenes), most, 7), torch.zeros(len(scenes), most, 3)
+    mask = torch.zeros(len(scenes), most, dtype=torch.bool)
+    for i, scene in enumerate(scenes):
+        for k, block in enumerate(scene.obstacles):
+            pose[i, k] = torch.tensor([*block.pose.position, *block.pose.quaternion])
+            size[i, k] = torch.tensor(block.size)
+            mask[i, k] = True
+    tokens = box_tokens(pose, size) * mask[..., None]
+    return {"obstacles": tokens.to(device), "obstacle_mask": mask.to(device)}

@@ -1,4 +1,4 @@
-"""Gymnasium's ids of the tasks, known to it without that ``import morphgen`` loads Gymnasium.
+"""Gymnasium's ids of the tasks, registered without that ``import morphgen`` loads Gymnasium.
 
 Gymnasium finds no plugins of its own accord: somebody has to register what is to be made. This is
 done at once if Gymnasium is imported already, and otherwise as soon as it is.
@@ -13,9 +13,8 @@ from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import ModuleType
 
-REACH, PUSH = "morphgen/Reach-v0", "morphgen/Push-v0"
-_CLASSES = {REACH: "ReachEnv", PUSH: "PushEnv"}
-_BATCHES = {REACH: "reach_vector", PUSH: "push_vector"}
+from morphgen.tasks.registry import TASKS
+
 _LIBRARY = "gymnasium"
 
 
@@ -32,12 +31,14 @@ def register() -> None:
 def _register() -> None:
     from gymnasium.envs.registration import register, registry
 
-    for name, made in _CLASSES.items():
+    for task in TASKS:
+        name = f"morphgen/{task.capitalize()}-v0"
         if name not in registry:
             register(
                 id=name,
-                entry_point=f"morphgen.tasks.gym_env:{made}",
-                vector_entry_point=f"morphgen.tasks.vector:{_BATCHES[name]}",
+                entry_point="morphgen.tasks.gym_env:TaskEnv",
+                vector_entry_point="morphgen.tasks.vector:task_vector",
+                kwargs={"task": task},
             )
 
 

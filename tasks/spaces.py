@@ -9,8 +9,8 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from morphgen.tasks.batch import Observation
 from morphgen.tasks.config import BINS
+from morphgen.tasks.observation import Observation
 
 BOUND = 1000.0
 """Largest number in an observation, in m, rad, m/s or rad/s; nothing gets there in an episode."""

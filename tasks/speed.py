@@ -69,7 +69,7 @@ def measure(
     spent: dict[str, float] = {}
     parts: dict[str, list[tuple[Any, str]]] = {
         "actions": [(batch, "_act")],
-        "rewards": [(batch, "_judge")],
+        "rewards": [(batch, "_evaluate")],
         "observation": [(batch, "observe")],
         "new episodes": [(batch, "_begin")],
         "around the simulator": [(batch.simulation, "step")],

@@ -1,7 +1,7 @@
 """Goal sets that ship with a built split, and how they are read back.
 
 goals/index.json             seed and constants of all sets, and a record a set
-goals/<side>/<name>.npz      the fields of a ``GoalSet`` (reach) or a ``PushSet`` (push)
+goals/<side>/<name>.npz      the fields of a goal set; its class is that of the task
 goals/README.md              what is what
 """
 
@@ -11,7 +11,6 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,11 @@ from morphgen.benchmark.split import Side
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import alone, replacing_folder, write_atomic
-from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.env_specs import GoalConfig, task_configs
 from morphgen.tasks.goal_making import Made, SplitGoals, gathered
-from morphgen.tasks.goal_npz import Goals, goals_from_npz
-from morphgen.tasks.set_files import set_npz
-from morphgen.tasks.settings import Recipe
+from morphgen.tasks.goal_sets import goals_from_npz, set_npz
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import GoalSet
 
 GOALS = "goals"
 """The folder in a built split."""
@@ -40,11 +39,7 @@ task, obstacles, hash of the body with fitted primitives as its collision shapes
 that the set follows from), seed, number of goals, configurations tried and accepted, SHA-256 of the
 file.
 
-- reach: `q` (n, dof) are configurations free of collisions, and `poses` (n, 7) of the tool at them
-  are the goals; `q` are the starts of episodes, too
-- push: `q` (n, dof) are starts, and `blocks` (n, 7) poses of the block, whose centre must cross
-  y = `line`
-- `obstacles` (m, 12) and `block` (12,): edges, pose, mass and friction of boxes
+{tasks}- `obstacles` (m, 12) and `block` (12,): edges, pose, mass and friction of boxes
 
 Poses are x, y, z, qw, qx, qy, qz in the world, whose origin is the robot's root; metres and rad.
 
@@ -57,7 +52,7 @@ for name, goals in read_goals("..", "test").items():
 """
 
 
-def write_goals(home: Path, made: Sequence[Made], recipe: Recipe) -> Path:
+def write_goals(home: Path, made: Sequence[Made], config: GoalConfig) -> Path:
     """Write the goal sets of a split into the folder where it is built, and their sums.
 
     The same sets give the same bytes. What was there before is replaced.
@@ -65,7 +60,7 @@ def write_goals(home: Path, made: Sequence[Made], recipe: Recipe) -> Path:
     Args:
         home: The built split.
         made: A set for every member.
-        recipe: How they were made.
+        config: Seed and constants that they were made with.
 
     Returns:
         The folder of the sets.
@@ -76,7 +71,7 @@ def write_goals(home: Path, made: Sequence[Made], recipe: Recipe) -> Path:
     """
     require_all(made)
     folder = home / GOALS
-    files = dict(_files(made, recipe))
+    files = dict(_files(made, config))
     read_sums(home / SUMS)  # refuses a folder that is not built, before anything is locked
     try:
         with alone(home):
@@ -115,7 +110,7 @@ def has_goals(folder: Path) -> bool:
     return (folder / GOALS).is_dir()
 
 
-def read_goals(folder: str | Path, side: Side) -> dict[str, Goals]:
+def read_goals(folder: str | Path, side: Side) -> dict[str, GoalSet]:
     """The goal sets of one side of a built split, by the names of its members.
 
     Args:
@@ -130,8 +125,8 @@ def read_goals(folder: str | Path, side: Side) -> dict[str, Goals]:
 
 
 def shipped_set(
-    sets: Mapping[str, Goals] | None, robot: str, folder: str | Path | None
-) -> Goals | None:
+    sets: Mapping[str, GoalSet] | None, robot: str, folder: str | Path | None
+) -> GoalSet | None:
     """The set of a robot among those that a folder ships; None if no folder does.
 
     Raises:
@@ -169,12 +164,11 @@ def _parsed(index: Mapping[str, Any], folder: Path) -> SplitGoals:
         raise BenchmarkError(
             f"{folder / INDEX}: format {index['format']!r}; this version reads {FORMAT}"
         )
-    recipe = Recipe(
-        int(index["seed"]),
-        ReachConfig(**_tuples(index["reach"])),
-        PushConfig(**_tuples(index["push"])),
-    )
-    return gathered([_read_set(folder, record) for record in index["sets"]], recipe)
+    for task in TASKS.builtin:
+        index[task]  # a KeyError if it is missing
+    constants = {key: index[key] for key in index if key not in ("format", "seed", "sets")}
+    config = GoalConfig(int(index["seed"]), task_configs(constants))
+    return gathered([_read_set(folder, record) for record in index["sets"]], config)
 
 
 def _read_set(folder: Path, record: Mapping[str, Any]) -> Made:
@@ -187,7 +181,7 @@ def _read_set(folder: Path, record: Mapping[str, Any]) -> Made:
     return Made(**facts, goals=goals)
 
 
-def _files(made: Sequence[Made], recipe: Recipe) -> Iterator[tuple[str, bytes]]:
+def _files(made: Sequence[Made], config: GoalConfig) -> Iterator[tuple[str, bytes]]:
     """Paths in the folder of the sets, and what is there."""
     records = []
     for one in made:
@@ -197,10 +191,12 @@ def _files(made: Sequence[Made], recipe: Recipe) -> Iterator[tuple[str, bytes]]:
         content = set_npz(one.goals)
         records.append(record_of(one) | {"file": name, "sha256": _sha256(content)})
         yield name, content
-    head = json.dumps({"format": FORMAT, **asdict(recipe)}, indent=2).removesuffix("\n}")
+    used = [one.task for one in made]
+    constants = {"format": FORMAT, "seed": config.seed, **config.as_data(used)}
+    head = json.dumps(constants, indent=2).removesuffix("\n}")
     lines = ",\n".join(f"    {json.dumps(record)}" for record in records)
     yield INDEX, f'{head},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
-    yield README, _README.format(index=INDEX).encode()
+    yield README, _README.format(index=INDEX, tasks=_readme_of(used)).encode()
 
 
 def record_of(one: Made) -> dict[str, object]:
@@ -224,9 +220,10 @@ def record_of(one: Made) -> dict[str, object]:
     }
 
 
-def _tuples(data: Mapping[str, object]) -> dict[str, Any]:
-    """Constants as JSON has them, with tuples again."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+def _readme_of(used: Sequence[str]) -> str:
+    """Return what is written of the arrays of morphgen's own tasks and of those that are used."""
+    names = dict.fromkeys((*TASKS.builtin, *used))
+    return "".join(TASKS[name].goal_files_readme for name in names)
 
 
 def _sha256(content: bytes) -> str:

@@ -12,7 +12,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import Task
 from morphgen.errors import TaskError
 from morphgen.model.robot import Robot
 from morphgen.tasks.batch import Step, TaskBatch
@@ -94,25 +93,23 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
             raise TaskError("these environments are closed")
 
 
-def reach_vector(num_envs: int, **options: Any) -> TaskVector:  # noqa: ANN401
-    """What ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, robots=[...])`` makes."""
-    return _vector("reach", num_envs, **options)
-
-
-def push_vector(num_envs: int, **options: Any) -> TaskVector:  # noqa: ANN401
-    """What ``gymnasium.make_vec("morphgen/Push-v0", num_envs, robots=[...])`` makes."""
-    return _vector("push", num_envs, **options)
-
-
-def _vector(
-    task: Task,
+def task_vector(
     num_envs: int,
     *,
+    task: str,
     robot: str | Path | Robot = "ur5-plane",
     robots: Sequence[str | Path | Robot] = (),
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
-    """Environments of several robots, or of one; the options are those of ``make_batch``."""
+    """Make what ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, robots=[...])`` returns.
+
+    Args:
+        num_envs: Number of environments.
+        task: Name of the task.
+        robot: The robot of all environments, if ``robots`` names none.
+        robots: Robots; environment i has robot i modulo their number.
+        **options: As of ``make_batch``.
+    """
     return TaskVector(make_batch(task, robots or [robot], num_envs, **options))
 
 

@@ -151,7 +151,7 @@ def test_processes_of_pybullet_load_little_else():
         "fitting.token_shapes",
         "model.kinematics",
         "model.inverse_kinematics",
-        "tasks.goals",
+        "tasks.env_specs",
     ],
 )
 def test_splits_and_goals_wait_for_no_torch(module):

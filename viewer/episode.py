@@ -1,20 +1,23 @@
 """Episodes as they were played, to be shown again: what moved, and how it was scored.
 
-An episode's file is an ``.npz``. ``about`` is a text of JSON: ``format`` (1), ``morphgen`` (its
+An episode's file is an ``.npz``. ``about`` is a text of JSON: ``format`` (2), ``morphgen`` (its
 version), ``task``, ``policy``, ``seed``, ``obstacles`` (whether any were asked for), ``simulator``,
 ``period`` (seconds between two moments), and of every body in ``bodies``: ``name``, ``place`` (see
 ``morphgen.viewer.places``), ``body`` (its ``robot_hash``), ``ground`` (metres, or null),
-``obstacles`` (``size`` and ``pose`` of each) and, for push, ``block`` (its edges) and ``line``.
+``obstacles`` (``size`` and ``pose`` of each), ``block`` (its edges, or null) and ``markers``
+(``name``, ``shape`` and ``size`` of each shape that shows a goal, see ``morphgen.tasks.task``).
 
 Arrays of body ``i``, of T control steps, in SI units; poses are (x, y, z, qw, qx, qy, qz):
 
     i/q          (T + 1, J)  independent joint positions at the start and after every step
     i/tool       (T + 1, 7)  pose of the tool in the root frame, which is the world's
-    i/goal       (7,)        wanted pose of the tool; reach only
-    i/block      (T + 1, 7)  pose of the block in the world; push only
+    i/block      (T + 1, 7)  pose of the block in the world, if there is one
+    i/<marker>   (T + 1, 7)  pose of each marker, such as ``goal`` (reach) or ``line`` (push)
     i/score      (T,)        score of every step, see ``morgphen.tasks``
     i/distance   (T,)        metres from success
     i/success    (T,)        whether it was successful then
+
+In format 1, which is still read, ``i/goal`` is of shape (7,), and ``line`` is a y in ``bodies``.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,19 +34,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import TASKS, Task, robot_hash
+from morphgen.benchmark.split import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
-from morphgen.tasks.rewards import episode_score
+from morphgen.model.rotation import Vec3
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Block
+from morphgen.tasks.task import Marker
 from morphgen.viewer.places import Places, read_place
 
 Array = NDArray[np.float32]
 
-FORMAT = 1
+FORMAT = 2
+_NEAR = 0.03
+"""Radius of the ball that showed a goal of format 1, metres."""
 
 
 class EpisodeError(MorphgenError):
@@ -58,15 +65,15 @@ class Track:
     place: str
     ground: float | None
     obstacles: tuple[Block, ...] = ()
-    goal: Array | None = None
-    """Wanted pose of the tool, shape (7,)."""
+    markers: tuple[Marker, ...] = ()
+    """Shapes that show the goal."""
     block_size: tuple[float, float, float] | None = None
-    line: float | None = None
-    """y that the block must cross, metres."""
     q: list[Array] = field(default_factory=list)
     """Positions of the independent joints at every moment, the start first."""
     block: list[Array] = field(default_factory=list)
     """Poses of the block likewise; empty where there is none."""
+    marker_poses: dict[str, list[Array]] = field(default_factory=dict)
+    """Poses of each marker likewise, by name."""
     score: list[float] = field(default_factory=list)
     distance: list[float] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
@@ -83,7 +90,7 @@ class Track:
 class Episode:
     """Bodies at the same task under the same policy."""
 
-    task: Task
+    task: str
     policy: str
     seed: int
     obstacles: bool
@@ -98,8 +105,8 @@ class Episode:
         return max((track.steps for track in self.tracks), default=0)
 
 
-def score_until(track: Track, task: Task, step: int) -> float | None:
-    """The score of an episode as if it had ended, see ``episode_score``.
+def score_until(track: Track, task: str, step: int) -> float | None:
+    """The score of an episode as if it had ended, see ``Task.episode_score``.
 
     Args:
         track: What the body did.
@@ -112,7 +119,7 @@ def score_until(track: Track, task: Task, step: int) -> float | None:
     scores = track.score[:step]
     if not scores:
         return None
-    return episode_score(task == "push", sum(scores), scores[-1], len(scores))
+    return TASKS[task].episode_score(sum(scores), scores[-1], len(scores))
 
 
 def still(episode: Episode) -> Episode:
@@ -160,10 +167,10 @@ def read_episode(path: Path, places: Places) -> Episode:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays["about"]))
-        if about["format"] != FORMAT or about["task"] not in TASKS:
+        if about["format"] not in (1, FORMAT) or about["task"] not in TASKS:
             raise ValueError(f"format {about['format']}, task {about['task']!r}")
         tracks = [
-            _track(row, {name: arrays[f"{i}/{name}"] for name in _names(about["task"])}, places)
+            _track(row, _arrays_of(arrays, f"{i}/"), places)
             for i, row in enumerate(about["bodies"])
         ]
         if not tracks:
@@ -187,14 +194,19 @@ def _still(track: Track) -> Track:
         track,
         q=track.q[: steps + 1],
         block=track.block[: steps + 1],
+        marker_poses={name: poses[: steps + 1] for name, poses in track.marker_poses.items()},
         score=track.score[:steps],
         distance=track.distance[:steps],
         success=track.success[:steps],
     )
 
 
-def _names(task: Task) -> tuple[str, ...]:
-    return ("q", "score", "distance", "success", "goal" if task == "reach" else "block")
+def _arrays_of(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    return {
+        name.removeprefix(prefix): values
+        for name, values in arrays.items()
+        if name.startswith(prefix)
+    }
 
 
 def _about(track: Track) -> dict[str, Any]:
@@ -208,7 +220,7 @@ def _about(track: Track) -> dict[str, Any]:
             for block in track.obstacles
         ],
         "block": track.block_size and list(track.block_size),
-        "line": track.line,
+        "markers": [asdict(marker) for marker in track.markers],
     }
 
 
@@ -223,8 +235,8 @@ def _arrays(track: Track) -> dict[str, NDArray[Any]]:
         "distance": np.array(track.distance[:steps], dtype=np.float32),
         "success": np.array(track.success[:steps], dtype=np.bool_),
     }
-    if track.goal is not None:
-        found["goal"] = track.goal
+    for name, moved in track.marker_poses.items():
+        found[name] = np.array(moved[: steps + 1], dtype=np.float32)
     if track.block:
         found["block"] = np.array(track.block[: steps + 1], dtype=np.float32)
     return found
@@ -236,41 +248,70 @@ def _track(row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], places: P
         raise EpisodeError(
             f"the robot at {row['place']} is not the one that was recorded: it has changed since"
         )
-    q, goal, block = arrays["q"], arrays.get("goal"), arrays.get("block")
+    q, block = arrays["q"], arrays.get("block")
     if q.ndim != 2 or not len(q):
         raise ValueError(f"q has shape {q.shape}; expected ({robot.dof},) for every moment")
-    _require(arrays, {"q": (len(q), robot.dof), "goal": (7,), "block": (len(q), 7)})
+    if "markers" not in row:
+        row, arrays = _as_format_2(row, arrays)
+    markers = tuple(
+        Marker(str(each["name"]), each["shape"], _edges(each["size"])) for each in row["markers"]
+    )
+    poses = [marker.name for marker in markers] + ["block"] * (row["block"] is not None)
+    if any(marker.shape not in ("frame", "box") for marker in markers):
+        raise ValueError(f"markers {row['markers']}")
+    _require(arrays, {"q": (len(q), robot.dof), **dict.fromkeys(poses, (len(q), 7))})
     _require(arrays, dict.fromkeys(("score", "distance", "success"), (len(q) - 1,)))
     return Track(
         robot,
         str(row["place"]),
         None if row["ground"] is None else float(row["ground"]),
         tuple(_block(each["size"], each["pose"]) for each in row["obstacles"]),
-        None if goal is None else goal.astype(np.float32),
+        markers,
         None if block is None else _block(row["block"], block[0]).size,
-        None if row["line"] is None else float(row["line"]),
         list(q.astype(np.float32)),
         [] if block is None else list(block.astype(np.float32)),
+        {marker.name: list(arrays[marker.name].astype(np.float32)) for marker in markers},
         arrays["score"].tolist(),
         arrays["distance"].tolist(),
         [bool(each) for each in arrays["success"]],
     )
 
 
+def _as_format_2(
+    row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Return what an episode of format 1 says of a body, with its goal and line as markers."""
+    markers, moments, own = [], len(arrays["q"]), dict(arrays)
+    if "goal" in arrays:
+        _require(arrays, {"goal": (7,)})
+        markers.append({"name": "goal", "shape": "frame", "size": [2 * _NEAR] * 3})
+        own["goal"] = np.tile(arrays["goal"], (moments, 1))
+    if row["line"] is not None:
+        _require(arrays, {"block": (moments, 7)})
+        x, ground = float(arrays["block"][0, 0]), float(row["ground"] or 0.0)
+        length = 2 * (max(map(float, row["block"])) + 0.3)
+        markers.append({"name": "line", "shape": "box", "size": [length, 0.012, 0.002]})
+        own["line"] = np.tile([x, float(row["line"]), ground, 1.0, 0.0, 0.0, 0.0], (moments, 1))
+    return {**row, "markers": markers}, own
+
+
 def _require(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:
     for name, shape in shapes.items():
-        if name in arrays:
-            values = arrays[name]
-            if values.shape != shape or values.dtype.kind not in "fb":
-                raise ValueError(f"{name} has shape {values.shape}; expected {shape}")
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name} is not finite")
+        values = arrays[name]
+        if values.shape != shape or values.dtype.kind not in "fb":
+            raise ValueError(f"{name} has shape {values.shape}; expected {shape}")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} is not finite")
+
+
+def _edges(size: Any) -> Vec3:  # noqa: ANN401
+    x, y, z = (float(value) for value in size)
+    return (x, y, z)
 
 
 def _block(size: Any, pose: Any) -> Block:  # noqa: ANN401
-    x, y, z = (float(value) for value in size)
     values = [float(value) for value in pose]
-    return Block((x, y, z), Pose((values[0], values[1], values[2]), _unit(values[3:])))
+    return Block(_edges(size), Pose((values[0], values[1], values[2]), _unit(values[3:])))
 
 
 def _unit(quaternion: list[float]) -> tuple[float, float, float, float]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import viser
 
-from morphgen.benchmark.split import REGIMES, TASKS, Member
+from morphgen.benchmark.split import REGIMES, Member
 from morphgen.errors import BenchmarkError
+from morphgen.tasks.registry import TASKS
 from morphgen.viewer import gallery, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.entries import Entry
@@ -72,7 +73,7 @@ def _add_new_split(rows: Gallery) -> None:
         wanted = _Wanted(
             gui.add_text("split name", ""),
             gui.add_dropdown("regime", REGIMES),
-            gui.add_dropdown("task", TASKS),
+            gui.add_dropdown("task", tuple(TASKS)),
             gui.add_checkbox("obstacles", False),
             gui.add_number("to train on", 10, min=1, step=1),
             gui.add_number("to test on", 1, min=1, step=1),
@@ -99,7 +100,7 @@ def _save(rows: Gallery, wanted: _Wanted) -> None:
 
 
 def _members(session: Session, entries: list[Entry], wanted: _Wanted) -> list[Member]:
-    task = next(each for each in TASKS if each == wanted.task.value)
+    task = wanted.task.value
     waiting = [
         session.workers.submit(
             member_of, entry.place, entry.category, task, wanted.obstacles.value, session.places

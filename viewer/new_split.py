@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.benchmark.split import COMPOSED, Member, Regime, Split, Task, robot_hash
+from morphgen.benchmark.split import COMPOSED, Member, Regime, Split, robot_hash
 from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
@@ -19,7 +19,7 @@ LONGEST_NAME = 200
 """Characters of a split's name."""
 
 
-def member_of(place: str, category: str, task: Task, obstacles: bool, places: Places) -> Member:
+def member_of(place: str, category: str, task: str, obstacles: bool, places: Places) -> Member:
     """The robot at a place as a member of a split.
 
     Raises:

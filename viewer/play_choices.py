@@ -8,9 +8,9 @@ from typing import Any
 
 import viser
 
-from morphgen.benchmark.split import TASKS
 from morphgen.errors import MorphgenError, nearest
 from morphgen.rl.names import REFERENCES, references_for
+from morphgen.tasks.registry import TASKS
 from morphgen.viewer import browser, play_bodies
 from morphgen.viewer.address import Address, whole_number
 from morphgen.viewer.places import WORDS, name_of
@@ -34,8 +34,8 @@ def wanted_of(address: Address, trained: Bodies) -> Wanted:
         MorphgenError: If there is no such task or simulator, or the seed is no number.
     """
     state, installed = address.state, simulators()
-    task = next((each for each in TASKS if each == address.subject), None)
-    if task is None:
+    task = address.subject
+    if task not in TASKS:
         raise MorphgenError(f"no task {address.subject!r} to play{nearest(address.subject, TASKS)}")
     simulator = next((each for each in installed if each == state.get("sim", installed[0])), None)
     if simulator is None:
@@ -84,7 +84,7 @@ def add_choices(page: PlayPage, wanted: Wanted) -> None:
     gui, session, controls = page.session.client.gui, page.session, page.controls
     again = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
     with gui.add_folder("Task"):
-        controls["task"] = gui.add_dropdown("task", TASKS, initial_value=wanted.task)
+        controls["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=wanted.task)
         names = _policies(page, wanted)
         controls["policy"] = gui.add_dropdown("policy", names, initial_value=wanted.policy)
         controls["obstacles"] = gui.add_checkbox("obstacles", wanted.obstacles)
@@ -147,7 +147,7 @@ def _put_body(page: PlayPage, how: str) -> None:
 def _change_task(page: PlayPage) -> None:
     """Play another task, with its own reference if the policy is the other's."""
     wanted = asked(page)
-    task = next(each for each in TASKS if each == page.controls["task"].value)
+    task = page.controls["task"].value
     policy = wanted.policy
     if policy in REFERENCES and policy not in references_for(task):
         policy = references_for(task)[0]

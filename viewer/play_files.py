@@ -10,10 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.tasks.film import SIZE, Frame, Stage, write_film
-from morphgen.tasks.goals import GoalSet
-from morphgen.tasks.push_sets import PushSet
-from morphgen.tasks.settings import Setting
+from morphgen.tasks.renderer import SIZE, Frame, Moment, Renderer, write_film
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.viewer.episode import Episode, Track
 from morphgen.viewer.gate import Gate
@@ -58,58 +55,41 @@ def recording(episode: Episode) -> bytes:
             server.stop()
 
 
-def setting_of(track: Track) -> Setting:
-    """What surrounds a body, with a view of all that its episode has."""
+def renderer_of(track: Track, size: tuple[int, int]) -> Renderer:
+    """Return a renderer with a view of all that a body's episode has."""
     every = np.linspace(0, track.steps, min(_SEEN, track.steps + 1)).astype(int)
-    q = np.array([track.q[i] for i in every], dtype=np.float64)
+    configurations = np.array([track.robot.home, *(track.q[i] for i in every)], dtype=np.float64)
     block = None if track.block_size is None else Block(track.block_size)
     scene = Scene(track.robot, block=block, obstacles=track.obstacles, ground=track.ground)
-    if track.goal is not None:
-        poses = track.goal[None].astype(np.float64)
-        goals = GoalSet(track.robot.name, "", q, poses, track.obstacles, 0, len(q), 0)
-        return Setting(track.robot, "reach", scene, goals=goals)
-    if block is None or track.line is None:
-        return Setting(track.robot, "push", scene)
-    blocks = np.array([track.block[i] for i in every], dtype=np.float64)
-    pushes = PushSet(
-        robot=track.robot.name,
-        key="",
-        q=q,
-        blocks=blocks,
-        block=block,
-        line=track.line,
-        scale=1.0,
-        ground=track.ground or 0.0,
-        obstacles=track.obstacles,
-        tried=0,
-        accepted=len(q),
-        seed=0,
-        behind=q,
-        across=q,
-    )
-    return Setting(track.robot, "push", scene, pushes=pushes)
+    tracked = [track.block] if track.block else []
+    poses = [poses[i] for poses in (*tracked, *track.marker_poses.values()) for i in every]
+    half = 0.0 if track.block_size is None else max(track.block_size) / 2
+    points = np.array([pose[:3] for pose in poses], dtype=np.float64).reshape(-1, 3)
+    points = np.concatenate([points - half, points + half])
+    return Renderer(scene, track.markers, configurations, points, size)
 
 
 def _frames(episode: Episode) -> Iterator[Frame]:
     columns = int(np.ceil(np.sqrt(len(episode.tracks))))
     width, height = (2 * round(edge / columns / 2) for edge in SIZE)
-    with contextlib.ExitStack() as open_stages:
-        stages = []
+    with contextlib.ExitStack() as opened:
+        renderers = []
         for track in episode.tracks:
-            stages.append(Stage(setting_of(track), (width, height)))
-            open_stages.callback(stages[-1].close)
+            renderers.append(renderer_of(track, (width, height)))
+            opened.callback(renderers[-1].close)
         for step in _steps(episode):
             tiles = [
-                _frame(stage, track, step)
-                for stage, track in zip(stages, episode.tracks, strict=True)
+                _frame(renderer, track, step)
+                for renderer, track in zip(renderers, episode.tracks, strict=True)
             ]
             yield _tiled(tiles, columns)
 
 
-def _frame(stage: Stage, track: Track, step: int) -> Frame:
+def _frame(renderer: Renderer, track: Track, step: int) -> Frame:
     at = min(step, track.steps)
     block = track.block[at] if track.block else None
-    return stage.frame(track.q[at], block=block, goal=track.goal, line=track.line)
+    markers = {name: poses[at] for name, poses in track.marker_poses.items()}
+    return renderer.frame(Moment(track.q[at], block, markers))
 
 
 def _tiled(tiles: list[Frame], columns: int) -> Frame:

@@ -11,8 +11,8 @@ import viser
 from numpy.typing import NDArray
 
 from morphgen.model.geometry import Pose
-from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.sim.base import Block
+from morphgen.tasks.task import Marker
 from morphgen.viewer.episode import Episode, Track
 from morphgen.viewer.robot_view import Rgb, RobotView, add_robot, move, robot_bounds
 
@@ -26,9 +26,6 @@ GAP = 0.3
 _GOAL: Rgb = (26, 166, 64)
 _BLOCK: Rgb = (230, 140, 38)
 _OBSTACLE: Rgb = (140, 64, 64)
-_LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002
-_ASIDE = 0.3
-"""How far a line reaches to both sides of its block, metres."""
 
 
 @dataclass(eq=False)
@@ -38,6 +35,7 @@ class Stand:
     track: Track
     view: RobotView
     block: viser.BoxHandle | None
+    markers: dict[str, viser.FrameHandle | viser.BoxHandle]
 
 
 @dataclass(eq=False)
@@ -81,6 +79,9 @@ def show_step(shown: PlayScene, step: int) -> None:
         if stand.block is not None:
             pose = stand.track.block[at].tolist()
             stand.block.position, stand.block.wxyz = tuple(pose[:3]), tuple(pose[3:])
+        for name, handle in stand.markers.items():
+            pose = stand.track.marker_poses[name][at].tolist()
+            handle.position, handle.wxyz = tuple(pose[:3]), tuple(pose[3:])
 
 
 def area(track: Track) -> tuple[Array, Array]:
@@ -88,11 +89,9 @@ def area(track: Track) -> tuple[Array, Array]:
     points = [np.zeros(3)]
     for q in (track.robot.home, track.q[0]):
         points += robot_bounds(track.robot, q)
-    if track.goal is not None:
-        points.append(track.goal[:3].astype(np.float64))
-    if track.block and track.line is not None:
-        start = track.block[0][:3].astype(np.float64)
-        points += [start, np.array([start[0], track.line, start[2]])]
+    shown = [track.block[0]] if track.block else []
+    shown += [poses[0] for poses in track.marker_poses.values()]
+    points += [pose[:3].astype(np.float64) for pose in shown]
     points += [np.array(block.pose.position) for block in track.obstacles]
     return np.min(points, axis=0), np.max(points, axis=0)
 
@@ -115,51 +114,34 @@ def _add_track(
     view = add_robot(scene, track.robot, f"{name}/robot")
     for i, obstacle in enumerate(track.obstacles):
         _add_box(scene, f"{name}/obstacle{i}", obstacle, _OBSTACLE)
-    if track.goal is not None:
-        _add_goal(scene, f"{name}/goal", track.goal.tolist())
+    markers = {m.name: _add_marker(scene, f"{name}/{m.name}", m) for m in track.markers}
     block = None
     if track.block and track.block_size is not None:
         start = Pose(tuple(track.block[0][:3].tolist()), tuple(track.block[0][3:].tolist()))
         block = _add_box(scene, f"{name}/block", Block(track.block_size, start), _BLOCK)
-        _add_line(scene, f"{name}/line", track)
     if named:
         top = float(robot_bounds(track.robot)[1][2])
         scene.add_label(f"{name}/label", track.robot.name, position=(0.0, 0.0, top + 0.1))
-    return Stand(track, view, block)
+    return Stand(track, view, block, markers)
 
 
-def _add_goal(scene: viser.SceneApi, name: str, pose: Sequence[float]) -> None:
-    """A ball in which the tool is near, and axes of the wanted pose."""
-    x, y, z, *quaternion = pose
-    near = ReachConfig.near
-    scene.add_frame(
-        name,
-        axes_length=2 * near,
-        axes_radius=0.1 * near,
-        origin_radius=0.15 * near,
-        position=(x, y, z),
-        wxyz=np.array(quaternion),
+def _add_marker(
+    scene: viser.SceneApi, name: str, marker: Marker
+) -> viser.FrameHandle | viser.BoxHandle:
+    """Add a box, or axes inside a translucent ball."""
+    if marker.shape == "box":
+        return scene.add_box(name, _GOAL, marker.size, cast_shadow=False)
+    radius = marker.size[0] / 2
+    frame = scene.add_frame(
+        name, axes_length=2 * radius, axes_radius=0.1 * radius, origin_radius=0.15 * radius
     )
-    scene.add_icosphere(f"{name}/near", near, _GOAL, opacity=0.45, cast_shadow=False)
+    scene.add_icosphere(f"{name}/near", radius, _GOAL, opacity=0.45, cast_shadow=False)
+    return frame
 
 
 def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> viser.BoxHandle:
     return scene.add_box(
         name, colour, block.size, position=block.pose.position, wxyz=block.pose.quaternion
-    )
-
-
-def _add_line(scene: viser.SceneApi, name: str, track: Track) -> None:
-    if track.line is None or track.block_size is None:
-        return
-    length = 2 * (max(track.block_size) + _ASIDE)
-    height = (track.ground or 0.0) + _LINE_HEIGHT / 2
-    scene.add_box(
-        name,
-        _GOAL,
-        (length, _LINE_WIDTH, _LINE_HEIGHT),
-        position=(float(track.block[0][0]), track.line, height),
-        cast_shadow=False,
     )
 
 

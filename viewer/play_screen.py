@@ -9,6 +9,7 @@ from typing import Any
 
 import viser
 
+from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
 from morphgen.viewer.episode import Episode, score_until
 from morphgen.viewer.play_bodies import Bodies
@@ -95,7 +96,7 @@ class PlayPage:
 def score_table(episode: Episode, step: int) -> str:
     """How the bodies have done until a moment."""
     rows = []
-    goal = "goal" if episode.task == "reach" else "line"
+    target = TASKS[episode.task].target
     for track in episode.tracks:
         at = min(step, track.steps)
         score = score_until(track, episode.task, at)
@@ -107,7 +108,7 @@ def score_table(episode: Episode, step: int) -> str:
         rows.append((escape(track.robot.name), f"{score:.2f}", distance, markup.tag(*kind)))
     seconds = step * episode.period
     head = f'<div class="dim">{seconds:.2f} s; simulated: {episode.steps * episode.period:.2f} s'
-    table = markup.table(("", "score so far", f"m from {goal}", "now"), rows, (1, 2))
+    table = markup.table(("", "score so far", f"m from {target}", "now"), rows, (1, 2))
     return f"{head}</div>{table}"
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import TASKS
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollision
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, file_findings, split_colours
 from morphgen.model.kinematics import bounds, random_configurations, reach
 from morphgen.model.robot import Robot
+from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup, overlays, robot_tables
 from morphgen.viewer.address import Address
 from morphgen.viewer.listings import neighbours

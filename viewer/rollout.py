@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 
-from morphgen.benchmark.split import Task
-from morphgen.errors import MorphgenError, TaskError, nearest
+from morphgen.errors import MissingDependencyError, MorphgenError, TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.model import SUFFIX
@@ -24,9 +23,9 @@ from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.sources import members
 from morphgen.tasks.batch import Step
 from morphgen.tasks.config import CONTROL_PERIOD
-from morphgen.tasks.film import moment
-from morphgen.tasks.gym_env import PushEnv, ReachEnv, TaskEnv
-from morphgen.tasks.make import SIMULATORS, SimulatorName
+from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.renderer import moment
 from morphgen.tasks.robots import robot_of
 from morphgen.viewer.episode import Array, Episode, Track
 from morphgen.viewer.places import (
@@ -49,14 +48,14 @@ MOST = 9
 class Wanted:
     """What is to be played."""
 
-    task: Task
+    task: str
     places: tuple[str, ...]
     """Of the bodies."""
     policy: str
     """A name of ``morphgen.rl.play``, or the path of a checkpoint as an address has it."""
     seed: int = 0
     obstacles: bool = False
-    simulator: SimulatorName = "mujoco"
+    simulator: str = "mujoco"
 
 
 class Source(Protocol):
@@ -156,12 +155,16 @@ class Rollout:
             each.env.close()
 
 
-def simulators() -> list[SimulatorName]:
-    """Those that are installed, MuJoCo first."""
-    return [name for name in reversed(SIMULATORS) if find_spec(name)]
+def simulators() -> list[str]:
+    """Return the names of the simulators that are installed, MuJoCo first."""
+    installed = []
+    for name in SIMULATORS:
+        with contextlib.suppress(MissingDependencyError):
+            installed.append(SIMULATORS[name].name)
+    return sorted(installed, key=lambda name: name != "mujoco")
 
 
-def policy_file(policy: str, task: Task, places: Places) -> str:
+def policy_file(policy: str, task: str, places: Places) -> str:
     """A policy as ``morphgen.rl.play`` knows it; the path of a checkpoint becomes absolute.
 
     Raises:
@@ -193,7 +196,7 @@ def checkpoints(places: Places, most: int = 50) -> list[str]:
     return [path.relative_to(root).as_posix() for path in found[:most]]
 
 
-def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[str, str]]]:
+def trained_with(policy: str, places: Places) -> tuple[str, bool, list[tuple[str, str]]]:
     """What the policy of a checkpoint was trained on.
 
     Returns:
@@ -217,19 +220,21 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
         robot = robot_of(source.name, library=places.folders)
     derivation = robot.provenance.get("derivation")
     place = f"{DERIVED}{derivation}" if derivation else source.name
-    return source.task or "reach", source.obstacles, [(source.name, place)]
+    assert source.task is not None  # a split says it of its robots, which are looked at above
+    return source.task, source.obstacles, [(source.name, place)]
 
 
 def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
     read = read_place(place, places)
     body = as_primitives(as_in_library(read, places.library), places.folders)
     seen = demands(policy)
-    env = {"reach": ReachEnv, "push": PushEnv}[wanted.task](
+    env = TaskEnv(
+        wanted.task,
         body,
         sim=wanted.simulator,
         obstacles=wanted.obstacles,
         kind=seen.kind,
-        channels=seen.channels,
+        observe=seen.channels,
         max_links=seen.max_links,
         library=places.folders,
     )
@@ -239,17 +244,17 @@ def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
     except MorphgenError:
         env.close()
         raise
-    now, scene = moment(env.batch), env.setting.scene
+    now, spec = moment(env.batch), env.env_spec
     track = Track(
         split_colours(read),
         place,
-        scene.ground,
-        scene.obstacles,
-        now.get("goal"),
-        scene.block.size if scene.block else None,
-        now.get("line"),
-        [now["q"]],
-        [now["block"]] if "block" in now else [],
+        spec.scene.ground,
+        spec.scene.obstacles,
+        TASKS[spec.task].markers(spec.config, spec.goals),
+        spec.scene.block.size if spec.scene.block else None,
+        [now.q],
+        [] if now.block is None else [now.block],
+        {name: [pose] for name, pose in now.markers.items()},
     )
     return _Player(env, acting, track)
 
@@ -264,11 +269,15 @@ def _step(player: _Player) -> None:
         return
     if track.block:
         track.block.append(_numbers(step.block_pose[0]))
+    over = bool(step.terminated[0] | step.truncated[0])  # then the batch is at the next episode
+    for name, pose in batch.groups.marker_poses(0).items():
+        poses = track.marker_poses[name]
+        poses.append(poses[-1] if over else pose)
     track.score.append(float(step.score[0]))
     track.distance.append(float(step.distance[0]))
     track.success.append(bool(step.success[0]))
     track.q.append(_numbers(step.q[0, : track.robot.dof]))
-    player.running = not bool(step.terminated[0] | step.truncated[0])
+    player.running = not over
     if step.unstable[0]:
         track.fault = "the simulation became unstable"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morphgen.benchmark.similarity import Features, features
-from morphgen.benchmark.split import COMPOSED, Member, Task, robot_hash
+from morphgen.benchmark.split import COMPOSED, Member, robot_hash
 from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError
@@ -157,7 +157,7 @@ def stream_seed(seed: int, prefix: str) -> int:
     return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
 
 
-def members(bodies: Iterable[Body], tasks: Sequence[Task], obstacles: bool) -> tuple[Member, ...]:
+def members(bodies: Iterable[Body], tasks: Sequence[str], obstacles: bool) -> tuple[Member, ...]:
     """Every robot at every task; with several tasks the name tells which."""
     return tuple(
         Member(

@@ -13,7 +13,7 @@ from morphgen.benchmark.bodies import Composed, Maker, Progress, make_all
 from morphgen.benchmark.generate import Order, assemble
 from morphgen.benchmark.holdout import Cell, covering, hold_out
 from morphgen.benchmark.regimes import NOTHING, combination, parts
-from morphgen.benchmark.split import Member, Split, Task
+from morphgen.benchmark.split import Member, Split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import parse_words
@@ -115,7 +115,7 @@ def _choices(word: str, pattern: str) -> list[str]:
     ]
 
 
-def _cells(patterns: Sequence[str], tasks: Sequence[Task], library: Library) -> Iterator[Cell]:
+def _cells(patterns: Sequence[str], tasks: Sequence[str], library: Library) -> Iterator[Cell]:
     """Every robot that the patterns name, once, at every task."""
     seen: dict[str, str] = {}
     for words in itertools.chain.from_iterable(map(expand, patterns)):

@@ -18,7 +18,7 @@ from morphgen.benchmark.bodies import (
     numbered,
     stream_seed,
 )
-from morphgen.benchmark.split import MADE_MAX_LINKS, Member, Regime, Split, Task
+from morphgen.benchmark.split import MADE_MAX_LINKS, Member, Regime, Split
 from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.choosers import Random, Recorded
@@ -46,7 +46,7 @@ class Order:
     none means all."""
     test: int
     """Robots to test on."""
-    tasks: tuple[Task, ...] = ("reach",)
+    tasks: tuple[str, ...] = ("reach",)
     obstacles: bool = False
     seed: int = 0
     max_links: int = MAX_LINKS

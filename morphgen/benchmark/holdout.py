@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morphgen.benchmark.split import Task
 from morphgen.errors import BenchmarkError
 
 ATTEMPTS = 50
@@ -28,7 +27,7 @@ class Cell:
     parts: frozenset[str]
     outermost: str
     """The last of its parts, most often the end-effector."""
-    task: Task
+    task: str
 
     @property
     def shows(self) -> set[str]:
@@ -91,7 +90,7 @@ class _Pool:
         self._cells = cells
         self._mixed = len({cell.task for cell in cells}) > 1
         self._alike: dict[str, list[int]] = defaultdict(list)
-        self._pairs: dict[tuple[str, Task], list[int]] = defaultdict(list)
+        self._pairs: dict[tuple[str, str], list[int]] = defaultdict(list)
         for i, cell in enumerate(cells):
             self._alike[cell.combination].append(i)
             for part in cell.parts:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from morphgen.benchmark.bodies import Body, Composed, Drawn, Maker, numbered, stream_seed
-from morphgen.benchmark.split import Member, Regime, Split, Task
+from morphgen.benchmark.split import Member, Regime, Split
 from morphgen.benchmark.split_file import SUFFIX, write_split
 from morphgen.benchmark.statistics import statistics
 from morphgen.errors import BenchmarkError, nearest
@@ -33,7 +33,7 @@ class Draws:
     """What is fixed in it, as ``morphgen compose`` takes it."""
     prefix: str = ""
     """Of their names, if not the grammar's name."""
-    task: Task | None = None
+    task: str | None = None
     """If not that of the scenario."""
     first: int = 0
     """Number of the first."""
@@ -45,7 +45,7 @@ class Given:
 
     name: str
     words: str
-    task: Task | None = None
+    task: str | None = None
 
 
 Row = Draws | Given
@@ -57,7 +57,7 @@ class Variant:
 
     suffix: str
     """Of the split's name."""
-    task: Task
+    task: str
     obstacles: bool = False
 
 
@@ -260,7 +260,7 @@ def _bodies(row: Row, maker: Maker) -> Iterator[Body]:
         yield maker(Drawn(grammar, number, stream_seed(SEED, prefix), numbered(prefix, number)))
 
 
-def _members(bodies: Iterable[tuple[Body, Task | None]], variant: Variant) -> Iterator[Member]:
+def _members(bodies: Iterable[tuple[Body, str | None]], variant: Variant) -> Iterator[Member]:
     for body, task in bodies:
         yield Member(
             body.name,

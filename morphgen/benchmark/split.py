@@ -35,8 +35,6 @@ from morphgen.model.rotation import to_matrix
 
 Regime = Literal["interpolation", "composition", "extrapolation"]
 REGIMES: tuple[Regime, ...] = ("interpolation", "composition", "extrapolation")
-Task = Literal["reach", "push"]
-TASKS: tuple[Task, ...] = ("reach", "push")
 Side = Literal["train", "test"]
 SIDES: tuple[Side, ...] = ("train", "test")
 
@@ -67,7 +65,8 @@ class Member:
     """The grammar that it was drawn from, or ``composed``."""
     derivation: str
     """Parts and parameters, see ``morphgen.grammar.derivation``."""
-    task: Task
+    task: str
+    """Name of a task; whoever makes environments of the split knows which there are."""
     obstacles: bool
     body: str
     """Hash of the finished body, see ``robot_hash``."""

@@ -11,17 +11,7 @@ from typing import Any, cast
 import yaml
 from yaml.nodes import MappingNode, Node, SequenceNode
 
-from morphgen.benchmark.split import (
-    FORMAT,
-    HASH_LENGTH,
-    REGIMES,
-    TASKS,
-    Member,
-    Regime,
-    Split,
-    Task,
-    split_id,
-)
+from morphgen.benchmark.split import FORMAT, HASH_LENGTH, REGIMES, Member, Regime, Split, split_id
 from morphgen.errors import BenchmarkError, FormatError, nearest
 from morphgen.formats.data_files import require_plain_yaml
 
@@ -45,6 +35,7 @@ MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
 """Keys of a robot, in order."""
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 
+TASK_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 _BODY = re.compile(rf"[0-9a-f]{{{HASH_LENGTH}}}")
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -180,6 +171,12 @@ class _Reader:
             raise self._fail(
                 fields["body"], f"body: {body!r} is no hash of {HASH_LENGTH} hexadecimal digits"
             )
+        task = self._text(fields["task"], "task")
+        if not TASK_NAME.fullmatch(task):
+            raise self._fail(
+                fields["task"],
+                f"task: {task!r}: expected a name of lower-case letters, digits, '-' and '_'",
+            )
         obstacles = self._value(fields["obstacles"])
         if not isinstance(obstacles, bool):
             raise self._fail(fields["obstacles"], f"obstacles: {obstacles!r}; valid: false, true")
@@ -187,7 +184,7 @@ class _Reader:
             name,
             self._text(fields["category"], "category"),
             self._text(fields["derivation"], "derivation"),
-            cast(Task, self._choice(fields["task"], "task", TASKS)),
+            task,
             obstacles,
             body,
         )

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library
+from morphgen.cli.options import Subparsers, add_json, add_library, add_sim
 from morphgen.cli.progress import Shower
 from morphgen.cli.train import count, require_words
 from morphgen.rl.names import REFERENCES
@@ -56,7 +56,7 @@ def add_parser(commands: Subparsers) -> None:
         help="of each robot: as many episodes as have so many steps if time ends them "
         "(default: 10,000)",
     )
-    parser.add_argument("--sim", choices=["pybullet", "mujoco"], help="default: the training's")
+    add_sim(parser, None)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
@@ -162,11 +162,11 @@ def _exam(args: argparse.Namespace, config: RunConfig) -> Exam:
 
 def _episodes(args: argparse.Namespace) -> int:
     from morphgen.rl.evaluation import episodes_for
-    from morphgen.tasks.config import ReachConfig
+    from morphgen.tasks.env_specs import default_configs
 
     if args.episodes is not None:
         return int(args.episodes)
-    return episodes_for(args.steps, ReachConfig().steps)
+    return episodes_for(args.steps, max(each.steps for each in default_configs()))
 
 
 def _sources(args: argparse.Namespace) -> list[Source]:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library
+from morphgen.cli.options import Subparsers, add_library, add_sim
 from morphgen.cli.train import OF_NETWORKS, add_learning, require_words, trained
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
-    parser.add_argument("--sim", choices=["pybullet", "mujoco"], help="default: the training's")
+    add_sim(parser, None)
     parser.add_argument(
         "--goal-seed", type=int, help="with --split: of all goals (default: as shipped, else 0)"
     )

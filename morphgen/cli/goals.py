@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
+from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, add_task, library_of
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit
     from morphgen.benchmark.split import Split
     from morphgen.processes import Progress
+    from morphgen.tasks.env_specs import GoalConfig
     from morphgen.tasks.goal_making import Made, SplitGoals
-    from morphgen.tasks.settings import Recipe
 
 HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
 
@@ -29,7 +29,7 @@ def add_parser(commands: Subparsers) -> None:
         help="make the goal sets of a split's robots, and prove that each goal can be reached",
         description="Make the goals of reach and the starts of push of every robot of a split, or "
         "of one robot, and keep them in the cache; interrupted, it goes on where it was. Exit code "
-        "1 if a robot has too few, or (with --certify) a goal is not proven by its witness.",
+        "1 if a robot has too few, or (with --certify) a goal is not proven by its configuration.",
         epilog="examples: morphgen goals extrapolation/arms/reach --certify; "
         "morphgen goals arm=ur5 ee=plane --task reach",
     )
@@ -40,7 +40,7 @@ def add_parser(commands: Subparsers) -> None:
         help="a split's file, name or built folder; with --task: words of compose, a bundle's "
         "folder or a URDF",
     )
-    parser.add_argument("--task", choices=["reach", "push"], help="of one robot")
+    add_task(parser, "--task", "task of one robot: ")
     parser.add_argument("--obstacles", action="store_true", help="with --task: among obstacles")
     parser.add_argument("--seed", type=int, default=0, help="of all goals (default: 0)")
     parser.add_argument(
@@ -63,40 +63,40 @@ def run(args: argparse.Namespace) -> int:
             raise BenchmarkError(
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
-    recipe = recipe_of(args.seed)
-    made = _of_robot(args, recipe) if args.task else _of_split(args, recipe)
+    config = goal_config(args.seed)
+    made = _of_robot(args, config) if args.task else _of_split(args, config)
     failed = [one for one in made if one.goals is None or one.unproven]
     if args.json:
-        print(json.dumps(_data(made, recipe.seed) | {"passed": not failed}))
+        print(json.dumps(_data(made, config.seed) | {"passed": not failed}))
     else:
-        print(_text(made, recipe.seed))
+        print(_text(made, config.seed))
     return int(bool(failed))
 
 
-def recipe_of(seed: int) -> Recipe:
-    """How the goals of a benchmark are made, with a seed.
+def goal_config(seed: int) -> GoalConfig:
+    """Return how the goals of a benchmark are made, with a seed.
 
     Raises:
         BenchmarkError: If the seed is none.
     """
     from morphgen.errors import BenchmarkError
-    from morphgen.tasks.settings import Recipe
+    from morphgen.tasks.env_specs import GoalConfig
 
     if seed < 0:
         raise BenchmarkError(f"goal seed {seed}: expected 0 or more")
-    return Recipe(seed)
+    return GoalConfig(seed)
 
 
-def _of_robot(args: argparse.Namespace, recipe: Recipe) -> list[Made]:
+def _of_robot(args: argparse.Namespace, config: GoalConfig) -> list[Made]:
     from morphgen.tasks.goal_making import robot_goals
     from morphgen.tasks.robots import robot_of
 
     robot = robot_of(" ".join(args.words), library=args.library)
-    made = robot_goals(robot, args.task, recipe, obstacles=args.obstacles, certified=args.certify)
+    made = robot_goals(robot, args.task, config, obstacles=args.obstacles, certified=args.certify)
     return [made]
 
 
-def _of_split(args: argparse.Namespace, recipe: Recipe) -> list[Made]:
+def _of_split(args: argparse.Namespace, config: GoalConfig) -> list[Made]:
     from morphgen.tasks.goal_making import split_goals
 
     split, _ = read_split_or_built(args.words[0])
@@ -104,7 +104,7 @@ def _of_split(args: argparse.Namespace, recipe: Recipe) -> list[Made]:
         return split_goals(
             split,
             library_of(args),
-            recipe,
+            config,
             jobs=args.jobs,
             certified=args.certify,
             progress=progress,
@@ -155,9 +155,9 @@ def ready_goals(args: argparse.Namespace, split: Split) -> list[Made]:
     from morphgen.tasks.goal_making import split_goals
     from morphgen.tasks.split_goals import require_all
 
-    recipe = recipe_of(args.goal_seed or 0)
+    config = goal_config(args.goal_seed or 0)
     with bar(args, "goals") as progress:
-        made = split_goals(split, library_of(args), recipe, jobs=args.jobs, progress=progress)
+        made = split_goals(split, library_of(args), config, jobs=args.jobs, progress=progress)
     require_all(made)
     return made
 
@@ -166,7 +166,7 @@ def ship_goals(args: argparse.Namespace, home: Path, made: Sequence[Made]) -> No
     """Write the goal sets of a split into the folder where it is built."""
     from morphgen.tasks.split_goals import write_goals
 
-    write_goals(home, made, recipe_of(args.goal_seed or 0))
+    write_goals(home, made, goal_config(args.goal_seed or 0))
 
 
 def audit_with_goals(
@@ -197,14 +197,14 @@ def _goals_to_audit(
 
     if folder is not None and has_goals(folder):
         found = read_split_goals(folder)
-        seed = found.recipe.seed if args.goal_seed is None else recipe_of(args.goal_seed).seed
-        return replace(found, recipe=replace(found.recipe, seed=seed))
+        seed = found.config.seed if args.goal_seed is None else goal_config(args.goal_seed).seed
+        return replace(found, config=replace(found.config, seed=seed))
     if not args.goals:
         return None
-    recipe = recipe_of(args.goal_seed or 0)
+    config = goal_config(args.goal_seed or 0)
     with bar(args, "goals") as progress:
-        made = split_goals(split, library_of(args), recipe, jobs=args.jobs, progress=progress)
-    return gathered(made, recipe)
+        made = split_goals(split, library_of(args), config, jobs=args.jobs, progress=progress)
+    return gathered(made, config)
 
 
 @contextmanager

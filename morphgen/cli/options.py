@@ -12,7 +12,38 @@ if TYPE_CHECKING:
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.robot import Robot
 
+from morphgen.tasks.registry import SIMULATORS, TASKS
+
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def add_task(parser: argparse.ArgumentParser, name: str, text: str = "") -> None:
+    """Let the user choose a task, also one of another package.
+
+    Args:
+        parser: The command's parser.
+        name: Name of the argument.
+        text: Text before the names in the help.
+    """
+    names = f"{text}{', '.join(TASKS.builtin)} or one that another package brings"
+    parser.add_argument(name, choices=TASKS, metavar="TASK", help=names)
+
+
+def add_sim(parser: argparse.ArgumentParser, default: str | None = "pybullet") -> None:
+    """Let the user choose a simulator, also one of another package.
+
+    Args:
+        parser: The command's parser.
+        default: The default; None for that of the training.
+    """
+    parser.add_argument(
+        "--sim",
+        choices=SIMULATORS,
+        metavar="SIM",
+        default=default,
+        help=f"{', '.join(SIMULATORS.builtin)} or one that another package brings (default: "
+        f"{default or 'that of the training'})",
+    )
 
 
 def add_library(parser: argparse.ArgumentParser) -> None:

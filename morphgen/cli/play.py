@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library
+from morphgen.cli.options import Subparsers, add_library, add_sim, add_task
 from morphgen.rl.names import REFERENCES
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def add_parser(commands: Subparsers) -> None:
         epilog="examples: morphgen play reach arm=ur5 ee=stick --policy ik --out ik.mp4; "
         "morphgen play push prims --policy scripted --episodes 3 --sim mujoco",
     )
-    parser.add_argument("task", choices=["reach", "push"])
+    add_task(parser, "task")
     parser.add_argument(
         "words",
         nargs="+",
@@ -38,7 +38,7 @@ def add_parser(commands: Subparsers) -> None:
         "push), or a checkpoint or a run's folder (default: random)",
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help="the film: .mp4 or .gif")
-    parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
+    add_sim(parser)
     parser.add_argument("--episodes", type=int, default=1, help="default: 1")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
     parser.add_argument("--obstacles", action="store_true", help="among obstacles")
@@ -65,8 +65,9 @@ def run(args: argparse.Namespace) -> int:
 
     from morphgen.errors import TaskError
     from morphgen.rl.play import FPS, controller, demands, play, require_policy
-    from morphgen.tasks.film import require_film, write_film
-    from morphgen.tasks.gym_env import PushEnv, ReachEnv
+    from morphgen.tasks.gym_env import TaskEnv
+    from morphgen.tasks.registry import TASKS
+    from morphgen.tasks.renderer import require_film, write_film
 
     if args.episodes < 1 or args.seed < 0:
         raise TaskError(
@@ -76,19 +77,20 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         require_film(args.out)
     wanted = demands(args.policy)
-    env = {"reach": ReachEnv, "push": PushEnv}[args.task](
+    env = TaskEnv(
+        args.task,
         " ".join(args.words),
         sim=args.sim,
         obstacles=args.obstacles,
         kind=args.kind or wanted.kind,
-        channels=wanted.channels,
+        observe=wanted.channels,
         max_links=wanted.max_links,
         library=args.library,
         render_mode=None if args.out is None else "rgb_array",
     )
     try:
         acting = controller(args.policy, env, args.seed)
-        frames = play(env, acting, args.episodes, args.seed, _Report(args.task))
+        frames = play(env, acting, args.episodes, args.seed, _Report(TASKS[args.task].target))
         if args.out is None:
             deque(frames, maxlen=0)
         else:
@@ -102,15 +104,14 @@ def run(args: argparse.Namespace) -> int:
 class _Report:
     """Prints a line an episode."""
 
-    def __init__(self, task: str) -> None:
-        self._number = 0
-        self._from = "goal" if task == "reach" else "line"
+    def __init__(self, target: str) -> None:
+        self._number, self._target = 0, target
 
     def __call__(self, episode: Episode) -> None:
         self._number += 1
         print(
             f"episode {self._number}: {'success' if episode.success else 'failure'}, "
-            f"{episode.distance:.3f} m from the {self._from}, score {episode.score:.2f}, "
+            f"{episode.distance:.3f} m from the {self._target}, score {episode.score:.2f}, "
             f"{episode.seconds:.2f} s{', the simulation became unstable' * episode.unstable}",
             flush=True,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from morphgen.cli.options import Subparsers, add_json, add_library
+from morphgen.cli.options import Subparsers, add_json, add_library, add_sim, add_task
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -19,12 +19,12 @@ def add_parser(commands: Subparsers) -> None:
         epilog="examples: morphgen speed reach arm=ur5 ee=plane --envs 128 --sim mujoco; "
         "morphgen speed push arm=panda ee=panda_hand --workers 2",
     )
-    parser.add_argument("task", choices=["reach", "push"])
+    add_task(parser, "task")
     parser.add_argument(
         "robot", nargs="+", help="words of compose, the name of parts, a bundle's folder or a URDF"
     )
     parser.add_argument("--envs", type=int, default=64, help="environments (default: 64)")
-    parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
+    add_sim(parser)
     parser.add_argument(
         "--workers", type=int, default=1, help="processes of PyBullet, threads of MuJoCo"
     )
@@ -37,10 +37,13 @@ def add_parser(commands: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
+    from importlib import import_module
+
     from tabulate import tabulate
 
     from morphgen.errors import TaskError
-    from morphgen.tasks.make import make_batch, own_step
+    from morphgen.tasks.make import make_batch
+    from morphgen.tasks.registry import SIMULATORS
     from morphgen.tasks.speed import measure
 
     if not args.seconds > 0:
@@ -56,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
         library=args.library,
     )
     try:
-        own = [own_step(args.sim)] if args.workers == 1 else []
+        module, step = SIMULATORS[args.sim].own_step
+        own = [(import_module(module), step)] if args.workers == 1 else []
         found = measure(batch, args.seconds, own=own)
     finally:
         batch.close()
@@ -64,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         facts = {"steps_per_second": found.steps_per_second, "shares": found.shares}
         print(json.dumps(facts, indent=2))
         return 0
-    name = batch.settings[0].robot.name
+    name = batch.specs[0].robot.name
     print(f"{args.task}, {name}, {args.envs} environments, {args.sim}, {args.workers} worker(s)")
     print(f"environment steps a second: {found.steps_per_second:,.0f}")
     print(f"physics steps a second:     {found.substeps_per_second:,.0f}")

@@ -134,7 +134,7 @@ def run_audit(args: argparse.Namespace) -> int:
     done, goals = audit_with_goals(args, done, split, folder)
     passed = done.passed(strict=args.strict)
     if args.json:
-        sets = {"sets": len(goals.sets), "seed": goals.recipe.seed} if goals else None
+        sets = {"sets": len(goals.sets), "seed": goals.config.seed} if goals else None
         print(json.dumps({**done.as_dict(), "goals": sets, "passed": passed}))
     else:
         print(_audit_text(done, passed, goals))
@@ -180,7 +180,7 @@ def _audit_text(done: Audit, passed: bool, goals: SplitGoals | None) -> str:
         lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
         lines += _shortened([f"  {each.where}: {each.why}" for each in findings])
     if goals:
-        lines.append(f"{len(goals.sets)} goal sets were looked at, seed {goals.recipe.seed}")
+        lines.append(f"{len(goals.sets)} goal sets were looked at, seed {goals.config.seed}")
     counts = {
         severity: sum(each.severity == severity for each in done.findings)
         for severity in ("error", "warning")

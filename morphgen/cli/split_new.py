@@ -21,7 +21,7 @@ from morphgen.cli.options import (
 
 if TYPE_CHECKING:
     from morphgen.benchmark.generate import Order
-    from morphgen.benchmark.split import Split, Task
+    from morphgen.benchmark.split import Split
     from morphgen.grammar.library import Library
     from morphgen.grammar.model import Grammar
 
@@ -126,7 +126,7 @@ def _add_order(parser: argparse.ArgumentParser, train: str, default: str = "") -
     )
     parser.add_argument("--test", type=int, default=1, help="robots to test on (default: 1)")
     parser.add_argument(
-        "--task", default="reach", metavar="TASK,...", help="reach, push or both (default: reach)"
+        "--task", default="reach", metavar="TASK,...", help="one task or several (default: reach)"
     )
     parser.add_argument("--obstacles", action="store_true", help="tasks have obstacles")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
@@ -219,11 +219,11 @@ def _subject(args: argparse.Namespace) -> str:
 
 def _order(args: argparse.Namespace) -> Order:
     from morphgen.benchmark.generate import Order
-    from morphgen.benchmark.split import TASKS
     from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.errors import BenchmarkError, nearest
+    from morphgen.tasks.registry import TASKS
 
-    tasks: list[Task] = []
+    tasks: list[str] = []
     for text in args.task.split(","):
         found = next((task for task in TASKS if task == text.strip()), None)
         if found is None or found in tasks:

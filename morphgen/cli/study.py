@@ -91,13 +91,15 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.study import agent_cell, matched_budget, reference_cells
     from morphgen.rl.training import parts_of, require_device, require_runnable
     from morphgen.rl.variants import parse_agents
-    from morphgen.tasks.config import ReachConfig
+    from morphgen.tasks.env_specs import default_configs
 
     if args.gpus is not None and args.ray is None:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     if args.ray is None and not args.report:
         require_device(args.device)
-    exam = Exam(episodes_for(args.eval_steps, ReachConfig().steps), args.sim)
+    exam = Exam(
+        episodes_for(args.eval_steps, max(each.steps for each in default_configs())), args.sim
+    )
     args.on, args.obstacles = "train", False
     agents, seeds = parse_agents(args.agents), seeds_of(args.seeds)
     made: list[Cell] = []

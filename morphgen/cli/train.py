@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library, add_max_links
+from morphgen.cli.options import Subparsers, add_library, add_max_links, add_sim
 from morphgen.cli.progress import shown
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from morphgen.rl.sources import Source
     from morphgen.rl.training import Part, Way
     from morphgen.rl.variants import Variant
-    from morphgen.tasks.config import PushConfig, ReachConfig
+    from morphgen.tasks.task import TaskConfig
 
 SWITCHES = {
     "symlog": "the critic predicts the symlog of returns (default: on)",
@@ -49,7 +49,7 @@ def add_parser(commands: Subparsers) -> None:
         nargs="+",
         metavar="SPLIT",
         help="a split's name, file or built folder; or words of compose, parts such as ur5-plane, "
-        "a bundle's folder or a URDF, and task=reach or task=push",
+        "a bundle's folder or a URDF, and its task such as task=reach",
     )
     parser.add_argument("--agent", default="me-tf", help="se, me-mlp or me-tf (default: me-tf)")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
@@ -74,7 +74,7 @@ def add_parser(commands: Subparsers) -> None:
 def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:
     """Options of what trains from the start."""
     add_learning(parser, steps=steps, envs=envs)
-    parser.add_argument("--sim", choices=["pybullet", "mujoco"], default="pybullet")
+    add_sim(parser)
     parser.add_argument(
         "--goal-seed", type=int, help="of all goals (default: as shipped with the split, else 0)"
     )
@@ -180,36 +180,39 @@ def source_of(words: list[str], args: argparse.Namespace) -> Source:
     from morphgen.cli.goals import read_split_or_built
     from morphgen.errors import BenchmarkError, TaskError
     from morphgen.rl.sources import robot_source, split_source
+    from morphgen.tasks.registry import TASKS
     from morphgen.tasks.split_goals import has_goals, read_split_goals
 
     seed = args.goal_seed or 0
     if seed < 0:
         raise TaskError(f"--goal-seed {seed}: expected 0 or more")
     library = tuple(args.library)
+    choices = " or ".join(f"task={name}" for name in TASKS)
     given = [word for word in words if word.startswith("task=")]
     robot = [word for word in words if not word.startswith("task=")]
     if given:
         task = given[-1].partition("=")[2]
-        if len(given) > 1 or task not in ("reach", "push") or not robot:
-            raise TaskError(f"{' '.join(words)}: name a robot and one task=reach or task=push")
+        if len(given) > 1 or not robot:
+            raise TaskError(f"{' '.join(words)}: name a robot and one task, {choices}")
+        TASKS[task]  # refuses one that is unknown
         return robot_source(
             " ".join(robot),
-            task,  # type: ignore[arg-type]
+            task,
             obstacles=args.obstacles,
             goal_seed=seed,
             library=library,
         )
     if len(words) > 1 or "=" in words[0]:
-        raise TaskError(f"{' '.join(words)}: a robot needs its task, task=reach or task=push")
+        raise TaskError(f"{' '.join(words)}: a robot needs its task, {choices}")
     if args.obstacles:
         raise TaskError("--obstacles is for one robot; a split says which robots have any")
     try:
         split, home = read_split_or_built(words[0])
     except BenchmarkError as error:
-        raise BenchmarkError(f"{error}; a robot needs task=reach or task=push") from error
+        raise BenchmarkError(f"{error}; a robot needs {choices}") from error
     shipped = home if home is not None and has_goals(home) else None
     if shipped is not None:
-        made_with = read_split_goals(shipped).recipe.seed
+        made_with = read_split_goals(shipped).config.seed
         if args.goal_seed not in (None, made_with):
             raise TaskError(f"--goal-seed {seed}: the goals in {shipped} are of seed {made_with}")
         seed = made_with
@@ -245,7 +248,6 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
 
     changes = {**constants(args.set), "bf16": args.bf16, "compile": args.compile}
     policy, ppo = settle(variant, tasks_of(source), changes, args.steps)
-    reach, push = _tasks(source, args.train_goals)
     return RunConfig(
         source,
         policy,
@@ -256,30 +258,32 @@ def config_of(source: Source, variant: Variant, args: argparse.Namespace) -> Run
         device=args.device,
         whole=args.whole and variant.agent == "se",
         max_links=MAX_LINKS if args.max_links is None else args.max_links,
-        reach=reach,
-        push=push,
+        tasks=_tasks(source, args.train_goals),
     )
 
 
-def _tasks(source: Source, goals: int | None) -> tuple[ReachConfig, PushConfig]:
-    """Tasks with so many goals, and starts, of each robot; by default as many as in evaluations.
+def _tasks(source: Source, num_goals: int | None) -> tuple[TaskConfig, ...]:
+    """Return constants with so many goals of each robot; by default as many as in evaluations.
 
     Raises:
         TaskError: If they are too few, or the split brings goals of its own.
     """
     from morphgen.errors import TaskError
-    from morphgen.tasks.config import PushConfig, ReachConfig
+    from morphgen.rl.sources import tasks_of
+    from morphgen.tasks.registry import TASKS
 
-    if goals is None:
-        return ReachConfig(), PushConfig()
-    if goals < 2:
-        raise TaskError(f"--train-goals {goals}: expected 2 or more")
+    names = dict.fromkeys((*TASKS.builtin, *tasks_of(source)))
+    configs: list[TaskConfig] = [TASKS[name].config_type() for name in names]
+    if num_goals is None:
+        return tuple(configs)
+    if num_goals < 2:
+        raise TaskError(f"--train-goals {num_goals}: expected 2 or more")
     if source.goals:
         raise TaskError(
-            f"--train-goals {goals}: {source.goals} brings the goals to train on; name the split "
-            f"itself, {source.name}, to have others"
+            f"--train-goals {num_goals}: {source.goals} brings the goals to train on; name the "
+            f"split itself, {source.name}, to have others"
         )
-    return ReachConfig(goals=goals), PushConfig(starts=goals)
+    return tuple(config.with_num_goals(num_goals) for config in configs)
 
 
 def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -109,3 +109,18 @@ class Simulation(Protocol):
 
     def close(self) -> None:
         """Free everything; a second time does nothing."""
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator behind the registry ``morphgen.tasks.registry.SIMULATORS``."""
+
+    name: str
+    load: Callable[[Sequence[Scene], Contacts | None, int], Simulation]
+    """Loads scenes: one for each environment, what may touch what, and the number of workers.
+
+    It raises a SimulationError if the simulator cannot hold a scene."""
+    own_step: tuple[str, str]
+    """Names of the module and function of the library's own step, which ``speed`` times."""
+    max_envs: int
+    """Number of environments that are held at once at most, where a task can be divided."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from morphgen.errors import SimulationError, UnstableError
-from morphgen.tasks.sim.base import Contacts, Scene
+from morphgen.tasks.sim.base import Contacts, Scene, Simulator
 from morphgen.tasks.sim.bullet_batch import BulletBatch, most_joints
 from morphgen.tasks.sim.bullet_files import export_robots
 from morphgen.tasks.sim.bullet_workers import (
@@ -192,3 +192,11 @@ def _free(
     for batch in own:
         batch.close()
     folder.cleanup()
+
+
+SIMULATOR = Simulator(
+    "pybullet",
+    lambda scenes, contacts, workers: BulletSimulation(scenes, contacts, processes=workers),
+    own_step=("pybullet", "stepSimulation"),
+    max_envs=128,  # one takes 36 MB
+)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from morphgen.checks.mujoco_warnings import caught
 from morphgen.errors import SimulationError, UnstableError
 from morphgen.model.kinematics import movable_positions
-from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
+from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
 from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
@@ -222,3 +222,11 @@ def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
             mujoco.mj_step(model, data, nstep=SUBSTEPS)
         except mujoco.FatalError as error:  # its stack is full
             refused[env] = f"unstable: MuJoCo: {str(error).splitlines()[0]}"
+
+
+SIMULATOR = Simulator(
+    "mujoco",
+    lambda scenes, contacts, workers: MujocoSimulation(scenes, contacts, threads=workers),
+    own_step=("mujoco", "mj_step"),
+    max_envs=1024,
+)

@@ -149,7 +149,7 @@ def test_a_file_that_was_changed_is_refused_unless_asked_for(written):
         ("test:\n- ", "test: []\n# ", 0, "test: expected a list of robots, one at least"),
         ("test:\n- ", "test: x\n# ", 0, "test: expected a list of robots, one at least"),
         ("test:\n- ", "tset:\n- ", 0, "unknown key 'tset'; did you mean 'test'?"),
-        ("task: push", "task: pull", 0, "task: unknown 'pull'; did you mean 'push'?"),
+        ("task: push", "task: Push!", 0, "task: 'Push!': expected a name of lower-case letters"),
         ("obstacles: true", "obstacles: maybe", 0, "obstacles: 'maybe'; valid: false, true"),
         ("name: ur5-stick", "nmae: ur5-stick", 0, "unknown key 'nmae'; did you mean 'name'?"),
         ("name: ur5-stick, ", "", 0, "a robot of test lacks 'name'"),

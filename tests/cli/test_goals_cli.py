@@ -10,15 +10,15 @@ from commands import start
 from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
 from morphgen.benchmark.split_file import split_text
-from morphgen.tasks import free_space, goal_making, goals, push_sets
+from morphgen.tasks import free_space, goal_sets
+from morphgen.tasks.registry import TASKS
 from splits import LIBRARY, TEST, TRAIN, member, split
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     """A cache of the test's own, but for fits."""
-    for module in (goals, push_sets):
-        monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / "cache" / name)
+    monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
     return tmp_path / "cache" / "morphgen"
 
 
@@ -99,8 +99,11 @@ def test_a_robot_that_fails_does_not_stop_the_others(run, tmp_path, monkeypatch)
 
 
 def test_a_goal_that_is_not_proven_fails(run, path, monkeypatch):
-    lines = ["goal 3: its witness is in collision", "goal 4: its witness is in collision"]
-    monkeypatch.setattr(goal_making, "certify", lambda *_: lines)
+    lines = [
+        "goal 3: its configuration is in collision",
+        "goal 4: its configuration is in collision",
+    ]
+    monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: lines)
     assert run("goals", path)[0] == 0
     code, out, _ = run("goals", path, "--certify")
     assert code == 1

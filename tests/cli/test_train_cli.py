@@ -12,8 +12,8 @@ from commands import start, tree
 from morphgen.benchmark.split_file import write_split
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
-from morphgen.rl.sources import settings_of
-from morphgen.tasks.settings import Recipe
+from morphgen.rl.sources import specs_of
+from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.split_goals import read_goals
 from small_runs import equal, small_split, weights
 
@@ -149,7 +149,7 @@ def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_y
     source = read_config(Path("a")).source
     assert (source.goal_seed, source.goals) == (5, str(home.resolve()))
     shipped = read_goals(home, "train")
-    for setting in settings_of(source, Recipe(5)):
+    for setting in specs_of(source, GoalConfig(5)):
         assert (setting.goals.q == shipped[setting.robot.name].q).all()
 
     code, _, err = run(*words, "--out", "b", "--goal-seed", "4")
@@ -165,7 +165,7 @@ def test_training_may_have_more_goals_than_evaluations(run):
     for name, more in (("a", ()), ("b", ("--train-goals", "150"))):
         assert run(*RUN, "--steps", "32", "--no-tensorboard", "--out", name, *more)[0] == 0
         config = read_config(Path(name))
-        (setting,) = settings_of(config.source, Recipe(reach=config.reach))
+        (setting,) = specs_of(config.source, GoalConfig(reach=config.reach))
         found.append(len(setting.goals.q))
         assert config.push.starts == found[-1]
     assert found == [100, 150]

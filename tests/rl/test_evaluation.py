@@ -22,8 +22,9 @@ from morphgen.rl.runs import read_checkpoint, write_checkpoint
 from morphgen.rl.score_tables import score_table, summary, write_scores
 from morphgen.rl.sources import other_side, robot_source, split_source
 from morphgen.rl.training import checkpoints, parts_of, train
-from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.make import batch_of
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import SIMULATORS
 from small_runs import EXAM, QUIET, small_config, small_source
 from splits import member, split
 
@@ -79,6 +80,12 @@ def test_workers_change_nothing(run):
     assert one == two
 
 
+def at_most(count, monkeypatch):
+    """Have MuJoCo hold no more environments at once."""
+    fewer = replace(SIMULATORS["mujoco"], max_envs=count)
+    monkeypatch.setitem(SIMULATORS._loaded, "mujoco", fewer)
+
+
 def test_more_episodes_than_environments_are_rounds():
     exam = replace(EXAM, episodes=35)
     (score,) = evaluate_reference("zero", robot_source("planar-cube", "reach"), exam)
@@ -98,7 +105,7 @@ def test_robots_that_do_not_fit_at_once_have_the_same_episodes(run, monkeypatch)
         return batch_of(settings, num_envs, **options)
 
     monkeypatch.setattr(evaluation, "batch_of", noted)
-    monkeypatch.setattr(evaluation, "AT_MOST", {"mujoco": 4})
+    at_most(4, monkeypatch)
     evaluation._known.clear()
     parts = evaluate_run(run, "train", exam, "deterministic")
     assert made[:3] == [(0, 4), (4, 4), (8, 2)]
@@ -153,11 +160,14 @@ def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
 
 @pytest.mark.parametrize(
     ("limit", "value", "calls", "whole"),
-    [("AT_ONCE", 34, 300, 6), ("AT_ONCE", 2, 600, 8), ("AT_MOST", {"mujoco": 4}, 600, 6)],
+    [("AT_ONCE", 34, 300, 6), ("AT_ONCE", 2, 600, 8), (None, 4, 600, 6)],
     ids=["at once", "in rounds", "in batches"],
 )
 def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
-    monkeypatch.setattr(evaluation, limit, value)
+    if limit is None:
+        at_most(value, monkeypatch)
+    else:
+        monkeypatch.setattr(evaluation, limit, value)
     seen = []
     exam = replace(EXAM, episodes=3)
     evaluate_reference("zero", small_source(), exam, tell=lambda *now: seen.append(now))

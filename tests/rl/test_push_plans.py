@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from goal_draws import draw_spec
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
 from morphgen.rl import push_plans
@@ -13,9 +14,10 @@ from morphgen.rl.cartesian import OneTool
 from morphgen.rl.push_contacts import poised
 from morphgen.rl.push_plans import SPEED, PushPlanner
 from morphgen.tasks.bodies import bodies_of
-from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.settings import member_setting, push_setting, reach_setting
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from scenes import robot
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
@@ -23,29 +25,29 @@ PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)
 
 
 def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
-    setting = push_setting(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
+    setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
     space, tool = FreeSpace(setting.scene), OneTool(bodies_of([setting.robot]), 0)
-    for q, block in zip(setting.pushes.q[:3], setting.pushes.blocks, strict=False):
+    for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
         plan = planner.plan(q, block)
         points = [q, *plan.way]
         for a, b in pairwise(points):
             between = a + np.linspace(0, 1, 200)[:, None] * (b - a)
             assert space.free(between, np.tile(block, (200, 1))).mean() > 0.99
         position, rotation = (each[0] for each in tool.poses(points[-1][None]))
-        assert position[1] < block[1] - setting.pushes.block.size[1] / 2
+        assert position[1] < block[1] - setting.goals.block.size[1] / 2
         assert position[2] == pytest.approx(plan.height)
         assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
-    across = (setting.pushes.line - block[1]) / SPEED
+    across = (setting.goals.line - block[1]) / SPEED
     assert planner.plan(q, block, left=across + 1) is not None
     assert planner.plan(q, block, left=across - 1) is None
 
 
 def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
     """Configurations near the first plan's last one are said to, on the way of the push."""
-    setting = push_setting(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
+    setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
-    q, block = setting.pushes.q[0], setting.pushes.blocks[0]
+    q, block = setting.goals.q[0], setting.goals.blocks[0]
     first = planner.plan(q, block).way[-1]
 
     def near(configurations):
@@ -62,7 +64,7 @@ def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
 
 
 def test_a_setting_of_another_task_is_refused(tmp_path):
-    setting = reach_setting(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
+    setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
         PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
 
@@ -72,14 +74,14 @@ def test_arms_in_each_others_way_push_below_the_middle(tmp_path):
     """Starts of YuMi from which no simple way leads behind the block."""
     members = read_split("extrapolation/arms/push").train
     member = next(each for each in members if each.name == "yumi")
-    setting = member_setting(replace(member, obstacles=False), default_library(()), cache=tmp_path)
+    setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
     bodies = bodies_of([setting.robot])
     planner = PushPlanner(setting, bodies, 0, np.random.default_rng(0))
-    space, edge = FreeSpace(setting.scene), setting.pushes.block.size[0]
+    space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
     over = []
     for i in (3, 4, 29, 31, 36, 39):
-        plan = planner.plan(setting.pushes.q[i], setting.pushes.blocks[i])
+        plan = planner.plan(setting.goals.q[i], setting.goals.blocks[i])
         if plan is not None:
-            block = setting.pushes.blocks[i]
+            block = setting.goals.blocks[i]
             over += poised(space, plan.way[-1][None], block, edge).over.tolist()
     assert (np.array(over) < 0.05).sum() >= 5

@@ -15,9 +15,11 @@ from morphgen.rl.references import STARTS, InverseKinematics, random_starts
 from morphgen.rl.rollouts import run_episodes
 from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.actions import actions_of
-from morphgen.tasks.config import CONTROL_PERIOD, PushConfig, ReachConfig
+from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import make_batch
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
 from scenes import robot
 
@@ -30,7 +32,7 @@ def made(tmp_path):
     opened = []
 
     def make(words, n, task="reach", **options):
-        given = {"cache": tmp_path, "reach": REACH, "push": PUSH, "sim": "mujoco", **options}
+        given = {"cache": tmp_path, "configs": (REACH, PUSH), "sim": "mujoco", **options}
         opened.append(make_batch(task, [robot(words)], n, **given))
         opened[-1].reset()
         return opened[-1]
@@ -41,7 +43,7 @@ def made(tmp_path):
 
 
 def spaces(batch):
-    return [FreeSpace(setting.scene) for setting in batch.settings]
+    return [FreeSpace(setting.scene) for setting in batch.specs]
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
@@ -50,7 +52,7 @@ def test_a_robot_gets_past_a_stop(made, kind):
     batch = made("prims", 1, kind=kind)
     routes = Routes(batch)
     start = batch.targets[0].numpy().astype(np.float64)
-    low, high = bounds(batch.settings[0].robot).T
+    low, high = bounds(batch.specs[0].robot).T
     stop, end = 0.6 * start + 0.4 * low, 0.6 * start + 0.4 * high
     routes.take(0, [stop, end])
     for _ in range(200):

@@ -31,9 +31,9 @@ from morphgen.rl.runs import (
     read_config,
     write_checkpoint,
 )
-from morphgen.rl.sources import robot_source, settings_of
+from morphgen.rl.sources import robot_source, specs_of
 from morphgen.rl.training import ROBOTS
-from morphgen.tasks.settings import Recipe
+from morphgen.tasks.env_specs import GoalConfig
 from small_runs import small_config, small_source
 
 
@@ -297,4 +297,4 @@ def test_a_source_of_neither_a_split_nor_a_robot_at_a_task_is_refused():
     with pytest.raises(
         TaskError, match=r"^'planar-cube': neither a split nor a robot with a task$"
     ):
-        settings_of(source, Recipe())
+        specs_of(source, GoalConfig())

@@ -7,8 +7,9 @@ import torch
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.push_plans import PushPlanner
 from morphgen.rl.scripted_push import PLANS, RISE, ScriptedPush
-from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.make import make_batch
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from scenes import robot
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
@@ -17,7 +18,7 @@ PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)
 
 def batch(words, n, cache, task="push", **options):
     robots = [robot(each) for each in words]
-    return make_batch(task, robots, n, cache=cache, push=PUSH, reach=REACH, **options)
+    return make_batch(task, robots, n, cache=cache, configs=(REACH, PUSH), **options)
 
 
 def successes(task, controller, steps=PUSH.steps):

@@ -9,14 +9,12 @@ from morphgen.errors import TaskError
 from morphgen.grammar.library import default_library
 from morphgen.tasks.actions import Targets, shares_of
 from morphgen.tasks.bodies import bodies_of
-from morphgen.tasks.config import BINS, PushConfig, ReachConfig
-from morphgen.tasks.rewards import (
-    anybody_score,
-    beyond_limits,
-    moved_line,
-    push_terms,
-    reach_terms,
-)
+from morphgen.tasks.config import BINS
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.push.envs import curriculum_line, push_terms
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.envs import anybody_score, reach_terms
+from morphgen.tasks.rows import limit_violation
 
 CPU = torch.device("cpu")
 
@@ -82,11 +80,11 @@ def test_targets_stay_within_limits_and_masked_links_do_not_move(bodies):
 def test_terms_of_reach():
     config = ReachConfig()
     distance = torch.tensor([0.029, 0.031])
-    beyond = beyond_limits(
+    violation = limit_violation(
         torch.tensor([[1.5, 0.0], [0.0, -2.5]]), torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 2])
     )
-    assert beyond.tolist() == pytest.approx([0.5, 0.5])
-    terms = reach_terms(config, distance, beyond, torch.tensor([10.0, 0.0]))
+    assert violation.tolist() == pytest.approx([0.5, 0.5])
+    terms = reach_terms(config, distance, violation, torch.tensor([10.0, 0.0]))
     assert terms["near"].tolist() == [config.near_weight, 0.0]
     assert terms["distance"].tolist() == pytest.approx([-0.029, -0.031])
     assert terms["joint_limits"].tolist() == pytest.approx([-0.5, -0.5])
@@ -101,7 +99,7 @@ def test_terms_of_push():
         PushConfig(),
         to_go=torch.tensor([0.0, 0.3]),
         approach=torch.tensor([0.1, 0.2]),
-        beyond=torch.zeros(2),
+        limit_violation=torch.zeros(2),
         success=success,
     )
     assert terms["success"].tolist() == [10.0, 0.0]
@@ -111,7 +109,7 @@ def test_terms_of_push():
 
 def test_the_line_moves_over_the_first_half_of_training_and_then_stays():
     line = torch.tensor([0.2, 0.1])
-    places = [moved_line(PushConfig(), line, p / 100)[0].item() for p in range(101)]
+    places = [curriculum_line(PushConfig(), line, p / 100)[0].item() for p in range(101)]
     assert places[0] == pytest.approx(0.02)
     assert places == sorted(places)
     assert places[50:] == [pytest.approx(0.2)] * 51

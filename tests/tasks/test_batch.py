@@ -7,18 +7,19 @@ import pytest
 import torch
 
 import morphgen
+from goal_draws import draw_spec
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import TOOL
 from morphgen.rl.references import InverseKinematics, Random, Zero
 from morphgen.tasks.actions import actions_of
-from morphgen.tasks.batch import Channels
-from morphgen.tasks.config import BINS, ReachConfig
+from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import batch_of, make_batch
+from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.points import NOISE
-from morphgen.tasks.settings import reach_setting
+from morphgen.tasks.reach.config import ReachConfig
 
 CONFIG = replace(ReachConfig(), goals=20)
 WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
@@ -34,8 +35,7 @@ def settings(robots, tmp_path_factory):
     cache = tmp_path_factory.mktemp("goals")
     return {
         obstacles: [
-            reach_setting(robot, CONFIG, obstacles=obstacles, seed=0, cache=cache)
-            for robot in robots
+            draw_spec(robot, CONFIG, obstacles=obstacles, seed=0, cache=cache) for robot in robots
         ]
         for obstacles in (False, True)
     }
@@ -46,9 +46,9 @@ def made(settings):
     """Make batches; they are closed when the test is over."""
     opened = []
 
-    def make(num_envs=3, robots=(0, 1, 2), obstacles=False, **options):
-        chosen = [settings[obstacles][i] for i in robots]
-        options = {"reach": CONFIG, "sim": "mujoco", **options}
+    def make(num_envs=3, robots=(0, 1, 2), obstacles=False, config=CONFIG, **options):
+        chosen = [replace(settings[obstacles][i], config=config) for i in robots]
+        options = {"sim": "mujoco", **options}
         opened.append(batch_of(chosen, num_envs, **options))
         return opened[-1]
 
@@ -63,8 +63,8 @@ def run(batch, controller, steps):
 
 
 def test_observations_have_the_shapes_they_claim(made):
-    channels = Channels(velocity=True, previous_action=True, tool=True, points=50)
-    batch = made(obstacles=True, channels=channels)
+    channels = ObservationConfig(velocity=True, previous_action=True, tool=True, points=50)
+    batch = made(obstacles=True, observe=channels)
     seen = batch.reset()
     n, links = 3, batch.bodies.max_links
     assert {name: tuple(value.shape) for name, value in seen.items()} == {
@@ -89,29 +89,29 @@ def test_observations_have_the_shapes_they_claim(made):
 
 
 def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
-    batch = made(reach=replace(CONFIG, steps=5))
+    batch = made(config=replace(CONFIG, steps=5))
     batch.reset()
-    goal = batch.goal.clone()
+    goal = batch.field("goal").clone()
     controller = Random(0)
     for k in range(4):
         step = batch.step(controller.act(batch))
         assert not step.truncated.any(), k
-        assert torch.equal(batch.goal, goal)
+        assert torch.equal(batch.field("goal"), goal)
     step = batch.step(controller.act(batch))
     assert step.truncated.all()
     assert not step.terminated.any()
-    assert not torch.equal(batch.goal, goal)
+    assert not torch.equal(batch.field("goal"), goal)
     assert (batch.elapsed == 0).all()
 
 
 def test_the_final_observation_is_before_the_next_start(made):
-    batch = made(reach=replace(CONFIG, steps=3))
+    batch = made(config=replace(CONFIG, steps=3))
     batch.reset()
     for _ in range(3):
-        goal = batch.goal.clone()
+        goal = batch.field("goal").clone()
         step = batch.step(Random(1).act(batch))
     assert torch.equal(step.final_observation["goal"], goal)
-    assert torch.equal(step.observation["goal"], batch.goal)
+    assert torch.equal(step.observation["goal"], batch.field("goal"))
     assert not torch.equal(step.observation["tokens"], step.final_observation["tokens"])
 
 
@@ -119,9 +119,10 @@ def test_a_start_is_never_the_goals_own_configuration(made):
     batch = made(40, robots=(0,))
     for _ in range(3):
         batch.reset()
-        assert ((batch.targets - batch.witness).abs().amax(dim=1) > 1e-3).all()
-        there = frame_positions(batch.bodies.chain, batch.body, batch.witness)
-        assert (there - batch.goal[:, :3]).abs().max() < 1e-4
+        goal_q = batch.groups["reach"].goal_configuration
+        assert ((batch.targets - goal_q).abs().amax(dim=1) > 1e-3).all()
+        there = frame_positions(batch.bodies.chain, batch.body, goal_q)
+        assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
 
 
 def test_doing_nothing_moves_nothing(made):
@@ -145,7 +146,7 @@ def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
 
 def test_inverse_kinematics_goes_around_what_is_in_the_way(made):
     batch = made(12, robots=(1, 1, 2))
-    spaces = [FreeSpace(setting.scene) for setting in batch.settings]
+    spaces = [FreeSpace(setting.scene) for setting in batch.specs]
     steps = run(batch, InverseKinematics(0, spaces), CONFIG.steps)
     assert steps[-1].success.float().mean() >= 0.9
 
@@ -182,12 +183,12 @@ def test_no_bit_of_a_reward_depends_on_the_rest_of_the_batch(made, others):
 
 def test_a_point_cloud_changes_no_episode(made):
     with_points, without = (
-        made(obstacles=True, seed=2, channels=Channels(points=points)) for points in (5, 0)
+        made(obstacles=True, seed=2, observe=ObservationConfig(points=points)) for points in (5, 0)
     )
     for _ in range(3):
         with_points.reset()
         without.reset()
-        assert torch.equal(with_points.goal, without.goal)
+        assert torch.equal(with_points.field("goal"), without.field("goal"))
         assert torch.equal(with_points.targets, without.targets)
 
 
@@ -215,11 +216,11 @@ def test_a_batch_goes_on_from_its_state(made):
     other.reset()
     other.reset()
     state = one.state_dict()
-    assert not torch.equal(one.goal, other.goal)
+    assert not torch.equal(one.field("goal"), other.field("goal"))
     other.load_state_dict(state)
     one.reset()
     other.reset()
-    assert torch.equal(one.goal, other.goal)
+    assert torch.equal(one.field("goal"), other.field("goal"))
     assert torch.equal(one.targets, other.targets)
     with pytest.raises(TaskError, match="the state is of 3 environments; there are 2"):
         made(2).load_state_dict(state)
@@ -229,7 +230,7 @@ def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
     """Whoever keeps it finds it as it was, and whoever writes into it changes no batch."""
     options = {
         "obstacles": True,
-        "channels": Channels(velocity=True, previous_action=True, tool=True, points=8),
+        "observe": ObservationConfig(velocity=True, previous_action=True, tool=True, points=8),
     }
     batch, whole, chance = made(**options), made(**options), Random(0)
 
@@ -247,7 +248,13 @@ def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
     whole.reset()
     state = batch.state_dict()
     batch.load_state_dict(state)
-    spoil([state["line"], batch.q, batch.goal, batch.witness, batch.line])
+    spoil(
+        [
+            batch.q,
+            batch.field("goal"),
+            batch.field("line")[:, 0],
+        ]
+    )
     for _ in range(3):
         actions = chance.act(whole)
         spoiled, kept = tensors(batch.step(actions)), tensors(whole.step(actions))
@@ -277,7 +284,7 @@ def test_first_episodes_may_be_spread_over_time(made):
 
 
 def test_velocities_and_actions_are_those_of_the_links(made):
-    batch = made(channels=Channels(velocity=True, previous_action=True))
+    batch = made(observe=ObservationConfig(velocity=True, previous_action=True))
     assert batch.reset()["velocity"].abs().max() == 0
     action = torch.ones(batch.mask.shape)
     seen = batch.step(action).observation
@@ -287,11 +294,11 @@ def test_velocities_and_actions_are_those_of_the_links(made):
 
 
 def test_the_tool_is_where_the_joints_bring_it(made):
-    batch = made(channels=Channels(tool=True))
+    batch = made(observe=ObservationConfig(tool=True))
     batch.reset()
     for _ in range(5):
         step = batch.step(torch.ones(batch.mask.shape))
-    for env, each in enumerate(batch.settings):
+    for env, each in enumerate(batch.specs):
         q = batch.q[env, : each.robot.dof].double().numpy()
         expected = frame_pose(each.robot, q[None], TOOL)[0, :3, 3]
         assert step.observation["tool"][env].tolist() == pytest.approx(expected, abs=1e-5)
@@ -299,19 +306,23 @@ def test_the_tool_is_where_the_joints_bring_it(made):
 
 
 def test_the_tool_is_at_the_goal_where_the_witness_is(made):
-    batch = made(channels=Channels(tool=True))
+    batch = made(observe=ObservationConfig(tool=True))
     batch.reset()
     envs = torch.arange(3)
-    batch.simulation.reset(envs, batch.witness, batch.simulation.block_pose)
-    torch.testing.assert_close(batch.observe()["tool"], batch.goal[:, :3], rtol=0, atol=1e-5)
+    batch.simulation.reset(
+        envs, batch.groups["reach"].goal_configuration, batch.simulation.block_pose
+    )
+    torch.testing.assert_close(
+        batch.observe()["tool"], batch.field("goal")[:, :3], rtol=0, atol=1e-5
+    )
 
 
 def test_points_are_on_the_obstacles(made):
-    batch = made(obstacles=True, channels=Channels(points=80))
+    batch = made(obstacles=True, observe=ObservationConfig(points=80))
     seen = batch.reset()
     for env in range(3):
         off = torch.stack(
-            [_outside(seen["points"][env], block) for block in batch.settings[env].scene.obstacles]
+            [_outside(seen["points"][env], block) for block in batch.specs[env].scene.obstacles]
         )
         assert off.abs().amin(dim=0).max() < 6 * NOISE
     again = batch.reset()["points"]

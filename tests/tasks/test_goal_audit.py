@@ -8,14 +8,15 @@ import pytest
 
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.split_file import read_split
-from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.goal_audit import CODES, audit_goals, with_goals
 from morphgen.tasks.goal_leaks import NEAR
 from morphgen.tasks.goal_making import gathered, split_goals
-from morphgen.tasks.settings import Recipe
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from splits import LIBRARY, TEST, TRAIN, member, split
 
-RECIPE = Recipe(0, ReachConfig(goals=12), PushConfig(starts=4))
+RECIPE = GoalConfig(0, (ReachConfig(goals=12), PushConfig(starts=4)))
 REACH = "train", "gantry-plane"
 PUSH = "train", "gantry-cylinder"
 LAST = "test", "planar-plane"
@@ -32,8 +33,8 @@ def some(**more):
     return split(train, [member(TEST[0], task="reach", obstacles=True)], **more)
 
 
-def made(which, cache, recipe=RECIPE):
-    return gathered(split_goals(which, LIBRARY, recipe, cache=cache), recipe)
+def made(which, cache, config=RECIPE):
+    return gathered(split_goals(which, LIBRARY, config, cache=cache), config)
 
 
 @pytest.fixture
@@ -83,7 +84,7 @@ def test_a_cache_that_ignores_the_seed_is_found(sets, cache):
 
 def test_sets_of_another_seed_are_found(cache):
     other = made(some(), cache, replace(RECIPE, seed=1))
-    told = audit_goals(some(), replace(other, recipe=RECIPE), LIBRARY)
+    told = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
     assert [each.code for each in told] == ["goals-seed"] * 3
     assert told[0].why == "its set was made with seed 1, the split's with 0"
     assert found(some(), other) == []
@@ -92,18 +93,20 @@ def test_sets_of_another_seed_are_found(cache):
 @pytest.mark.parametrize(
     "recipe",
     [
-        replace(RECIPE, reach=ReachConfig(goals=10), push=PushConfig(starts=3)),
+        replace(RECIPE, tasks=(ReachConfig(goals=10), PushConfig(starts=3))),
         replace(
             RECIPE,
-            reach=ReachConfig(goals=12, obstacles=2),
-            push=PushConfig(starts=4, block_size=(0.1, 0.12)),
+            tasks=(
+                ReachConfig(goals=12, obstacles=2),
+                PushConfig(starts=4, block_size=(0.1, 0.12)),
+            ),
         ),
     ],
 )
 def test_sets_with_other_constants_are_found(sets, cache, recipe):
     other = made(some(), cache, recipe)
     wrong = [at for at, one in other.sets.items() if one.goals.key != sets.sets[at].goals.key]
-    told = audit_goals(some(), replace(other, recipe=RECIPE), LIBRARY)
+    told = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
     assert [each.code for each in told] == ["goals-config"] * len(wrong)
     assert len(wrong) >= 2
 
@@ -145,7 +148,7 @@ def test_goals_out_of_reach_are_found(sets):
         some(), changed(sets, REACH, {"poses": moved(goals.poses, [3, 5], 0, 0.01)}), LIBRARY
     )
     assert [each.code for each in told] == ["goals-changed", "goals-unproven"]
-    assert told[1].why.startswith("goal 3: the tool of its witness is 0.01 m away")
+    assert told[1].why.startswith("goal 3: the tool of its configuration is 0.01 m away")
     assert told[1].why.endswith("(and 1 more)")
 
 
@@ -155,7 +158,7 @@ def test_goals_in_collision_are_found(sets):
     inside = (replace(box, pose=replace(box.pose, position=at)),)
     told = audit_goals(some(), changed(sets, LAST, {"obstacles": inside}), LIBRARY)
     assert [each.code for each in told] == ["goals-changed", "goals-unproven"]
-    assert told[1].why.startswith("goal 0: its witness is in collision")
+    assert told[1].why.startswith("goal 0: its configuration is in collision")
 
 
 @pytest.mark.parametrize(

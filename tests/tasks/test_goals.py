@@ -9,18 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from goal_draws import draw_goals
 from morphgen.benchmark.workspace import shoulder, workspace
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import bounds, frame_pose
 from morphgen.model.robot import Link
-from morphgen.tasks import free_space, obstacles
-from morphgen.tasks import goals as module
-from morphgen.tasks.config import ReachConfig
+from morphgen.tasks import free_space, goal_sets, obstacles
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals import certify, goal_set
 from morphgen.tasks.obstacles import KEPT, draw_obstacles
+from morphgen.tasks.reach import goals as module
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
 from robots import arm
 from scenes import robot
@@ -47,7 +48,7 @@ def body():
 
 
 def made(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
-    return goal_set(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
+    return draw_goals(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
 
 
 def scene_of(body, found, ground=LIFTED):
@@ -67,7 +68,7 @@ def test_every_goal_is_proven_by_its_witness(words, boxes, cache):
     assert found.poses.shape == (12, 7)
     assert (found.poses[:, 3] >= 0).all()
     assert len(found.obstacles) == (3 if boxes else 0)
-    assert certify(found, body, scene_of(body, found, 0.0)) == []
+    assert certify_goals(found, body, scene_of(body, found, 0.0)) == []
     assert 12 == found.accepted <= found.tried
     assert len(np.unique(found.q, axis=0)) == 12
 
@@ -75,8 +76,8 @@ def test_every_goal_is_proven_by_its_witness(words, boxes, cache):
 def test_goals_are_above_the_ground_wherever_it_is(body, cache):
     here, there = (made(body, cache, ground=ground) for ground in (0.0, LIFTED))
     assert there.poses[:, :3] == pytest.approx(frame_pose(body, there.q)[:, :3, 3])
-    assert certify(there, body, scene_of(body, there)) == []
-    assert certify(there, body, scene_of(body, there, 0.5)) != []
+    assert certify_goals(there, body, scene_of(body, there)) == []
+    assert certify_goals(there, body, scene_of(body, there, 0.5)) != []
     assert here.key != there.key
 
 
@@ -194,10 +195,9 @@ def test_every_run_gives_the_same_bytes(body, tmp_path):
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
         "from dataclasses import replace; from robots import arm; "
         "from morphgen.checks.self_collision import ignore_pairs; "
-        "from morphgen.tasks.config import ReachConfig; "
-        "from morphgen.tasks.goals import goal_set; "
+        "from morphgen.tasks.reach.config import ReachConfig; from goal_draws import draw_goals; "
         "body = replace(arm(), ignore_pairs=ignore_pairs(arm())); "
-        "goal_set(body, ReachConfig(goals=12), obstacles=True, seed=0, ground=-0.4, "
+        "draw_goals(body, ReachConfig(goals=12), obstacles=True, seed=0, ground=-0.4, "
         "cache=Path(sys.argv[1]))"
     )
     tests = Path(__file__).parents[1]
@@ -251,7 +251,7 @@ def test_a_broken_file_is_named(body, cache, keep):
     made(body, cache)
     (path,) = cache.iterdir()
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(TaskError, match=f"{path.name}: no GoalSet: .*; delete it"):
+    with pytest.raises(TaskError, match=f"{path.name}: no ReachGoalSet: .*; delete it"):
         made(body, cache)
 
 
@@ -275,13 +275,13 @@ def test_a_file_under_another_name_is_noticed(body, cache):
 
 def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot keep a GoalSet"):
+    with pytest.warns(UserWarning, match="cannot keep a ReachGoalSet"):
         found = made(body, tmp_path / "file" / "goals")
     assert len(found.q) == 12
 
 
 def test_the_users_cache_is_the_default(body, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / name)
+    monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / name)
     found = made(body, None)
     assert (tmp_path / "morphgen" / "goals-4" / f"{found.key}.npz").is_file()
 
@@ -291,7 +291,7 @@ def test_a_certificate_names_every_fault(body, cache):
     scene = scene_of(body, found)
 
     def faults(**changes):
-        return certify(replace(found, **changes), body, scene)
+        return certify_goals(replace(found, **changes), body, scene)
 
     q, poses = found.q.copy(), found.poses.copy()
     q[3, 1] = bounds(body)[1, 1] + 0.1
@@ -313,5 +313,5 @@ def test_a_certificate_notices_a_collision(body, cache):
     found = made(body, cache)
     around = Shape(Box((2.0, 2.0, 2.0)))
     walled = body.with_links([Link("base", body.link("base").inertial, (), (around,))])
-    lines = certify(found, walled, scene_of(walled, found))
-    assert "goal 0: its witness is in collision" in lines
+    lines = certify_goals(found, walled, scene_of(walled, found))
+    assert "goal 0: its configuration is in collision" in lines

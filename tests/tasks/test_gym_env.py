@@ -15,9 +15,11 @@ from stable_baselines3.common.env_checker import check_env as check_for_sb3
 import morphgen
 from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.tasks import make_batch, registration
-from morphgen.tasks.batch import Channels
-from morphgen.tasks.config import BINS, PushConfig, ReachConfig
-from morphgen.tasks.gym_env import PushEnv, ReachEnv
+from morphgen.tasks.config import BINS
+from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Contacts
 
 STEPS = 8
@@ -36,7 +38,7 @@ def make(cache):
     made = []
 
     def of(name, robot="arm3-stick", **options):
-        config = REACH if name == registration.REACH else PUSH
+        config = REACH if name == "morphgen/Reach-v0" else PUSH
         given = {"config": config, "sim": "mujoco", "cache": cache} | options
         made.append(gym.make(name, robot=robot, **given))
         return made[-1]
@@ -62,12 +64,15 @@ def run(env, steps):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        (registration.REACH, {"sim": "pybullet"}),
-        (registration.REACH, {"kind": "discrete", "obstacles": True}),
-        (registration.PUSH, {"robot": "prims"}),
+        ("morphgen/Reach-v0", {"sim": "pybullet"}),
+        ("morphgen/Reach-v0", {"kind": "discrete", "obstacles": True}),
+        ("morphgen/Push-v0", {"robot": "prims"}),
         (
-            registration.PUSH,
-            {"robot": "prims", "channels": Channels(velocity=True, previous_action=True, points=9)},
+            "morphgen/Push-v0",
+            {
+                "robot": "prims",
+                "observe": ObservationConfig(velocity=True, previous_action=True, points=9),
+            },
         ),
     ],
 )
@@ -116,17 +121,17 @@ def test_registering_loads_nothing_and_waits_for_gymnasium():
 
 
 def test_reach_observes_what_one_robot_needs(make):
-    env = make(registration.REACH)
-    links = len(env.unwrapped.setting.robot.links)
+    env = make("morphgen/Reach-v0")
+    links = len(env.unwrapped.env_spec.robot.links)
     shapes = {name: space.shape for name, space in env.observation_space.items()}
     assert shapes == {"tokens": (links, 48), "goal": (7,)}
     assert env.action_space.shape == (len(env.unwrapped.action_joints),)
 
 
 def test_push_observes_block_line_and_obstacles(make):
-    channels = Channels(velocity=True, previous_action=True, points=12)
-    env = make(registration.PUSH, "prims", obstacles=True, channels=channels, kind="discrete")
-    links, joints = len(env.unwrapped.setting.robot.links), len(env.unwrapped.action_joints)
+    channels = ObservationConfig(velocity=True, previous_action=True, points=12)
+    env = make("morphgen/Push-v0", "prims", obstacles=True, observe=channels, kind="discrete")
+    links, joints = len(env.unwrapped.env_spec.robot.links), len(env.unwrapped.action_joints)
     assert {name: space.shape for name, space in env.observation_space.items()} == {
         "tokens": (links, 48),
         "object": (13,),
@@ -140,7 +145,7 @@ def test_push_observes_block_line_and_obstacles(make):
 
 
 def test_an_action_moves_its_own_joint(make):
-    env = make(registration.REACH, channels=Channels(previous_action=True)).unwrapped
+    env = make("morphgen/Reach-v0", observe=ObservationConfig(previous_action=True)).unwrapped
     for k, name in enumerate(env.action_joints):
         env.reset(seed=0)
         before = env.batch.targets.clone()
@@ -148,14 +153,14 @@ def test_an_action_moves_its_own_joint(make):
         action[k] = 0.5 if before[0, k] < env.batch.bodies.home[0, k] else -0.5
         seen, *_ = env.step(action)
         moved = torch.nonzero(env.batch.targets[0] != before[0])[:, 0].tolist()
-        robot = env.setting.robot
+        robot = env.env_spec.robot
         assert [robot.joints[robot.independent[j]].name for j in moved] == [name]
         assert seen["previous_action"].tolist() == action.tolist()
 
 
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
 def test_a_seed_gives_its_episodes(make, sim):
-    env, other = make(registration.REACH, sim=sim), make(registration.REACH, sim=sim)
+    env, other = make("morphgen/Reach-v0", sim=sim), make("morphgen/Reach-v0", sim=sim)
     env.reset(seed=5)
     first = run(env, 3 * STEPS)
     env.reset(seed=6)
@@ -167,20 +172,20 @@ def test_a_seed_gives_its_episodes(make, sim):
 
 
 def test_without_a_seed_episodes_go_on_and_begin_anywhere(make):
-    env = make(registration.REACH)
+    env = make("morphgen/Reach-v0")
     goals = [tuple(env.reset(seed=1)[0]["goal"])]
     goals += [tuple(env.reset()[0]["goal"]) for _ in range(7)]
     assert len(set(goals)) > 1
     again = [tuple(env.reset(seed=1)[0]["goal"])]
     assert again + [tuple(env.reset()[0]["goal"]) for _ in range(7)] == goals
-    starts = {tuple(make(registration.REACH).reset()[0]["tokens"].ravel()) for _ in range(6)}
+    starts = {tuple(make("morphgen/Reach-v0").reset()[0]["tokens"].ravel()) for _ in range(6)}
     assert len(starts) > 1
 
 
 def test_asking_for_the_generator_makes_the_first_episode_no_less_random(make):
     starts = set()
     for _ in range(6):
-        env = make(registration.REACH)
+        env = make("morphgen/Reach-v0")
         assert env.unwrapped.np_random is not None
         starts.add(tuple(env.reset()[0]["tokens"].ravel()))
     assert len(starts) > 1
@@ -189,16 +194,18 @@ def test_asking_for_the_generator_makes_the_first_episode_no_less_random(make):
 def test_a_robot_of_many_links_needs_more_numbers_for_them(make):
     body = morphgen.compose("chain beads=7", geometry="primitive")
     with pytest.raises(MorphgenError, match="max_links 25 or more"):
-        make(registration.REACH, robot=body)
-    assert make(registration.REACH, robot=body, max_links=25).reset(seed=0)
+        make("morphgen/Reach-v0", robot=body)
+    assert make("morphgen/Reach-v0", robot=body, max_links=25).reset(seed=0)
     for robot, links, numbered in ((body, 25, 25), ("arm3-stick", 7, 23)):
-        seen, _ = make(registration.REACH, robot=robot, max_links=None).reset(seed=0)
+        seen, _ = make("morphgen/Reach-v0", robot=robot, max_links=None).reset(seed=0)
         assert seen["tokens"][:, 0] * (numbered - 1) == pytest.approx(range(links))
 
 
 def test_the_episodes_are_those_of_a_batch(make, cache):
-    env = make(registration.REACH)
-    batch = make_batch("reach", ["arm3-stick"], 1, sim="mujoco", seed=7, reach=REACH, cache=cache)
+    env = make("morphgen/Reach-v0")
+    batch = make_batch(
+        "reach", ["arm3-stick"], 1, sim="mujoco", seed=7, configs=(REACH,), cache=cache
+    )
     seen, _ = env.reset(seed=7)
     expected = batch.reset()
     for k in range(2 * STEPS):
@@ -218,7 +225,7 @@ def test_the_episodes_are_those_of_a_batch(make, cache):
 
 
 def test_an_episode_ends_by_itself_and_is_seen_to_its_end(make):
-    env = make(registration.PUSH, "prims", channels=Channels(velocity=True)).unwrapped
+    env = make("morphgen/Push-v0", "prims", observe=ObservationConfig(velocity=True)).unwrapped
     env.reset(seed=0)
     for k in range(STEPS):
         seen, _, terminated, truncated, info = env.step(np.ones(5, dtype=np.float32))
@@ -231,13 +238,13 @@ def test_an_episode_ends_by_itself_and_is_seen_to_its_end(make):
 
 
 def test_info_says_how_contacts_are_set(make):
-    env = make(registration.REACH, contacts=Contacts(self_collision=False))
+    env = make("morphgen/Reach-v0", contacts=Contacts(self_collision=False))
     assert env.reset(seed=0)[1] == {"self_collision": False}
     assert env.step(env.action_space.sample())[4]["self_collision"] is False
 
 
 @pytest.mark.parametrize(
-    ("name", "robot"), [(registration.REACH, "arm3-stick"), (registration.PUSH, "prims")]
+    ("name", "robot"), [("morphgen/Reach-v0", "arm3-stick"), ("morphgen/Push-v0", "prims")]
 )
 def test_the_last_moment_of_an_episode_can_be_seen(make, name, robot):
     """The batch has begun the next one by then, elsewhere."""
@@ -255,14 +262,14 @@ def test_the_last_moment_of_an_episode_can_be_seen(make, name, robot):
 
 
 def test_without_a_render_mode_nothing_is_drawn(make):
-    env = make(registration.REACH)
+    env = make("morphgen/Reach-v0")
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert env.unwrapped.render() is None
 
 
 def test_a_closed_environment_says_so(make):
-    env = make(registration.REACH, render_mode="rgb_array").unwrapped
+    env = make("morphgen/Reach-v0", render_mode="rgb_array").unwrapped
     env.reset(seed=0)
     env.render()
     env.close()
@@ -281,25 +288,26 @@ def test_a_closed_environment_says_so(make):
     ],
 )
 def test_an_action_that_is_none_is_refused(make, action, says):
-    env = make(registration.REACH).unwrapped
+    env = make("morphgen/Reach-v0").unwrapped
     env.reset(seed=0)
     with pytest.raises(TaskError, match=says):
         env.step(action)
 
 
 @pytest.mark.parametrize(
-    ("made", "options", "error", "says"),
+    ("task", "options", "error", "says"),
     [
-        (ReachEnv, {"robot": "ur5-plain"}, CompositionError, "did you mean 'plane'"),
-        (ReachEnv, {"sim": "bullet"}, TaskError, "did you mean 'pybullet'"),
-        (ReachEnv, {"kind": "discreet"}, TaskError, "did you mean 'discrete'"),
-        (ReachEnv, {"render_mode": "rgb"}, TaskError, "did you mean 'rgb_array'"),
-        (ReachEnv, {"config": PUSH}, TaskError, "PushConfig is not the config of reach"),
-        (PushEnv, {"config": REACH}, TaskError, "ReachConfig is not the config of push"),
+        ("raech", {}, TaskError, "unknown task 'raech'; did you mean 'reach'"),
+        ("reach", {"robot": "ur5-plain"}, CompositionError, "did you mean 'plane'"),
+        ("reach", {"sim": "bullet"}, TaskError, "did you mean 'pybullet'"),
+        ("reach", {"kind": "discreet"}, TaskError, "did you mean 'discrete'"),
+        ("reach", {"render_mode": "rgb"}, TaskError, "did you mean 'rgb_array'"),
+        ("reach", {"config": PUSH}, TaskError, "PushConfig is not the config of reach"),
+        ("push", {"config": REACH}, TaskError, "ReachConfig is not the config of push"),
     ],
 )
-def test_wrong_options_are_refused(made, options, error, says, cache):
-    config = REACH if made is ReachEnv else PUSH
+def test_wrong_options_are_refused(task, options, error, says, cache):
+    config = REACH if task == "reach" else PUSH
     given = {"robot": "arm3-stick", "config": config, "cache": cache} | options
     with pytest.raises(error, match=says):
-        made(**given)
+        TaskEnv(task, **given)

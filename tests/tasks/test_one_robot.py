@@ -7,8 +7,8 @@ import pytest
 
 import morphgen
 from morphgen.benchmark.split import robot_hash
-from morphgen.tasks.config import ReachConfig
 from morphgen.tasks.make import make_batch, make_split_batch
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.robots import robot_of
 from splits import member, split
 
@@ -43,7 +43,7 @@ def batches(named, tmp_path_factory):
 
     def options(name):
         cache = tmp_path_factory.mktemp(name.replace(" ", "-"))
-        return {"sim": "mujoco", "seed": 0, "reach": CONFIG, "cache": cache}
+        return {"sim": "mujoco", "seed": 0, "configs": (CONFIG,), "cache": cache}
 
     made = {
         name: make_batch("reach", [robot], 1, obstacles=True, **options(name))
@@ -72,7 +72,7 @@ def scores(batches):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_shapes_and_key_are_the_same(batches, name):
-    ours, theirs = (batches[each].settings[0].robot for each in ("words", name))
+    ours, theirs = (batches[each].specs[0].robot for each in ("words", name))
     assert [link.collisions for link in theirs.links] == [link.collisions for link in ours.links]
     assert theirs.joints == ours.joints
     assert theirs.home == ours.home
@@ -82,7 +82,7 @@ def test_shapes_and_key_are_the_same(batches, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_goals_are_the_same(batches, name):
-    ours, theirs = (batches[each].settings[0].goals for each in ("words", name))
+    ours, theirs = (batches[each].specs[0].goals for each in ("words", name))
     assert theirs.key == ours.key
     assert theirs.tried == ours.tried
     assert theirs.obstacles == ours.obstacles

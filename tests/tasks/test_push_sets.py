@@ -5,17 +5,18 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from goal_draws import draw_goals
 from morphgen.benchmark.workspace import workspace
-from morphgen.errors import TaskError
+from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose
-from morphgen.tasks import push_sets as module
-from morphgen.tasks import push_ways
-from morphgen.tasks.config import PushConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push_proofs import CLOSE
-from morphgen.tasks.push_region import effective_reach, push_region
-from morphgen.tasks.push_sets import PushSet, push_set
+from morphgen.tasks.push import feasibility
+from morphgen.tasks.push import starts as module
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.push.feasibility import CLOSE
+from morphgen.tasks.push.region import effective_reach, push_region
+from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import Block, Scene
 from scenes import robot
 
@@ -32,7 +33,7 @@ def cache(tmp_path):
 
 
 def made(words, cache, *, config=CONFIG, obstacles=False, seed=0, ground=0.0):
-    return push_set(
+    return draw_goals(
         robot(words), config, obstacles=obstacles, seed=seed, ground=ground, cache=cache
     )
 
@@ -146,7 +147,7 @@ def test_what_is_stored_is_what_was_made(cache, monkeypatch):
 
     monkeypatch.setattr(module, "FreeSpace", forbidden)
     stored = made("prims", cache, obstacles=True)
-    for field in fields(PushSet):
+    for field in fields(PushStartSet):
         a, b = getattr(stored, field.name), getattr(fresh, field.name)
         assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
 
@@ -175,7 +176,7 @@ def test_the_key_knows_all_that_matters_and_nothing_else(cache):
     assert len(set(keys)) == len(keys)
     same = replace(CONFIG, steps=5, success_weight=3.0, curriculum_steps=2, obstacles=9)
     other = replace(robot("prims"), name="other")
-    found = push_set(other, same, obstacles=False, seed=0, cache=cache)
+    found = draw_goals(other, same, obstacles=False, seed=0, cache=cache)
     assert (found.key, found.robot) == (keys[0], "other")
 
 
@@ -200,7 +201,7 @@ def test_obstacles_that_always_stand_in_the_way_are_an_error(cache, monkeypatch)
     def wall(*_, **__):
         return (Block((9.0, 0.1, 0.1)),)
 
-    monkeypatch.setattr(push_ways, "draw_obstacles", wall)
+    monkeypatch.setattr(feasibility, "draw_obstacles", wall)
     with pytest.raises(TaskError, match="each of 8 layouts of 3 obstacles stands in more than 50%"):
         made("prims", cache, obstacles=True)
 
@@ -208,15 +209,15 @@ def test_obstacles_that_always_stand_in_the_way_are_an_error(cache, monkeypatch)
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"starts": 0}, "0 starts with seed 0: at least one start"),
+        ({"starts": 0}, "0 goals with seed 0: at least one goal"),
         ({"block_size": (0.2, 0.1)}, "a block of 0.2 to 0.1"),
         ({"start": 0.3}, "is to cross 0.2: sizes are positive, and it starts before the line"),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(changes, text, cache):
-    with pytest.raises(TaskError, match=text):
+    with pytest.raises((TaskError, BenchmarkError), match=text):
         made("prims", cache, config=replace(CONFIG, **changes))
-    with pytest.raises(TaskError, match="with seed -1"):
+    with pytest.raises(BenchmarkError, match="with seed -1"):
         made("prims", cache, seed=-1)
 
 
@@ -227,12 +228,12 @@ def test_a_broken_or_misnamed_file_is_named(cache):
     with pytest.raises(TaskError, match=f"a set of key {first.key}, not"):
         made("prims", cache, seed=1)
     paths[0].write_bytes(paths[0].read_bytes()[:-100])
-    with pytest.raises(TaskError, match=f"{paths[0].name}: no PushSet: .*; delete it"):
+    with pytest.raises(TaskError, match=f"{paths[0].name}: no PushStartSet: .*; delete it"):
         made("prims", cache)
 
 
 def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot keep a PushSet"):
+    with pytest.warns(UserWarning, match="cannot keep a PushStartSet"):
         found = made("prims", tmp_path / "file" / "pushes")
     assert len(found.q) == 5

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 import morphgen
+from goal_draws import draw_spec
 from morphgen.model.dynamics import actuation
 from morphgen.rl.references import Random
-from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import batch_of
-from morphgen.tasks.settings import push_setting, reach_setting
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Contacts
 
 SIMS = ("pybullet", "mujoco")
@@ -39,9 +40,9 @@ def test_joints_are_reset_within_their_limits_and_stay_there(robot, sim, cache):
 
     Where nothing touches: what an arm lies on can press a joint past its limit for a while.
     """
-    setting = reach_setting(robot, FEW, obstacles=False, seed=0, cache=cache)
+    setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
     free = Contacts(False, False)
-    with closing(batch_of([setting], 4, sim=sim, reach=FEW, contacts=free)) as batch:
+    with closing(batch_of([setting], 4, sim=sim, contacts=free)) as batch:
         batch.reset()
         low, high = batch.bodies.lower, batch.bodies.upper
         outwards = torch.ones(batch.mask.shape)
@@ -87,8 +88,8 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
     assert heavy_stiffness == pytest.approx([10 * value for value in light_stiffness], rel=0.05)
     ends = []
     for body in (robot, heavy):
-        setting = reach_setting(body, FEW, obstacles=False, seed=0, cache=cache)
-        with closing(batch_of([setting], 1, sim=sim, reach=FEW)) as batch:
+        setting = draw_spec(body, FEW, obstacles=False, seed=0, cache=cache)
+        with closing(batch_of([setting], 1, sim=sim)) as batch:
             batch.reset()
             start = torch.tensor(body.home)[None].float()
             batch.simulation.reset(torch.tensor([0]), start, torch.zeros(1, 7))
@@ -102,42 +103,42 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_obstacles_of_an_episode_never_hold_its_goal_or_start(robot, task, cache):
     """Their goals could lie inside the obstacle that was there at the time."""
-    make = {"reach": reach_setting, "push": push_setting}[task]
     config = FEW if task == "reach" else replace(PushConfig(), starts=6, steps=40)
-    setting = make(robot, config, obstacles=True, seed=0, cache=cache)
+    setting = draw_spec(robot, config, obstacles=True, seed=0, cache=cache)
     space = FreeSpace(setting.scene)
-    with closing(batch_of([setting], 6, sim="mujoco", reach=FEW)) as batch:
+    with closing(batch_of([setting], 6, sim="mujoco")) as batch:
         for seed in range(3):
             batch.reset(seed)
             blocks = batch.simulation.block_pose.numpy() if task == "push" else None
             assert space.free(batch.q.numpy(), blocks).all()
             if task == "reach":
-                assert space.free(batch.witness.numpy()).all()
+                assert space.free(batch.groups["reach"].goal_configuration.numpy()).all()
 
 
 def test_one_goal_holds_for_the_whole_episode(robot, cache):
     """Theirs was drawn again inside the episode."""
-    setting = reach_setting(robot, FEW, obstacles=False, seed=0, cache=cache)
-    with closing(batch_of([setting], 3, sim="mujoco", reach=FEW)) as batch:
+    setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
+    with closing(batch_of([setting], 3, sim="mujoco")) as batch:
         batch.reset()
-        goal, acting = batch.goal.clone(), Random(0)
+        goal, acting = batch.field("goal").clone(), Random(0)
         for _ in range(FEW.steps - 1):
             batch.step(acting.act(batch))
-            assert torch.equal(batch.goal, goal)
+            assert torch.equal(batch.field("goal"), goal)
         batch.step(acting.act(batch))
-        assert not torch.equal(batch.goal, goal)
+        assert not torch.equal(batch.field("goal"), goal)
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_episodes_follow_their_seed(robot, task, cache):
     """Generators of theirs had none."""
-    make = {"reach": reach_setting, "push": push_setting}[task]
     config = FEW if task == "reach" else replace(PushConfig(), starts=6)
-    setting = make(robot, config, obstacles=False, seed=0, cache=cache)
+    setting = draw_spec(robot, config, obstacles=False, seed=0, cache=cache)
     seen = []
     for seed in (5, 5, 6):
         with closing(batch_of([setting], 4, sim="mujoco", seed=seed)) as batch:
             batch.reset()
-            seen.append(torch.cat([batch.q, batch.goal, batch.simulation.block_pose], dim=1))
+            seen.append(
+                torch.cat([batch.q, batch.field("goal"), batch.simulation.block_pose], dim=1)
+            )
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[0], seen[2])

@@ -2,13 +2,15 @@
 
 from contextlib import closing
 from dataclasses import replace
+from importlib import import_module
 from itertools import count
 
 import pytest
 
 import morphgen
-from morphgen.tasks.config import ReachConfig
-from morphgen.tasks.make import make_batch, own_step
+from morphgen.tasks.make import make_batch
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.speed import measure
 
 CONFIG = replace(ReachConfig(), goals=4, steps=10)
@@ -21,9 +23,13 @@ def robot():
 
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
 def test_shares_sum_up_and_the_simulators_own_step_is_told_apart(robot, sim, tmp_path):
-    ticks = count()
-    with closing(make_batch("reach", [robot], 3, sim=sim, reach=CONFIG, cache=tmp_path)) as batch:
-        found = measure(batch, 2000, own=[own_step(sim)], clock=lambda: float(next(ticks)))
+    ticks, (module, step) = count(), SIMULATORS[sim].own_step
+    with closing(
+        make_batch("reach", [robot], 3, sim=sim, configs=(CONFIG,), cache=tmp_path)
+    ) as batch:
+        found = measure(
+            batch, 2000, own=[(import_module(module), step)], clock=lambda: float(next(ticks))
+        )
         assert "step" not in vars(batch.simulation)
         assert "observe" not in vars(batch)
     assert sum(found.shares.values()) == pytest.approx(1)
@@ -37,7 +43,7 @@ def test_shares_sum_up_and_the_simulators_own_step_is_told_apart(robot, sim, tmp
 def test_without_it_all_within_the_simulation_is_one(robot, tmp_path):
     ticks = count()
     with closing(
-        make_batch("reach", [robot], 2, sim="mujoco", reach=CONFIG, cache=tmp_path)
+        make_batch("reach", [robot], 2, sim="mujoco", configs=(CONFIG,), cache=tmp_path)
     ) as batch:
         found = measure(batch, 507, clock=lambda: float(next(ticks)))
         assert batch.elapsed.tolist() == [0, 0]  # whole episodes

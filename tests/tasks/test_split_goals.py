@@ -17,19 +17,21 @@ from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.tasks import free_space, goal_making, goals, push_sets, settings, split_goals
-from morphgen.tasks.config import PushConfig, ReachConfig
+from morphgen.tasks import env_specs, free_space, split_goals
+from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.goal_making import gathered, robot_goals
 from morphgen.tasks.goal_making import split_goals as make
-from morphgen.tasks.goal_npz import goals_from_npz
+from morphgen.tasks.goal_sets import arrays_of, goals_from_npz, set_npz
 from morphgen.tasks.make import make_split_batch
-from morphgen.tasks.set_files import arrays_of, set_npz
-from morphgen.tasks.settings import Recipe
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach import goals as reach_goals
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.split_goals import read_goals, read_split_goals, write_goals
 from scenes import robot
 from splits import LIBRARY, TEST, TRAIN, member, split
 
-RECIPE = Recipe(0, ReachConfig(goals=12), PushConfig(starts=4))
+RECIPE = GoalConfig(0, (ReachConfig(goals=12), PushConfig(starts=4)))
 
 
 @pytest.fixture
@@ -50,8 +52,8 @@ def mixed():
     return split(train, [member(TRAIN[0])])
 
 
-def made(which, cache, recipe=RECIPE, **options):
-    return make(which, LIBRARY, recipe, cache=cache, **options)
+def made(which, cache, config=RECIPE, **options):
+    return make(which, LIBRARY, config, cache=cache, **options)
 
 
 def same(a, b):
@@ -79,7 +81,7 @@ def test_goals_follow_the_seed_that_the_cache_must_not_ignore(cache):
     for a, b in zip(first, second, strict=True):
         assert (a.goals.seed, b.goals.seed) == (0, 1)
         assert not np.isin(a.goals.q, b.goals.q).any()
-    assert settings.BENCHMARK.seed == settings.SEED == 0
+    assert env_specs.BENCHMARK.seed == 0
 
 
 def test_every_member_has_its_own_set_train_first(cache):
@@ -111,9 +113,10 @@ def test_a_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
 
 
 def test_a_set_that_cannot_be_certified_says_so(cache, monkeypatch):
-    monkeypatch.setattr(goal_making, "certify", lambda *_: ["goal 3: its witness is in collision"])
+    line = "goal 3: its configuration is in collision"
+    monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
     found = made(reaching(), cache, certified=True)
-    assert {one.unproven for one in found} == {("goal 3: its witness is in collision",)}
+    assert {one.unproven for one in found} == {("goal 3: its configuration is in collision",)}
 
 
 def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
@@ -126,7 +129,7 @@ def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
         made(reaching(), cache, progress=interrupt)
     assert len(list(cache.iterdir())) == 2
     found = made(reaching(), cache)
-    monkeypatch.setattr(goals, "FreeSpace", forbidden)
+    monkeypatch.setattr(reach_goals, "FreeSpace", forbidden)
     assert all(same(a.goals, b.goals) for a, b in zip(found, made(reaching(), cache), strict=True))
 
 
@@ -165,7 +168,7 @@ def test_what_ships_is_read_back_as_it_was(home, cache):
     found = made(mixed(), cache)
     assert write_goals(home, found, RECIPE) == home / "goals"
     read = read_split_goals(home)
-    assert read.recipe == RECIPE
+    assert read.config == RECIPE
     assert read.sets.keys() == gathered(found, RECIPE).sets.keys()
     for one in found:
         again = read.sets[one.side, one.robot]
@@ -174,7 +177,7 @@ def test_what_ships_is_read_back_as_it_was(home, cache):
         assert (again.body, again.task, again.obstacles) == (one.body, one.task, one.obstacles)
     assert read_goals(home, "train")["gantry-cylinder"].block == found[1].goals.block
     assert read_goals(home, "test").keys() == {"gantry-plane"}
-    assert type(read_goals(home, "train")["gantry-plane"]) is goals.GoalSet
+    assert type(read_goals(home, "train")["gantry-plane"]) is reach_goals.ReachGoalSet
     for one in found:
         for each in fields(one.goals):
             was, is_ = (getattr(x, each.name) for x in (one.goals, read.of(one.side, one.robot)))
@@ -205,17 +208,17 @@ def test_a_file_carries_no_time(cache):
 def test_a_batch_takes_the_sets_that_are_shipped_and_refuses_others(home, cache, monkeypatch):
     which = mixed()
     write_goals(home, made(which, cache), RECIPE)
-    monkeypatch.setattr(push_sets, "_made", forbidden)
-    options = {"sim": "mujoco", "reach": RECIPE.reach, "push": RECIPE.push, "goals": home}
+    monkeypatch.setattr(TASKS["push"], "sample", forbidden)
+    options = {"sim": "mujoco", "configs": RECIPE.tasks, "goals": home}
     for side in ("train", "test"):
         shipped = read_goals(home, side)
         with closing(make_split_batch(which, side, 2, cache=home / "none", **options)) as batch:
-            for setting in batch.settings:
+            for setting in batch.specs:
                 own = setting.goals or setting.pushes
                 assert same(own, shipped[setting.robot.name])
     for wrong, words in (
         ({"goal_seed": 1}, "seed"),
-        ({"reach": ReachConfig(goals=3)}, "constants"),
+        ({"configs": (ReachConfig(goals=3),)}, "constants"),
     ):
         with pytest.raises(MorphgenError, match=f"robot 'gantry-plane': the set .* {words}"):
             make_split_batch(which, "train", 2, **{**options, **wrong})

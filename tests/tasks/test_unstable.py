@@ -6,13 +6,14 @@ import mujoco
 import pytest
 import torch
 
+from goal_draws import draw_spec
 from morphgen.rl.references import Random
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.batch import Channels
-from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.make import batch_of
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.robots import robot_of
-from morphgen.tasks.settings import push_setting, reach_setting
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
@@ -20,7 +21,7 @@ import pybullet
 from bullets import client_of
 
 REACH, PUSH = ReachConfig(goals=5), PushConfig(starts=5)
-CHANNELS = Channels(velocity=True, previous_action=True, tool=True)
+CHANNELS = ObservationConfig(velocity=True, previous_action=True, tool=True)
 ENVS = 4
 
 
@@ -29,8 +30,8 @@ def settings(tmp_path_factory):
     """A robot that reaches and one that pushes."""
     cache = tmp_path_factory.mktemp("goals")
     chosen = {"obstacles": False, "seed": 0, "cache": cache}
-    reaching = reach_setting(robot_of("arm3-stick"), REACH, **chosen)
-    return [reaching, push_setting(robot_of("prims"), PUSH, **chosen)]
+    reaching = draw_spec(robot_of("arm3-stick"), REACH, **chosen)
+    return [reaching, draw_spec(robot_of("prims"), PUSH, **chosen)]
 
 
 @pytest.fixture(params=["pybullet", "mujoco"])
@@ -39,9 +40,9 @@ def made(request, settings):
     opened = []
 
     def make():
-        options = {"reach": REACH, "push": PUSH, "channels": CHANNELS, "seed": 1}
+        options = {"observe": CHANNELS, "seed": 1}
         opened.append(batch_of(settings, ENVS, sim=request.param, **options))
-        assert opened[-1].pushes.tolist() == [False, True, False, True]
+        assert opened[-1].does("push").tolist() == [False, True, False, True]
         return opened[-1]
 
     yield make
@@ -103,12 +104,12 @@ def test_the_episode_that_follows_is_the_one_that_would_have(made):
     batch, whole = made(), made()
     batch.reset()
     whole.reset()
-    assert torch.equal(batch.goal, whole.goal)
+    assert torch.equal(batch.field("goal"), whole.field("goal"))
     break_physics(batch, 0)
     step = batch.step(Random(0).act(batch))
     whole.reset()
     assert step.unstable.tolist() == [True, False, False, False]
-    assert torch.equal(batch.goal[0], whole.goal[0])
+    assert torch.equal(batch.field("goal")[0], whole.field("goal")[0])
     assert torch.equal(batch.targets[0], whole.targets[0])
 
 
@@ -137,8 +138,11 @@ def test_an_episode_that_diverges_is_never_a_success(made):
     def put_at_goals():
         q, block = batch.simulation.q.clone(), batch.simulation.block_pose.clone()
         joints = q.shape[1]
-        q[0], block[1, 1] = batch.witness[0, :joints], batch.line[1] + 0.05
-        batch.targets[0] = batch.witness[0]
+        q[0], block[1, 1] = (
+            batch.groups["reach"].goal_configuration[0, :joints],
+            batch.field("line")[:, 0][1] + 0.05,
+        )
+        batch.targets[0] = batch.groups["reach"].goal_configuration[0]
         batch.simulation.reset(torch.arange(2), q[:2], block[:2])
 
     batch.reset()

@@ -16,7 +16,9 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from morphgen.errors import MissingDependencyError, TaskError
 from morphgen.tasks import make_batch, registration
-from morphgen.tasks.config import BINS, PushConfig, ReachConfig
+from morphgen.tasks.config import BINS
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sb3 import sb3_vector
 from morphgen.tasks.vector import TaskVector
 
@@ -35,7 +37,7 @@ def batch_of(cache):
     made = []
 
     def of(num_envs=4, **options):
-        given = {"sim": "mujoco", "reach": REACH, "push": PUSH, "cache": cache} | options
+        given = {"sim": "mujoco", "configs": (REACH, PUSH), "cache": cache} | options
         made.append(make_batch(TASKS, ROBOTS, num_envs, obstacles=[True, False], **given))
         return made[-1]
 
@@ -64,7 +66,7 @@ def test_spaces_hold_what_is_seen_and_done(batch_of, kind):
 
 
 def test_what_is_empty_is_not_observed(cache):
-    batch = make_batch("reach", ROBOTS[:1], 2, sim="mujoco", reach=REACH, cache=cache)
+    batch = make_batch("reach", ROBOTS[:1], 2, sim="mujoco", configs=(REACH,), cache=cache)
     with closing(TaskVector(batch)) as envs:
         assert "obstacles" in batch.observe()
         assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
@@ -209,9 +211,14 @@ def test_without_stable_baselines3_the_error_says_what_to_install(batch_of, monk
 
 def test_gymnasium_makes_vectors_of_several_robots(cache):
     registration.register()
-    options = {"robots": ["prims", "arm3-stick"], "sim": "mujoco", "push": PUSH, "cache": cache}
-    envs = gym.make_vec(registration.PUSH, num_envs=3, **options)
-    assert [each.robot.name for each in envs.batch.settings] == ["prims", "arm3-stick"]
+    options = {
+        "robots": ["prims", "arm3-stick"],
+        "sim": "mujoco",
+        "configs": (PUSH,),
+        "cache": cache,
+    }
+    envs = gym.make_vec("morphgen/Push-v0", num_envs=3, **options)
+    assert [each.robot.name for each in envs.batch.specs] == ["prims", "arm3-stick"]
     assert envs.reset(seed=0)[0] in envs.observation_space
     envs.close()
     envs.close()

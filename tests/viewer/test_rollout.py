@@ -15,12 +15,12 @@ from morphgen.model.kinematics import frame_pose
 from morphgen.rl import runs
 from morphgen.rl.play import controller, play
 from morphgen.rl.training import train
-from morphgen.tasks.gym_env import ReachEnv
+from morphgen.tasks.gym_env import TaskEnv
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, still
 from morphgen.viewer.places import CHECKPOINT, Places
 from morphgen.viewer.play_choices import address_of, wanted_of
-from morphgen.viewer.play_files import recording, setting_of
+from morphgen.viewer.play_files import recording, renderer_of
 from morphgen.viewer.play_scene import GAP, area, places_in_grid
 from morphgen.viewer.rollout import Recorded, Rollout, Wanted, simulators
 from morphgen.viewer.targets import target_address
@@ -60,7 +60,7 @@ def episode(places, cache):
 
 
 def test_an_episode_is_the_one_that_morphgen_play_has(episode):
-    env = ReachEnv("planar-cube", sim="mujoco")
+    env = TaskEnv("reach", "planar-cube", sim="mujoco")
     results = []
     list(play(env, controller("ik", env, 3), 1, 3, results.append))
     env.close()
@@ -88,7 +88,7 @@ def test_an_episode_comes_back_from_its_file(episode, places, root):
     for one, other in zip(read.tracks, episode.tracks, strict=True):
         assert one.place == other.place
         assert np.array_equal(one.q, other.q)
-        assert np.array_equal(one.goal, other.goal)
+        assert np.array_equal(one.marker_poses["goal"], other.marker_poses["goal"])
         assert one.score == pytest.approx(other.score, rel=1e-6)
         assert one.success == other.success
     assert episode_bytes(read) == content
@@ -240,6 +240,10 @@ def test_a_recording_is_of_all_moments_that_are_shown(episode):
 
 
 def test_the_camera_of_a_film_sees_what_the_episode_has(episode):
-    setting = setting_of(episode.tracks[0])
-    assert np.allclose(setting.goals.poses[0], episode.tracks[0].goal)
-    assert np.allclose(setting.goals.q[-1], episode.tracks[0].q[-1])
+    track = episode.tracks[0]
+    points = renderer_of(track, (64, 48))._model.points
+    low, high = points.min(axis=0), points.max(axis=0)
+    tools = frame_pose(track.robot, np.array(track.q))[:, :3, 3]
+    for point in (track.marker_poses["goal"][0][:3], tools[-1]):
+        assert (low - 0.01 < point).all()
+        assert (point < high + 0.01).all()

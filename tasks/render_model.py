@@ -1,7 +1,8 @@
-"""A setting as a MuJoCo model that is only looked at: visuals, ground, obstacles and marks."""
+"""A scene as a MuJoCo model that is drawn and never simulated: visuals, ground and markers."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -14,52 +15,69 @@ from morphgen.formats.mjcf import to_spec
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
-from morphgen.tasks.config import ReachConfig
-from morphgen.tasks.settings import Setting
-from morphgen.tasks.sim.base import Block
+from morphgen.model.rotation import Vec3
+from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.task import Marker
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]
 
-_STARTS = 32
-"""Configurations of a set that are to be in view."""
+BLOCK = "block"
+"""Name of the block among the mocap bodies."""
 _BLOCK, _OBSTACLE = (0.90, 0.55, 0.15, 1.0), (0.55, 0.25, 0.25, 1.0)
-_GOAL, _LINE = (0.10, 0.65, 0.25, 0.45), (0.10, 0.65, 0.25, 0.9)
+_FRAME_MARKER, _BOX_MARKER = (0.10, 0.65, 0.25, 0.45), (0.10, 0.65, 0.25, 0.9)
 _AXES = ((0.85, 0.15, 0.15, 1.0), (0.15, 0.70, 0.15, 1.0), (0.15, 0.30, 0.90, 1.0))
 _BODY = (0.65, 0.67, 0.70, 1.0)
-_LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.001
 _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
 """Corners of a cube of edge 1."""
 
 
 @dataclass(frozen=True, eq=False)
-class StageModel:
-    """What is drawn, and where its state is."""
+class RenderModel:
+    """A MuJoCo model that is drawn and never simulated, and where its state is."""
 
     model: mujoco.MjModel
     q_at: NDArray[np.int64]
-    """Where ``qpos`` has the robot's movable joints."""
-    marks: dict[str, int]
-    """Mocap bodies of ``block``, ``goal`` and ``line``."""
+    """Indices of the robot's movable joints in ``qpos``."""
+    mocap: dict[str, int]
+    """Mocap indices of the markers and, if there is one, of ``block``."""
     points: Array
-    """What is to be in view, shape (n, 3), metres."""
+    """Points that are to be in view, shape (n, 3), metres."""
 
 
-def stage_model(setting: Setting) -> StageModel:
-    """Compile what is to be seen of a setting, whose robot stands at the origin.
+def render_model(
+    scene: Scene, markers: Sequence[Marker], configurations: Array, points: Array
+) -> RenderModel:
+    """Compile what is drawn of a scene, whose robot stands at the origin.
+
+    Args:
+        scene: Robot, ground, obstacles and block.
+        markers: Shapes that show a goal.
+        configurations: Joint positions at which the robot is to be in view, shape (n, dof).
+        points: Points that are to be in view, too, shape (m, 3), metres.
 
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    robot, points = setting.robot, _in_view(setting)
+    robot = scene.robot
+    corners = [_corners(block) for block in scene.obstacles]
+    points = np.concatenate(
+        [np.zeros((1, 3)), *corners, points, _robot_corners(robot, configurations)]
+    )
+    if scene.ground is not None:
+        points = points[points[:, 2] >= scene.ground - 1e-6]
     spec = to_spec(_as_seen(robot))
-    _add_surroundings(spec, setting, float(np.ptp(points, axis=0).max()))
-    marks = {"block": _add_block, "goal": _add_goal, "line": _add_line}
-    bodies = {name: add(spec, setting) for name, add in marks.items()}
+    _add_surroundings(spec, scene, float(np.ptp(points, axis=0).max()))
+    bodies = {}
+    if scene.block is not None:
+        bodies[BLOCK] = spec.worldbody.add_body(mocap=True)
+        _add_box(bodies[BLOCK], scene.block.size, _BLOCK)
+    for marker in markers:
+        bodies[marker.name] = _add_marker(spec, marker)
     model = spec.compile()
     at = [int(model.joint(robot.joints[k].name).qposadr[0]) for k in robot.movable]
-    found = {name: int(model.body_mocapid[body.id]) for name, body in bodies.items()}
-    return StageModel(model, np.array(at, dtype=np.int64), found, points)
+    mocap = {name: int(model.body_mocapid[body.id]) for name, body in bodies.items()}
+    return RenderModel(model, np.array(at, dtype=np.int64), mocap, points)
 
 
 def _as_seen(robot: Robot) -> Robot:
@@ -79,7 +97,7 @@ def _as_seen(robot: Robot) -> Robot:
     return replace(coloured, links=grey, ignore_pairs=())
 
 
-def _add_surroundings(spec: mujoco.MjSpec, setting: Setting, extent: float) -> None:
+def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
     """Sky, light, ground and obstacles."""
     spec.add_texture(
         name="morphgen/sky",
@@ -98,10 +116,10 @@ def _add_surroundings(spec: mujoco.MjSpec, setting: Setting, extent: float) -> N
         specular=[0.1, 0.1, 0.1],
         castshadow=True,
     )
-    if setting.scene.ground is not None:
-        _add_ground(spec, setting.scene.ground)
-    for obstacle in setting.scene.obstacles:
-        geom = _add_box(spec.worldbody, obstacle, _OBSTACLE)
+    if scene.ground is not None:
+        _add_ground(spec, scene.ground)
+    for obstacle in scene.obstacles:
+        geom = _add_box(spec.worldbody, obstacle.size, _OBSTACLE)
         geom.pos, geom.quat = obstacle.pose.position, obstacle.pose.quaternion
 
 
@@ -128,63 +146,27 @@ def _add_ground(spec: mujoco.MjSpec, height: float) -> None:
     )
 
 
-def _add_box(body: mujoco.MjsBody, block: Block, rgba: Colour) -> mujoco.MjsGeom:
-    size = [edge / 2 for edge in block.size]
+def _add_box(body: mujoco.MjsBody, edges: Vec3, rgba: Colour) -> mujoco.MjsGeom:
+    size = [edge / 2 for edge in edges]
     return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=rgba)
 
 
-def _add_block(spec: mujoco.MjSpec, setting: Setting) -> mujoco.MjsBody:
+def _add_marker(spec: mujoco.MjSpec, marker: Marker) -> mujoco.MjsBody:
+    """Add a box, or axes inside a translucent ball."""
     body = spec.worldbody.add_body(mocap=True)
-    if setting.scene.block is not None:
-        _add_box(body, setting.scene.block, _BLOCK)
-    return body
-
-
-def _add_goal(spec: mujoco.MjSpec, setting: Setting) -> mujoco.MjsBody:
-    """A ball in which the tool is near, and axes of the wanted pose."""
-    near = ReachConfig.near
-    body = spec.worldbody.add_body(mocap=True)
-    for axis, rgba in zip(np.eye(3) * 2 * near, _AXES, strict=True):
+    if marker.shape == "box":
+        _add_box(body, marker.size, _BOX_MARKER)
+        return body
+    radius = marker.size[0] / 2
+    for axis, rgba in zip(np.eye(3) * 2 * radius, _AXES, strict=True):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=[0, 0, 0, *axis],
-            size=[0.1 * near, 0, 0],
+            size=[0.1 * radius, 0, 0],
             rgba=rgba,
         )
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[near, 0, 0], rgba=_GOAL)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], rgba=_FRAME_MARKER)
     return body
-
-
-def _add_line(spec: mujoco.MjSpec, setting: Setting) -> mujoco.MjsBody:
-    """A strip on the ground, along x, as long as the starts of the block are spread and more."""
-    body = spec.worldbody.add_body(mocap=True)
-    if setting.pushes is not None:
-        low, high = setting.pushes.blocks[:, 0].min(), setting.pushes.blocks[:, 0].max()
-        spare = 2 * max(setting.pushes.block.size)
-        size = [(high - low) / 2 + spare, _LINE_WIDTH / 2, _LINE_HEIGHT]
-        strip = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=_LINE)
-        strip.pos = [(low + high) / 2, 0.0, 0.0]
-    return body
-
-
-def _in_view(setting: Setting) -> Array:
-    """The robot at home and at starts, its goals, the block's ways and obstacles, shape (n, 3)."""
-    robot, scene = setting.robot, setting.scene
-    points = [np.zeros((1, 3)), *(_corners(block) for block in scene.obstacles)]
-    configurations = [np.array([robot.home])]
-    if setting.goals is not None:
-        configurations.append(setting.goals.q[:_STARTS])
-        points.append(setting.goals.poses[:, :3])
-    if setting.pushes is not None:
-        configurations.append(setting.pushes.q[:_STARTS])
-        across = setting.pushes.blocks[:, :3].copy()
-        across[:, 1] = setting.pushes.line
-        corners = _SIGNS * setting.pushes.block.size
-        for centres in (setting.pushes.blocks[:, :3], across):
-            points.append((centres[:, None] + corners).reshape(-1, 3))
-    points.append(_robot_corners(robot, np.concatenate(configurations)))
-    found = np.concatenate(points)
-    return found if scene.ground is None else found[found[:, 2] >= scene.ground - 1e-6]
 
 
 def _robot_corners(robot: Robot, q: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Where a robot's block starts, how large it is and what it has to cross."""
+"""The region where a robot's block starts, the block's size, and the line that it must cross."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from morphgen.model.kinematics import (
     random_configurations,
 )
 from morphgen.model.robot import TOOL, Robot
-from morphgen.tasks.config import PushConfig
+from morphgen.tasks.push.config import PushConfig
 
 Array = NDArray[np.float64]
 
 FULL_REACH = 0.4
-"""Bodies that reach less have everything scaled down, metres."""
+"""Robots that reach less have everything scaled down, metres."""
 
 _SAMPLES = 16_384
 _LEVEL = 1e-3
@@ -32,25 +32,25 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Region:
-    """A block's place in the world and what it is to cross, metres."""
+    """Where a block starts and ends in the world, metres."""
 
     edge: float
-    """Of the block, a cube."""
+    """Edge of the block, a cube."""
     scale: float
-    """1, or less for bodies that reach under ``FULL_REACH``."""
+    """1, or less for robots that reach less than ``FULL_REACH``."""
     x: tuple[float, float]
     y: tuple[float, float]
-    """Ranges of the block's centre at the start."""
+    """Ranges of x and y of the block's centre at the start."""
     line: float
-    """y that its centre must cross."""
+    """y that the block's centre must cross."""
 
 
 def push_region(
     robot: Robot, config: PushConfig, ground: float, rng: np.random.Generator
 ) -> Region:
-    """Where a robot's block starts, by how its tool moves.
+    """Return the region of a robot's block, by how its tool moves.
 
-    - Free bodies, whose tool slides along two horizontal directions: the edge is in metres, x in
+    - Free robots, whose tool slides along two horizontal directions: the edge is in metres, x in
       ``config.free_x``.
     - Arms, whose tool slides along none and leaves every plane: the edge is relative to the
       effective reach, x in ``config.arm_x`` of it beyond the shoulder.
@@ -74,14 +74,14 @@ def push_region(
         TaskError: If the tool does not get down to the block, or not along y at all.
         BenchmarkError: If the robot has no tool that moves.
     """
-    found = workspace(robot)  # refuses a robot whose tool does not move
+    space = workspace(robot)  # refuses a robot whose tool does not move
     tools = _tools(robot)
     share = float(rng.uniform(*config.block_size))
     slides = _directions(robot)
     if slides:
         reach = float(np.ptp(tools[1])) / 2 / (1.0 if slides == 2 else math.sqrt(2))
     else:
-        reach = effective_reach(found.reach, found.shoulder[2] - ground, share)
+        reach = effective_reach(space.reach, space.shoulder[2] - ground, share)
     if not reach > 0:
         how = "does not move along y" if slides else "does not get down to the ground"
         raise TaskError(f"robot {robot.name!r} cannot push: its tool {how}")
@@ -90,7 +90,7 @@ def push_region(
     if slides == 2:
         x = (config.free_x[0] * scale, config.free_x[1] * scale)
     elif not slides and np.ptp(tools[2]) > _LEVEL:
-        x0 = found.shoulder[0]
+        x0 = space.shoulder[0]
         x = (x0 + config.arm_x[0] * reach, x0 + config.arm_x[1] * reach)
     else:
         x = _sweep(robot, ground, edge)
@@ -98,8 +98,36 @@ def push_region(
     return Region(edge, scale, x, y, config.line * scale)
 
 
+def draw_blocks(region: Region, ground: float, n: int, rng: np.random.Generator) -> Array:
+    """Draw poses of blocks that stand on the ground, uniform in the region and turned at random.
+
+    Args:
+        region: Where they start.
+        ground: Height of the ground, metres.
+        n: Number of poses.
+        rng: Where they come from; the first of many are the same as few.
+
+    Returns:
+        Shape (n, 7).
+    """
+    x, y, yaw = rng.random((n, 3)).T
+    blocks = np.empty((n, 7))
+    blocks[:, 0] = region.x[0] + x * (region.x[1] - region.x[0])
+    blocks[:, 1] = region.y[0] + y * (region.y[1] - region.y[0])
+    blocks[:, 2] = ground + region.edge / 2
+    blocks[:, 3:] = yawed((2 * yaw - 1) * np.pi)
+    return blocks
+
+
+def yawed(yaw: Array) -> Array:
+    """Return quaternions of rotations about z, shape (n, 4), w >= 0."""
+    zero = np.zeros_like(yaw)
+    q = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
+    return np.where(q[:, :1] < 0, -q, q)
+
+
 def effective_reach(reach: float, height: float, share: float) -> float:
-    """How far from the shoulder's vertical an arm gets to the middle of a block on the ground.
+    """Return how far from the shoulder's vertical an arm reaches the centre of a block.
 
     The block's edge is a share of this effective reach e, so its centre is ``share * e / 2`` above
     the ground, and by Pythagoras e^2 + (height - share e / 2)^2 = reach^2; e is the larger root.
@@ -118,7 +146,7 @@ def effective_reach(reach: float, height: float, share: float) -> float:
 
 
 def _tools(robot: Robot, *, sliding: bool = True) -> Array:
-    """Where the tool is at random configurations, in the root frame, shape (3, n)."""
+    """Return positions of the tool at random configurations, in the root frame, shape (3, n)."""
     q = random_configurations(robot, _SAMPLES, np.random.default_rng(_SEED))
     if not sliding:
         slides = [robot.joints[k].kind == "prismatic" for k in robot.independent]
@@ -127,7 +155,7 @@ def _tools(robot: Robot, *, sliding: bool = True) -> Array:
 
 
 def _directions(robot: Robot) -> int:
-    """Along how many horizontal directions the tool slides, all else at home."""
+    """Return along how many horizontal directions the tool slides, all else at home."""
     _, directions = joint_axes(robot, forward_kinematics(robot, np.array(robot.home)))
     axes = [
         directions[k + 1, :2]
@@ -138,7 +166,7 @@ def _directions(robot: Robot) -> int:
 
 
 def _sweep(robot: Robot, ground: float, edge: float) -> tuple[float, float]:
-    """Range of x of the tool at the height of the block, its slides at home."""
+    """Return the range of x of the tool at the height of the block, its slides at home."""
     tools = _tools(robot, sliding=False)
     low = tools[0, (tools[2] > ground) & (tools[2] < ground + edge)]
     if not len(low):

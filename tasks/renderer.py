@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import imageio_ffmpeg
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FormatError
@@ -21,8 +22,10 @@ from morphgen.formats.files import replacing_file
 from morphgen.formats.picture import gl_context
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.settings import Setting
-from morphgen.tasks.stage import stage_model
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.render_model import BLOCK, render_model
+from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.task import EnvSpec, Marker
 
 Frame = NDArray[np.uint8]
 
@@ -39,42 +42,64 @@ _SHADOW_SIZE = 2048
 """Of the map that says where it is dark, pixels. Shadows say how high a tool is. Without a GPU they
 take half of the time; smoothed edges would take as long again, and are hardly seen in a film."""
 _AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
-"""Pose of what is not to be seen."""
+"""Pose of what is not drawn."""
+_STARTS = 32
+"""Number of configurations of a goal set that are to be in view."""
 
 
-class Stage:
-    """A setting in front of a camera that does not move.
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The state of an environment that is drawn."""
+
+    q: NDArray[np.float32]
+    """Positions of the robot's independent joints, shape (dof,), rad or m."""
+    block: NDArray[np.float32] | None = None
+    """Pose of the block, (x, y, z, qw, qx, qy, qz), if there is one."""
+    markers: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """Poses of the markers by name; others are not drawn."""
+
+
+class Renderer:
+    """Draws a scene, seen by a camera that does not move.
 
     MuJoCo's OpenGL draws it, by EGL or OSMesa, whichever simulator moves it. PyBullet's software
-    renderer needs no library of the system, but it draws nothing that one can see through.
-    The camera shows the robot at home and at starts of its episodes, its goals, obstacles, and the
-    block from its starts to the line.
+    renderer needs no library of the system, but it draws nothing translucent.
     """
 
-    def __init__(self, setting: Setting, size: tuple[int, int] = SIZE) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        markers: Sequence[Marker],
+        configurations: NDArray[np.float64],
+        points: NDArray[np.float64],
+        size: tuple[int, int] = SIZE,
+    ) -> None:
         """Prepare.
 
         Args:
-            setting: The robot, which stands at the origin, and what is around it.
+            scene: The robot, which stands at the origin, and what is around it.
+            markers: Shapes that show a goal.
+            configurations: Joint positions at which the robot is to be in view, shape (n, dof).
+            points: Points that are to be in view, too, shape (m, 3), metres.
             size: Width and height of frames, pixels.
 
         Raises:
             MeshError: If a mesh cannot be read.
             MissingDependencyError: If there is no offscreen OpenGL.
         """
-        self.size, self._setting = size, setting
-        self._stage = stage_model(setting)
-        model = self._stage.model
+        self.size, self._robot = size, scene.robot
+        self._model = render_model(scene, markers, configurations, points)
+        model = self._model.model
         model.vis.global_.fovy = _FOV
         model.vis.global_.offwidth, model.vis.global_.offheight = size
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_SIZE, 0
-        low, high = self._stage.points.min(axis=0), self._stage.points.max(axis=0)
+        low, high = self._model.points.min(axis=0), self._model.points.max(axis=0)
         model.stat.center[:], model.stat.extent = (low + high) / 2, 1.5 * (high - low).max()
         model.vis.map.shadowclip = 2.0
         light = model.vis.headlight
         light.ambient[:], light.diffuse[:], light.specular[:] = 0.35, 0.35, 0.1
         self._data = mujoco.MjData(model)
-        self._camera = _camera(self._stage.points, size[0] / size[1])
+        self._camera = _camera(self._model.points, size[0] / size[1])
         self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + 100)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._context = gl_context(*size)
@@ -83,38 +108,33 @@ class Stage:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
         self._closed = False
 
-    def frame(
-        self,
-        q: ArrayLike,
-        *,
-        block: ArrayLike | None = None,
-        goal: ArrayLike | None = None,
-        line: float | None = None,
-    ) -> Frame:
-        """Draw a moment.
+    @classmethod
+    def of_spec(cls, spec: EnvSpec, size: tuple[int, int] = SIZE) -> Renderer:
+        """Return a renderer that shows the robot at home and at starts, and all of its goals."""
+        task = TASKS[spec.task]
+        configurations = np.concatenate([[spec.robot.home], spec.goals.q[:_STARTS]])
+        markers = task.markers(spec.config, spec.goals)
+        return cls(spec.scene, markers, configurations, task.points_in_view(spec.goals), size)
 
-        Args:
-            q: Positions of the robot's independent joints, shape (dof,), rad or m.
-            block: Pose of the block in the world, (x, y, z, qw, qx, qy, qz).
-            goal: Wanted pose of the tool: a ball of the size of success, and axes.
-            line: y that the block must cross, metres.
+    def frame(self, moment: Moment) -> Frame:
+        """Draw a moment.
 
         Returns:
             Shape (height, width, 3).
 
         Raises:
-            ValueError: If the stage is closed, or ``q`` has another shape.
+            ValueError: If the renderer is closed, or ``q`` has another shape.
         """
         if self._closed:
-            raise ValueError("this stage is closed")
-        model, data = self._stage.model, self._data
-        data.qpos[self._stage.q_at] = movable_positions(self._setting.robot, q)
-        ground = self._setting.scene.ground or 0.0
-        at_line = None if line is None else (0.0, line, ground, 1.0, 0.0, 0.0, 0.0)
-        for name, pose in (("block", block), ("goal", goal), ("line", at_line)):
-            where = np.asarray(_AWAY if pose is None else pose)
-            mark = self._stage.marks[name]
-            data.mocap_pos[mark], data.mocap_quat[mark] = where[:3], where[3:]
+            raise ValueError("this renderer is closed")
+        model, data = self._model.model, self._data
+        data.qpos[self._model.q_at] = movable_positions(self._robot, moment.q)
+        poses = dict(moment.markers)
+        if moment.block is not None:
+            poses[BLOCK] = moment.block
+        for name, index in self._model.mocap.items():
+            pose = np.asarray(poses.get(name, _AWAY))
+            data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -140,14 +160,11 @@ class Stage:
         return np.ascontiguousarray(pixels[::-1])
 
 
-def moment(batch: TaskBatch, env: int = 0) -> dict[str, Any]:
-    """How an environment of a batch is now: the arguments of ``Stage.frame``."""
-    setting = batch.settings[int(batch.body[env])]
-    now: dict[str, Any] = {"q": _copied(batch.q[env, : setting.robot.dof])}
-    if setting.task == "reach":
-        return now | {"goal": _copied(batch.goal[env])}
-    block = _copied(batch.simulation.block_pose[env])
-    return now | {"block": block, "line": float(batch.line[env])}
+def moment(batch: TaskBatch, env: int = 0) -> Moment:
+    """Return the state of an environment of a batch as it is now."""
+    spec = batch.specs[int(batch.body[env])]
+    block = None if spec.scene.block is None else _copied(batch.simulation.block_pose[env])
+    return Moment(_copied(batch.q[env, : spec.robot.dof]), block, batch.groups.marker_poses(env))
 
 
 def _copied(values: torch.Tensor) -> NDArray[np.float32]:
@@ -205,7 +222,10 @@ class FilmError(Exception):
     """Why ffmpeg did not write a film."""
 
 
-def _append(writer: Any, frame: Frame) -> None:  # noqa: ANN401
+def _append(
+    writer: Any,  # noqa: ANN401 - imageio has no type for it
+    frame: Frame,
+) -> None:
     try:
         writer.append_data(frame)
     except OSError as error:

@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from goal_draws import draw_goals
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Link
-from morphgen.tasks.barriers import barriers, beyond
-from morphgen.tasks.config import ReachConfig
+from morphgen.tasks.cspace_components import cspace_components, in_other_component
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals import certify, goal_set
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
 from scenes import ball, robot
 
@@ -46,56 +47,56 @@ def hinged(kind, *walls):
 
 def test_a_wall_across_parts_what_is_behind_it():
     body = walled(ACROSS)
-    (found,) = barriers(body)
+    (found,) = cspace_components(body)
     assert found.pairs == (("ball", "base"),)
     assert found.joints == (0, 1)
-    assert beyond([found], THERE).tolist() == [True]
-    assert beyond([found], HERE).tolist() == [False]
+    assert in_other_component([found], THERE).tolist() == [True]
+    assert in_other_component([found], HERE).tolist() == [False]
     for x, far in ((0.33, False), (0.67, True)):
         assert FreeSpace(Scene(body)).free([[x, 0.0]])[0]
-        assert beyond([found], np.array([x, 0.0]))[0] == far
+        assert in_other_component([found], np.array([x, 0.0]))[0] == far
 
 
 @pytest.mark.parametrize("walls", [(), GAP])
 def test_what_can_be_gone_round_parts_nothing(walls):
-    assert barriers(walled(*walls)) == ()
+    assert cspace_components(walled(*walls)) == ()
 
 
 def test_a_joint_without_end_goes_on_at_the_other():
     """A wall on one side is no barrier to what goes round, two are; limits make one enough."""
     left, right = ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0))
-    assert barriers(hinged("continuous", left)) == ()
+    assert cspace_components(hinged("continuous", left)) == ()
     body = hinged("continuous", left, right)
-    found = barriers(body)
-    assert beyond(found, np.array([math.pi - 0.1, 0.9])).all()
-    assert beyond(found, np.array([0.1 - math.pi, 0.9])).all()
-    assert not beyond(found, np.array([0.5, 0.9])).any()
+    found = cspace_components(body)
+    assert in_other_component(found, np.array([math.pi - 0.1, 0.9])).all()
+    assert in_other_component(found, np.array([0.1 - math.pi, 0.9])).all()
+    assert not in_other_component(found, np.array([0.5, 0.9])).any()
 
 
 def test_whole_turns_part_nothing():
     """A wall in the way of a hinge that turns twice: where it is counts, not how often round."""
     body = hinged("revolute", ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0)))
-    found = barriers(body)
+    found = cspace_components(body)
     for turns in (-1, 0):
-        assert not beyond(found, np.array([0.5 + 2 * math.pi * turns, 0.9])).any()
-    assert beyond(found, np.array([math.pi, 0.9])).all()
+        assert not in_other_component(found, np.array([0.5 + 2 * math.pi * turns, 0.9])).any()
+    assert in_other_component(found, np.array([math.pi, 0.9])).all()
 
 
 @pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"])
 def test_robots_as_they_are_have_none(words):
-    assert barriers(robot(words)) == ()
+    assert cspace_components(robot(words)) == ()
 
 
 def test_goals_are_on_the_larger_side(tmp_path):
     body = walled(ACROSS)
     both, _ = FreeSpace(Scene(body)).draw(40, np.random.default_rng(0))
     assert 5 < (both[:, 0] > 0.5).sum() < 35
-    goals = goal_set(body, ReachConfig(goals=40), obstacles=False, seed=0, cache=tmp_path)
+    goals = draw_goals(body, ReachConfig(goals=40), obstacles=False, seed=0, cache=tmp_path)
     assert (goals.q[:, 0] < 0.5).all()
     assert goals.accepted == 40 < goals.tried
-    few = goal_set(body, ReachConfig(goals=7), obstacles=False, seed=0, cache=tmp_path)
+    few = draw_goals(body, ReachConfig(goals=7), obstacles=False, seed=0, cache=tmp_path)
     assert (few.q == goals.q[:7]).all()
-    assert certify(goals, body, Scene(body)) == []
+    assert certify_goals(goals, body, Scene(body)) == []
 
 
 def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
@@ -110,9 +111,9 @@ def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
 
 
 def test_a_certificate_notices_what_is_beyond(tmp_path):
-    goals = goal_set(ball(0.2), ReachConfig(goals=12), obstacles=False, seed=0, cache=tmp_path)
+    goals = draw_goals(ball(0.2), ReachConfig(goals=12), obstacles=False, seed=0, cache=tmp_path)
     body = walled(ACROSS)
-    lines = certify(goals, body, Scene(body))
+    lines = certify_goals(goals, body, Scene(body))
     there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]
     assert there
     said = "'ball' and 'base' touch on all ways to most others"
@@ -122,4 +123,4 @@ def test_a_certificate_notices_what_is_beyond(tmp_path):
 def test_joints_that_do_not_move_the_tool_part_nothing():
     body = walled(ACROSS)
     (frame,) = body.frames
-    assert barriers(replace(body, frames=(replace(frame, link="cart"),))) == ()
+    assert cspace_components(replace(body, frames=(replace(frame, link="cart"),))) == ()

@@ -7,14 +7,15 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from goal_draws import draw_spec
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
-from morphgen.tasks import film
-from morphgen.tasks.config import PushConfig, ReachConfig
-from morphgen.tasks.film import Stage, moment, require_film, write_film
+from morphgen.tasks import renderer
 from morphgen.tasks.make import make_batch
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.renderer import Moment, Renderer, moment, require_film, write_film
 from morphgen.tasks.robots import robot_of
-from morphgen.tasks.settings import Setting, push_setting, reach_setting
 from morphgen.tasks.sim.base import Block, Scene
 from robots import arm
 
@@ -29,27 +30,47 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reach(cache):
     config = ReachConfig(goals=10)
-    return reach_setting(robot_of("arm3-stick"), config, obstacles=True, seed=0, cache=cache)
+    return draw_spec(robot_of("arm3-stick"), config, obstacles=True, seed=0, cache=cache)
 
 
 @pytest.fixture(scope="module")
 def push(cache):
     config = PushConfig(starts=10)
-    return push_setting(robot_of("prims"), config, obstacles=False, seed=0, cache=cache)
+    return draw_spec(robot_of("prims"), config, obstacles=False, seed=0, cache=cache)
 
 
 @pytest.fixture
 def on():
-    """Put settings on a stage, which is closed at the end of the test."""
-    stages = []
+    """Make renderers, which are closed at the end of the test."""
+    drawn = []
 
-    def of(setting, size=SIZE):
-        stages.append(Stage(setting, size))
-        return stages[-1]
+    def of(spec, size=SIZE):
+        drawn.append(Renderer.of_spec(spec, size))
+        return drawn[-1]
 
     yield of
-    for stage in stages:
-        stage.close()
+    for drawing in drawn:
+        drawing.close()
+
+
+@pytest.fixture
+def plain():
+    """Make renderers of scenes alone, likewise."""
+    made = []
+
+    def of(scene):
+        home = np.array([scene.robot.home])
+        made.append(Renderer(scene, (), home, np.zeros((0, 3)), SIZE))
+        return made[-1]
+
+    yield of
+    for each in made:
+        each.close()
+
+
+def at_goal(spec, i):
+    """The first start, with a goal."""
+    return Moment(spec.goals.q[0], markers={"goal": spec.goals.poses[i]})
 
 
 def changed(a, b):
@@ -58,25 +79,25 @@ def changed(a, b):
 
 
 def test_a_frame_is_of_its_size_and_its_bytes_are_always_the_same(on, reach):
-    stage = on(reach)
-    frame = stage.frame(reach.goals.q[0], goal=reach.goals.poses[1])
+    drawing = on(reach)
+    frame = drawing.frame(at_goal(reach, 1))
     assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
-    stage.frame(reach.goals.q[5])
-    again = [stage.frame(reach.goals.q[0], goal=reach.goals.poses[1])]
-    again.append(on(reach).frame(reach.goals.q[0], goal=reach.goals.poses[1]))
+    drawing.frame(Moment(reach.goals.q[5]))
+    again = [drawing.frame(at_goal(reach, 1))]
+    again.append(on(reach).frame(at_goal(reach, 1)))
     assert all(np.array_equal(frame, each) for each in again)
 
 
 def test_the_robot_is_where_its_joints_are(on, reach):
-    stage = on(reach)
-    a, b = (stage.frame(q) for q in reach.goals.q[:2])
+    drawing = on(reach)
+    a, b = (drawing.frame(Moment(q)) for q in reach.goals.q[:2])
     assert 50 < changed(a, b).sum() < a.size / 6
 
 
 def test_the_goal_is_green_and_only_where_it_is_asked_for(on, reach):
-    stage = on(reach)
-    without = stage.frame(reach.goals.q[0])
-    shown = [stage.frame(reach.goals.q[0], goal=pose) for pose in reach.goals.poses[1:3]]
+    drawing = on(reach)
+    without = drawing.frame(Moment(reach.goals.q[0]))
+    shown = [drawing.frame(at_goal(reach, i)) for i in (1, 2)]
     spots = [changed(without, frame) for frame in shown]
     assert all(8 < spot.sum() < 600 for spot in spots)
     assert not (spots[0] & spots[1]).all()
@@ -85,14 +106,16 @@ def test_the_goal_is_green_and_only_where_it_is_asked_for(on, reach):
 
 
 def test_the_block_is_drawn_where_it_is_and_the_line_on_the_ground(on, push):
-    stage = on(push)
-    start, line = push.pushes.blocks[0], push.pushes.line
-    here = stage.frame(push.pushes.q[0], block=start, line=line)
+    drawing = on(push)
+    start, line, q = push.goals.blocks[0], push.goals.line, push.goals.q[0]
+    x = push.goals.blocks[:, 0]
+    markers = {"line": ((x.min() + x.max()) / 2, line, 0.0, 1.0, 0.0, 0.0, 0.0)}
+    here = drawing.frame(Moment(q, start, markers))
     aside = start.copy()
     aside[1] = line
-    there = stage.frame(push.pushes.q[0], block=aside, line=line)
+    there = drawing.frame(Moment(q, aside, markers))
     assert changed(here, there).sum() > 30
-    no_line = stage.frame(push.pushes.q[0], block=start)
+    no_line = drawing.frame(Moment(q, start))
     strip = changed(here, no_line)
     assert 20 < strip.sum() < 1500
     assert here[strip].mean(axis=0).argmax() == 1
@@ -101,18 +124,17 @@ def test_the_block_is_drawn_where_it_is_and_the_line_on_the_ground(on, push):
 def test_obstacles_are_drawn(on, reach):
     bare = replace(reach, scene=replace(reach.scene, obstacles=()))
     q = reach.goals.q[0]
-    points = on(reach)._stage.points
-    stage = on(bare)
-    stage._camera = film._camera(points, SIZE[0] / SIZE[1])
-    assert changed(on(reach).frame(q), stage.frame(q)).sum() > 50
+    points = on(reach)._model.points
+    drawing = on(bare)
+    drawing._camera = renderer._camera(points, SIZE[0] / SIZE[1])
+    assert changed(on(reach).frame(Moment(q)), drawing.frame(Moment(q))).sum() > 50
 
 
 @pytest.mark.parametrize("name", ["reach", "push"])
 def test_all_that_matters_is_in_view_and_fills_it(name, request):
     """Points are projected here anew, by the position and axes of the camera."""
-    setting = request.getfixturevalue(name)
-    points = film.stage_model(setting).points
-    camera = film._camera(points, 4 / 3)
+    points = Renderer.of_spec(request.getfixturevalue(name))._model.points
+    camera = renderer._camera(points, 4 / 3)
     azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
     flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     forward = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
@@ -121,44 +143,44 @@ def test_all_that_matters_is_in_view_and_fills_it(name, request):
     up = np.cross(right, forward)
     seen = points - (camera.lookat - camera.distance * forward)
     depth = seen @ forward
-    half = np.tan(np.radians(film._FOV / 2))
+    half = np.tan(np.radians(renderer._FOV / 2))
     vertical = seen @ up / depth / half
     across = seen @ right / depth / (half * 4 / 3)
     assert depth.min() > 0
     most = max(np.abs(vertical).max(), np.abs(across).max())
-    assert most == pytest.approx(film._MARGIN, abs=1e-6)
+    assert most == pytest.approx(renderer._MARGIN, abs=1e-6)
 
 
-def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(on):
+def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(plain):
     robot = arm()
     bare = replace(robot, links=tuple(replace(link, visuals=()) for link in robot.links))
-    still = Setting(bare, "reach", Scene(bare, ground=None))
-    a, b = (on(still).frame(q) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
+    still = plain(Scene(bare, ground=None))
+    a, b = (still.frame(Moment(q)) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
     assert changed(a, b).sum() > 50
 
 
-def test_a_scene_without_anything_else_can_be_drawn(on):
+def test_a_scene_without_anything_else_can_be_drawn(plain):
     block = Block((0.2, 0.2, 0.2), Pose((0.2, -0.5, 0.1)), 0.1)
-    stage = on(Setting(arm(), "push", Scene(arm(), block=block)))
-    with_block = stage.frame(arm().home, block=(0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0))
-    assert changed(with_block, stage.frame(arm().home)).sum() > 50
+    drawn = plain(Scene(arm(), block=block))
+    with_block = drawn.frame(Moment(arm().home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
+    assert changed(with_block, drawn.frame(Moment(arm().home))).sum() > 50
 
 
-def test_two_stages_do_not_disturb_each_other(on, reach, push):
+def test_two_renderers_do_not_disturb_each_other(on, reach, push):
     one, other = on(reach), on(push, (100, 80))
-    first = one.frame(reach.goals.q[0])
-    small = other.frame(push.pushes.q[0])
+    first = one.frame(Moment(reach.goals.q[0]))
+    small = other.frame(Moment(push.goals.q[0]))
     assert small.shape == (80, 100, 3)
     other.close()
-    assert np.array_equal(one.frame(reach.goals.q[0]), first)
+    assert np.array_equal(one.frame(Moment(reach.goals.q[0])), first)
 
 
-def test_a_closed_stage_says_so(on, reach):
-    stage = on(reach)
-    stage.close()
-    stage.close()
+def test_a_closed_renderer_says_so(on, reach):
+    drawing = on(reach)
+    drawing.close()
+    drawing.close()
     with pytest.raises(ValueError, match="closed"):
-        stage.frame(reach.goals.q[0])
+        drawing.frame(Moment(reach.goals.q[0]))
 
 
 def test_a_moment_is_an_environment_of_a_batch(cache):
@@ -167,18 +189,18 @@ def test_a_moment_is_an_environment_of_a_batch(cache):
         ["arm3-stick", "prims"],
         2,
         sim="mujoco",
-        reach=ReachConfig(goals=10),
-        push=PushConfig(starts=10),
+        configs=(ReachConfig(goals=10), PushConfig(starts=10)),
         cache=cache,
     )
     batch.reset()
     reaching, pushing = moment(batch, 0), moment(batch, 1)
-    assert set(reaching) == {"q", "goal"}
-    assert set(pushing) == {"q", "block", "line"}
+    assert reaching.block is None
+    assert np.array_equal(pushing.block, batch.simulation.block_pose[1].numpy())
+    assert np.array_equal(reaching.markers["goal"], batch.field("goal")[0].numpy())
     for env, now in enumerate((reaching, pushing)):
-        assert len(now["q"]) == batch.settings[env].robot.dof
-        assert np.array_equal(now["q"], batch.q[env, : len(now["q"])].numpy())
-    assert pushing["line"] == pytest.approx(batch.settings[1].pushes.line)
+        assert len(now.q) == batch.specs[env].robot.dof
+        assert np.array_equal(now.q, batch.q[env, : len(now.q)].numpy())
+    assert pushing.markers["line"][1] == pytest.approx(batch.specs[1].goals.line)
     batch.close()
 
 

@@ -1,0 +1,1 @@
+"""Push: move a block across a line."""

@@ -1,0 +1,120 @@
+"""Environments that push, as tensors: starts, curriculum, rewards and score of every step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.tasks.observation import box_tokens
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.rows import padded_rows, row_norms
+from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
+
+
+class PushEnvs(TaskEnvs):
+    """Environments that push the blocks of their robots' push sets."""
+
+    def __init__(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> None:
+        """Set up with the line at its final position; arguments as of ``Task.make_envs``."""
+        self._config: PushConfig = specs[0].config  # type: ignore[assignment]  # its own type
+        sets: list[PushStartSet] = [each.goals for each in specs]  # type: ignore[misc]
+        device = spec.device
+        self._spec = spec
+        self._count = [len(pushes.q) for pushes in sets]
+        self._q = padded_rows([pushes.q for pushes in sets], num_joints, device)
+        self._blocks = padded_rows([pushes.blocks for pushes in sets], 7, device)
+        self._final_line = torch.tensor([pushes.line for pushes in sets], device=device)[spec]
+        self._size = torch.tensor([pushes.block.size for pushes in sets], device=device)[spec]
+        self._middle = [(np.ptp(s.blocks[:, 0]) / 2 + s.blocks[:, 0].min(), s.ground) for s in sets]
+        self.line = self._final_line.clone()
+        """y that the block must cross now, shape (k,), metres."""
+
+    def begin(
+        self, rows: torch.Tensor, random: Sequence[np.random.Generator]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw starts of the robots' sets: configurations and poses of blocks."""
+        spec = self._spec[rows]
+        drawn = [
+            int(stream.integers(self._count[i]))
+            for stream, i in zip(random, spec.tolist(), strict=True)
+        ]
+        start = torch.tensor(drawn, device=spec.device)
+        return self._q[spec, start], self._blocks[spec, start]
+
+    def evaluate(self, state: TaskState) -> StepResult:
+        """Compare the block with the line."""
+        y = state.block_pose[:, 1]
+        to_go = torch.clamp(self.line - y, min=0)
+        success = (y > self.line) & ~state.unstable
+        approach = row_norms(state.tool - state.block_pose[:, :3])
+        return StepResult(
+            success=success,
+            terminated=success.clone(),
+            distance=to_go,
+            score=success.float(),
+            terms=push_terms(self._config, to_go, approach, state.limit_violation, success),
+        )
+
+    def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the block and the line."""
+        return {"object": box_tokens(block_pose, self._size), "line": self.line[:, None]}
+
+    def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
+        """Return the pose of the line."""
+        x, ground = self._middle[int(self._spec[row])]
+        pose = (x, float(self.line[row]), ground, 1.0, 0.0, 0.0, 0.0)
+        return {"line": np.array(pose, dtype=np.float32)}
+
+    def advance(self, progress: float) -> None:
+        """Move the line as the curriculum has it; see ``curriculum_line``."""
+        self.line = curriculum_line(self._config, self._final_line, progress)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return the position of the line."""
+        return {"line": self.line.clone()}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Put the line where it was."""
+        self.line = state["line"].to(self.line, copy=True)
+
+
+def push_terms(
+    config: PushConfig,
+    to_go: torch.Tensor,
+    approach: torch.Tensor,
+    limit_violation: torch.Tensor,
+    success: torch.Tensor,
+) -> dict[str, torch.Tensor]:
+    """Return the reward terms of push (paper, tables of reward terms).
+
+    Args:
+        config: Weights.
+        to_go: Distance of the block from the line, 0 beyond it, shape (k,), metres.
+        approach: Distance of tool and block, shape (k,), metres.
+        limit_violation: See ``TaskState``, shape (k,).
+        success: Whether the block is across, shape (k,), bool.
+    """
+    return {
+        "joint_limits": -config.joint_limit_weight * limit_violation,
+        "distance": -config.distance_weight * to_go,
+        "approach": -config.approach_weight * approach,
+        "success": config.success_weight * success.float(),
+    }
+
+
+def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
+    """Return the position of the line in a curriculum, shape as ``line``.
+
+    Args:
+        config: The curriculum.
+        line: Final position.
+        progress: Progress of the training, 0 to 1; the line is at its end from 0.5 on.
+    """
+    steps = config.curriculum_steps
+    reached = min(math.floor(2 * progress * steps + 1e-9), steps) / steps
+    return line * (config.curriculum_start + (1 - config.curriculum_start) * reached)

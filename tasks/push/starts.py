@@ -1,0 +1,268 @@
+"""Push sets: poses of a block from which a robot can push it, each with its feasibility proof."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.errors import TaskError
+from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.model.geometry import Pose
+from morphgen.model.robot import Robot
+from morphgen.tasks.certificates import outside_limits
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.push.feasibility import CLOSE, FeasibilityTest, clear_obstacles
+from morphgen.tasks.push.region import Region, draw_blocks, push_region
+from morphgen.tasks.sim.base import Block, Scene
+
+Array = NDArray[np.float64]
+
+TRIES = 30
+"""Poses of the block tried for each start that is needed, before giving up."""
+RESTS = 1e-6
+"""Largest height of a block above the ground that counts as standing on it, metres."""
+
+_CHUNK = 32
+_CONFIGURATIONS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class PushStartSet:
+    """Starts of a robot's episodes of push, and the block and obstacles that they share."""
+
+    start_belongs_to_goal: ClassVar[bool] = True
+    not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "behind", "across"))
+
+    robot: str
+    key: str
+    """Hash of all that the set follows from: 64 hexadecimal digits."""
+    q: Array
+    """Free configurations at the start, shape (S, dof), rad or m."""
+    blocks: Array
+    """Poses of the block then in the world: (x, y, z, qw, qx, qy, qz), shape (S, 7)."""
+    block: Block
+    """A cube; its own pose is that of the first start."""
+    line: float
+    """y that the block's centre must cross, metres."""
+    scale: float
+    """1, or less for robots that reach less than 0.4 m."""
+    ground: float
+    """Height of the ground, metres."""
+    obstacles: tuple[Block, ...]
+    tried: int
+    """Number of poses of the block that were tested."""
+    accepted: int
+    """Number of poses that are proven: S."""
+    seed: int
+    behind: Array
+    """Proofs: free configurations with the tool behind the block, at its height, (S, dof)."""
+    across: Array
+    """Proofs: the same with the tool on the line, where the block's centre is to cross it."""
+
+    @property
+    def goal_poses(self) -> Array:
+        """Poses of the block at the start, shape (S, 7)."""
+        return self.blocks
+
+
+def require_sound(config: PushConfig) -> None:
+    """Require that the constants describe a push.
+
+    Raises:
+        TaskError: If a number is out of its range.
+    """
+    low, high = config.block_size
+    if config.curriculum_steps < 1:
+        raise TaskError(f"a curriculum of {config.curriculum_steps} steps: expected 1 or more")
+    nearest_line = config.line * min(1.0, config.curriculum_start)
+    if not (0 < low <= high < np.inf and config.start < nearest_line and config.start_depth >= 0):
+        raise TaskError(
+            f"a block of {low:g} to {high:g} that starts {config.start_depth:g} below "
+            f"{config.start:g} and is to cross {config.line:g}: sizes are positive, and it starts "
+            "before the line"
+        )
+
+
+def sample_starts(
+    robot: Robot,
+    config: PushConfig,
+    *,
+    obstacles: bool,
+    ground: float,
+    seeds: np.random.SeedSequence,
+    identity: Mapping[str, Any],
+) -> PushStartSet:
+    """Draw a robot's push set; see ``Task.sample``.
+
+    Blocks stand on the ground where ``push_region`` has them, turned at random. A pose counts if
+    nothing that stands still, obstacle or base, is on the straight way along y across the line,
+    and if there are free configurations with the tool behind the block and with the tool on the
+    line, both at the height of the block. Configurations at the start are drawn uniformly within
+    the joint limits; what collides, also with the block, is drawn again.
+
+    Raises:
+        TaskError: If the robot cannot push, too few of the poses tried can be proven, or obstacles
+            stand in the way whatever is drawn.
+        BenchmarkError: If the robot has no tool that moves, or hardly a free configuration.
+        MeshError: If a mesh cannot be read.
+    """
+    of_region, of_proofs, of_places, of_starts, of_obstacles = seeds.spawn(5)
+    region = push_region(robot, config, ground, np.random.default_rng(of_region))
+    edge = region.edge
+    block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
+    placed: tuple[Block, ...] = ()
+    if obstacles:
+        placed = clear_obstacles(robot, config, region, block, ground, of_obstacles)
+    space = FreeSpace(Scene(robot, block=block, obstacles=placed, ground=ground))
+    test = FeasibilityTest(space, region, np.random.default_rng(of_proofs))
+    kept, tried = _proven(robot, config.starts, region, test, ground, of_places)
+    blocks = np.array([each[0] for each in kept])
+    return PushStartSet(
+        q=_starts(space, blocks, of_starts),
+        blocks=blocks,
+        block=replace(block, pose=_pose(blocks[0])),
+        line=region.line,
+        scale=region.scale,
+        ground=ground,
+        obstacles=placed,
+        tried=tried,
+        accepted=len(kept),
+        behind=np.array([each[1] for each in kept]),
+        across=np.array([each[2] for each in kept]),
+        **identity,
+    )
+
+
+def _proven(
+    robot: Robot,
+    wanted: int,
+    region: Region,
+    test: FeasibilityTest,
+    ground: float,
+    seeds: np.random.SeedSequence,
+) -> tuple[list[tuple[Array, Array, Array]], int]:
+    """Return poses of the block with their proofs, and how many were tried."""
+    rng = np.random.default_rng(seeds)
+    kept: list[tuple[Array, Array, Array]] = []
+    refused: Counter[str] = Counter()
+    tried = 0
+    while tried < TRIES * wanted:
+        blocks = draw_blocks(region, ground, _CHUNK, rng)
+        found = test(blocks)
+        for place, room, behind, across in zip(
+            blocks, found.room, found.behind, found.across, strict=True
+        ):
+            tried += 1
+            if not room:
+                refused["something stands in the block's way"] += 1
+            elif not np.isfinite(across).all():
+                refused["the tool does not get to the line at its height"] += 1
+            elif not np.isfinite(behind).all():
+                refused["the tool does not get behind it"] += 1
+            else:
+                kept.append((place, behind, across))
+            if len(kept) == wanted:
+                return kept, tried
+    reasons = ", ".join(f"{why} ({times / tried:.0%})" for why, times in refused.most_common())
+    raise TaskError(
+        f"robot {robot.name!r} can hardly push: only {len(kept)} of {tried:,} places of a block of "
+        f"{region.edge:.3g} m with x in ({region.x[0]:.3g}, {region.x[1]:.3g}) and y in "
+        f"({region.y[0]:.3g}, {region.y[1]:.3g}) are proven (acceptance rate "
+        f"{len(kept) / tried:.2g}), {wanted} are needed; {reasons}"
+    )
+
+
+def _starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> Array:
+    """Return a free configuration for each block, shape (n, dof); they do not depend on n."""
+    found = []
+    for block, child in zip(blocks, seeds.spawn(len(blocks)), strict=True):
+        rng = np.random.default_rng(child)
+        for _ in range(_CONFIGURATIONS):
+            q, _ = space.draw(1, rng)
+            if space.free(q, block[None])[0]:
+                found.append(q[0])
+                break
+        else:
+            raise TaskError(
+                f"robot {space.scene.robot.name!r}: {_CONFIGURATIONS} free configurations all "
+                f"penetrate the block at ({block[0]:.3g}, {block[1]:.3g}, {block[2]:.3g})"
+            )
+    return np.array(found)
+
+
+def _pose(row: Array) -> Pose:
+    x, y, z, *quaternion = row.tolist()
+    return Pose((x, y, z), tuple(quaternion))
+
+
+def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
+    """Test that every block can be pushed across the line, as far as configurations tell.
+
+    Tool positions are MuJoCo's, not those of our kinematics, which the proofs were found with.
+
+    Args:
+        pushes: The set.
+        robot: The robot.
+        scene: Its ground and obstacles; the block is the set's.
+
+    Returns:
+        What is wrong, a line each: a block that does not stand on the ground, is past the line or
+        in what stands still; a configuration out of limits or in collision; a proof whose tool is
+        not behind the block, or not on the line; a set of another robot or other obstacles.
+
+    Raises:
+        FormatError: If MJCF cannot express the robot.
+        MeshError: If a mesh cannot be read.
+    """
+    n = len(pushes.blocks)
+    configurations = {
+        "start": pushes.q,
+        "proof behind": pushes.behind,
+        "proof across": pushes.across,
+    }
+    if any(q.shape != (n, robot.dof) for q in configurations.values()) or pushes.blocks.shape != (
+        n,
+        7,
+    ):
+        shapes = ", ".join(str(q.shape) for q in (*configurations.values(), pushes.blocks))
+        return [f"arrays {shapes} are no starts of robot {robot.name!r} with {robot.dof} joints"]
+    if not all(np.isfinite(q).all() for q in (*configurations.values(), pushes.blocks)):
+        return ["not all numbers are finite"]
+    wrong = []
+    if scene.obstacles != pushes.obstacles:
+        wrong.append("the obstacles of the scene are not those of the push set")
+    for name, q in configurations.items():
+        wrong += [f"start {i}: {name}: {why}" for i, why in outside_limits(robot, q)]
+    space = FreeSpace(replace(scene, robot=robot, block=pushes.block))
+    wrong += _misplaced_blocks(pushes, space)
+    for name, q in configurations.items():
+        free = space.free(q, None if q is pushes.across else pushes.blocks)
+        wrong += [f"start {i}: {name} is in collision" for i in np.flatnonzero(~free).tolist()]
+    return [*wrong, *_misplaced_tools(pushes, robot)]
+
+
+def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
+    edge = pushes.block.size[2]
+    above = pushes.blocks[:, 2] - edge / 2 - pushes.ground
+    for i in np.flatnonzero(np.abs(above) > RESTS).tolist():
+        yield f"start {i}: the block is {above[i]:.2g} m above the ground"
+    for i in np.flatnonzero(pushes.blocks[:, 1] >= pushes.line).tolist():
+        yield f"start {i}: the block is across the line already"
+    for i in np.flatnonzero(~space.room(pushes.blocks)).tolist():
+        yield f"start {i}: the block is in an obstacle or the base"
+
+
+def _misplaced_tools(pushes: PushStartSet, robot: Robot) -> Iterator[str]:
+    tool = MujocoKinematics(robot)
+    behind, across = (tool.frame_pose(q)[:, :3, 3] for q in (pushes.behind, pushes.across))
+    for i, (back, front, block) in enumerate(zip(behind, across, pushes.blocks, strict=True)):
+        if abs(back[0] - block[0]) > CLOSE or back[1] >= block[1]:
+            yield f"start {i}: the tool of its proof is not behind the block"
+        if abs(front[0] - block[0]) > CLOSE or abs(front[1] - pushes.line) > CLOSE:
+            yield f"start {i}: the tool of its proof is not on the line"

@@ -1,0 +1,101 @@
+"""Push as an object behind the protocol of tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.model.robot import Robot
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.push.starts import PushStartSet, certify_starts, require_sound, sample_starts
+from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.task import LINE, OBJECT, EnvSpec, Marker, Task
+
+if TYPE_CHECKING:
+    import torch
+
+    from morphgen.tasks.push.envs import PushEnvs
+
+_LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002
+
+
+class Push(Task[PushConfig, PushStartSet]):
+    """Push a block across a line within 6 s."""
+
+    name = "push"
+    config_type = PushConfig
+    goal_set_type = PushStartSet
+    goal_format = 2
+    cache_folder = "pushes-3"
+    fields = (OBJECT, LINE)
+    moves_fingers = True
+    relative_to_random = False
+    relative_distance = False
+    target = "line"
+    goal_files_readme = """\
+- push: `q` (n, dof) are starts, and `blocks` (n, 7) poses of the block, whose centre must cross
+  y = `line`
+"""
+
+    def check(self, robot: Robot, config: PushConfig) -> None:
+        """Refuse constants that describe no push."""
+        require_sound(config)
+
+    def key_parts(self, config: PushConfig) -> list[object]:
+        """Return the number of starts, and what they are drawn from."""
+        ranges = [*config.block_size, *config.arm_x, *config.free_x]
+        numbers = [config.line, config.start, config.start_depth]
+        numbers += [config.block_mass, config.friction]
+        return [config.starts, [*map(float, ranges), *map(float, numbers)]]
+
+    def sample(
+        self,
+        robot: Robot,
+        config: PushConfig,
+        *,
+        obstacles: bool,
+        ground: float,
+        seeds: np.random.SeedSequence,
+        identity: Mapping[str, Any],
+    ) -> PushStartSet:
+        """Draw poses of the block that can be pushed; see ``sample_starts``."""
+        return sample_starts(
+            robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
+        )
+
+    def certify(self, goals: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
+        """Test every start and its proofs; see ``certify_starts``."""
+        return certify_starts(goals, robot, scene)
+
+    def scene(self, robot: Robot, goals: PushStartSet, ground: float) -> Scene:
+        """Return the scene with the block."""
+        return Scene(robot, block=goals.block, obstacles=goals.obstacles, ground=ground)
+
+    def make_envs(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> PushEnvs:
+        """Make the environments of a batch that push."""
+        from morphgen.tasks.push.envs import PushEnvs
+
+        return PushEnvs(specs, spec, num_joints)
+
+    def episode_score(self, total: float, last: float, steps: int) -> float:
+        """Return 1 for success at the end, else 0."""
+        return last
+
+    def markers(self, config: PushConfig, goals: PushStartSet) -> tuple[Marker, ...]:
+        """Return a strip on the ground as long as the starts of the block are spread, and more."""
+        length = float(np.ptp(goals.blocks[:, 0])) + 4 * max(goals.block.size)
+        return (Marker("line", "box", (length, _LINE_WIDTH, _LINE_HEIGHT)),)
+
+    def points_in_view(self, goals: PushStartSet) -> NDArray[np.float64]:
+        """Return corners of the block at its starts, and where it has crossed the line."""
+        across = goals.blocks[:, :3].copy()
+        across[:, 1] = goals.line
+        signs = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
+        centres = np.concatenate([goals.blocks[:, :3], across])
+        return (centres[:, None] + signs * goals.block.size).reshape(-1, 3)
+
+
+PUSH = Push()

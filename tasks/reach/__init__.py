@@ -1,0 +1,1 @@
+"""Reach: bring the tool to a goal, and keep it there."""

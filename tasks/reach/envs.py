@@ -1,0 +1,100 @@
+"""Environments that reach, as tensors: goals, rewards and score of every step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.errors import TaskError
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.rows import padded_rows, row_norms
+from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
+
+
+class ReachEnvs(TaskEnvs):
+    """Environments that reach for goals of their robots' goal sets."""
+
+    def __init__(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> None:
+        """Set up; arguments as of ``Task.make_envs``.
+
+        Raises:
+            TaskError: If a robot has fewer than two goals.
+        """
+        self._config: ReachConfig = specs[0].config  # type: ignore[assignment]  # its own type
+        self._spec = spec
+        sets = [each.goals for each in specs]
+        for goals in sets:
+            if len(goals.q) < 2:
+                raise TaskError(f"robot {goals.robot!r}: a goal set needs two goals")
+        device = spec.device
+        self._count = [len(goals.q) for goals in sets]
+        self._q = padded_rows([goals.q for goals in sets], num_joints, device)
+        self._poses = padded_rows([goals.goal_poses for goals in sets], 7, device)
+        self.goal = torch.zeros(len(spec), 7, device=device)
+        """Wanted pose of the tool, shape (k, 7)."""
+        self.goal_configuration = torch.zeros(len(spec), num_joints, device=device)
+        """Joint positions that bring the tool to its goal, shape (k, J)."""
+
+    def begin(
+        self, rows: torch.Tensor, random: Sequence[np.random.Generator]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw starts and goals of the robots' sets, never the same one for both."""
+        spec = self._spec[rows]
+        pairs = [
+            stream.choice(self._count[i], size=2, replace=False)
+            for stream, i in zip(random, spec.tolist(), strict=True)
+        ]
+        start, goal = torch.tensor(np.array(pairs), device=spec.device).T
+        self.goal_configuration[rows] = self._q[spec, goal]
+        self.goal[rows] = self._poses[spec, goal]
+        return self._q[spec, start], torch.zeros(len(rows), 7, device=spec.device)
+
+    def evaluate(self, state: TaskState) -> StepResult:
+        """Compare the tool with its goal."""
+        distance = row_norms(state.tool - self.goal[:, :3])
+        return StepResult(
+            success=(distance < self._config.near) & ~state.unstable,
+            terminated=torch.zeros_like(state.unstable),
+            distance=distance,
+            score=anybody_score(self._config, distance),
+            terms=reach_terms(self._config, distance, state.limit_violation, state.acceleration),
+        )
+
+    def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the goal."""
+        return {"goal": self.goal}
+
+    def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
+        """Return the pose of the goal."""
+        return {"goal": np.array(self.goal[row].cpu().numpy())}
+
+
+def reach_terms(
+    config: ReachConfig,
+    distance: torch.Tensor,
+    limit_violation: torch.Tensor,
+    acceleration: torch.Tensor,
+) -> dict[str, torch.Tensor]:
+    """Return the reward terms of reach (paper, tables of reward terms).
+
+    Args:
+        config: Weights and the distance that is near.
+        distance: Distance of tool and goal, shape (k,), metres.
+        limit_violation: See ``TaskState``, shape (k,).
+        acceleration: See ``TaskState``, shape (k,).
+    """
+    return {
+        "joint_limits": -config.joint_limit_weight * limit_violation,
+        "joint_acceleration": -config.joint_acceleration_weight * acceleration,
+        "distance": -config.distance_weight * distance,
+        "near": config.near_weight * (distance < config.near).float(),
+    }
+
+
+def anybody_score(config: ReachConfig, distance: torch.Tensor) -> torch.Tensor:
+    """Return the score of a step, shape (k,): a bonus where near, else the squared distance."""
+    far = -config.score_square * distance.square()
+    return torch.where(distance < config.near, torch.full_like(far, config.score_near), far)

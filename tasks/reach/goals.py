@@ -1,0 +1,146 @@
+"""Goal sets of reach: tool poses that are reachable, each with a configuration that proves it.
+
+The configurations are the starts of episodes, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.formats.mujoco_kinematics import MujocoKinematics
+from morphgen.model.geometry import Pose
+from morphgen.model.kinematics import frame_pose
+from morphgen.model.robot import TOOL, Robot
+from morphgen.tasks.certificates import outside_limits
+from morphgen.tasks.cspace_components import cspace_components, in_other_component
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.obstacles import draw_obstacles
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.sim.base import Block, Scene
+
+Array = NDArray[np.float64]
+
+EXACT = 1e-6
+"""Largest deviation of a goal from the tool of its configuration, metres and of a quaternion."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReachGoalSet:
+    """Goals of a robot, which are its starts too, and the obstacles that they are free of."""
+
+    start_belongs_to_goal: ClassVar[bool] = False
+    not_compared: ClassVar[frozenset[str]] = frozenset(("robot",))
+
+    robot: str
+    key: str
+    """Hash of all that the set follows from: 64 hexadecimal digits."""
+    q: Array
+    """Free configurations in the main component of C-space, shape (G, dof), rad or m."""
+    poses: Array
+    """Of the tool at them in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0, shape (G, 7)."""
+    obstacles: tuple[Block, ...]
+    tried: int
+    """Number of random configurations that were tested."""
+    accepted: int
+    """Number of configurations that became goals: G."""
+    seed: int
+
+    @property
+    def goal_poses(self) -> Array:
+        """Poses of the tool, shape (G, 7)."""
+        return self.poses
+
+
+def sample_goals(
+    robot: Robot,
+    config: ReachConfig,
+    *,
+    obstacles: bool,
+    ground: float,
+    seeds: np.random.SeedSequence,
+    identity: Mapping[str, Any],
+) -> ReachGoalSet:
+    """Draw a robot's goal set; see ``Task.sample``.
+
+    Configurations are drawn uniformly within the joint limits. One that collides, with the ground
+    and obstacles too, is drawn again, and so is one outside of the main component of free C-space
+    (see ``cspace_components``).
+    """
+    of_goals, of_obstacles = (np.random.default_rng(child) for child in seeds.spawn(2))
+    placed: tuple[Block, ...] = ()
+    if obstacles:
+        count, size = config.obstacles, config.obstacle_size
+        placed = draw_obstacles(robot, count, size, of_obstacles, ground=ground)
+    space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
+    planes = cspace_components(robot)
+    q, tried = space.draw(
+        config.goals, of_goals, lambda each: not in_other_component(planes, each).any()
+    )
+    poses = _vectors(frame_pose(robot, q, TOOL))
+    return ReachGoalSet(
+        q=q, poses=poses, obstacles=placed, tried=tried, accepted=len(q), **identity
+    )
+
+
+def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
+    """Test that every goal can be taken.
+
+    Tool poses are MuJoCo's, not those of our kinematics, which the goals are made with.
+
+    Args:
+        goals: The set.
+        robot: The robot.
+        scene: Where it stands, and among which obstacles.
+
+    Returns:
+        What is wrong, a line each: a configuration out of limits, in collision or in another
+        component of C-space, or whose tool is not at the goal; a set of another robot or other
+        obstacles.
+
+    Raises:
+        FormatError: If MJCF cannot express the robot.
+        MeshError: If a mesh cannot be read.
+    """
+    if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
+        return [
+            f"configurations {goals.q.shape} and poses {goals.poses.shape} are no goals of robot "
+            f"{robot.name!r} with {robot.dof} joints"
+        ]
+    wrong = []
+    if scene.obstacles != goals.obstacles:
+        wrong.append("the obstacles of the scene are not those of the goal set")
+    wrong += [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
+    usable = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
+    free = FreeSpace(replace(scene, robot=robot)).free(goals.q[usable])
+    wrong += [f"goal {i}: its configuration is in collision" for i in usable[~free].tolist()]
+    planes = cspace_components(robot)
+    for i in usable[free].tolist():
+        for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
+            a, b = planes[k].pairs[0]
+            wrong.append(f"goal {i}: {a!r} and {b!r} touch on all ways to most others")
+    tools = _vectors(MujocoKinematics(robot).frame_pose(goals.q[usable]))
+    for i, tool in zip(usable.tolist(), tools, strict=True):
+        away, turned = _deviation(goals.poses[i], tool)
+        if not (away <= EXACT and turned <= EXACT):
+            wrong.append(
+                f"goal {i}: the tool of its configuration is {away:.2g} m away, and its quaternion "
+                f"{turned:.2g}"
+            )
+    return wrong
+
+
+def _deviation(a: Array, b: Array) -> tuple[float, float]:
+    """Return the distance of two poses (7,), metres, and of their quaternions up to sign."""
+    turned = min(float(np.linalg.norm(a[3:] - sign * b[3:])) for sign in (1, -1))
+    return float(np.linalg.norm(a[:3] - b[:3])), turned
+
+
+def _vectors(T: Array) -> Array:
+    """Poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
+    poses = [Pose.from_matrix(each) for each in T]
+    return np.array([[*pose.position, *pose.quaternion] for pose in poses]).reshape(len(T), 7)

@@ -1,0 +1,331 @@
+"""What a task is: the protocol behind which reach, push and tasks of other packages stand.
+
+A ``Task`` is one object. It draws the goal sets of robots and certifies them (``sample``,
+``certify``), says what stands in the scene (``scene``), and makes ``TaskEnvs``, which hold the
+goals of a batch's environments at this task and evaluate every step of them as tensors.
+``morphgen.tasks.registry`` knows tasks by their names.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.model.robot import Robot
+from morphgen.model.rotation import Vec3
+from morphgen.tasks.sim.base import Block, Scene
+
+if TYPE_CHECKING:  # goals are drawn by processes that need no torch, which takes seconds to load
+    import torch
+
+Array = NDArray[np.float64]
+
+
+class TaskConfig(Protocol):
+    """Constants of a task: a frozen dataclass whose fields all have defaults."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    task: ClassVar[str]
+    """Name of the task."""
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode at most."""
+
+    @property
+    def obstacles(self) -> int:
+        """Number of boxes among which robots work if obstacles are asked for."""
+
+    @property
+    def obstacle_size(self) -> tuple[float, float]:
+        """Range of the edges of these boxes, relative to the robot's reach."""
+
+    @property
+    def num_goals(self) -> int:
+        """Number of goals in a robot's goal set."""
+
+    def with_num_goals(self, num_goals: int) -> TaskConfig:
+        """Return the same constants with another number of goals."""
+
+
+class GoalSet(Protocol):
+    """Starts and goals of a robot's episodes: a frozen dataclass of arrays, boxes and numbers."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    start_belongs_to_goal: ClassVar[bool]
+    """Whether a goal is the same as another only if the configurations at the start are, too."""
+    not_compared: ClassVar[frozenset[str]]
+    """Fields that an audit certifies, and does not compare with those of a set drawn anew."""
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+
+    @property
+    def key(self) -> str:
+        """Hash of all that the set follows from: 64 hexadecimal digits."""
+
+    @property
+    def q(self) -> Array:
+        """Configurations at the start of episodes, shape (G, dof), rad or m."""
+
+    @property
+    def goal_poses(self) -> Array:
+        """A pose for each goal by which goals are told apart, shape (G, 7), xyz and wxyz."""
+
+    @property
+    def obstacles(self) -> tuple[Block, ...]:
+        """Boxes in the robot's workspace."""
+
+    @property
+    def tried(self) -> int:
+        """Number of candidates that were tested."""
+
+    @property
+    def accepted(self) -> int:
+        """Number of candidates that became goals: G."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of all that was drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class EnvSpec:
+    """A kind of environment: robot, task, scene, and the goal set that episodes draw from."""
+
+    robot: Robot
+    task: str
+    """Name of the task."""
+    scene: Scene
+    """The robot with its ground, obstacles and block; it stands at the origin."""
+    goals: GoalSet
+    config: TaskConfig
+    """Constants of the task."""
+
+
+@dataclass(frozen=True)
+class ObservationField:
+    """An entry of an observation: a vector for each environment whose task has it, else zeros."""
+
+    name: str
+    size: int
+    """Length of the vector."""
+    mask: str
+    """Entry that says which environments have the field, shape (n,), bool."""
+
+
+GOAL = ObservationField("goal", 7, "goal_mask")
+"""Wanted pose of the tool in the root frame: x, y, z, qw, qx, qy, qz."""
+OBJECT = ObservationField("object", 13, "object_mask")
+"""The block, as ``observation.box_tokens`` has it."""
+LINE = ObservationField("line", 1, "object_mask")
+"""y that the block must cross, metres."""
+STANDARD_FIELDS = (GOAL, OBJECT, LINE)
+"""Fields that every observation has, so that a policy fits batches of all tasks that use them."""
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A shape that a renderer draws to show a goal; it follows a pose and touches nothing."""
+
+    name: str
+    shape: Literal["frame", "box"]
+    """``frame``: axes inside a translucent ball. ``box``: a box."""
+    size: Vec3
+    """Edges of the box, or diameters of the ball, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class TaskState:
+    """What a step is evaluated by: rows of k environments; positions in the root frame."""
+
+    tool: torch.Tensor
+    """Position of the tool, shape (k, 3), metres."""
+    block_pose: torch.Tensor
+    """Pose of the block, shape (k, 7); zeros if there is none."""
+    limit_violation: torch.Tensor
+    """Sum over joints of how far they are outside of their limits, shape (k,), rad and m."""
+    acceleration: torch.Tensor
+    """Sum over joints of the absolute mean acceleration in the step, shape (k,)."""
+    unstable: torch.Tensor
+    """Whether the simulation diverged, shape (k,), bool; such a step is never a success."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """How a step went: rows of k environments."""
+
+    success: torch.Tensor
+    """Shape (k,), bool."""
+    terminated: torch.Tensor
+    """Whether the task ends the episode, shape (k,), bool."""
+    distance: torch.Tensor
+    """Distance from success, shape (k,), metres."""
+    score: torch.Tensor
+    """Score of the step, shape (k,); see ``Task.episode_score``."""
+    terms: dict[str, torch.Tensor]
+    """Weighted reward terms by name, each of shape (k,); the reward is their sum."""
+
+
+class TaskEnvs(ABC):
+    """The environments of one task in a batch, k rows; all methods but ``begin`` loop over none."""
+
+    @abstractmethod
+    def begin(
+        self, rows: torch.Tensor, random: Sequence[np.random.Generator]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Begin episodes.
+
+        Args:
+            rows: Environments whose episodes begin, shape (m,), int64, each from 0 to k - 1.
+            random: A stream of random numbers for each of these.
+
+        Returns:
+            Joint positions at the start, shape (m, J), and poses of the block, shape (m, 7), zeros
+            if there is none.
+        """
+
+    @abstractmethod
+    def evaluate(self, state: TaskState) -> StepResult:
+        """Return how a step went, and move on whatever follows time."""
+
+    @abstractmethod
+    def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the task's observation fields by name, each of shape (k, size).
+
+        Args:
+            block_pose: Pose of the block, shape (k, 7).
+        """
+
+    def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
+        """Return the pose of each of the task's markers in an environment, shape (7,) each."""
+        return {}
+
+    def advance(self, progress: float) -> None:
+        """Follow the curriculum, if there is one; progress of the training is from 0 to 1."""
+        return
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return what the next episodes follow from, besides random numbers; k rows each."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Take over what ``state_dict`` returned."""
+        return
+
+
+C = TypeVar("C", bound=TaskConfig)
+G = TypeVar("G", bound=GoalSet)
+
+
+class Task(ABC, Generic[C, G]):
+    """A task; the class attributes describe it to commands, evaluation and viewer."""
+
+    name: str
+    """Name in the registry, in splits and on the command line: lower-case letters and digits."""
+    config_type: type[C]
+    goal_set_type: type[G]
+    goal_format: int
+    """Version of ``sample``, part of every key; raise it when other sets are drawn."""
+    cache_folder: str
+    """Name of the folder of goal sets in the user's cache."""
+    fields: tuple[ObservationField, ...]
+    """Observation fields that the task fills."""
+    moves_fingers: bool = False
+    """Whether actions move joints beyond the tool, too."""
+    discrete_actions: bool = False
+    """Whether agents act by bins unless asked for numbers."""
+    relative_to_random: bool = True
+    """Whether the reported score is what is above that of the random policy."""
+    relative_distance: bool = True
+    """Whether the distance at the end is also reported relative to the robot's reach."""
+    target: str = "goal"
+    """Noun for what ``StepResult.distance`` is the distance from."""
+    goal_files_readme: str = ""
+    """Lines of Markdown that explain the arrays of a stored goal set."""
+
+    @abstractmethod
+    def sample(
+        self,
+        robot: Robot,
+        config: C,
+        *,
+        obstacles: bool,
+        ground: float,
+        seeds: np.random.SeedSequence,
+        identity: Mapping[str, Any],
+    ) -> G:
+        """Draw a robot's goal set.
+
+        Args:
+            robot: The robot, with a tool.
+            config: Constants of the task.
+            obstacles: Whether there are obstacles.
+            ground: Height of the ground in the root frame, metres.
+            seeds: Where all random numbers come from.
+            identity: The fields ``robot``, ``key`` and ``seed`` of the set.
+
+        Raises:
+            BenchmarkError: If the robot cannot have such a set; the message says why.
+            TaskError: Likewise.
+        """
+
+    @abstractmethod
+    def certify(self, goals: G, robot: Robot, scene: Scene) -> list[str]:
+        """Test the goals of a set; return what is wrong, a line each.
+
+        Args:
+            goals: The set.
+            robot: The robot.
+            scene: Where it stands, with the obstacles of the set.
+        """
+
+    @abstractmethod
+    def make_envs(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> TaskEnvs:
+        """Make the environments of a batch that are at this task.
+
+        Args:
+            specs: Kinds of environments, all at this task.
+            spec: Index of each environment's kind, shape (k,), int64, on the batch's device.
+            num_joints: Independent joints of a row, padding included, J.
+        """
+
+    def check(self, robot: Robot, config: C) -> None:
+        """Refuse constants or robots that have no goal set, before anything is drawn.
+
+        Raises:
+            TaskError: If a constant is out of its range.
+            BenchmarkError: If the robot's tool does not move.
+        """
+
+    def key_parts(self, config: C) -> list[object]:
+        """Return what the goal set follows from besides robot, obstacles, seed and ground."""
+        return [config.num_goals]
+
+    def scene(self, robot: Robot, goals: G, ground: float) -> Scene:
+        """Return the scene of an environment."""
+        return Scene(robot, obstacles=goals.obstacles, ground=ground)
+
+    def episode_score(self, total: float, last: float, steps: int) -> float:
+        """Return the score of an episode: the mean of its steps' scores.
+
+        Args:
+            total: Sum of the steps' scores.
+            last: Score of the last step.
+            steps: Number of steps.
+        """
+        return total / steps
+
+    def markers(self, config: C, goals: G) -> tuple[Marker, ...]:
+        """Return the shapes that show a robot's goal."""
+        return ()
+
+    def points_in_view(self, goals: G) -> Array:
+        """Return points that a camera should see besides robot and obstacles, shape (m, 3)."""
+        return goals.goal_poses[:, :3]

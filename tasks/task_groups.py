@@ -1,0 +1,213 @@
+"""The environments of a batch, grouped by task: each task sees rows of its own alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.errors import TaskError
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import (
+    STANDARD_FIELDS,
+    EnvSpec,
+    StepResult,
+    Task,
+    TaskEnvs,
+    TaskState,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StepRows(StepResult):
+    """How a step went, for all environments of a batch."""
+
+    reward: torch.Tensor
+    """Sum of the terms, shape (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """The environments of one task."""
+
+    task: Task[Any, Any]
+    envs: TaskEnvs
+    rows: torch.Tensor
+    """Indices of its environments in the batch, shape (k,), int64."""
+
+
+class TaskGroups:
+    """The environments of a batch by task; tensors of the batch have n rows."""
+
+    def __init__(self, specs: Sequence[EnvSpec], body: torch.Tensor, num_joints: int) -> None:
+        """Group environments.
+
+        Args:
+            specs: Specifications.
+            body: Index of each environment's specification, shape (n,), int64.
+            num_joints: Independent joints of a row, padding included.
+
+        Raises:
+            TaskError: If a task is unknown or has different constants in the batch.
+        """
+        n, device = len(body), body.device
+        used = [specs[i] for i in body.tolist()]
+        self._groups: dict[str, _Group] = {}
+        self._row = torch.zeros(n, dtype=torch.int64, device=device)
+        """Row of each environment in its group."""
+        self.longest = torch.zeros(n, dtype=torch.int64, device=device)
+        """Control steps of an episode at most, shape (n,)."""
+        self.moves_fingers = torch.zeros(n, dtype=torch.bool, device=device)
+        """Whether actions move joints beyond the tool, shape (n,)."""
+        for name in dict.fromkeys(spec.task for spec in used):
+            own = [i for i, spec in enumerate(specs) if spec.task == name]
+            task, config = TASKS[name], specs[own[0]].config
+            if any(specs[i].config != config for i in own):
+                raise TaskError(f"environments at {name} have different constants; expected one")
+            of_spec = torch.zeros(len(specs), dtype=torch.int64)
+            of_spec[own] = torch.arange(len(own))
+            does = torch.tensor([spec.task == name for spec in used], device=device)
+            rows = torch.nonzero(does)[:, 0]
+            spec = of_spec.to(device)[body[rows]]
+            envs = task.make_envs([specs[i] for i in own], spec, num_joints)
+            self._groups[name] = _Group(task, envs, rows)
+            self._row[rows] = torch.arange(len(rows), device=device)
+            self.longest[rows] = config.steps
+            self.moves_fingers[rows] = task.moves_fingers
+        every = (field for group in self._groups.values() for field in group.task.fields)
+        self._fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *every)))
+        self.masks = {
+            mask: torch.zeros(n, dtype=torch.bool, device=device)
+            for mask in dict.fromkeys(field.mask for field in self._fields)
+        }
+        """Which environments have the fields of a mask, shape (n,) each."""
+        for group in self._groups.values():
+            for field in group.task.fields:
+                self.masks[field.mask][group.rows] = True
+
+    def __getitem__(self, task: str) -> TaskEnvs:
+        """Return the environments of a task."""
+        return self._groups[task].envs
+
+    def does(self, task: str) -> torch.Tensor:
+        """Return which environments are at a task, shape (n,), bool."""
+        does = torch.zeros_like(self.moves_fingers)
+        if task in self._groups:
+            does[self._groups[task].rows] = True
+        return does
+
+    def begin(
+        self, envs: torch.Tensor, random: Sequence[np.random.Generator]
+    ) -> Iterator[tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]]:
+        """Begin episodes.
+
+        Args:
+            envs: Environments whose episodes begin, shape (m,), int64.
+            random: A stream of random numbers for each environment of the batch.
+
+        Yields:
+            For each task, which rows of ``envs`` it has, and what ``TaskEnvs.begin`` returns.
+        """
+        for name, group in self._groups.items():
+            rows = torch.nonzero(self.does(name)[envs])[:, 0]
+            if len(rows):
+                own = envs[rows]
+                streams = [random[i] for i in own.tolist()]
+                yield rows, group.envs.begin(self._row[own], streams)
+
+    def evaluate(self, state: TaskState) -> StepRows:
+        """Evaluate a step of all environments."""
+        results = [
+            (group.rows, group.envs.evaluate(self._of(group, state)))
+            for group in self._groups.values()
+        ]
+        rewards = [torch.stack(list(each.terms.values())).sum(dim=0) for _, each in results]
+        if len(results) == 1:
+            return StepRows(**vars(results[0][1]), reward=rewards[0])
+        rows = [rows for rows, _ in results]
+        each = [result for _, result in results]
+        names = dict.fromkeys(name for result in each for name in result.terms)
+        none = [torch.zeros_like(result.distance) for result in each]
+        return StepRows(
+            success=self._scattered(rows, [result.success for result in each]),
+            terminated=self._scattered(rows, [result.terminated for result in each]),
+            distance=self._scattered(rows, [result.distance for result in each]),
+            score=self._scattered(rows, [result.score for result in each]),
+            terms={
+                name: self._scattered(
+                    rows, [r.terms.get(name, zero) for r, zero in zip(each, none, strict=True)]
+                )
+                for name in names
+            },
+            reward=self._scattered(rows, rewards),
+        )
+
+    def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the observation fields of all tasks, shape (n, size) each, in own memory.
+
+        Args:
+            block_pose: Pose of the block, shape (n, 7); zeros if there is none.
+        """
+        n = len(self._row)
+        values = {
+            field.name: torch.zeros(n, field.size, device=self._row.device)
+            for field in self._fields
+        }
+        for group in self._groups.values():
+            alone = len(self._groups) == 1
+            seen = group.envs.observe(block_pose if alone else block_pose[group.rows])
+            for name, own in seen.items():
+                if alone:
+                    values[name] = own.clone()
+                else:
+                    values[name][group.rows] = own
+        return values
+
+    def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:
+        """Return the pose of each marker of an environment's task, shape (7,) each."""
+        group = next(group for group in self._groups.values() if bool((group.rows == env).any()))
+        return group.envs.marker_poses(int(self._row[env]))
+
+    def advance(self, progress: float) -> None:
+        """Follow the curricula; progress of the training is from 0 to 1."""
+        for group in self._groups.values():
+            group.envs.advance(progress)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return the states of the tasks, n rows each, zero where another task is."""
+        state: dict[str, torch.Tensor] = {}
+        for group in self._groups.values():
+            for name, values in group.envs.state_dict().items():
+                state.setdefault(name, values.new_zeros(len(self._row), *values.shape[1:]))
+                state[name][group.rows] = values
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over what ``state_dict`` returned."""
+        for group in self._groups.values():
+            own = {
+                name: state[name].to(self._row.device)[group.rows]
+                for name in group.envs.state_dict()
+            }
+            group.envs.load_state_dict(own)
+
+    def _of(self, group: _Group, state: TaskState) -> TaskState:
+        """Return the rows of a group."""
+        if len(self._groups) == 1:
+            return state
+        return TaskState(
+            **{each.name: getattr(state, each.name)[group.rows] for each in fields(state)}
+        )
+
+    def _scattered(
+        self, rows: Sequence[torch.Tensor], values: Sequence[torch.Tensor]
+    ) -> torch.Tensor:
+        """Put values of the groups into the rows of the batch, shape (n,)."""
+        whole = values[0].new_empty(len(self._row))
+        for own, value in zip(rows, values, strict=True):
+            whole[own] = value
+        return whole
