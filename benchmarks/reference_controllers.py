@@ -35,7 +35,7 @@ from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.processes import mapped
 from morphgen.rl.names import references_for
-from morphgen.rl.references import Random, Zero
+from morphgen.rl.references import Random, Zero, reference
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import member_spec
