@@ -172,6 +172,8 @@ def config_from(data: object) -> RunConfig:
         raise TaskError("run: expected a table")
     own = {key: value for key, value in data.items() if key not in ("format", "morphgen")}
     constants = {name: own.pop(name) for name in list(own) if name in TASKS}
+    if "tasks" in own:  # a field, but in files each task has an entry of its own
+        raise TaskError("run: unknown entry 'tasks'")
     require_fields(RunConfig, own, "run")
     for name in TASKS.builtin:
         if name not in constants:

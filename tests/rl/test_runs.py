@@ -291,7 +291,7 @@ def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
 
 
 def test_a_source_of_neither_a_split_nor_a_robot_at_a_task_is_refused():
-    config = asdict(small_config())
+    config = small_config().as_data()
     config["source"]["task"] = None
     source = config_from(json.loads(json.dumps(config))).source
     with pytest.raises(

@@ -106,6 +106,33 @@ def test_an_episode_is_what_a_viewer_can_be_started_for(episode, places, root, m
     assert target_address(("episode.npz",), places) == Address("play", ("episode.npz",))
 
 
+def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, places, root):
+    for extra, marker in ((None, "goal"), (0.2, "line")):
+        path = root / "first.npz"
+        path.write_bytes(episode_bytes(episode))
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays["about"])) | {"format": 1}
+        block = np.tile(np.array([0.3, -0.2, 0.1, 1, 0, 0, 0], dtype=np.float32), (301, 1))
+        for i, row in enumerate(about["bodies"]):
+            del row["markers"]
+            row["line"], goal = extra, arrays.pop(f"{i}/goal")
+            if extra is None:
+                arrays[f"{i}/goal"] = goal[0]
+            else:
+                row["block"], arrays[f"{i}/block"] = [0.2, 0.2, 0.2], block
+        np.savez(path, **(arrays | {"about": np.array(json.dumps(about))}))
+        track = read_episode(path, places).tracks[0]
+        (shown,) = track.markers
+        assert (shown.name, len(track.marker_poses[marker])) == (marker, 301)
+        if extra is None:
+            expected = episode.tracks[0]
+            assert shown == expected.markers[0]
+            assert np.array_equal(track.marker_poses["goal"], expected.marker_poses["goal"])
+        else:
+            assert track.marker_poses["line"][0][:3] == pytest.approx((0.3, 0.2, 0.0))
+
+
 def test_an_episode_at_its_start_can_be_saved(places, root, cache):
     rollout = Rollout(Wanted("reach", ("robots/one",), "zero"), places)
     (root / "start.npz").write_bytes(episode_bytes(rollout.episode))
@@ -129,10 +156,10 @@ def changed(path, **arrays):
         ({"about": None}, "is no episode of morphgen view"),
         ({"about": np.array("{")}, "is no episode of morphgen view"),
         ({"about": np.array('{"format": 9, "task": "reach"}')}, "format 9"),
-        ({"0_q": None}, "0/q"),
+        ({"0_q": None}, "'q'"),
         ({"0_q": np.zeros(3)}, "expected"),
         ({"0_q": np.zeros((301, 1))}, "q has shape"),
-        ({"0_goal": np.full(7, np.nan)}, "goal is not finite"),
+        ({"0_goal": np.full((301, 7), np.nan)}, "goal is not finite"),
         ({"0_score": np.zeros(2)}, "score has shape"),
     ],
 )

@@ -1,0 +1,61 @@
+"""Examples run, and a task that is outside of morphgen does all that its own tasks do."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morphgen.cli import main
+from morphgen.grammar.library import default_library
+from morphgen.tasks.registry import TASKS
+from morphgen.viewer.address import Address
+from morphgen.viewer.episode import episode_bytes, read_episode
+from morphgen.viewer.places import Places
+from morphgen.viewer.play_choices import wanted_of
+from morphgen.viewer.play_files import recording
+from morphgen.viewer.rollout import Rollout, Wanted
+
+CUSTOM_TASK = Path(__file__).parents[1] / "examples" / "custom_task.py"
+RUN = "runs/planar-cube-follow/se/seed0"
+
+
+@pytest.fixture
+def follow(monkeypatch, tmp_path):
+    """Register the example's task for one test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
+    spec = importlib.util.spec_from_file_location("custom_task", CUSTOM_TASK)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "custom_task", module)
+    spec.loader.exec_module(module)
+
+
+def test_a_task_outside_of_the_package_trains_plays_and_is_shown(follow, tmp_path, capsys):
+    assert len(CUSTOM_TASK.read_text(encoding="utf-8").splitlines()) < 150
+    few = ("--steps", "512", "--envs", "4", "--set", "minibatches=4", "--no-tensorboard")
+    robot, sim = "planar-cube", ("--sim", "mujoco")
+    assert main(["train", robot, "task=follow", "--agent", "se", *sim, *few]) == 0
+    assert main(["eval", RUN, "--episodes", "1"]) == 0
+    assert "follow" in capsys.readouterr().out
+    assert main(["play", "follow", robot, "--policy", RUN, *sim]) == 0
+    assert "m from the goal" in capsys.readouterr().out
+    assert main(["goals", robot, "--task", "follow", "--certify"]) == 0
+
+    places = Places(default_library().folders, (tmp_path,), tmp_path / "none")
+    assert wanted_of(Address("play", ("follow",)), []).task == "follow"
+    rollout = Rollout(Wanted("follow", ("words:base=planar ee=cube",), RUN), places)
+    while rollout.advance():
+        pass
+    rollout.close()
+    (track,) = rollout.episode.tracks
+    assert track.steps == 200
+    goals = np.array(track.marker_poses["goal"])
+    assert goals.shape == (201, 7)
+    assert np.linalg.norm(goals[100, :2] - goals[0, :2]) == pytest.approx(0.1, abs=1e-3)
+    (tmp_path / "episode.npz").write_bytes(episode_bytes(rollout.episode))
+    read = read_episode(tmp_path / "episode.npz", places).tracks[0]
+    assert np.array_equal(read.marker_poses["goal"], goals)
+    assert recording(rollout.episode)
