@@ -34,7 +34,8 @@ from morphgen.benchmark.split import SIDES, Member
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.processes import mapped
-from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.baselines.simple import Random, Zero
+from morphgen.rl.references import InverseKinematics
 from morphgen.rl.rollouts import run_episodes
 from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.batch import TaskBatch

@@ -16,11 +16,11 @@ from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.model import SUFFIX
-from morphgen.rl.names import REFERENCES, references_for
-from morphgen.rl.play import controller, demands, require_policy
+from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.play import controller, interface_of, require_policy
+from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
-from morphgen.rl.sources import members
 from morphgen.tasks.batch import Step
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.film import moment
@@ -167,8 +167,8 @@ def policy_file(policy: str, task: Task, places: Places) -> str:
         TaskError: If there is none of that name, or it is for the other task.
         PlaceError: If it is a file that may not be looked at.
     """
-    if policy not in REFERENCES:
-        return str(_checkpoint_file(policy, references_for(task), places))
+    if policy not in BASELINES:
+        return str(_checkpoint_file(policy, baselines_for(task), places))
     require_policy(policy, task)
     return policy
 
@@ -202,7 +202,7 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
     Raises:
         MorphgenError: If it is no checkpoint, or its robot has no parts to be made of.
     """
-    source = read_checkpoint(_checkpoint_file(policy, REFERENCES, places))[0].source
+    source = read_checkpoint(_checkpoint_file(policy, BASELINES, places))[0].source
     rows = members(source)
     if rows:
         named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]
@@ -222,7 +222,7 @@ def trained_with(policy: str, places: Places) -> tuple[Task, bool, list[tuple[st
 def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
     read = read_place(place, places)
     body = as_primitives(as_in_library(read, places.library), places.folders)
-    seen = demands(policy)
+    seen = interface_of(policy)
     env = {"reach": ReachEnv, "push": PushEnv}[wanted.task](
         body,
         sim=wanted.simulator,

@@ -10,7 +10,8 @@ import morphgen
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL
-from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.baselines.simple import Random, Zero
+from morphgen.rl.references import InverseKinematics
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import BINS, ReachConfig

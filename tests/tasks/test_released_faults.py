@@ -12,7 +12,7 @@ import torch
 
 import morphgen
 from morphgen.model.dynamics import actuation
-from morphgen.rl.references import Random
+from morphgen.rl.baselines.simple import Random
 from morphgen.tasks.config import PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import batch_of

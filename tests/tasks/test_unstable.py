@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 
-from morphgen.rl.references import Random
+from morphgen.rl.baselines.simple import Random
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import Channels
 from morphgen.tasks.config import PushConfig, ReachConfig
