@@ -57,9 +57,10 @@ from tqdm import tqdm
 
 from morphgen.benchmark.tokens import MAX_LINKS, TOKEN_SIZE
 from morphgen.model.robot import Robot
+from morphgen.rl.agents import mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.heads import START
-from morphgen.rl.policies import MLP, layout_of
+from morphgen.rl.heads import INITIAL_LOG_STD
+from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.ppo import Learner
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.config import BINS
@@ -70,7 +71,8 @@ Update = Callable[[], tuple[float, float]]
 Row = dict[str, str | int | float]
 
 SE = PolicyConfig("se", discrete=False)
-PLAIN = PPOConfig(transitions=10**9, symlog=False, slow_critic=False)
+SIZES = mlp.Config()
+PLAIN = PPOConfig(total_timesteps=10**9, symlog=False, slow_critic=False)
 ROBOTS, OBSTACLES = 10, 3
 """Of the random rollouts."""
 
@@ -127,7 +129,7 @@ def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Itera
             stack.callback(single.close)
             updates["stable-baselines3, own MLP, Gymnasium"] = _peer(single, None)
         found = _measured(updates, rounds, f"{sim}, {threads} threads")
-    made = PLAIN.steps * envs
+    made = PLAIN.num_steps * envs
     ours = sum(found["morphgen"])
     for name, (collecting, learning) in found.items():
         yield {
@@ -176,21 +178,21 @@ def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
             "net_arch": [],
         }
     else:
-        layers = [SE.mlp_width] * SE.mlp_layers
+        layers = [SIZES.mlp_width] * SIZES.mlp_layers
         network = {"net_arch": {"pi": layers, "vf": layers}}
     model = PPO(
         "MultiInputPolicy",
         envs,
         learning_rate=PLAIN.learning_rate,
-        n_steps=PLAIN.steps,
-        batch_size=PLAIN.minibatch(envs.num_envs),
+        n_steps=PLAIN.num_steps,
+        batch_size=PLAIN.minibatch_size(envs.num_envs),
         n_epochs=PLAIN.epochs,
         gamma=PLAIN.gamma,
-        gae_lambda=PLAIN.lam,
-        clip_range=PLAIN.clip,
-        ent_coef=PLAIN.entropy,
-        max_grad_norm=PLAIN.gradient_clip,
-        policy_kwargs={**network, "log_std_init": START},
+        gae_lambda=PLAIN.gae_lambda,
+        clip_range=PLAIN.clip_coef,
+        ent_coef=PLAIN.ent_coef,
+        max_grad_norm=PLAIN.max_grad_norm,
+        policy_kwargs={**network, "log_std_init": INITIAL_LOG_STD},
         seed=0,
         device="cpu",
     )
@@ -211,7 +213,7 @@ def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
 
     def update() -> tuple[float, float]:
         began = time.perf_counter()
-        model.learn(PLAIN.steps * envs.num_envs, reset_num_timesteps=False)
+        model.learn(PLAIN.num_steps * envs.num_envs, reset_num_timesteps=False)
         return time.perf_counter() - began - spent, spent
 
     return update
@@ -245,11 +247,11 @@ def _extractor() -> type[Any]:
 
     class Extractor(BaseFeaturesExtractor):
         def __init__(self, space: Any, like: Observation) -> None:  # noqa: ANN401
-            super().__init__(space, SE.mlp_width)
+            super().__init__(space, SIZES.mlp_width)
             self.kinds = {name: (each.dtype, each.shape[1:]) for name, each in like.items()}
-            self.network = MLP(SE, layout_of(like), 1, per_link=False)
+            self.network = mlp.Network(SE, layout_of(like), 1, per_link=False)
             self.network.leave = cast(torch.nn.Linear, torch.nn.Identity())
-            self.network.shape = (SE.mlp_width,)
+            self.network.shape = (SIZES.mlp_width,)
 
         def forward(self, seen: Observation) -> torch.Tensor:
             restored = {}
@@ -271,13 +273,13 @@ def _learners(device: str, envs: int, rounds: int) -> list[Row]:
     updates: dict[str, Update] = {}
     settings = list(product((False, True), repeat=2))
     for bf16, compiled in settings:
-        config = PPOConfig(transitions=10**9, bf16=bf16, compile=compiled)
+        config = PPOConfig(total_timesteps=10**9, bf16=bf16, compile=compiled)
         batch = cast(TaskBatch, _RandomBatch(envs, device))
         learner = Learner(batch, PolicyConfig("me-tf"), config, device=device)
         updates[f"{bf16} {compiled}"] = partial(_own_update, learner)
     found = _measured(updates, rounds, device)
     config = PPOConfig()
-    samples = config.steps * envs * config.epochs
+    samples = config.num_steps * envs * config.epochs
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else device
     return [
         {

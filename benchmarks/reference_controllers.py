@@ -35,8 +35,8 @@ from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import mapped
-from morphgen.rl.names import references_for
-from morphgen.rl.references import Random, Zero, reference
+from morphgen.rl.baselines import baselines_for, make_baseline
+from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import member_spec
@@ -67,7 +67,7 @@ class Measuring:
         row: Row = {"robot": member.name, "task": member.task}
         for sim in self.sims:
             with closing(batch_of([spec], self.envs, sim=sim)) as batch:
-                acting = reference(references_for(member.task)[0], batch, 0)
+                acting = make_baseline(baselines_for(member.task)[0], batch, 0)
                 good = run_episodes(batch, acting, self.episodes)
                 chance = run_episodes(batch, Random(0), self.episodes)
                 row[f"{sim} reference"] = mean(episode.success for episode in good)

@@ -1,4 +1,4 @@
-"""What a checkpoint says of its learner: checked before anything is made of it."""
+"""Check the content of a checkpoint before anything is built from it."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.policies import Layout, layout_from, make_networks
+from morphgen.rl.agents import require_agent
+from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from
+from morphgen.rl.observation_layout import Layout, layout_from
+from morphgen.rl.policies import make_networks
 
 MAX_ROWS = 100_000
-"""Links, obstacles or points of an observation; numbers of a token."""
+"""Largest number of links, obstacles or points of an observation, and of numbers of a token."""
 _KINDS: Mapping[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("actor", "critic", "optimiser", "generators", "batch"), dict),
     **dict.fromkeys(("layout", "policy", "config"), dict),
     **dict.fromkeys(("update", "updates"), int),
-    "share": (int, float),
+    "actor_lr_scale": (int, float),
     "device": str,
 }
-"""Entries of every learner, and of which kind they are."""
+"""Entries of every learner, and their types."""
 
 
 def require_fields(made: type, data: object, where: str) -> None:
     """Require that stored values fit the fields of a dataclass.
 
     Args:
-        made: The dataclass; its fields that are dataclasses are not looked into.
-        data: What is stored of it.
-        where: Its place, for messages.
+        made: The dataclass; its fields that are dataclasses themselves are not checked.
+        data: The stored values.
+        where: Place of the values, for messages.
 
     Raises:
         TaskError: If a field is unknown or missing, or its value of another type.
@@ -54,15 +56,31 @@ def require_fields(made: type, data: object, where: str) -> None:
             raise TaskError(f"{where}: no {name}")
 
 
+def require_policy(data: object, where: str) -> None:
+    """Require that stored values fit a policy config, and the sizes of its agent's networks.
+
+    Raises:
+        TaskError: If the agent is unknown, or as ``require_fields``.
+    """
+    require_fields(PolicyConfig, data, where)
+    assert isinstance(data, Mapping)
+    try:
+        network = require_agent(data.get("agent", PolicyConfig.agent)).config
+    except TaskError as error:
+        raise TaskError(f"{where}: {error}") from error
+    if data.get("network") is not None:
+        require_fields(network, data["network"], where)
+
+
 def require_learner(learner: object, where: str) -> None:
-    """Require that a learner is whole: its networks are those that its sizes ask for.
+    """Require that the state of a learner is complete, and its weights have the right shapes.
 
     Args:
-        learner: What a checkpoint holds of it.
+        learner: The state, as a checkpoint has it.
         where: The checkpoint, for messages.
 
     Raises:
-        TaskError: If something is missing, of another type, shape or number format.
+        TaskError: If an entry is missing, or of another type, shape or number format.
     """
     if not isinstance(learner, dict):
         raise TaskError(f"{where}: {_short(learner)}: expected a learner")
@@ -71,17 +89,17 @@ def require_learner(learner: object, where: str) -> None:
             raise TaskError(f"{where}: its learner has no {name}")
         if not isinstance(learner[name], kind) or isinstance(learner[name], bool):
             raise TaskError(f"{where}: {name} of its learner is {_short(learner[name])}")
-    require_fields(PolicyConfig, learner["policy"], f"{where}: policy")
+    require_policy(learner["policy"], f"{where}: policy")
     require_fields(PPOConfig, learner["config"], f"{where}: config")
     layout = _layout(learner["layout"], f"{where}: layout")
     try:
         PPOConfig(**learner["config"])
         with torch.device("meta"):  # shapes alone: nothing is allocated
-            actor, critic = make_networks(PolicyConfig(**learner["policy"]), layout, 0)
+            actor, critic = make_networks(policy_from(learner["policy"]), layout, 0)
     except TaskError as error:
         raise TaskError(f"{where}: {error}") from error
     wanted = {"actor": actor.state_dict(), "critic": critic.state_dict()}
-    for name in ("actor", "critic", "slow"):
+    for name in ("actor", "critic", "target_critic"):
         if name in learner:
             _require_network(
                 learner[name], wanted["actor" if name == "actor" else "critic"], f"{where}: {name}"
@@ -91,7 +109,7 @@ def require_learner(learner: object, where: str) -> None:
 
 
 def _layout(stored: Mapping[str, Any], where: str) -> Layout:
-    """The layout that is stored, if it is one."""
+    """Return the stored layout, if it is valid."""
     stored = {**stored}
     if isinstance(stored.get("channels"), list):
         stored["channels"] = tuple(stored["channels"])

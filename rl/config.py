@@ -1,185 +1,174 @@
-"""Constants of agents and of PPO, each with its source; "paper" is AnyBody, arXiv 2505.14986."""
+"""Constants of policies and of PPO, each with its source; "paper" is AnyBody, arXiv 2505.14986."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Any
 
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError
+from morphgen.rl.agents import NetworkConfig, require_agent
+from morphgen.tasks.actions import ActionKind
 
-AgentName = Literal["se", "me-mlp", "me-tf"]
-AGENTS: tuple[AgentName, ...] = get_args(AgentName)
-"""``se`` is for one robot, and sees no morphology; ``me-...`` are for many."""
-MAX_WIDTH = 8192
-"""Numbers of a layer of a network; the weights between two such layers are 256 MiB."""
-MAX_LAYERS = 100
-"""Layers of a network."""
-MAX_STEPS = 16_384
-"""Steps of every environment between updates, which are held in memory."""
+MAX_NUM_STEPS = 16_384
+"""Largest rollout length per environment; a rollout is held in memory."""
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Networks of actor and critic: two of the same kind, which share nothing.
+    """An agent and its networks: actor and critic have the same sizes and share no weights."""
 
-    The paper gives no sizes; unless said otherwise these are those of its released code.
-    """
-
-    agent: AgentName = "me-tf"
+    agent: str = "me-tf"
+    """Name in ``morphgen.rl.agents.AGENTS``."""
     discrete: bool = True
-    """Bins or numbers as actions (paper: bins for reach, numbers for push)."""
-    fixed_deviation: bool = False
-    """Numbers as actions keep the deviation that they start with (as in the paper's released code,
-    by a clamp); otherwise it is learned."""
-    mask_morphology: bool = False
-    """Hide of the links' tokens all but the codes of the joint positions; ``se`` always does."""
+    """Actions are bins rather than numbers (paper: bins for reach, numbers for push)."""
+    fixed_std: bool = False
+    """Keep the initial standard deviation of continuous actions instead of learning it (the paper's
+    released code does so, by a clamp)."""
+    proprioceptive_only: bool = False
+    """Hide all of the link tokens except the codes of the joint positions; ``se`` always does."""
     tool_position: bool = False
-    """See where the tool is, too (ours; the paper's policies have to work it out)."""
-    mlp_features: int = 16
-    """Of a token in the MLP."""
-    mlp_width: int = 192
-    mlp_layers: int = 3
-    features: int = 64
-    """Of a token in the transformer."""
-    layers: int = 4
-    heads: int = 4
-    feedforward: int = 512
-    decoder: int = 64
-    """Width of the MLP from a link's features to its action, and to the value (ours)."""
-    logit_scale: float = 64.0
-    """What the transformer's numbers for bins are multiplied by (ours): a step of the optimiser
-    moves probabilities by as much more. The MLP learns less with it, and has none."""
+    """Show the tool's position to the networks (ours; the paper's policies have to infer it)."""
+    network: NetworkConfig | None = None
+    """Sizes of the agent's networks; by default those of the agent's module."""
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check, and fill in the sizes of the networks.
 
         Raises:
-            TaskError: If the agent is unknown, or a size is none.
+            TaskError: If the agent is unknown, or the sizes are those of another agent.
         """
-        if self.agent not in AGENTS:
-            raise TaskError(f"agent {self.agent!r}{nearest(self.agent, AGENTS)}")
-        if self.fixed_deviation and self.discrete:
-            raise TaskError("fixed-deviation: bins have no deviation; it goes with --no-discrete")
-        if not self.logit_scale > 0:
-            raise TaskError(f"logit_scale {self.logit_scale:g}: expected more than 0")
-        for each in fields(self):
-            if each.type == "int":
-                most = MAX_LAYERS if each.name.endswith("layers") else MAX_WIDTH
-                _at_least(each.name, getattr(self, each.name), 1)
-                if getattr(self, each.name) > most:
-                    raise TaskError(
-                        f"{each.name} {getattr(self, each.name)}: expected at most {most}"
-                    )
-        if self.features % self.heads:
-            raise TaskError(f"features {self.features}: expected a multiple of heads {self.heads}")
+        config = require_agent(self.agent).config
+        if self.fixed_std and self.discrete:
+            raise TaskError(
+                "fixed-deviation: discrete actions have no deviation; it goes with --no-discrete"
+            )
+        if self.network is None:
+            object.__setattr__(self, "network", config())
+        if not isinstance(self.network, config):
+            raise TaskError(
+                f"network {type(self.network).__name__} of agent {self.agent!r}: "
+                f"expected {config.__module__}.{config.__qualname__}"
+            )
 
     @property
-    def kind(self) -> Literal["continuous", "discrete"]:
-        """Of the actions."""
+    def kind(self) -> ActionKind:
+        """Kind of the actions."""
         return "discrete" if self.discrete else "continuous"
 
     @property
-    def blind(self) -> bool:
-        """Whether the agent sees no morphology."""
-        return self.mask_morphology or self.agent == "se"
+    def hides_morphology(self) -> bool:
+        """Whether the networks see joint positions only, by choice or because of the agent."""
+        return self.proprioceptive_only or require_agent(self.agent).proprioceptive_only
 
 
-OWNERS: Mapping[str, tuple[AgentName, ...]] = {
-    each.name: ("se", "me-mlp") if each.name.startswith("mlp_") else ("me-tf",)
-    for each in fields(PolicyConfig)
-    if each.type in ("int", "float")
-}
-"""Whose networks have which numbers."""
+def policy_from(stored: Mapping[str, Any]) -> PolicyConfig:
+    """Return the policy config that ``dataclasses.asdict`` made a dictionary of.
+
+    Raises:
+        TaskError: If the agent is unknown, or a value is out of its range.
+    """
+    own = dict(stored)
+    sizes = own.pop("network", None) or {}
+    agent = own.get("agent", PolicyConfig.agent)
+    return PolicyConfig(**own, network=require_agent(agent).config(**sizes))
 
 
 @dataclass(frozen=True)
 class PPOConfig:
     """Proximal policy optimisation (Schulman et al. 2017), and what the paper adds to it."""
 
-    transitions: int = 2_000_000
-    """Steps of all environments together; rounded up to whole updates (paper: 1.28e9)."""
-    steps: int = 128
-    """Of every environment between updates (paper)."""
+    total_timesteps: int = 2_000_000
+    """Control steps of all environments together; rounded up to whole updates (paper: 1.28e9)."""
+    num_steps: int = 128
+    """Rollout length per environment between updates [control steps] (paper)."""
     epochs: int = 4
-    """Passes over these (paper)."""
+    """Passes over a rollout per update (paper)."""
     minibatches: int = 16
-    """Of an epoch (paper)."""
-    clip: float = 0.2
-    """Of the ratio of probabilities (paper)."""
+    """Minibatches per epoch (paper)."""
+    clip_coef: float = 0.2
+    """Clip range of the ratio of action probabilities (paper)."""
     gamma: float = 0.99
-    """Discount (paper)."""
-    lam: float = 0.95
-    """Of generalised advantage estimation (Schulman et al. 2017)."""
+    """Discount factor (paper)."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation (Schulman et al. 2017)."""
     learning_rate: float = 3e-4
-    """Of the first update; falls in a line to zero after the last (Schulman et al. 2017)."""
-    target_kl: float = 0.0
-    """If not 0, the actor's learning rate is lowered where an update changes its actions by more
-    than this, and raised where by less: between a hundredth of ``learning_rate`` and all of it. KL
-    divergence, nats (after Rudin et al. 2022, "Learning to Walk in Minutes"; for robots that learn
-    alone with few environments, where the same learning rate changes more)."""
+    """Learning rate of the first update; it falls linearly to zero after the last one (Schulman et
+    al. 2017)."""
+    desired_kl: float = 0.0
+    """KL divergence per update that the actor's learning rate is adapted to [nats]; 0 for no
+    adaptation. The rate is lowered after an update with a larger divergence and raised after one
+    with a smaller one, between a hundredth of ``learning_rate`` and all of it (after Rudin et al.
+    2022, "Learning to Walk in Minutes"). It helps robots that learn alone with few environments,
+    where the same learning rate changes the policy more."""
     adam_epsilon: float = 1e-5
-    """Huang et al. 2022, "The 37 implementation details of PPO"."""
-    gradient_clip: float = 1.0
-    """Largest norm of the actor's gradient, and of the critic's (ours)."""
-    entropy: float = 0.002
-    """Weight of the entropy, which is the sum of that of the joints (ours)."""
+    """Epsilon of Adam (Huang et al. 2022, "The 37 implementation details of PPO")."""
+    max_grad_norm: float = 1.0
+    """Largest norm of the actor's gradient, and of the critic's; each is clipped by itself (ours).
+    """
+    ent_coef: float = 0.002
+    """Weight of the entropy bonus; the entropy is the sum over the joints (ours)."""
     symlog: bool = True
-    """The critic predicts the symlog of returns (paper, after DreamerV3), that of their mean, by
-    ``matching_loss`` (ours; the squared error of symlogs learns the mean of the symlogs)."""
+    """Let the critic predict the symlog of the mean return (paper, after DreamerV3), learned by
+    ``matching_loss`` (ours; the squared error of symlogs would learn the mean of the symlogs)."""
     slow_critic: bool = True
-    """Returns to learn come from a moving average of the critic (paper)."""
+    """Compute returns with a moving average of the critic, the target critic (paper)."""
     slow_decay: float = 0.9
-    """Of that average, a gradient step (ours; the paper gives none). DreamerV3's 0.98 is a lag of
-    an update here, when returns to learn are made of the values of the last but one."""
+    """Decay of that average per gradient step (ours; the paper gives none). DreamerV3's 0.98 is a
+    lag of one update here: returns would be made of the values of the last update but one."""
     task_reweighting: bool = False
-    """Robots count with weights drawn anew every gradient step (paper: "random")."""
+    """Weight the robots randomly, with new weights for every gradient step (paper: "random")."""
     curriculum: bool = True
-    """Move the line of push; nothing else has one (paper)."""
+    """Move the line of the push task from near to far during training; reach has no curriculum
+    (paper)."""
     bf16: bool = False
-    """Networks in bfloat16, by autocast."""
+    """Run the networks in bfloat16, by autocast."""
     compile: bool = False
-    """Networks and losses by ``torch.compile``; on a GPU as CUDA graphs."""
+    """Run networks and losses by ``torch.compile``; on a GPU as CUDA graphs."""
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check the numbers.
 
         Raises:
             TaskError: If a number is out of its range.
         """
-        for name in ("transitions", "steps", "epochs", "minibatches"):
-            _at_least(name, getattr(self, name), 1)
-        if self.steps > MAX_STEPS:
-            raise TaskError(f"steps {self.steps}: expected at most {MAX_STEPS}")
-        for name in ("clip", "learning_rate", "adam_epsilon", "gradient_clip"):
+        for name in ("total_timesteps", "num_steps", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise TaskError(f"{name} {getattr(self, name)}: expected 1 or more")
+        if self.num_steps > MAX_NUM_STEPS:
+            raise TaskError(f"num_steps {self.num_steps}: expected at most {MAX_NUM_STEPS}")
+        for name in ("clip_coef", "learning_rate", "adam_epsilon", "max_grad_norm"):
             if not getattr(self, name) > 0:
                 raise TaskError(f"{name} {getattr(self, name):g}: expected more than 0")
-        for name in ("gamma", "lam", "slow_decay"):
+        for name in ("gamma", "gae_lambda", "slow_decay"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TaskError(f"{name} {getattr(self, name):g}: expected 0 to 1")
-        for name in ("entropy", "target_kl"):
+        for name in ("ent_coef", "desired_kl"):
             if not getattr(self, name) >= 0:
                 raise TaskError(f"{name} {getattr(self, name):g}: expected 0 or more")
 
-    def updates(self, num_envs: int) -> int:
-        """How many updates the transitions are."""
-        return -(-self.transitions // (self.steps * num_envs))
+    def num_updates(self, num_envs: int) -> int:
+        """Return how many updates ``total_timesteps`` are with so many environments."""
+        return -(-self.total_timesteps // (self.num_steps * num_envs))
 
-    def minibatch(self, num_envs: int) -> int:
-        """Transitions of a minibatch.
+    def minibatch_size(self, num_envs: int) -> int:
+        """Return the transitions per minibatch.
 
         Raises:
-            TaskError: If the minibatches would not be of one size.
+            TaskError: If the minibatches would differ in size.
         """
-        size, rest = divmod(self.steps * num_envs, self.minibatches)
+        size, rest = divmod(self.num_steps * num_envs, self.minibatches)
         if rest or not size:
             raise TaskError(
-                f"{self.steps} steps of {num_envs} environments cannot be split into "
+                f"{self.num_steps} steps of {num_envs} environments cannot be split into "
                 f"{self.minibatches} equal minibatches"
             )
         return size
 
 
-def _at_least(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise TaskError(f"{name} {value}: expected {least} or more")
+NUMBERS: Mapping[str, Any] = {
+    field.name: field.default
+    for field in fields(PPOConfig)
+    if type(field.default) in (int, float) and field.name != "total_timesteps"
+}
+"""Numbers of ``PPOConfig`` that ``--set`` changes, with their defaults."""

@@ -1,4 +1,4 @@
-"""How well a policy or a reference controller does, robot by robot, beside chance."""
+"""Score a policy or a baseline robot by robot, relative to the random policy."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ import numpy as np
 from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError, nearest
 from morphgen.model.kinematics import reach
+from morphgen.rl.baselines import BASELINES, make_baseline
+from morphgen.rl.baselines.simple import Random
+from morphgen.rl.inference import Mode, Policy, PolicyController
 from morphgen.rl.intervals import mean_interval
-from morphgen.rl.names import REFERENCES
-from morphgen.rl.references import Random, reference
+from morphgen.rl.robot_source import RobotSource, members, other_side, specs_of
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
-from morphgen.rl.sources import Source, members, other_side, specs_of
-from morphgen.rl.trained import Mode, Policy
+from morphgen.rl.scores import Score
 from morphgen.rl.training import checkpoints
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, default_configs
@@ -28,39 +29,40 @@ from morphgen.tasks.make import batch_of
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
-STEPS = 10_000
-"""Control steps of an evaluation, a robot (paper)."""
-AT_ONCE = 34
-"""Environments of a robot at most: with these, 10,000 steps are one episode in each."""
-SALT = 0x5C0_4E5
-"""So that an evaluation's episodes are not those of the training with the same seed."""
+MAX_ENVS_PER_ROBOT = 34
+"""Largest number of environments of a robot: 10,000 control steps are one episode in each."""
+EVAL_SEED_OFFSET = 0x5C0_4E5
+"""Mixed into the seed, so that evaluation episodes differ from training ones with the same seed."""
 
-Acting = Callable[[TaskBatch], Controller]
-"""What acts in a batch."""
-Tell = Callable[[float, int], None]
-"""Told how many episodes are over, parts of them included, and how many there are."""
-Count = Callable[[str], Tell]
-"""Called with the name of an evaluation that begins; what it returns, with how far it is."""
+MakeController = Callable[[TaskBatch], Controller]
+"""Builds a controller for a batch."""
+Progress = Callable[[float, int], None]
+"""Callback with the number of episodes done, fractions included, and their total number."""
+StartProgress = Callable[[str], Progress]
+"""Called with the name of an evaluation when it starts; returns the callback for its progress."""
 
 
-def silent(done: float, total: int) -> None:
-    """Tell nobody."""
+def no_progress(done: float, total: int) -> None:
+    """Report the progress to nobody."""
 
 
-def uncounted(name: str) -> Tell:
-    """Tell nobody of any evaluation."""
-    return silent
+def no_progress_of(name: str) -> Progress:
+    """Return a callback that reports to nobody."""
+    return no_progress
 
 
 @dataclass(frozen=True)
-class Exam:
-    """How an evaluation is done."""
+class EvalConfig:
+    """Constants of an evaluation."""
 
     episodes: int = 34
-    """Of each robot at least; all episodes of a robot count, from their starts to their ends."""
+    """Least number of episodes per robot; all episodes count, from start to end."""
     sim: str = "pybullet"
+    """Simulator."""
     seed: int = 0
+    """Seed of the episodes."""
     workers: int = 1
+    """Number of processes of PyBullet, or threads of MuJoCo; scores do not depend on it."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Constants of tasks; others have their defaults."""
 
@@ -74,49 +76,20 @@ class Exam:
         """Check.
 
         Raises:
-            TaskError: If there is no episode, or the seed is none.
+            TaskError: If the number of episodes or the seed is out of its range.
         """
         if self.episodes < 1 or not 0 <= self.seed < 2**63:
             raise TaskError(
-                f"{self.episodes} episodes, seed {self.seed}: at least one episode, and a seed "
-                "from 0 to 2^63 - 1"
+                f"{self.episodes} episodes, seed {self.seed}: expected at least one episode, and a "
+                "seed from 0 to 2^63 - 1"
             )
 
 
-@dataclass(frozen=True)
-class Score:
-    """A robot's part of an evaluation."""
-
-    robot: str
-    side: Side
-    task: str
-    episodes: int
-    steps: int
-    score: float
-    """``raw``, for some tasks above that of the random policy; see ``Task.relative_to_random``."""
-    low: float
-    high: float
-    """Of the score: 95% bootstrap interval over episodes; nan if there is one episode."""
-    raw: float
-    """Mean score of episodes; see ``Task.episode_score``."""
-    random: float
-    """The same of the random controller."""
-    success: float
-    """Share of the episodes that end in success."""
-    random_success: float
-    distance: float
-    """From success at the end, metres, mean."""
-    relative_distance: float
-    """The same over the robot's reach; nan for tasks where this means nothing."""
-    unstable: int = 0
-    """How many episodes ended because their simulation became unstable."""
-
-
 def episodes_for(steps: int, longest: int) -> int:
-    """How many episodes of full length have so many steps.
+    """Return how many episodes of full length have so many control steps.
 
     Raises:
-        TaskError: If there are none.
+        TaskError: If ``steps`` is below 1.
     """
     if steps < 1:
         raise TaskError(f"--steps {steps}: expected 1 or more")
@@ -124,62 +97,71 @@ def episodes_for(steps: int, longest: int) -> int:
 
 
 def evaluate_run(
-    path: Path, side: Side, exam: Exam, mode: Mode, *, device: str = "cpu", tell: Tell = silent
+    path: Path,
+    side: Side,
+    config: EvalConfig,
+    mode: Mode,
+    *,
+    device: str = "cpu",
+    progress: Progress = no_progress,
 ) -> list[Score]:
-    """Evaluate what was trained on the robots of a side of its split, or on its one robot.
+    """Evaluate a run on the robots of a side of its split, or on its one robot.
 
     Args:
         path: A checkpoint, or a run's folder.
-        side: Of the split.
-        exam: How.
-        mode: Whether policies act by the mean of their actions, or draw.
-        device: Where the networks are.
-        tell: Told how far it is; for ``se`` robot by robot.
+        side: Side of the split.
+        config: Constants of the evaluation.
+        mode: Whether policies act by the mean of their actions, or sample them.
+        device: Device of the networks.
+        progress: Callback for the progress; for ``se`` robot by robot.
 
     Raises:
         TaskError: If there is no checkpoint, or no such side.
     """
     files = list(checkpoints(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
-    return evaluate_checkpoints(files, source, exam, mode, device=device, tell=tell)
+    return evaluate_checkpoints(files, source, config, mode, device=device, progress=progress)
 
 
 def evaluate_checkpoints(
     paths: Sequence[Path],
-    source: Source,
-    exam: Exam,
+    source: RobotSource,
+    config: EvalConfig,
     mode: Mode,
     *,
     device: str = "cpu",
-    tell: Tell = silent,
+    progress: Progress = no_progress,
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
 
-    Policies of single robots, of ``se``, are each evaluated on their own robot, if ``source`` is
-    the robots that they were trained on, and all of them on every robot of another, where their
-    episodes count alike.
+    Policies of single robots (``se``) are each evaluated on their own robot if ``source`` has the
+    robots that they were trained on. On other robots all of them are evaluated, and their episodes
+    count alike.
 
     Raises:
-        TaskError: If one is no checkpoint, or for other observations or actions.
-        MorphgenError: If a robot or simulator cannot be made.
+        TaskError: If a file is no checkpoint, or its policy has other observations or actions than
+            the first.
+        MorphgenError: If a robot or simulator cannot be built.
     """
     trained = [read_checkpoint(path) for path in paths]
     sources = [run.source for run, _ in trained]
-    if all(own.only for own in sources) and _of_same(sources[0], source):
+    if all(own.member for own in sources) and _of_same(sources[0], source):
         found = (
-            _evaluate_together([one], replace(source, only=own.only), exam, mode, device, tell)
+            _evaluate_together(
+                [one], replace(source, member=own.member), config, mode, device, progress
+            )
             for one, own in zip(trained, sources, strict=True)
         )
         return [score for scores in found for score in scores]
     _require_same_interface(paths, [run for run, _ in trained])
-    return _evaluate_together(trained, source, exam, mode, device, tell)
+    return _evaluate_together(trained, source, config, mode, device, progress)
 
 
 def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) -> None:
     """Require that all policies take the same observations and actions.
 
     Raises:
-        TaskError: If one does not; it says in what.
+        TaskError: If one does not; the message lists the differences.
     """
     interfaces = [asdict(run.interface) for run in runs]
     first, *others = [{**each.pop("channels"), **each} for each in interfaces]
@@ -194,173 +176,174 @@ def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) ->
             )
 
 
-def _of_same(one: Source, whole: Source) -> bool:
-    """Whether a robot is of the robots of a split's side, all of which are meant."""
-    if not whole.split or whole.only is not None or one.side != whole.side:
+def _of_same(one: RobotSource, whole: RobotSource) -> bool:
+    """Return whether a single robot belongs to a split's whole side."""
+    if not whole.split or whole.member is not None or one.side != whole.side:
         return False
-    return members(replace(one, only=None)) == members(whole)
+    return members(replace(one, member=None)) == members(whole)
 
 
 def _evaluate_together(
     trained: Sequence[tuple[RunConfig, dict[str, Any]]],
-    source: Source,
-    exam: Exam,
+    source: RobotSource,
+    config: EvalConfig,
     mode: Mode,
     device: str,
-    tell: Tell,
+    progress: Progress,
 ) -> list[Score]:
-    """The episodes of all policies count together."""
-    acting = [_policy(learner, mode, exam.seed, device) for _, learner in trained]
-    wanted = trained[0][0].interface
-    return evaluate(acting, source, exam, wanted, tell=tell)
+    """Evaluate policies on the same robots; their episodes count together."""
+
+    def make(learner: dict[str, Any], batch: TaskBatch) -> Controller:
+        return PolicyController(Policy(learner, mode, config.seed, device))
+
+    controllers = [partial(make, learner) for _, learner in trained]
+    interface = trained[0][0].interface
+    return evaluate(controllers, source, config, interface, progress=progress)
 
 
-def _policy(learner: dict[str, Any], mode: Mode, seed: int, device: str) -> Acting:
-    return lambda batch: Policy(learner, mode, seed, device)
-
-
-def evaluate_reference(
-    name: str, source: Source, exam: Exam, *, tell: Tell = silent
+def evaluate_baseline(
+    name: str, source: RobotSource, config: EvalConfig, *, progress: Progress = no_progress
 ) -> list[Score]:
-    """Evaluate a controller that learns nothing; see ``REFERENCES``.
-
-    Its actions are continuous. Robots at a task that it is not for are left out.
+    """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out.
 
     Raises:
-        TaskError: If it is unknown, or for none of the robots' tasks.
+        TaskError: If it is unknown, or can do none of the robots' tasks.
     """
-    if name not in REFERENCES:
-        raise TaskError(f"unknown reference {name!r}{nearest(name, REFERENCES)}")
+    if name not in BASELINES:
+        raise TaskError(f"unknown baseline {name!r}{nearest(name, BASELINES)}")
 
-    def acting(batch: TaskBatch) -> Controller:
-        return reference(name, batch, exam.seed)
+    def make(batch: TaskBatch) -> Controller:
+        return make_baseline(name, batch, config.seed)
 
-    return evaluate([acting], source, exam, Interface(), tasks=REFERENCES[name], tell=tell)
+    return evaluate([make], source, config, Interface(), tasks=BASELINES[name], progress=progress)
 
 
 def evaluate(
-    acting: Sequence[Acting],
-    source: Source,
-    exam: Exam,
-    wanted: Interface,
+    controllers: Sequence[MakeController],
+    source: RobotSource,
+    config: EvalConfig,
+    interface: Interface,
     *,
     tasks: Sequence[str] | None = None,
-    tell: Tell = silent,
+    progress: Progress = no_progress,
 ) -> list[Score]:
-    """Scores of the robots of a source, in order; the random controller has the same episodes.
+    """Return the scores of the robots of a source, in order.
+
+    The random policy, which scores are relative to, has the same episodes.
 
     Args:
-        acting: What acts: each in episodes of its own, which all count.
+        controllers: Controllers; each has its own episodes, and the episodes of all count.
         source: The robots.
-        exam: How.
-        wanted: What those that act see and do.
-        tasks: Robots at other tasks are left out, if tasks are named.
-        tell: Told how far those that act are, and not the random controller.
+        config: Constants of the evaluation.
+        interface: Actions and observations of the controllers.
+        tasks: Tasks to evaluate, robots with others are left out; None for all.
+        progress: Callback for the progress of the controllers, without the random policy.
 
     Raises:
         TaskError: If no robot is left.
-        MorphgenError: If a robot or simulator cannot be made.
+        MorphgenError: If a robot or simulator cannot be built.
     """
-    specs = specs_of(source, GoalConfig(tasks=exam.tasks))
+    specs = specs_of(source, GoalConfig(tasks=config.tasks))
     if tasks is not None:
-        specs = [each for each in specs if each.task in tasks]
+        specs = [spec for spec in specs if spec.task in tasks]
         if not specs:
             raise TaskError(f"{source.name}: no robot is there to {' or '.join(tasks)}")
-    folders = tuple(map(Path, source.library))
-    played: list[list[Episode]] = [[] for _ in specs]
-    for i, one in enumerate(acting):
-        found = _played(one, specs, exam, wanted, folders, partial(_of, i, len(acting), tell))
-        for all_own, own in zip(played, found, strict=True):
-            all_own.extend(own)
-    chance = _chance(source, exam, None if tasks is None else tuple(tasks), specs, folders)
+    library = tuple(map(Path, source.library))
+    episodes: list[list[Episode]] = [[] for _ in specs]
+    for i, make in enumerate(controllers):
+
+        def add(done: float, total: int, before: int = i) -> None:
+            progress(before * total + done, len(controllers) * total)
+
+        more = _run_all(make, specs, config, interface, library, add)
+        for of_robot, more_of_robot in zip(episodes, more, strict=True):
+            of_robot.extend(more_of_robot)
+    random = _random_episodes(
+        source, config, None if tasks is None else tuple(tasks), specs, library
+    )
     return [
         _score(spec, source.side, own, other)
-        for spec, own, other in zip(specs, played, chance, strict=True)
+        for spec, own, other in zip(specs, episodes, random, strict=True)
     ]
 
 
-_known: dict[object, list[list[Episode]]] = {}
+_random_cache: dict[object, list[list[Episode]]] = {}
 
 
-def _chance(
-    source: Source,
-    exam: Exam,
+def _random_episodes(
+    source: RobotSource,
+    config: EvalConfig,
     tasks: tuple[str, ...] | None,
     specs: Sequence[EnvSpec],
-    folders: tuple[Path, ...],
+    library: tuple[Path, ...],
 ) -> list[list[Episode]]:
-    """Episodes of the random controller; played once in a process."""
-    key = (source, replace(exam, workers=1), tasks)
-    if key not in _known:
-        _known[key] = _played(lambda batch: Random(exam.seed), specs, exam, Interface(), folders)
-    return _known[key]
+    """Return the episodes of the random policy by robot; they are run once per process."""
+    key = (source, replace(config, workers=1), tasks)
+    if key not in _random_cache:
+        _random_cache[key] = _run_all(
+            lambda batch: Random(config.seed), specs, config, Interface(), library
+        )
+    return _random_cache[key]
 
 
-def _played(
-    acting: Acting,
+def _run_all(
+    make: MakeController,
     specs: Sequence[EnvSpec],
-    exam: Exam,
-    wanted: Interface,
-    folders: tuple[Path, ...],
-    tell: Tell = silent,
+    config: EvalConfig,
+    interface: Interface,
+    library: tuple[Path, ...],
+    progress: Progress = no_progress,
 ) -> list[list[Episode]]:
-    """Episodes by robot, in as many batches as it takes; what acts is made for the first."""
-    rounds = -(-exam.episodes // AT_ONCE)
-    each = -(-exam.episodes // rounds)
-    most = max(SIMULATORS[exam.sim].max_envs // len(specs), 1)
-    found: list[list[Episode]] = [[] for _ in specs]
+    """Return episodes by robot, run in as many batches as needed by one controller."""
+    rounds = -(-config.episodes // MAX_ENVS_PER_ROBOT)
+    envs_per_robot = -(-config.episodes // rounds)
+    at_once = max(SIMULATORS[config.sim].max_envs // len(specs), 1)
+    episodes: list[list[Episode]] = [[] for _ in specs]
     controller: Controller | None = None
-    whole = each * rounds * len(specs)
-    for begin in range(0, each, most):
-        before = begin * rounds * len(specs)
-        batch = _batch(range(begin, min(begin + most, each)), specs, exam, wanted, folders)
+    total = envs_per_robot * rounds * len(specs)
+    for begin in range(0, envs_per_robot, at_once):
+        envs = range(begin, min(begin + at_once, envs_per_robot))
+        batch = _batch(envs, specs, config, interface, library)
+
+        def add(done: float, before: int = begin * rounds * len(specs)) -> None:
+            progress(before + done, total)
+
         try:
-            controller = controller or acting(batch)
-            now = partial(_in, before, whole, tell)
-            for episode in run_episodes(batch, controller, rounds, now):
-                found[episode.body].append(episode)
+            controller = controller or make(batch)
+            for episode in run_episodes(batch, controller, rounds, add):
+                episodes[episode.robot_index].append(episode)
         finally:
             batch.close()
-    return found
-
-
-def _in(before: int, whole: int, tell: Tell, done: float) -> None:
-    """Tell of all batches, when so many episodes of one are over."""
-    tell(before + done, whole)
-
-
-def _of(before: int, parts: int, tell: Tell, done: float, own: int) -> None:
-    """Tell of all parts, each of as many episodes, when so many are over."""
-    tell(before * own + done, parts * own)
+    return episodes
 
 
 def _batch(
-    own: range,
+    envs: range,
     specs: Sequence[EnvSpec],
-    exam: Exam,
-    wanted: Interface,
-    folders: tuple[Path, ...],
+    config: EvalConfig,
+    interface: Interface,
+    library: tuple[Path, ...],
 ) -> TaskBatch:
-    """Some of the environments of each robot."""
+    """Build some of the environments of each robot; ``envs`` counts them per robot."""
     return batch_of(
         specs,
-        len(own) * len(specs),
-        first=own.start * len(specs),
-        sim=exam.sim,
-        seed=int(np.random.SeedSequence([SALT, exam.seed]).generate_state(1)[0]),
-        kind=wanted.kind,
-        observe=wanted.channels,
-        workers=exam.workers,
-        max_links=wanted.max_links,
-        library=folders,
+        len(envs) * len(specs),
+        first=envs.start * len(specs),
+        sim=config.sim,
+        seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
+        kind=interface.kind,
+        observe=interface.channels,
+        workers=config.workers,
+        max_links=interface.max_links,
+        library=library,
     )
 
 
-def _score(spec: EnvSpec, side: Side, own: Sequence[Episode], chance: Sequence[Episode]) -> Score:
-    raw, random = (np.array([each.score for each in found]) for found in (own, chance))
+def _score(spec: EnvSpec, side: Side, own: Sequence[Episode], random: Sequence[Episode]) -> Score:
+    raw, random_raw = (np.array([each.score for each in episodes]) for episodes in (own, random))
     task = TASKS[spec.task]
-    above = raw - np.resize(random, len(raw)) if task.relative_to_random else raw
-    interval = mean_interval(above)
+    relative = raw - np.resize(random_raw, len(raw)) if task.relative_to_random else raw
+    interval = mean_interval(relative)
     distance = float(np.mean([episode.distance for episode in own]))
     return Score(
         robot=spec.robot.name,
@@ -372,29 +355,23 @@ def _score(spec: EnvSpec, side: Side, own: Sequence[Episode], chance: Sequence[E
         low=interval.low,
         high=interval.high,
         raw=float(raw.mean()),
-        random=float(random.mean()),
+        random=float(random_raw.mean()),
         success=float(np.mean([episode.success for episode in own])),
-        random_success=float(np.mean([episode.success for episode in chance])),
+        random_success=float(np.mean([episode.success for episode in random])),
         distance=distance,
         relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,
         unstable=sum(episode.unstable for episode in own),
     )
 
 
-def exam_of(config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1) -> Exam:
-    """An evaluation in the simulator and with the tasks of a run, but for how many goals it had."""
-    return Exam(
+def eval_config_of(
+    config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1
+) -> EvalConfig:
+    """Return an evaluation in the simulator and tasks of a run, with as many goals as usual."""
+    return EvalConfig(
         episodes,
         config.sim,
         seed,
         workers,
         tuple(each.with_num_goals(type(each)().num_goals) for each in config.tasks),
     )
-
-
-def as_data(scores: Sequence[Score]) -> list[dict[str, Any]]:
-    """Scores for JSON; nothing instead of what is no number."""
-    return [
-        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(each).items()}
-        for each in scores
-    ]

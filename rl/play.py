@@ -1,4 +1,4 @@
-"""Watch a controller at work: episodes of one robot, with their results and pictures."""
+"""Run episodes of one robot with a controller, and render them."""
 
 from __future__ import annotations
 
@@ -6,45 +6,44 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.names import REFERENCES, references_for
-from morphgen.rl.references import reference
+from morphgen.rl.baselines import BASELINES, baselines_for, make_baseline
+from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
-from morphgen.rl.trained import Policy
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.renderer import Frame
 
 STRIDE = 2
-"""Control steps between two pictures."""
+"""Control steps between two frames."""
 FPS = 1 / (STRIDE * CONTROL_PERIOD)
-"""Pictures a second, so that films run as fast as what they show: 25."""
+"""Frames per second, so that videos run in real time: 25."""
 
 
 def require_policy(name: str, task: str) -> None:
-    """Require that there is such a controller for a task.
+    """Require that a controller exists for a task.
 
     Raises:
-        TaskError: If there is none, or it is for other tasks.
+        TaskError: If it is unknown, or for another task.
     """
     if _is_file(name):
         return
-    valid = references_for(task)
-    if name in REFERENCES and name not in valid:
+    valid = baselines_for(task)
+    if name in BASELINES and name not in valid:
         raise TaskError(
-            f"policy {name!r} is for {' or '.join(REFERENCES[name] or ())}, not for {task}; "
+            f"policy {name!r} is for {' or '.join(BASELINES[name] or ())}, not for {task}; "
             f"valid: {', '.join(valid)}"
         )
-    if name not in REFERENCES:
+    if name not in BASELINES:
         raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
 
 
-def demands(name: str) -> Interface:
-    """What a checkpoint's policy sees and does; other controllers take any environment.
+def interface_of(name: str) -> Interface:
+    """Return the interface of a checkpoint's policy; baselines take any environment.
 
     Raises:
-        TaskError: If what is there is no checkpoint.
+        TaskError: If the file is no checkpoint.
     """
     if not _is_file(name):
         return Interface()
@@ -53,18 +52,18 @@ def demands(name: str) -> Interface:
 
 
 def controller(name: str, env: TaskEnv, seed: int) -> Controller:
-    """A controller by its name.
+    """Return a controller by its name.
 
     Args:
-        name: ``zero``, ``random``, ``ik`` (for reach) or ``scripted`` (for push); or the path of a
-            checkpoint or of a run's folder, whose policy acts by the mean of its actions.
-        env: What it is to act in.
-        seed: Of what it draws.
+        name: Name of a baseline; or the path of a checkpoint or of a run's folder, whose policy
+            acts by the mean of its actions.
+        env: Environment that the controller acts in.
+        seed: Seed of random numbers.
 
     Raises:
-        TaskError: As ``require_policy``; or if what is there is no checkpoint, or one for other
+        TaskError: As ``require_policy``; or if the file is no checkpoint, or one for other
             observations or actions.
-        BenchmarkError: If the robot has hardly a free configuration.
+        BenchmarkError: If the robot has hardly any collision-free configuration.
     """
     require_policy(name, env.task)
     if _is_file(name):
@@ -73,8 +72,8 @@ def controller(name: str, env: TaskEnv, seed: int) -> Controller:
             raise TaskError(f"{name}: its actions are {run.policy.kind}, not {env.batch.kind}")
         policy = Policy(learner, "deterministic", seed)
         policy.require(env.batch.observe())
-        return policy
-    return reference(name, env.batch, seed)
+        return PolicyController(policy)
+    return make_baseline(name, env.batch, seed)
 
 
 def play(
@@ -84,17 +83,17 @@ def play(
     seed: int,
     report: Callable[[Episode], None],
 ) -> Iterator[Frame]:
-    """Run episodes, and show them if the environment is rendered.
+    """Run episodes, and yield their frames if the environment renders.
 
     Args:
         env: The environment, not wrapped.
         acting: The controller.
-        episodes: How many.
-        seed: Of the episodes.
-        report: Called at the end of each.
+        episodes: Number of episodes.
+        seed: Seed of the episodes.
+        report: Called with the result of each episode.
 
     Yields:
-        Pictures, ``FPS`` a second of simulated time, with the first and last moment of an episode.
+        Frames, ``FPS`` per second of simulated time, with the first and the last of an episode.
 
     Raises:
         SimulationError: If the simulator fails.
@@ -118,7 +117,7 @@ def play(
 
 
 def _is_file(policy: str) -> bool:
-    return policy not in REFERENCES and Path(policy).exists()
+    return policy not in BASELINES and Path(policy).exists()
 
 
 def _shown(env: TaskEnv) -> Iterator[Frame]:

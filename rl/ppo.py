@@ -1,4 +1,8 @@
-"""Proximal policy optimisation over a batch of bodies: the whole algorithm, top to bottom."""
+"""Proximal policy optimisation over a batch of robots: the whole algorithm, top to bottom.
+
+An update (``Learner.iterate``) collects a rollout into preallocated buffers, estimates advantages
+and returns (GAE), and then takes gradient steps on minibatches of the rollout.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,7 @@ import copy
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,50 +20,27 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from morphgen.errors import TaskError
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.gae import gae, next_values
-from morphgen.rl.learning_rates import learning_rate, next_share
-from morphgen.rl.policies import (
-    layout_from,
-    layout_of,
-    make_networks,
-    require_layout,
-    rows_needed,
-    with_all_rows,
-    with_rows,
-)
-from morphgen.rl.report import Numbers, Report, explained_variance, outcome
+from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
+from morphgen.rl.policies import make_networks, rows_needed
+from morphgen.rl.report import Metrics, Report, explained_variance
+from morphgen.rl.rollout_buffer import STEP_KEYS, RolloutBuffer
 from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import Observation
 
-TOLD = ("reward", "score", "success", "terminated", "truncated", "unstable")
-"""What of every step is kept besides observations and actions."""
-LOSSES = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
-LEARNED = (*LOSSES, "actor_gradient", "critic_gradient")
-"""What is reported of gradient steps; see ``Report``."""
+LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
+LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")
+"""Metrics of a gradient step; see ``Report``."""
+KL_FACTOR = 1.2
+"""Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
+MIN_ACTOR_LR_SCALE = 0.01
+"""Smallest factor on the actor's learning rate, as in rsl_rl (1e-5 of 1e-3).
 
-
-@dataclass(frozen=True, eq=False)
-class Rollout:
-    """T steps of n environments, on the learner's device; of links the rows that are needed."""
-
-    observation: Observation
-    """What was acted upon, tensors (T, n, ...)."""
-    last: Observation
-    """What came after, tensors (n, ...)."""
-    final: Observation
-    """Where time ended an episode, its last; tensors (k, ...), in the order of ``nonzero``."""
-    actions: torch.Tensor
-    """Shape (T, n, rows of links)."""
-    log_prob: torch.Tensor
-    rewards: torch.Tensor
-    terminated: torch.Tensor
-    truncated: torch.Tensor
-    """These four of shape (T, n)."""
+Without it, a factor that fell for long needs as many updates to rise again."""
 
 
 class Learner:
-    """A policy in training. Once made, ``iterate`` until ``done``."""
+    """A policy in training: call ``iterate`` until ``done``."""
 
     def __init__(
         self,
@@ -72,313 +51,330 @@ class Learner:
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Set up; the batch begins its episodes.
+        """Build networks, optimiser and buffers, and begin episodes in the batch.
 
         Args:
             batch: Environments; their actions are of the policy's kind.
-            policy: The networks.
-            config: The algorithm.
-            seed: Of weights, actions, minibatches and weights of robots.
-            device: Where networks and rollouts are; the batch may be elsewhere.
+            policy: Agent and networks.
+            config: Constants of the algorithm.
+            seed: Seed of weights, actions, minibatches and random weights of robots.
+            device: Device of networks and rollouts; the batch may be on another.
 
         Raises:
-            TaskError: If the batch takes other actions, or cannot be split into minibatches.
+            TaskError: If the batch takes other actions, or rollouts cannot be split into
+                minibatches.
         """
         if batch.kind != policy.kind:
             raise TaskError(f"the policy's actions are {policy.kind}, the batch's {batch.kind}")
         self.batch, self.policy, self.config = batch, policy, config
         self.device = torch.device(device)
-        self.update, self.updates = 0, config.updates(batch.num_envs)
-        self._size = config.minibatch(batch.num_envs)
-        self._body = batch.body.to(self.device)
-        self._bodies = int(batch.body.max()) + 1
+        self.update, self.num_updates = 0, config.num_updates(batch.num_envs)
+        self._minibatch_size = config.minibatch_size(batch.num_envs)
+        self._env_robot_index = batch.body.to(self.device)
+        self._num_robots = int(batch.body.max()) + 1
         self._observation: Observation | None = None
-        self._buffer: Observation = {}
-        first = self._begin()
+        first = self._current_observation()
         self.layout, self._rows = layout_of(first), rows_needed(policy, first)
-        weights, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
-        actor, critic = make_networks(policy, self.layout, weights)
+
+        network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
+        actor, critic = make_networks(policy, self.layout, network_seed)
         self.actor, self.critic = actor.to(self.device), critic.to(self.device)
-        self.slow = copy.deepcopy(self.critic).requires_grad_(False)
+        self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.optimiser = torch.optim.Adam(
             [{"params": [*net.parameters()]} for net in (self.actor, self.critic)],
             eps=config.adam_epsilon,
             fused=True,
         )
-        self._share = 1.0
-        self._generators = {
+        self.actor_lr_scale = 1.0
+        self.generators = {
             name: torch.Generator(self.device).manual_seed(stream)
             for name, stream in zip(("actions", "minibatches", "weights"), streams, strict=True)
         }
         ready = partial(prepared, device=self.device, bf16=config.bf16, compiled=config.compile)
-        self._act = ready(self.actor)
-        self._value = ready(self.slow if config.slow_critic else self.critic)
-        self._losses = ready(self._objective)
+        self._actor_numbers = ready(self.actor)
+        self._value = ready(self.target_critic if config.slow_critic else self.critic)
+        self._compiled_loss = ready(self._loss)
+        self.buffer = RolloutBuffer(
+            self._visible(first), config.num_steps, discrete=policy.discrete, device=batch.device
+        )
 
     @property
     def done(self) -> bool:
         """Whether all updates have been made."""
-        return self.update >= self.updates
+        return self.update >= self.num_updates
 
     def iterate(self) -> Report:
         """Collect a rollout and learn from it.
 
         Raises:
-            TaskError: If a number is no longer finite.
-            SimulationError: If the simulator failed.
+            TaskError: If a metric is not finite.
+            SimulationError: If the simulator fails.
         """
-        began = time.perf_counter()
-        rollout, seen = self._collect(self._begin())
+        started = time.perf_counter()
+        rollout_metrics = self._collect_rollout()
         collected = time.perf_counter()
-        learned = self._learn(rollout)
+        learn_metrics = self._learn()
         self.update += 1
-        lost = [name for name, value in learned.items() if not math.isfinite(value)]
+        lost = [name for name, value in learn_metrics.items() if not math.isfinite(value)]
         if lost:
             raise TaskError(f"update {self.update}: {', '.join(lost)} is not finite any more")
         ended = time.perf_counter()
-        made = self.config.steps * self.batch.num_envs
+        timesteps = self.config.num_steps * self.batch.num_envs
         return Report(
             update=self.update,
-            transitions=self.update * made,
-            collect_seconds=collected - began,
+            transitions=self.update * timesteps,
+            collect_seconds=collected - started,
             learn_seconds=ended - collected,
-            steps_per_second=made / (ended - began),
-            **seen,
-            **learned,
+            steps_per_second=timesteps / (ended - started),
+            **rollout_metrics,
+            **learn_metrics,
         )
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Return the state of training; ``torch.load`` reads it with ``weights_only``.
-
-        The learner does not change. The state of the simulator is not part of a checkpoint, so
-        that a resumed run begins new episodes. A run that continues equals a resumed one only if it
-        calls ``restart_episodes`` after the checkpoint.
-        """
-        learned = {name: net.state_dict() for name, net in self._networks().items()}
-        return {
-            **copy.deepcopy({**learned, "optimiser": self.optimiser.state_dict()}),
-            "generators": {name: each.get_state() for name, each in self._generators.items()},
-            "batch": self.batch.state_dict(),
-            "share": self._share,
-            "update": self.update,
-            "updates": self.updates,
-            "device": self.device.type,
-            "layout": asdict(self.layout),
-            "policy": asdict(self.policy),
-            "config": asdict(self.config),
-        }
-
-    def restart_episodes(self) -> None:
-        """Begin new episodes in all environments at the next ``iterate``."""
-        self._observation = None
-
-    def resume(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on where another learner of the same batch, configuration and device stopped.
-
-        All environments begin new episodes.
-
-        Raises:
-            TaskError: If these are not the same; nothing is changed then.
-        """
-        self._require_policy(checkpoint)
-        here = {**asdict(self.config), "updates": self.updates, "device": self.device.type}
-        config = asdict(PPOConfig(**checkpoint["config"]))
-        _require_same({**config, **{k: checkpoint[k] for k in ("updates", "device")}}, here)
-        self.batch.load_state_dict(checkpoint["batch"])
-        for name, network in self._networks().items():
-            network.load_state_dict(checkpoint[name])
-        self.optimiser.load_state_dict(checkpoint["optimiser"])
-        for name, generator in self._generators.items():
-            generator.set_state(checkpoint["generators"][name].cpu())
-        self.update, self._share = checkpoint["update"], checkpoint["share"]
-        self.restart_episodes()
-
-    def adopt(self, checkpoint: Mapping[str, Any]) -> None:
-        """Begin with the networks of a checkpoint, and nothing else of it: to fine-tune.
-
-        Raises:
-            TaskError: If they are other networks, or for other observations.
-        """
-        self._require_policy(checkpoint)
-        for name, network in self._networks().items():
-            network.load_state_dict(checkpoint[name])
-
-    def _networks(self) -> dict[str, nn.Module]:
-        return {"actor": self.actor, "critic": self.critic, "slow": self.slow}
-
-    def _require_policy(self, checkpoint: Mapping[str, Any]) -> None:
-        require_layout(layout_from(checkpoint["layout"]), self.layout, "the checkpoint")
-        _require_same(asdict(PolicyConfig(**checkpoint["policy"])), asdict(self.policy))
-
-    def _begin(self) -> Observation:
-        """Move the curriculum, begin episodes if none are under way; what is seen now."""
+    def _current_observation(self) -> Observation:
+        """Advance the curriculum, begin episodes if none are under way; return the observation."""
         if self.config.curriculum:
-            self.batch.advance(self.update / self.updates)
+            self.batch.advance(self.update / self.num_updates)
         if self._observation is None:
             self._observation = self.batch.reset(spread=True)
         elif self.config.curriculum:
             self._observation = self.batch.observe()
         return self._observation
 
-    def _here(self, observation: Observation) -> Observation:
-        """What networks see of an observation, on their device."""
-        return {k: v.to(self.device) for k, v in with_rows(observation, self._rows).items()}
+    def _visible(self, observation: Observation) -> Observation:
+        """Return an observation as the networks get it, on their device."""
+        needed = truncate_links(observation, self._rows)
+        return {name: value.to(self.device) for name, value in needed.items()}
 
     @torch.no_grad()
-    def _collect(self, first: Observation) -> tuple[Rollout, Numbers]:
-        """Act for ``steps`` control steps; returns them, and what the report says of them."""
-        now = self._here(first)
-        if not self._buffer:
-            self._buffer = {
-                name: each.new_empty(self.config.steps, *each.shape) for name, each in now.items()
-            }
-        acted, told, terms, finals = [], [], [], []
-        for t in range(self.config.steps):
-            for name, rows in self._buffer.items():
-                rows[t].copy_(now[name])
-            seen = {name: rows[t] for name, rows in self._buffer.items()}
-            head = self.actor.head(self._act(seen), seen["actions"])
-            actions = head.sample(self._generators["actions"])
-            step = self.batch.step(with_all_rows(actions, self.layout.links).to(self.batch.device))
-            acted.append((actions, head.log_prob(actions)))
-            told.append([getattr(step, name) for name in TOLD])
-            terms.append({name: each.mean() for name, each in step.terms.items()})
-            finals.append({k: v[step.truncated] for k, v in step.final_observation.items()})
+    def _collect_rollout(self) -> Metrics:
+        """Act for ``num_steps`` control steps and fill the buffer; return the rollout's metrics."""
+        buffer, obs = self.buffer, self._visible(self._current_observation())
+        reward_terms, final_observations = [], []
+        for t in range(self.config.num_steps):
+            for name, rows in buffer.observations.items():
+                rows[t].copy_(obs[name])
+            # Compiled as a CUDA graph, the actor reads its inputs from where they are: the buffer.
+            obs = {name: rows[t] for name, rows in buffer.observations.items()}
+            head = self.actor.head(self._actor_numbers(obs), obs["actions"])
+            action = head.sample(self.generators["actions"])
+            buffer.actions[t] = action
+            buffer.log_probs[t] = head.log_prob(action)
+
+            step = self.batch.step(pad_links(action, self.layout.links).to(self.batch.device))
+            for name in STEP_KEYS:
+                getattr(buffer, name)[t] = getattr(step, name)
+            reward_terms.append({name: term.mean() for name, term in step.terms.items()})
+            final_observations.append(
+                {name: value[step.truncated] for name, value in step.final_observation.items()}
+            )
             self._observation = step.observation
-            now = self._here(step.observation)
-        tallied = dict(zip(TOLD, map(torch.stack, zip(*told, strict=True)), strict=True))
-        means = {k: float(torch.stack([each[k] for each in terms]).mean()) for k in terms[0]}
-        actions, log_prob = (torch.stack(each) for each in zip(*acted, strict=True))
-        rollout = Rollout(
-            observation=self._buffer,
-            last={name: each.clone() for name, each in now.items()},
-            final=self._here({k: torch.cat([each[k] for each in finals]) for k in now}),
-            actions=actions,
-            log_prob=log_prob,
-            rewards=tallied["reward"].to(self.device),
-            terminated=tallied["terminated"].to(self.device),
-            truncated=tallied["truncated"].to(self.device),
+            obs = self._visible(step.observation)
+        # The batch may reuse the tensors of its observation in the next step.
+        buffer.last_observation = {name: value.clone() for name, value in obs.items()}
+        buffer.final_observations = self._visible(
+            {name: torch.cat([final[name] for final in final_observations]) for name in obs}
         )
-        return rollout, {**outcome(tallied, self.batch.body, self._bodies), "terms": means}
+        metrics = buffer.metrics(self.batch.body, self._num_robots)
+        metrics["terms"] = {
+            name: float(torch.stack([terms[name] for terms in reward_terms]).mean())
+            for name in reward_terms[0]
+        }
+        return metrics
 
     @torch.no_grad()
-    def _targets(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Values, advantages and returns, each (T, n)."""
-        flat = {name: each.flatten(0, 1) for name, each in rollout.observation.items()}
-        values = self._values(flat).reshape(rollout.rewards.shape)
-        ahead = next_values(
-            values, self._values(rollout.last), rollout.truncated, self._values(rollout.final)
+    def _compute_returns(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return values, advantages and returns of the rollout, each (T, n)."""
+        buffer = self.buffer
+        rewards, terminated, truncated = (
+            each.to(self.device) for each in (buffer.reward, buffer.terminated, buffer.truncated)
         )
+        flat = {name: rows.flatten(0, 1) for name, rows in buffer.observations.items()}
+        values = self._values(flat).reshape(rewards.shape)
+        # Values of the observations that the actions led to: where time ended an episode, that of
+        # its last observation; where the task did, the next episode's, which ``gae`` ignores.
+        next_values = torch.cat([values[1:], self._values(buffer.last_observation)[None]])
+        next_values[truncated] = self._values(buffer.final_observations)
         advantages = gae(
-            rollout.rewards,
+            rewards,
             values,
-            ahead,
-            rollout.terminated,
-            rollout.truncated,
+            next_values,
+            terminated,
+            truncated,
             gamma=self.config.gamma,
-            lam=self.config.lam,
+            gae_lambda=self.config.gae_lambda,
         )
         return values, advantages, advantages + values
 
     def _values(self, observation: Observation) -> torch.Tensor:
-        """Expected returns by the critic whose word counts, in chunks of one shape, (n,)."""
-        count, found = len(observation["goal"]), []
-        for start in range(0, count, self._size):
-            rows = torch.arange(start, start + self._size, device=self.device)
+        """Return expected returns, shape (n,), in chunks of one shape: they compile once."""
+        count, chunks = len(observation["goal"]), [torch.zeros(0, device=self.device)]
+        for start in range(0, count, self._minibatch_size):
+            rows = torch.arange(start, start + self._minibatch_size, device=self.device)
             rows = rows.clamp(max=count - 1)
-            chunk = {name: each[rows] for name, each in observation.items()}
-            found.append(self._value(chunk).clone())
-        every = torch.cat([torch.zeros(0, device=self.device), *found])[:count]
-        return symexp(every) if self.config.symlog else every
+            chunk = {name: value[rows] for name, value in observation.items()}
+            chunks.append(self._value(chunk).clone())
+        values = torch.cat(chunks)[:count]
+        return symexp(values) if self.config.symlog else values
 
-    def _learn(self, rollout: Rollout) -> Numbers:
-        """Improve the policy and the critic; returns what the report says of it."""
-        rate = learning_rate(self.config, self.update, self.updates)
-        actor, critic = self.optimiser.param_groups
-        actor["lr"], critic["lr"] = rate * self._share, rate
-        values, advantages, returns = self._targets(rollout)
-        normal = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        seen = {name: each.flatten(0, 1) for name, each in rollout.observation.items()}
-        data = {
-            "actions": rollout.actions.flatten(0, 1),
-            "log_prob": rollout.log_prob.flatten(),
-            "advantage": normal.flatten(),
+    def _learn(self) -> Metrics:
+        """Improve actor and critic on the rollout; return the metrics of learning."""
+        config, buffer = self.config, self.buffer
+        rate = learning_rate(config, self.update, self.num_updates)
+        actor_group, critic_group = self.optimiser.param_groups
+        actor_group["lr"], critic_group["lr"] = rate * self.actor_lr_scale, rate
+
+        values, advantages, returns = self._compute_returns()
+        normalised = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        observations = {name: rows.flatten(0, 1) for name, rows in buffer.observations.items()}
+        transitions = {
+            "action": buffer.actions.flatten(0, 1),
+            "log_prob": buffer.log_probs.flatten(),
+            "advantage": normalised.flatten(),
             "return": returns.flatten(),
-            "body": self._body.repeat(self.config.steps),
+            "robot": self._env_robot_index.repeat(config.num_steps),
         }
-        found = []
-        for _ in range(self.config.epochs):
+        metrics = []
+        for _ in range(config.epochs):
             order = torch.randperm(
-                len(data["body"]), generator=self._generators["minibatches"], device=self.device
+                len(transitions["robot"]),
+                generator=self.generators["minibatches"],
+                device=self.device,
             )
-            for rows in order.reshape(-1, self._size):
-                here = {name: each[rows] for name, each in seen.items()}
-                found.append(self._descend(here, {k: v[rows] for k, v in data.items()}))
-        means = dict(zip(LEARNED, torch.stack(found).mean(dim=0).tolist(), strict=True))
-        self._share = next_share(self.config, self._share, means["kl"])
+            for rows in order.reshape(-1, self._minibatch_size):
+                obs = {name: value[rows] for name, value in observations.items()}
+                minibatch = {name: value[rows] for name, value in transitions.items()}
+                metrics.append(self._gradient_step(obs, minibatch))
+
+        means = dict(zip(LEARN_METRICS, torch.stack(metrics).mean(dim=0).tolist(), strict=True))
+        self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         explained = float(explained_variance(values, returns))
-        return {**means, "explained_variance": explained, "learning_rate": actor["lr"]}
+        return {**means, "explained_variance": explained, "learning_rate": actor_group["lr"]}
 
-    def _descend(self, seen: Observation, data: Observation) -> torch.Tensor:
-        """One gradient step on a minibatch, actor and critic clipped apart; ``LEARNED``, (7,)."""
+    def _gradient_step(
+        self, observations: Observation, minibatch: Mapping[str, torch.Tensor]
+    ) -> torch.Tensor:
+        """Take one gradient step on a minibatch; return its ``LEARN_METRICS``, shape (7,)."""
         self.optimiser.zero_grad(set_to_none=True)
-        loss, told = self._losses(seen, data, self._weights())
+        loss, metrics = self._compiled_loss(observations, minibatch, self._robot_weights())
         loss.backward()  # type: ignore[no-untyped-call]
-        clip, nets = self.config.gradient_clip, (self.actor, self.critic)
-        norms = [nn.utils.clip_grad_norm_(net.parameters(), clip) for net in nets]
+        norms = [
+            nn.utils.clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
+            for network in (self.actor, self.critic)
+        ]
         self.optimiser.step()
-        follow(self.slow, self.critic, self.config.slow_decay)
-        return torch.stack([*told, *norms])
+        ema_update(self.target_critic, self.critic, self.config.slow_decay)
+        return torch.stack([*metrics, *norms])
 
-    def _objective(
-        self, seen: Observation, data: Observation, weights: torch.Tensor
+    def _loss(
+        self,
+        observations: Observation,
+        minibatch: Mapping[str, torch.Tensor],
+        robot_weights: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What is to become smaller on a minibatch, shape (), and its ``LOSSES``, (5,).
+        """Return the loss of a minibatch, shape (), and its ``LOSS_METRICS``, shape (5,).
 
         Args:
-            seen: Observations, tensors (m, ...).
-            data: What was done and what came of it, tensors (m, ...).
-            weights: How much each robot's transitions count, shape (R,).
+            observations: Observations, tensors (m, ...).
+            minibatch: Actions, log-probabilities, advantages, returns and robots, tensors (m, ...).
+            robot_weights: Weight of each robot's transitions, shape (R,).
         """
-        head = self.actor.head(self.actor(seen), seen["actions"])
-        log_ratio = head.log_prob(data["actions"]) - data["log_prob"]
-        policy = policy_loss(log_ratio, data["advantage"], self.config.clip)
+        head = self.actor.head(self.actor(observations), observations["actions"])
+        log_ratio = head.log_prob(minibatch["action"]) - minibatch["log_prob"]
+        policy = policy_loss(log_ratio, minibatch["advantage"], self.config.clip_coef)
         entropy = head.entropy()
-        error = matching_loss if self.config.symlog else half_square
-        value = error(self.critic(seen), data["return"])
-        loss = (weights[data["body"]] * (policy - self.config.entropy * entropy + value)).mean()
+        value_error = matching_loss if self.config.symlog else half_square
+        value = value_error(self.critic(observations), minibatch["return"])
+        weights = robot_weights[minibatch["robot"]]
+        loss = (weights * (policy - self.config.ent_coef * entropy + value)).mean()
         ratio = log_ratio.exp()
-        clipped = ((ratio - 1).abs() > self.config.clip).float()
-        told = (policy, value, entropy, ratio - 1 - log_ratio, clipped)
-        return loss, torch.stack([each.mean() for each in told]).detach()
+        kl = ratio - 1 - log_ratio  # Schulman 2020, estimator k3
+        clipped = ((ratio - 1).abs() > self.config.clip_coef).float()
+        metrics = (policy, value, entropy, kl, clipped)
+        return loss, torch.stack([metric.mean() for metric in metrics]).detach()
 
-    def _weights(self) -> torch.Tensor:
-        """How much each robot's transitions count, (R,), mean 1.
+    def _robot_weights(self) -> torch.Tensor:
+        """Return the weight of each robot's transitions, shape (R,), mean 1.
 
-        With reweighting they are drawn anew: a softmax of normal numbers (Lin et al. 2022,
-        "Reasonable effectiveness of random weighting").
+        With reweighting they are drawn for each gradient step: a softmax of normal numbers (Lin et
+        al. 2022, "Reasonable effectiveness of random weighting").
         """
         if not self.config.task_reweighting:
-            return torch.ones(self._bodies, device=self.device)
-        drawn = torch.empty(self._bodies, device=self.device)
-        drawn.normal_(generator=self._generators["weights"])
-        return self._bodies * torch.softmax(drawn, dim=0)
+            return torch.ones(self._num_robots, device=self.device)
+        drawn = torch.empty(self._num_robots, device=self.device)
+        drawn.normal_(generator=self.generators["weights"])
+        return self._num_robots * torch.softmax(drawn, dim=0)
+
+    def restart_episodes(self) -> None:
+        """Begin new episodes in all environments at the next ``iterate``."""
+        self._observation = None
 
 
-def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip: float) -> torch.Tensor:
-    """The clipped objective (Schulman et al. 2017, equation 7), negative; all shapes (m,)."""
+def gae(
+    rewards: torch.Tensor,
+    values: torch.Tensor,
+    next_values: torch.Tensor,
+    terminated: torch.Tensor,
+    truncated: torch.Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> torch.Tensor:
+    """Return advantages by generalised estimation (Schulman et al. 2016, equation 16).
+
+    After a termination the return is zero. After a truncation it is the value of the episode's last
+    observation (Pardo et al. 2018), and the sum stops there. All tensors have the shape (T, n).
+
+    Args:
+        rewards: Rewards of T control steps in n environments.
+        values: Values of the observations that were acted upon.
+        next_values: Values of the observations that the actions led to, before any new episode.
+        terminated: Where the task ended the episode, bool.
+        truncated: Where the time limit ended the episode, bool.
+        gamma: Discount factor.
+        gae_lambda: Weight of longer estimates.
+
+    Returns:
+        Advantages; plus ``values`` they are the returns that the critic learns.
+    """
+    delta = rewards + gamma * torch.where(terminated, 0.0, next_values) - values
+    carry = gamma * gae_lambda * (~(terminated | truncated)).to(delta.dtype)
+    advantages = torch.empty_like(delta)
+    advantage = torch.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        advantage = delta[t] + carry[t] * advantage
+        advantages[t] = advantage
+    return advantages
+
+
+def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip_coef: float) -> torch.Tensor:
+    """Return the negative clipped objective (Schulman et al. 2017, equation 7), shape (m,)."""
     ratio = log_ratio.exp()
-    return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
+    return -torch.minimum(ratio * advantage, clipped * advantage)
+
+
+def learning_rate(config: PPOConfig, update: int, num_updates: int) -> float:
+    """Return the learning rate of an update, counted from 0; it falls linearly to zero."""
+    return config.learning_rate * (1 - update / num_updates)
+
+
+def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
+    """Return the factor on the actor's learning rate in the next update.
+
+    Args:
+        config: The algorithm; without a ``desired_kl`` the factor is 1.
+        scale: Factor in the last update.
+        kl: Mean divergence of the last update's gradient steps [nats].
+    """
+    if not config.desired_kl:
+        return 1.0
+    if kl > config.desired_kl:
+        return max(scale / KL_FACTOR, MIN_ACTOR_LR_SCALE)
+    return min(scale * KL_FACTOR, 1.0)
 
 
 @torch.no_grad()
-def follow(slow: nn.Module, fast: nn.Module, decay: float) -> None:
-    """Move the weights of one network towards another's: ``decay`` of its own remain."""
+def ema_update(target: nn.Module, source: nn.Module, decay: float) -> None:
+    """Move a network's weights towards another's: keep ``decay`` of them, take the rest."""
     average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    average([*slow.parameters()], [*fast.parameters()], 0)
-
-
-def _require_same(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
-    wrong = [f"{k} {theirs.get(k)}, here {ours[k]}" for k in ours if theirs.get(k) != ours[k]]
-    if wrong:
-        raise TaskError(f"the checkpoint is of another run: {'; '.join(wrong)}")
+    average([*target.parameters()], [*source.parameters()], 0)

@@ -1,4 +1,4 @@
-"""What is measured on the way of a run: lines of JSON, events of TensorBoard, Weights & Biases."""
+"""Record the metrics of a run: JSON lines, TensorBoard events, Weights & Biases."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ METRICS, EVENTS = "metrics.jsonl", "events"
 
 
 class Recorder(Protocol):
-    """Keeps reports."""
+    """Stores reports."""
 
     def record(self, report: Report) -> None:
-        """Keep one."""
+        """Store a report."""
 
     def close(self) -> None:
-        """Finish."""
+        """Finish the record."""
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Reports of a run, an update each, oldest first; none if it has none yet.
+    """Return the reports of a run, one per update, oldest first.
 
-    A last line that a killed run left unfinished does not count.
+    An unfinished last line of a killed run is ignored.
 
     Raises:
         FormatError: If a line is no report.
@@ -56,10 +56,10 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 
 
 class Metrics:
-    """``metrics.jsonl``: a line a report, nothing instead of what is not finite."""
+    """``metrics.jsonl``: a line per report, with null for numbers that are not finite."""
 
     def __init__(self, folder: Path, update: int) -> None:
-        """Go on after an update; what was kept of later ones is forgotten."""
+        """Continue after an update; reports of later updates are removed."""
         kept = [each for each in read_metrics(folder) if each["update"] <= update]
         path = folder / METRICS
         write_atomic(path, "".join(json.dumps(each) + "\n" for each in kept))
@@ -76,10 +76,10 @@ class Metrics:
 
 
 class TensorBoard:
-    """Events that ``tensorboard --logdir`` shows."""
+    """Events for ``tensorboard --logdir``."""
 
     def __init__(self, folder: Path, update: int) -> None:
-        """Go on after an update.
+        """Continue after an update.
 
         Raises:
             MissingDependencyError: If tensorboard is not installed.
@@ -98,7 +98,7 @@ class TensorBoard:
             self._writer.add_scalar(name, value, report.update)
 
     def close(self) -> None:
-        """Write what is not written yet."""
+        """Write the remaining events."""
         self._writer.close()
 
 
@@ -106,11 +106,11 @@ class WeightsAndBiases:
     """A run of Weights & Biases."""
 
     def __init__(self, folder: Path, config: RunConfig) -> None:
-        """Begin, or go on with the run of this folder.
+        """Begin, or continue the run of this folder.
 
         Raises:
             MissingDependencyError: If wandb is not installed.
-            TaskError: If it refuses, such as where nobody is logged in.
+            TaskError: If it refuses, for example without a login.
         """
         wandb = require_wandb()
         try:
@@ -135,7 +135,7 @@ class WeightsAndBiases:
 
 
 def require_wandb() -> ModuleType:
-    """Weights & Biases.
+    """Return the module of Weights & Biases.
 
     Raises:
         MissingDependencyError: If wandb is not installed.
@@ -152,7 +152,7 @@ def require_wandb() -> ModuleType:
 def recording(
     folder: Path, config: RunConfig, update: int, *, tensorboard: bool, wandb: bool
 ) -> Iterator[list[Recorder]]:
-    """The recorders of a run that goes on after an update."""
+    """Open the recorders of a run that continues after an update."""
     with ExitStack() as stack:
         kept: list[Recorder] = [Metrics(folder, update)]
         stack.callback(kept[0].close)
@@ -166,7 +166,7 @@ def recording(
 
 
 def scalars(report: Report) -> Iterator[tuple[str, float]]:
-    """Names and values of a report that are numbers; those of robots and terms by ``/``."""
+    """Yield names and values of a report's numbers; those of robots and terms as ``name/key``."""
     for name, value in asdict(report).items():
         if isinstance(value, Mapping):
             yield from ((f"{name}/{key}", float(each)) for key, each in value.items())

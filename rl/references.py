@@ -10,12 +10,9 @@ from numpy.typing import NDArray
 
 from morphgen.model.inverse_kinematics_torch import solve_position_ik
 from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
-from morphgen.rl.rollouts import Controller
-from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
-from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
 
 Array = NDArray[np.float64]
@@ -31,29 +28,6 @@ MAX_STEP = 0.5
 """Largest change of a joint in one iteration, rad or m."""
 CLOSE = 0.003
 """Distance from a goal that counts as solved, metres."""
-
-
-class Zero:
-    """Does nothing."""
-
-    def act(self, task: TaskBatch) -> torch.Tensor:
-        """No change of any target."""
-        return actions_of(torch.zeros(task.mask.shape, device=task.mask.device), task.kind)
-
-
-class Random:
-    """Draws every action evenly from all there are; its stream is its own."""
-
-    def __init__(self, seed: int) -> None:
-        self._generator = torch.Generator().manual_seed(seed)
-
-    def act(self, task: TaskBatch) -> torch.Tensor:
-        """Even over [-1, 1], or over the bins."""
-        if task.kind == "discrete":
-            drawn = torch.randint(len(BINS), task.mask.shape, generator=self._generator)
-        else:
-            drawn = 2 * torch.rand(task.mask.shape, generator=self._generator) - 1
-        return drawn.to(task.mask.device)
 
 
 class InverseKinematics:
@@ -161,19 +135,6 @@ def random_starts(
     drawn = torch.rand(STARTS - 1, *near.shape, generator=generator).to(near.device)
     starts = torch.cat([near[None], lower + (upper - lower) * drawn])
     return torch.where(bodies.moves_tool[body], starts, near)
-
-
-def reference(name: str, batch: TaskBatch, seed: int) -> Controller:
-    """The controller of a name in ``morphgen.rl.names.REFERENCES``, for a batch.
-
-    Raises:
-        BenchmarkError: If a robot has hardly a free configuration.
-    """
-    if name == "ik":
-        return InverseKinematics(seed, [FreeSpace(spec.scene) for spec in batch.specs])
-    if name == "scripted":
-        return ScriptedPush(seed)
-    return Random(seed) if name == "random" else Zero()
 
 
 def _numbers(values: torch.Tensor) -> Array:

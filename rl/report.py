@@ -1,4 +1,4 @@
-"""What learning says of itself, an update at a time."""
+"""The metrics of an update."""
 
 from __future__ import annotations
 
@@ -7,75 +7,59 @@ from typing import Any
 
 import torch
 
-Numbers = dict[str, Any]
+Metrics = dict[str, Any]
 """Fields of a report by name."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """An update in numbers; means over its transitions unless said otherwise."""
+    """Metrics of one update; means over its transitions unless said otherwise."""
 
     update: int
-    """How many updates there were, this one among them."""
+    """Number of updates so far, this one included."""
     transitions: int
-    """Of all of these."""
+    """Control steps of all environments so far."""
     reward: float
+    """Mean reward of a control step."""
     score: float
+    """Mean task score of a control step."""
     scores: tuple[float, ...]
-    """By robot; nan for one without an environment."""
+    """Mean score of each robot; nan for one without an environment."""
     success: float
-    """Share of the episodes that ended here; nan if none did."""
+    """Share of successes among the episodes that ended in the rollout; nan if none did."""
     episodes: int
-    """How many ended here."""
+    """Number of episodes that ended in the rollout."""
     unstable: int
-    """How many of them because their simulation became unstable."""
+    """Number of episodes that ended because the simulation diverged."""
     terms: dict[str, float]
-    """Of the reward."""
+    """Mean of each reward term."""
     policy_loss: float
+    """Clipped policy loss."""
     value_loss: float
     """Half the squared error, or ``matching_loss`` if the critic predicts symlogs."""
     entropy: float
-    """Of a robot's action, nats."""
+    """Entropy of a robot's action distribution [nats]."""
     kl: float
-    """From the policy that acted to the one that is learned (Schulman 2020, estimator k3)."""
+    """Divergence of the updated policy from the one that acted [nats] (Schulman 2020, k3)."""
     clip_fraction: float
-    """Share of the ratios outside of the clip range."""
+    """Share of the probability ratios outside of the clip range."""
     actor_gradient: float
+    """Norm of the actor's gradient before clipping."""
     critic_gradient: float
-    """Norms before clipping."""
+    """Norm of the critic's gradient before clipping."""
     explained_variance: float
-    """Of the returns, by the values before the update."""
+    """Share of the returns' variance that the values before the update explain."""
     learning_rate: float
-    """Of the actor."""
+    """Learning rate of the actor."""
     collect_seconds: float
+    """Time to collect the rollout [s]."""
     learn_seconds: float
+    """Time to learn from it [s]."""
     steps_per_second: float
-    """Transitions a second, collection and learning together."""
-
-
-def outcome(tallied: dict[str, torch.Tensor], body: torch.Tensor, bodies: int) -> Numbers:
-    """What a report says of a rollout.
-
-    Args:
-        tallied: Tensors (T, n) of steps, by the names of ``Step``.
-        body: Which robot each environment holds, shape (n,), int64.
-        bodies: How many robots there are.
-    """
-    over = tallied["terminated"] | tallied["truncated"]
-    score = tallied["score"].float().mean(dim=0)
-    count = torch.bincount(body, minlength=bodies)
-    scores = torch.zeros(bodies, device=score.device).index_add_(0, body, score) / count
-    return {
-        "reward": float(tallied["reward"].mean()),
-        "score": float(score.mean()),
-        "scores": tuple(scores.tolist()),
-        "success": float(tallied["success"][over].float().mean()),
-        "episodes": int(over.sum()),
-        "unstable": int(tallied["unstable"].sum()),
-    }
+    """Transitions per second, collection and learning together."""
 
 
 def explained_variance(values: torch.Tensor, returns: torch.Tensor) -> torch.Tensor:
-    """1 if values predict returns, 0 if no better than their mean; 0 if these are all one."""
+    """Return 1 if values predict the returns, and 0 if no better than the returns' mean."""
     spread = returns.var()
     return torch.where(spread > 0, 1 - (returns - values).var() / spread.clamp(min=1e-12), 0.0)

@@ -1,4 +1,4 @@
-"""Episodes of a controller in a batch, one line each."""
+"""Run a controller in a batch of environments, and record its episodes."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ from morphgen.tasks.registry import TASKS
 
 
 class Controller(Protocol):
-    """What acts."""
+    """Acts in a batch: a baseline, or a policy (``inference.PolicyController``)."""
 
     def act(self, task: TaskBatch) -> torch.Tensor:
-        """Actions of all environments, shape (n, L)."""
+        """Return actions of all environments, shape (n, L)."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """How an episode went."""
+    """Result of an episode."""
 
     env: int
-    body: int
+    """Index of the environment."""
+    robot_index: int
     """Index of the robot."""
     success: bool
-    """At its end."""
+    """Whether the episode ended in success."""
     distance: float
-    """From success then, metres; see ``Step``."""
+    """Distance from success at the end [m]."""
     score: float
-    """See ``Task.episode_score``."""
+    """Score of the episode; see ``episode_score``."""
     steps: int
+    """Length of the episode [control steps]."""
     unstable: bool
-    """Whether it ended because the simulation became unstable; see ``Step``."""
+    """Whether the episode ended because the simulation diverged."""
 
     @property
     def seconds(self) -> float:
-        """How long it was, simulated."""
+        """Length of the episode [s of simulated time]."""
         return self.steps * CONTROL_PERIOD
 
 
@@ -49,24 +51,24 @@ def run_episodes(
     count: int,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Episode]:
-    """The first episodes of every environment, as many of each.
+    """Return the first episodes of every environment, as many of each.
 
     Args:
         batch: Environments; they are reset first.
-        controller: What acts.
-        count: Episodes of each environment.
-        progress: Told after every step how many episodes are over, parts of them included.
+        controller: The controller.
+        count: Episodes per environment.
+        progress: Called after every step with the episodes done so far, fractions included.
 
     Returns:
-        By environment, and then in their order.
+        Episodes by environment, in their order.
 
     Raises:
         SimulationError: If the simulator fails.
     """
     batch.reset()
     n = batch.num_envs
-    found: list[list[Episode]] = [[] for _ in range(n)]
-    bodies = batch.body.tolist()
+    episodes: list[list[Episode]] = [[] for _ in range(n)]
+    robot_indices = batch.body.tolist()
     total = torch.zeros(n, device=batch.device)
     steps = torch.zeros(n, dtype=torch.int64, device=batch.device)
     done = 0
@@ -75,23 +77,23 @@ def run_episodes(
         step = batch.step(controller.act(batch))
         total += step.score
         steps += 1
-        over = torch.nonzero(step.terminated | step.truncated)[:, 0]
-        left[over] -= 1
-        for env in over.tolist():
-            if len(found[env]) < count:
+        ended = torch.nonzero(step.terminated | step.truncated)[:, 0]
+        left[ended] -= 1
+        for env in ended.tolist():
+            if len(episodes[env]) < count:
                 numbers = float(total[env]), float(step.score[env]), int(steps[env])
-                found[env].append(
+                episodes[env].append(
                     Episode(
                         env,
-                        bodies[env],
+                        robot_indices[env],
                         bool(step.success[env]),
                         float(step.distance[env]),
-                        TASKS[batch.specs[bodies[env]].task].episode_score(*numbers),
+                        TASKS[batch.specs[robot_indices[env]].task].episode_score(*numbers),
                         int(steps[env]),
                         bool(step.unstable[env]),
                     )
                 )
                 done += 1
-        total[over], steps[over] = 0, 0
+        total[ended], steps[ended] = 0, 0
         progress(done + float((steps / batch.longest)[left > 0].sum()))
-    return [episode for own in found for episode in own]
+    return [episode for own in episodes for episode in own]

@@ -1,4 +1,4 @@
-"""A run's folder: what was asked for, and how far it got."""
+"""The folder of a run: its config and its last checkpoint."""
 
 from __future__ import annotations
 
@@ -10,80 +10,90 @@ from pathlib import Path
 from typing import Any
 
 from morphgen.benchmark.token_layout import MAX_LINKS
-from morphgen.errors import FormatError, TaskError
+from morphgen.errors import FormatError, TaskError, nearest
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_of, write_atomic
-from morphgen.rl.checkpoint_content import require_fields, require_learner
+from morphgen.rl.aliases import current_learner, current_run
+from morphgen.rl.checkpoint_content import require_fields, require_learner, require_policy
 from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
-from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.sources import Source, most_obstacles
+from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from
+from morphgen.rl.robot_source import RobotSource, most_obstacles
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.task import TaskConfig
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
-FORMAT = 2
-"""Of config and checkpoint; rises when older ones cannot be read any more. In 1 every agent had a
-scale of logits, and none by default."""
+FORMAT = 3
+"""Version of config and checkpoint. Format 2 has other names of keys; see ``aliases``."""
+READABLE = (2, FORMAT)
+"""Formats that are read. In format 1 every agent had a scale of logits, and none by default."""
 
 
 @dataclass(frozen=True)
 class Interface:
-    """What policies see and do; environments for them are made so."""
+    """Actions and observations of a policy; its environments are made accordingly."""
 
     kind: ActionKind = "continuous"
+    """Kind of the actions."""
     max_links: int | None = None
-    """Links that observations and actions are padded to, as ``batch_of`` has it."""
+    """Links that observations and actions are padded to; None for those of the largest robot."""
     channels: ObservationConfig = field(default_factory=ObservationConfig)
+    """Channels of the observations."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """All that a run's weights follow from, but the machine."""
+    """Everything that determines the weights of a run, except for the machine."""
 
-    source: Source
+    source: RobotSource
+    """Robots and their tasks."""
     policy: PolicyConfig
+    """Agent and networks."""
     ppo: PPOConfig
+    """Constants of the algorithm."""
     seed: int = 0
-    """Of weights, actions, minibatches and episodes."""
+    """Seed of weights, actions, minibatches and episodes."""
     sim: str = "pybullet"
-    envs: int = 128
+    """Simulator."""
+    num_envs: int = 128
+    """Number of parallel environments, which the robots share."""
     device: str = "cpu"
-    """Of networks and rollouts."""
-    begin: str = ""
-    """A checkpoint whose networks it begins with."""
-    whole: bool = False
-    """Whether ``se`` has all environments and transitions for each robot of a split (paper); else
-    the robots share them, as those of an agent of many robots do."""
+    """Device of networks and rollouts."""
+    initial_checkpoint: str = ""
+    """Path of a checkpoint whose networks the run begins with; empty for random weights."""
+    full_budget: bool = False
+    """Give an agent of single robots all environments and timesteps for each robot of a split
+    (paper); otherwise the robots share them, as they do with an agent of many robots."""
     max_links: int = MAX_LINKS
     """Links that observations and actions are padded to; no robot may have more."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Constants of tasks; in files each has an entry of its own, under the name of its task."""
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check the numbers.
 
         Raises:
-            TaskError: If the seed is none, there is no environment, or so many links are too few
-                for any robot.
+            TaskError: If the seed, the number of environments or of links is out of its range.
         """
         if self.seed < 0:
             raise TaskError(f"--seed {self.seed}: expected 0 or more")
-        if self.envs < 1:
-            raise TaskError(f"--envs {self.envs}: expected 1 or more")
+        if self.num_envs < 1:
+            raise TaskError(f"--envs {self.num_envs}: expected 1 or more")
+        if self.sim not in SIMULATORS:
+            raise TaskError(f"unknown simulator {self.sim!r}{nearest(self.sim, SIMULATORS)}")
         if self.max_links < 2:
             raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
 
     @property
-    def updates(self) -> int:
-        """How many there will be."""
-        return self.ppo.updates(self.envs)
+    def num_updates(self) -> int:
+        """Number of updates of the whole run."""
+        return self.ppo.num_updates(self.num_envs)
 
     @property
     def interface(self) -> Interface:
-        """Of its policy."""
+        """Actions and observations of the policy."""
         obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
         channels = ObservationConfig(tool=self.policy.tool_position, obstacles=obstacles)
         return Interface(self.policy.kind, self.max_links, channels)
@@ -96,9 +106,9 @@ class RunConfig:
 
 
 def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
-    """Make a run's folder, or make sure that the one that is there is of this run.
+    """Create a run's folder, or check that an existing one is of this run.
 
-    A run that has no checkpoint yet has nothing to go on from, and may become another.
+    A run without a checkpoint has nothing to continue from, and is overwritten.
 
     Raises:
         TaskError: As ``require_open``.
@@ -117,10 +127,10 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
 
 
 def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
-    """Require that a run can be in a folder, before anything is written.
+    """Require that a folder can hold a run, before anything is written.
 
     Raises:
-        TaskError: If it is there and is not to be resumed, or is of another run or none.
+        TaskError: If it has a run that is not to be resumed, or another run, or other files.
     """
     path = folder / CONFIG
     if _has_learned(folder):
@@ -138,15 +148,15 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
 
 
 def _has_learned(folder: Path) -> bool:
-    """Whether it is a run's folder, and has a checkpoint, or one of its robots has."""
+    """Return whether a run's folder has a checkpoint, or one of its robots has."""
     return (folder / CONFIG).is_file() and next(folder.rglob(CHECKPOINT), None) is not None
 
 
 def read_config(folder: Path) -> RunConfig:
-    """What a run was asked for.
+    """Return the config of a run.
 
     Raises:
-        TaskError: If the folder is no run's.
+        TaskError: If the folder has none, or an invalid one.
     """
     path = folder / CONFIG
     try:
@@ -163,14 +173,14 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def config_from(data: object) -> RunConfig:
-    """A config from what JSON keeps of it.
+    """Return the config that is stored in JSON or in a checkpoint, with earlier names or today's.
 
     Raises:
-        TaskError: If something is missing, unknown, of another type or out of its range.
+        TaskError: If an entry is missing, unknown, of another type or out of its range.
     """
     if not isinstance(data, Mapping):
         raise TaskError("run: expected a table")
-    own = {key: value for key, value in data.items() if key not in ("format", "morphgen")}
+    own = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
     constants = {name: own.pop(name) for name in list(own) if name in TASKS}
     if "tasks" in own:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown entry 'tasks'")
@@ -180,15 +190,16 @@ def config_from(data: object) -> RunConfig:
             raise TaskError(f"run: no {name}")
     for name, values in constants.items():
         require_fields(TASKS[name].config_type, values, name)
-    made = {"source": Source, "policy": PolicyConfig, "ppo": PPOConfig}
+    made = {"source": RobotSource, "policy": PolicyConfig, "ppo": PPOConfig}
     for name, kind in made.items():
         if name not in own:
             raise TaskError(f"run: no {name}")
         require_fields(kind, own[name], name)
+    require_policy(own["policy"], "policy")
     source = _tuples(own.pop("source"))
     return RunConfig(
-        Source(**source),
-        PolicyConfig(**own.pop("policy")),
+        RobotSource(**source),
+        policy_from(own.pop("policy")),
         PPOConfig(**own.pop("ppo")),
         tasks=task_configs(constants),
         **own,
@@ -196,7 +207,7 @@ def config_from(data: object) -> RunConfig:
 
 
 def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:
-    """Put a checkpoint in the place of the last one.
+    """Replace the checkpoint of a run.
 
     Raises:
         FormatError: If it cannot be written.
@@ -212,14 +223,15 @@ def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]
 
 
 def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
-    """The run of a checkpoint, and what its learner was then.
+    """Return the config of a checkpoint's run, and the state of its learner.
 
     Args:
-        path: The file, or the run's folder. Nothing in it is executed.
+        path: The file, or the run's folder. Nothing in it is executed. Earlier names of keys are
+            replaced by today's.
 
     Raises:
-        TaskError: If there is none, or it is none of a run: it is damaged, incomplete or beyond a
-            limit, or a number in it is not finite.
+        TaskError: If there is no checkpoint, or it is damaged, incomplete or beyond a limit, or a
+            number in it is not finite.
     """
     file = path / CHECKPOINT if path.is_dir() else path
     if not file.is_file():
@@ -232,17 +244,18 @@ def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
         config = config_from(data["run"])
     except TaskError as error:
         raise TaskError(f"{file}: {error}") from error
-    require_learner(data["learner"], str(file))
+    learner = current_learner(data["learner"])
+    require_learner(learner, str(file))
     if not is_hashed:
         warn_of_no_hash(file)
-    return config, data["learner"]
+    return config, learner
 
 
 def _require_format(path: Path, data: Mapping[str, Any]) -> None:
-    if data["format"] != FORMAT or isinstance(data["format"], bool):
+    if data["format"] not in READABLE or isinstance(data["format"], bool):
         raise TaskError(
-            f"{path} has format {data['format']!r}, and this morphgen reads {FORMAT}: it was "
-            "written by another version"
+            f"{path} has format {data['format']!r}; expected {' or '.join(map(str, READABLE))}: it "
+            "was written by another version of morphgen"
         )
 
 

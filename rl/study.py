@@ -1,14 +1,13 @@
-"""A study: agents times seeds times splits, a run's folder each, and reference controllers."""
+"""Studies: every agent with every seed on every split, and baselines to compare with."""
 
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,114 +20,131 @@ from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, write_atomic
 from morphgen.processes import ray_cluster, require_ray
+from morphgen.rl.aliases import renamed
+from morphgen.rl.baselines import BASELINES, is_for
 from morphgen.rl.evaluation import (
-    Count,
-    Exam,
-    Score,
-    as_data,
-    evaluate_reference,
+    EvalConfig,
+    StartProgress,
+    evaluate_baseline,
     evaluate_run,
-    uncounted,
+    no_progress_of,
 )
-from morphgen.rl.names import REFERENCES, is_for
+from morphgen.rl.inference import MODES, Mode
+from morphgen.rl.robot_source import RobotSource, members, other_side, tasks_of
 from morphgen.rl.runs import RunConfig, require_open
-from morphgen.rl.sources import Source, members, other_side, tasks_of
-from morphgen.rl.trained import MODES, Mode
-from morphgen.rl.training import Part, Show, Way, train
+from morphgen.rl.scores import Score, score_from_json, scores_to_json
+from morphgen.rl.training import ExecutionConfig, Part, Show, train
 
 SCORES = "scores.json"
 POLL = 2.0
-"""Seconds between two looks at cells that another process works on."""
+"""Seconds between two checks of cells that another process works on."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One agent, seed and split, or a reference controller; done when its scores are there."""
+    """One agent, seed and split, or a baseline; done when its scores are there."""
 
     folder: Path
+    """Folder of the run and its scores."""
     split: str
+    """Name of the split."""
     agent: str
+    """Label of the agent, or name of the baseline."""
     seed: int | None
-    """None for a reference."""
-    source: Source
-    exam: Exam
+    """Seed of the run; None for a baseline."""
+    source: RobotSource
+    """Robots that the agent is trained on; for a baseline, those of the split."""
+    eval_config: EvalConfig
+    """Constants of the evaluation."""
     config: RunConfig | None = None
-    """None for a reference."""
+    """Config of the run; None for a baseline."""
 
     @property
     def sides(self) -> tuple[Side, ...]:
-        """On which it is evaluated: the test side alone, if it is trained there."""
+        """Sides that the cell is evaluated on: the test side alone, if it is trained there."""
         return ("test",) if self.source.side == "test" else ("train", "test")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cell."""
+    """Result of the work on a cell."""
 
     cell: Cell
-    why: str = ""
+    """The cell."""
+    error: str = ""
     """Why it failed; empty if it did not."""
 
 
-Work = Callable[[Sequence[Cell], Way], Iterator[Outcome]]
-"""Does cells, and tells as each is done."""
+Work = Callable[[Sequence[Cell], ExecutionConfig], Iterator[Outcome]]
+"""Does cells, and yields the outcome of each when it is done."""
 
 
-def reference_cells(folder: Path, source: Source, exam: Exam) -> list[Cell]:
-    """The reference controllers for the tasks of a split."""
+def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -> list[Cell]:
+    """Return the cells of the baselines for the tasks of a split."""
     tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
     return [
-        Cell(folder / source.name / name, source.name, name, None, source, _plain(exam))
-        for name in REFERENCES
+        Cell(
+            folder / source.name / name,
+            source.name,
+            name,
+            None,
+            source,
+            replace(eval_config, workers=1),
+        )
+        for name in BASELINES
         if is_for(name, tasks)
     ]
 
 
-def agent_cell(folder: Path, agent: str, config: RunConfig, exam: Exam) -> Cell:
-    """The cell of a run."""
+def agent_cell(folder: Path, agent: str, config: RunConfig, eval_config: EvalConfig) -> Cell:
+    """Return the cell of a run."""
     source = config.source
-    place = folder / source.name / agent / f"seed{config.seed}"
-    return Cell(place, source.name, agent, config.seed, source, _plain(exam), config)
+    own = folder / source.name / agent / f"seed{config.seed}"
+    return Cell(
+        own, source.name, agent, config.seed, source, replace(eval_config, workers=1), config
+    )
 
 
 def matched_budget(config: RunConfig) -> RunConfig:
-    """A run on a split's test robots with as much of each as a run on its train robots has.
+    """Give a run on test robots the environments and timesteps per robot of one on train robots.
 
-    Others are as they are, and so are all that give each robot the whole.
+    Other runs stay as they are, and so do those with the full budget for each robot.
     """
-    if config.source.side == "train" or config.whole:
+    if config.source.side == "train" or config.full_budget:
         return config
     own, trained = len(members(config.source)), len(members(other_side(config.source, "train")))
-    transitions = -(-config.ppo.transitions * own // trained)
-    ppo = replace(config.ppo, transitions=transitions)
-    return replace(config, ppo=ppo, envs=-(-config.envs * own // trained))
+    total_timesteps = -(-config.ppo.total_timesteps * own // trained)
+    ppo = replace(config.ppo, total_timesteps=total_timesteps)
+    return replace(config, ppo=ppo, num_envs=-(-config.num_envs * own // trained))
 
 
 def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
-    """Scores by mode, or by the reference's name; None if the cell is not done.
+    """Return the scores of a cell by mode, or by the baseline's name; None if it is not done.
 
     Raises:
         TaskError: If they are of another evaluation, or of other robots or goals.
-        FormatError: If they are malformed.
+        FormatError: If the file is malformed.
     """
     path = cell.folder / SCORES
     if not path.is_file():
         return None
     try:
-        data = read_json(path)
-        found = {mode: [_score(each) for each in own] for mode, own in data["scores"].items()}
-        made_with = data["exam"], data["source"]
+        data = renamed("scores", read_json(path))
+        scores = {
+            mode: [score_from_json(each) for each in own] for mode, own in data["scores"].items()
+        }
+        made_with = data["eval"], renamed("source", data["source"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: not the scores of a cell: {error}") from error
-    wanted = json.loads(json.dumps([cell.exam.as_data(), asdict(cell.source)]))
+    wanted = json.loads(json.dumps([cell.eval_config.as_data(), asdict(cell.source)]))
     for what, theirs, ours in zip(("evaluation", "set of robots"), made_with, wanted, strict=True):
         if theirs != ours:
             raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
-    return found
+    return scores
 
 
 def require_cells(cells: Sequence[Cell]) -> None:
-    """Require that what is there of cells is of these, before anything is done.
+    """Require that the folders of cells have no other runs or scores, before anything is done.
 
     Raises:
         TaskError: If a cell's folder has another run or evaluation.
@@ -140,79 +156,81 @@ def require_cells(cells: Sequence[Cell]) -> None:
         read_scores(cell)
 
 
-def do(
+def do_cell(
     cell: Cell,
-    way: Way,
+    execution: ExecutionConfig,
     show: Callable[[Part], Show] | None = None,
-    count: Count = uncounted,
+    progress: StartProgress = no_progress_of,
 ) -> None:
-    """Train and evaluate what is not there yet. Nobody else may work on the cell.
+    """Train and evaluate a cell, as far as it is not done. No other process may work on it.
 
     Raises:
         MorphgenError: As ``train`` and ``evaluate``.
     """
     if read_scores(cell) is not None:
         return
-    exam = replace(cell.exam, workers=way.workers)
+    eval_config = replace(cell.eval_config, workers=execution.workers)
     if cell.config is None:
-        found = {cell.agent: _reference(cell, exam, count)}
+        scores = {cell.agent: _baseline_scores(cell, eval_config, progress)}
     else:
-        train(cell.folder, cell.config, resume=True, way=way, show=show, hold=_held)
-        found = {mode: _trained(cell, cell.config, exam, mode, count) for mode in MODES}
+        train(cell.folder, cell.config, resume=True, execution=execution, show=show, hold=_locked)
+        scores = {
+            mode: _policy_scores(cell, cell.config, eval_config, mode, progress) for mode in MODES
+        }
     data = {
-        "exam": cell.exam.as_data(),
+        "eval": cell.eval_config.as_data(),
         "source": asdict(cell.source),
-        "scores": {mode: as_data(scores) for mode, scores in found.items()},
+        "scores": {mode: scores_to_json(own) for mode, own in scores.items()},
     }
     write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
 
 
 def work_here(
     cells: Sequence[Cell],
-    way: Way,
+    execution: ExecutionConfig,
     show: Callable[[Part], Show] | None = None,
-    count: Count = uncounted,
+    progress: StartProgress = no_progress_of,
 ) -> Iterator[Outcome]:
-    """Do cells one after another.
+    """Do cells one after another, and yield their outcomes.
 
-    Other processes may do the same: each cell is done by one, and those that others work on are
-    waited for at the end.
+    Other processes may work on the same cells: each cell is done by one process, and this one waits
+    at the end for the cells of the others.
     """
     waiting = deque(cells)
-    passed = 0
+    skipped = 0
     while waiting:
         cell = waiting.popleft()
-        outcome = _alone(cell, way, show, count)
+        outcome = _do_locked(cell, execution, show, progress)
         if outcome is not None:
-            passed = 0
+            skipped = 0
             yield outcome
             continue
         waiting.append(cell)
-        passed += 1
-        if passed >= len(waiting):
+        skipped += 1
+        if skipped >= len(waiting):
             time.sleep(POLL)
-            passed = 0
+            skipped = 0
 
 
 def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
-    """Do cells on the Ray cluster at an address, a task each; without one, on a local Ray.
+    """Return work on the Ray cluster at an address, a task per cell; without one, on a local Ray.
 
     Its machines have morphgen installed and share the study's folder.
 
     Args:
-        address: Of the cluster.
-        gpus: Of a cell; a share if below 1.
+        address: Address of the cluster.
+        gpus: GPUs per cell; a fraction if below 1.
 
     Raises:
         MissingDependencyError: If ray is not installed.
     """
     ray = require_ray()
 
-    def work(cells: Sequence[Cell], way: Way) -> Iterator[Outcome]:
+    def work(cells: Sequence[Cell], execution: ExecutionConfig) -> Iterator[Outcome]:
         with ray_cluster(address):
-            remote = ray.remote(num_cpus=way.workers, num_gpus=gpus, max_retries=0)(_on_ray)
+            remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)
             running = {
-                remote.remote(replace(cell, folder=cell.folder.resolve()), way): cell
+                remote.remote(replace(cell, folder=cell.folder.resolve()), execution): cell
                 for cell in cells
             }
             while running:
@@ -226,67 +244,63 @@ def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
     return work
 
 
-def _on_ray(cell: Cell, way: Way) -> str:
-    (outcome,) = work_here([cell], way)
-    return outcome.why
+def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:
+    (outcome,) = work_here([cell], execution)
+    return outcome.error
 
 
-def _alone(
-    cell: Cell, way: Way, show: Callable[[Part], Show] | None, count: Count
+def _do_locked(
+    cell: Cell,
+    execution: ExecutionConfig,
+    show: Callable[[Part], Show] | None,
+    progress: StartProgress,
 ) -> Outcome | None:
-    """Do a cell; None if another process works on it."""
+    """Do a cell and return its outcome; None if another process works on it."""
     try:
         cell.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(cell.folder / LOCK, timeout=0):
-            do(cell, way, show, count)
+            do_cell(cell, execution, show, progress)
     except Timeout:
         return None
     except MorphgenError as error:
         return Outcome(cell, str(error))
     except OSError as error:
         return Outcome(cell, f"{error.filename or cell.folder}: {error.strerror}")
-    except Exception as error:  # such as a GPU without memory: the other cells may do without
+    except Exception as error:  # such as a GPU out of memory: the other cells go on
         traceback.print_exc(file=sys.stderr)
         return Outcome(cell, f"{type(error).__name__}: {error}")
     return Outcome(cell)
 
 
-def _held(folder: Path) -> AbstractContextManager[None]:
-    """The cell's lock is held already."""
+def _locked(folder: Path) -> AbstractContextManager[None]:
+    """Lock nothing: ``_do_locked`` holds the lock of the cell's folder."""
     return nullcontext()
 
 
-def _score(data: Mapping[str, Any]) -> Score:
-    """A score from what ``as_data`` made of it."""
-    whole: dict[str, Any] = {k: math.nan if v is None else v for k, v in data.items()}
-    return Score(**whole)
-
-
-def _trained(cell: Cell, config: RunConfig, exam: Exam, mode: Mode, count: Count) -> list[Score]:
-    """Of the sides that the cell is scored on."""
-    found = []
+def _policy_scores(
+    cell: Cell, config: RunConfig, eval_config: EvalConfig, mode: Mode, progress: StartProgress
+) -> list[Score]:
+    """Return the scores of a run on the sides that its cell is evaluated on."""
+    scores = []
     for side in cell.sides:
-        tell = count(f"{cell.agent} {mode} on {side}")
-        found += evaluate_run(cell.folder, side, exam, mode, device=config.device, tell=tell)
-    return found
+        show = progress(f"{cell.agent} {mode} on {side}")
+        scores += evaluate_run(
+            cell.folder, side, eval_config, mode, device=config.device, progress=show
+        )
+    return scores
 
 
-def _reference(cell: Cell, exam: Exam, count: Count) -> list[Score]:
-    """Of both sides; those whose robots are at other tasks have none."""
-    found = []
+def _baseline_scores(cell: Cell, eval_config: EvalConfig, progress: StartProgress) -> list[Score]:
+    """Return the scores of a baseline on both sides, as far as their robots do its tasks."""
+    scores = []
     for side in cell.sides:
         source = other_side(cell.source, side)
         if is_for(cell.agent, tasks_of(source)):
-            tell = count(f"{cell.agent} on {side}")
-            found += evaluate_reference(cell.agent, source, exam, tell=tell)
-    return found
-
-
-def _plain(exam: Exam) -> Exam:
-    """Without what scores do not depend on."""
-    return replace(exam, workers=1)
+            show = progress(f"{cell.agent} on {side}")
+            scores += evaluate_baseline(cell.agent, source, eval_config, progress=show)
+    return scores
 
 
 def as_record(cell: Cell) -> dict[str, Any]:
-    """What a cell is, for tables."""
+    """Return the columns of tables that identify a cell."""
     return {"split": cell.split, "agent": cell.agent, "seed": cell.seed}

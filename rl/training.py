@@ -1,4 +1,4 @@
-"""Train: make a run's folder, learn, and leave at any time what can be taken up again."""
+"""Train runs: create the folder, learn, and write checkpoints that training resumes from."""
 
 from __future__ import annotations
 
@@ -12,9 +12,13 @@ import torch
 
 from morphgen.errors import TaskError
 from morphgen.formats.files import alone
+from morphgen.rl.agents import AGENTS
+from morphgen.rl.learner_state import load_networks, state_of
+from morphgen.rl.learner_state import resume as resume_learner
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import recording, require_wandb
 from morphgen.rl.report import Report
+from morphgen.rl.robot_source import members, require_links, single_members, specs_of
 from morphgen.rl.runs import (
     CHECKPOINT,
     RunConfig,
@@ -24,38 +28,39 @@ from morphgen.rl.runs import (
     require_open,
     write_checkpoint,
 )
-from morphgen.rl.sources import apart, members, require_links, specs_of
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.make import batch_of
 
-LEAST, MOST = 1500, 3000
-"""Control steps of an environment between checkpoints: five and ten of the tasks' episodes.
+MIN_CHECKPOINT_STEPS, MAX_CHECKPOINT_STEPS = 1500, 3000
+"""Control steps per environment between checkpoints: five and ten episodes of the tasks.
 
-After each episodes begin anew, so that few of them are cut short; a checkpoint has no simulator's
-state."""
-PARTS, FEWEST = 10, 4
-"""Checkpoints of a run if these steps allow it, and if they are too many for it."""
+A checkpoint has no state of the simulator, so that all episodes begin anew after it: few
+checkpoints cut few episodes short."""
+CHECKPOINTS, MIN_CHECKPOINTS = 10, 4
+"""Checkpoints per run within these bounds, and their least number in a run too short for them."""
 ROBOTS = "robots"
-"""Where the runs of single robots are in the folder of a run of ``se`` on a split."""
+"""Subfolder with the runs of single robots, in a run of ``se`` on a split."""
 
 Show = Callable[[Report, int], None]
-"""Told every report, and how many updates there will be."""
+"""Callback for every report, with the number of updates of the run."""
 
 
 @dataclass(frozen=True)
-class Way:
-    """How a run is done; its weights do not depend on it."""
+class ExecutionConfig:
+    """How a run is executed; its weights do not depend on it."""
 
     workers: int = 1
-    """Processes of PyBullet, threads of MuJoCo."""
+    """Number of processes of PyBullet, or threads of MuJoCo."""
     tensorboard: bool = True
+    """Write TensorBoard events."""
     wandb: bool = False
+    """Send metrics to Weights & Biases."""
 
     def __post_init__(self) -> None:
         """Check.
 
         Raises:
-            TaskError: If there are no workers.
+            TaskError: If the number of workers is below 1.
             MissingDependencyError: If Weights & Biases is asked for and not installed.
         """
         if self.wandb:
@@ -66,28 +71,32 @@ class Way:
 
 @dataclass(frozen=True)
 class Part:
-    """A run of one set of weights."""
+    """A run that trains one set of weights."""
 
     folder: Path
+    """Folder of config, metrics and checkpoint."""
     config: RunConfig
+    """Config of this run alone."""
 
 
 def parts_of(folder: Path, config: RunConfig) -> list[Part]:
-    """The runs that a run is made of: itself, or for ``se`` on a split one for each robot.
+    """Return the parts of a run: itself, or one per robot for an agent of single robots.
 
-    Each of these has a seed of its own, and its share of environments and transitions, rounded up.
+    Each part has its own seed, and its share of environments and timesteps, rounded up.
     """
-    if config.policy.agent != "se" or not config.source.split or config.source.only:
+    per_robot = AGENTS[config.policy.agent].per_robot
+    if not per_robot or not config.source.split or config.source.member:
         return [Part(folder, config)]
-    alone = list(apart(config.source))
-    share = 1 if config.whole else len(alone)
-    made = []
-    for i, source in enumerate(alone):
+    sources = list(single_members(config.source))
+    share = 1 if config.full_budget else len(sources)
+    num_envs = -(-config.num_envs // share)
+    ppo = replace(config.ppo, total_timesteps=-(-config.ppo.total_timesteps // share))
+    parts = []
+    for i, source in enumerate(sources):
         seed = int(np.random.SeedSequence([config.seed, i]).generate_state(1)[0])
-        ppo = replace(config.ppo, transitions=-(-config.ppo.transitions // share))
-        own = replace(config, source=source, ppo=ppo, seed=seed, envs=-(-config.envs // share))
-        made.append(Part(folder / ROBOTS / str(source.only), own))
-    return made
+        own = replace(config, source=source, ppo=ppo, seed=seed, num_envs=num_envs)
+        parts.append(Part(folder / ROBOTS / str(source.member), own))
+    return parts
 
 
 def train(
@@ -95,80 +104,81 @@ def train(
     config: RunConfig,
     *,
     resume: bool = False,
-    way: Way | None = None,
+    execution: ExecutionConfig | None = None,
     show: Callable[[Part], Show] | None = None,
     hold: Callable[[Path], AbstractContextManager[None]] = alone,
 ) -> list[Part]:
     """Train a run to its end; see ``parts_of``.
 
-    At any time it may be interrupted or killed; resumed, it takes up its last checkpoint, and comes
-    to the same weights as if it had not been. Nothing is written before learning can begin.
+    It may be interrupted or killed at any time. Resumed, it continues from its last checkpoint and
+    ends with the same weights as an uninterrupted run. Nothing is written before learning can
+    begin.
 
     Args:
-        folder: Of the run.
-        config: What is asked for.
-        resume: Whether a run that is there is to be continued.
-        way: How it is done.
-        show: Called with every part that begins; what it returns, with its reports.
-        hold: Holds the folder against other runs.
+        folder: Folder of the run.
+        config: Config of the run.
+        resume: Whether to continue a run that is already in the folder.
+        execution: How the run is executed.
+        show: Called at the start of every part; returns the callback for its reports.
+        hold: Context manager that locks the folder against other runs.
 
     Returns:
-        What it is made of, all of it trained.
+        All parts of the run, trained.
 
     Raises:
-        TaskError: If the folder is another run's, or a number is no longer finite.
-        FormatError: If another run is writing there.
-        MorphgenError: If a robot or simulator cannot be made.
+        TaskError: If the folder has another run, or a metric is not finite.
+        FormatError: If another process writes to the folder.
+        MorphgenError: If a robot or simulator cannot be built.
     """
-    way, made = way or Way(), parts_of(folder, config)
-    for part in made:
+    execution, parts = execution or ExecutionConfig(), parts_of(folder, config)
+    for part in parts:
         require_runnable(part.config)
     require_device(config.device)
     require_open(folder, config, resume=resume)
     with ExitStack() as held:
         holds = False
-        for part in made:
+        for part in parts:
             if is_done(part):
                 continue
             if not holds:
                 require_links(config.source, config.max_links)
-            with _learner(part, way) as learner:
+            with _learner(part, execution) as learner:
                 if not holds:
                     folder.mkdir(parents=True, exist_ok=True)
                     held.enter_context(hold(folder))
                     open_run(folder, config, resume=resume)
                     holds = True
                 open_run(part.folder, part.config, resume=True)
-                _learn(learner, part, way, show(part) if show else _unseen)
-    return made
+                _learn(learner, part, execution, show(part) if show else _ignore)
+    return parts
 
 
 def require_runnable(config: RunConfig) -> None:
-    """Require that a run has an update, and every robot an environment.
+    """Require that a run has at least one update, and every robot an environment.
 
     Raises:
-        TaskError: If it has not.
+        TaskError: If not.
     """
     robots = len(members(config.source))
-    if config.envs < robots:
+    if config.num_envs < robots:
         raise TaskError(
-            f"--envs {config.envs}: fewer than the {robots} robots, each of which has one"
+            f"--envs {config.num_envs}: fewer than the {robots} robots, each of which has one"
         )
-    one = config.ppo.steps * config.envs
-    if config.ppo.transitions < one:
-        share = f", the share of {config.source.only}" if config.source.only else ""
+    one = config.ppo.num_steps * config.num_envs
+    if config.ppo.total_timesteps < one:
+        share = f", the share of {config.source.member}" if config.source.member else ""
         raise TaskError(
-            f"--steps {config.ppo.transitions} with --envs {config.envs}{share}: an update takes "
-            f"{one:,} transitions ({config.ppo.steps} steps of every environment)"
+            f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}{share}: an update "
+            f"takes {one:,} transitions ({config.ppo.num_steps} steps of every environment)"
         )
-    config.ppo.minibatch(config.envs)
+    config.ppo.minibatch_size(config.num_envs)
 
 
 def require_device(name: str) -> None:
-    """Require that there is such a device.
+    """Require that a device exists.
 
     Raises:
-        TaskError: If there is none.
+        TaskError: If it is unknown or missing.
     """
     kind, _, number = name.partition(":")
     if name != "cpu" and (kind != "cuda" or not (number or "0").isdecimal()):
@@ -180,10 +190,10 @@ def require_device(name: str) -> None:
 
 
 def checkpoints(path: Path) -> Iterator[Path]:
-    """The checkpoints of what a user names: a file, a run's folder, or that of ``se`` on a split.
+    """Yield the checkpoints of a path: a file, or the folder of a run, with one or many parts.
 
     Raises:
-        TaskError: If there is none, or ``se`` has not begun with some of its robots.
+        TaskError: If there is none, or some parts of the run have none yet.
     """
     if path.is_file() or (path / CHECKPOINT).is_file():
         yield path if path.is_file() else path / CHECKPOINT
@@ -202,67 +212,68 @@ def checkpoints(path: Path) -> Iterator[Path]:
 
 
 def is_done(part: Part) -> bool:
-    """Whether all updates of a run have been made."""
+    """Return whether all updates of a part have been made."""
     if not (part.folder / CHECKPOINT).is_file():
         return False
-    return bool(read_checkpoint(part.folder)[1]["update"] >= part.config.updates)
+    return bool(read_checkpoint(part.folder)[1]["update"] >= part.config.num_updates)
 
 
 def updates_between(config: RunConfig) -> int:
-    """How many updates there are from a checkpoint of a run to the next."""
-    steps = config.ppo.steps
-    span = min(max(config.updates * steps // PARTS, LEAST), MOST)
-    return max(min(-(-span // steps), config.updates // FEWEST), 1)
+    """Return the number of updates between two checkpoints of a run."""
+    steps = config.ppo.num_steps
+    even = config.num_updates * steps // CHECKPOINTS
+    span = min(max(even, MIN_CHECKPOINT_STEPS), MAX_CHECKPOINT_STEPS)
+    return max(min(-(-span // steps), config.num_updates // MIN_CHECKPOINTS), 1)
 
 
 @contextmanager
-def _learner(part: Part, way: Way) -> Iterator[Learner]:
-    """The learner of a part, as far as it got."""
-    config, wanted = part.config, part.config.interface
+def _learner(part: Part, execution: ExecutionConfig) -> Iterator[Learner]:
+    """Build the learner of a part, and resume its checkpoint if there is one."""
+    config, interface = part.config, part.config.interface
     specs = specs_of(config.source, GoalConfig(tasks=config.tasks))
     batch = batch_of(
         specs,
-        config.envs,
+        config.num_envs,
         sim=config.sim,
         seed=config.seed,
-        kind=wanted.kind,
-        observe=wanted.channels,
-        workers=way.workers,
-        max_links=wanted.max_links,
+        kind=interface.kind,
+        observe=interface.channels,
+        workers=execution.workers,
+        max_links=interface.max_links,
         library=map(Path, config.source.library),
     )
     try:
         learner = Learner(batch, config.policy, config.ppo, seed=config.seed, device=config.device)
         if (part.folder / CHECKPOINT).is_file():
-            learner.resume(read_checkpoint(part.folder)[1])
-        elif config.begin:
-            learner.adopt(read_checkpoint(Path(config.begin))[1])
+            resume_learner(learner, read_checkpoint(part.folder)[1])
+        elif config.initial_checkpoint:
+            load_networks(learner, read_checkpoint(Path(config.initial_checkpoint))[1])
         yield learner
     finally:
         batch.close()
 
 
-def _learn(learner: Learner, part: Part, way: Way, show: Show) -> None:
-    often = updates_between(part.config)
-    kept = recording(
+def _learn(learner: Learner, part: Part, execution: ExecutionConfig, show: Show) -> None:
+    interval = updates_between(part.config)
+    recorders = recording(
         part.folder,
         part.config,
         learner.update,
-        tensorboard=way.tensorboard,
-        wandb=way.wandb,
+        tensorboard=execution.tensorboard,
+        wandb=execution.wandb,
     )
-    with kept as recorders:
+    with recorders as opened:
         while not learner.done:
             report = learner.iterate()
-            for recorder in recorders:
+            for recorder in opened:
                 recorder.record(report)
-            rest = learner.updates - learner.update
-            if not rest or (learner.update % often == 0 and rest >= often):
-                write_checkpoint(part.folder, part.config, learner.checkpoint())
-                # A resumed run begins new episodes here, and must come to the same weights.
+            left = learner.num_updates - learner.update
+            if not left or (learner.update % interval == 0 and left >= interval):
+                write_checkpoint(part.folder, part.config, state_of(learner))
+                # A resumed run begins new episodes here, and must end with the same weights.
                 learner.restart_episodes()
-            show(report, learner.updates)
+            show(report, learner.num_updates)
 
 
-def _unseen(report: Report, updates: int) -> None:
-    """A report that is shown to nobody."""
+def _ignore(report: Report, num_updates: int) -> None:
+    """Show a report to nobody."""

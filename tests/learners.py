@@ -9,7 +9,7 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
 from on_a_line import OnALine
 
-SMALL = PPOConfig(transitions=4 * 8 * 8, steps=8, epochs=2, minibatches=4, target_kl=0)
+SMALL = PPOConfig(total_timesteps=4 * 8 * 8, num_steps=8, epochs=2, minibatches=4, desired_kl=0)
 """Four updates of eight environments."""
 
 
@@ -20,7 +20,7 @@ def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, device="cpu", 
 
 
 def weights(made):
-    networks = {"actor": made.actor, "critic": made.critic, "slow": made.slow}
+    networks = {"actor": made.actor, "critic": made.critic, "target_critic": made.target_critic}
     return {
         f"{name}.{key}": each.clone()
         for name, network in networks.items()

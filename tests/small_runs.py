@@ -2,17 +2,18 @@
 
 from dataclasses import replace
 
+from morphgen.rl.agents import AGENTS, mlp
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.evaluation import Exam
+from morphgen.rl.evaluation import EvalConfig
+from morphgen.rl.robot_source import robot_source, split_source
 from morphgen.rl.runs import RunConfig, read_checkpoint
-from morphgen.rl.sources import robot_source, split_source
-from morphgen.rl.training import Way
+from morphgen.rl.training import ExecutionConfig
 from splits import member, split
 
-QUIET = Way(tensorboard=False)
-EXAM = Exam(episodes=2, sim="mujoco")
-POLICY = PolicyConfig("me-mlp", mlp_features=4, mlp_width=8, mlp_layers=1)
-PPO = PPOConfig(transitions=6 * 4 * 8, steps=8, epochs=1, minibatches=2)
+QUIET = ExecutionConfig(tensorboard=False)
+EVAL = EvalConfig(episodes=2, sim="mujoco")
+POLICY = PolicyConfig("me-mlp", network=mlp.Config(4, 8, 1))
+PPO = PPOConfig(total_timesteps=6 * 4 * 8, num_steps=8, epochs=1, minibatches=2)
 """Six updates of four environments."""
 
 
@@ -26,9 +27,10 @@ def small_source(**more):
 
 
 def small_config(source=None, *, agent="me-mlp", seed=0, **ppo):
-    policy = replace(POLICY, agent=agent)
+    small = POLICY.network if AGENTS[agent].config is mlp.Config else None
+    policy = replace(POLICY, agent=agent, network=small)
     source = source or robot_source("planar-cube", "reach")
-    return RunConfig(source, policy, replace(PPO, **ppo), seed=seed, sim="mujoco", envs=4)
+    return RunConfig(source, policy, replace(PPO, **ppo), seed=seed, sim="mujoco", num_envs=4)
 
 
 def weights(folder):

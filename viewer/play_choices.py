@@ -9,7 +9,7 @@ from typing import Any
 import viser
 
 from morphgen.errors import MorphgenError, nearest
-from morphgen.rl.names import REFERENCES, references_for
+from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import browser, play_bodies
 from morphgen.viewer.address import Address, whole_number
@@ -48,7 +48,7 @@ def wanted_of(address: Address, trained: Bodies) -> Wanted:
     return Wanted(
         task,
         (address.robots or (default,))[:MOST],
-        state.get("policy") or references_for(task)[0],
+        state.get("policy") or baselines_for(task)[0],
         number,
         bool(state.get("obstacles")),
         simulator,
@@ -70,7 +70,7 @@ def trained_bodies(page: PlayPage) -> Bodies:
     """The bodies of the address's checkpoint; where it names no task or body, it gets them."""
     address, places = page.session.address, page.session.places
     policy = address.state.get("policy", "")
-    if not policy or policy in REFERENCES:
+    if not policy or policy in BASELINES:
         return []
     task, obstacles, bodies = trained_with(policy, places)
     if not address.subject:
@@ -113,7 +113,7 @@ def add_choices(page: PlayPage, wanted: Wanted) -> None:
 
 def _policies(page: PlayPage, wanted: Wanted) -> tuple[str, ...]:
     """Those of the task, checkpoints of this folder, and the one that is wanted."""
-    found = (*references_for(wanted.task), *checkpoints(page.session.places), wanted.policy)
+    found = (*baselines_for(wanted.task), *checkpoints(page.session.places), wanted.policy)
     return tuple(dict.fromkeys(found))
 
 
@@ -149,8 +149,8 @@ def _change_task(page: PlayPage) -> None:
     wanted = asked(page)
     task = page.controls["task"].value
     policy = wanted.policy
-    if policy in REFERENCES and policy not in references_for(task):
-        policy = references_for(task)[0]
+    if policy in BASELINES and policy not in baselines_for(task):
+        policy = baselines_for(task)[0]
     changed = replace(wanted, task=task, policy=policy)
     page.controls["policy"].options = _policies(page, changed)
     set_value(page.controls["policy"], policy)

@@ -16,11 +16,11 @@ from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.model import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.rl.names import REFERENCES, references_for
-from morphgen.rl.play import controller, demands, require_policy
+from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.play import controller, interface_of, require_policy
+from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
-from morphgen.rl.sources import members
 from morphgen.tasks.batch import Step
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.gym_env import TaskEnv
@@ -171,8 +171,8 @@ def policy_file(policy: str, task: str, places: Places) -> str:
         TaskError: If there is none of that name, or it is for the other task.
         PlaceError: If it is a file that may not be looked at.
     """
-    if policy not in REFERENCES:
-        return str(_checkpoint_file(policy, references_for(task), places))
+    if policy not in BASELINES:
+        return str(_checkpoint_file(policy, baselines_for(task), places))
     require_policy(policy, task)
     return policy
 
@@ -206,7 +206,7 @@ def trained_with(policy: str, places: Places) -> tuple[str, bool, list[tuple[str
     Raises:
         MorphgenError: If it is no checkpoint, or its robot has no parts to be made of.
     """
-    source = read_checkpoint(_checkpoint_file(policy, REFERENCES, places))[0].source
+    source = read_checkpoint(_checkpoint_file(policy, BASELINES, places))[0].source
     rows = members(source)
     if rows:
         named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]
@@ -227,7 +227,7 @@ def trained_with(policy: str, places: Places) -> tuple[str, bool, list[tuple[str
 def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
     read = read_place(place, places)
     body = as_primitives(as_in_library(read, places.library), places.folders)
-    seen = demands(policy)
+    seen = interface_of(policy)
     env = TaskEnv(
         wanted.task,
         body,

@@ -1,4 +1,4 @@
-"""``morphgen eval``: how well a policy, or a reference controller, does on each robot."""
+"""``morphgen eval``: score a policy or a baseline on each robot."""
 
 from __future__ import annotations
 
@@ -12,29 +12,30 @@ from typing import TYPE_CHECKING
 from morphgen.cli.options import Subparsers, add_json, add_library, add_sim
 from morphgen.cli.progress import Shower
 from morphgen.cli.train import count, require_words
-from morphgen.rl.names import REFERENCES
+from morphgen.rl.baselines import BASELINES
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
-    from morphgen.rl.evaluation import Count, Exam, Score
+    from morphgen.rl.evaluation import EvalConfig, StartProgress
+    from morphgen.rl.inference import Mode
+    from morphgen.rl.robot_source import RobotSource
     from morphgen.rl.runs import RunConfig
-    from morphgen.rl.sources import Source
-    from morphgen.rl.trained import Mode
+    from morphgen.rl.scores import Score
 
 
 def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "eval",
-        help="score a trained policy, or a reference controller, robot by robot",
+        help="score a trained policy or a baseline, robot by robot",
         description="Run episodes of every robot and print scores with 95% bootstrap intervals "
-        "over episodes. The score of reach is above that of random actions; that of push is the "
+        "over episodes. The score of reach is relative to the random policy; that of push is the "
         "success rate.",
         epilog="examples: morphgen eval runs/interpolation/arm3/reach/me-tf/seed0 --on test; "
         "morphgen eval ik --split interpolation/arm3/reach",
     )
     parser.add_argument(
-        "checkpoint", help=f"a checkpoint or a run's folder; or one of {', '.join(REFERENCES)}"
+        "checkpoint", help=f"a checkpoint or a run's folder; or one of {', '.join(BASELINES)}"
     )
     parser.add_argument(
         "--split",
@@ -42,24 +43,23 @@ def add_parser(commands: Subparsers) -> None:
         nargs="+",
         metavar="SPLIT",
         default=[],
-        help="of a reference, or instead of a checkpoint's own: as for morphgen train",
+        help="robots for a baseline, or instead of the checkpoint's: as for morphgen train",
     )
     parser.add_argument("--on", choices=["train", "test"], help="side of the split (default: both)")
     parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
     parser.add_argument("--mode", choices=["deterministic", "stochastic"], help="default: both")
     amount = parser.add_mutually_exclusive_group()
-    amount.add_argument("--episodes", type=int, help="of each robot, at least")
+    amount.add_argument("--episodes", type=int, help="least number of episodes per robot")
     amount.add_argument(
         "--steps",
         type=count,
         default=10_000,
-        help="of each robot: as many episodes as have so many steps if time ends them "
-        "(default: 10,000)",
+        help="control steps per robot, in episodes of full length (default: 10,000)",
     )
     add_sim(parser, None)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument(
         "--goal-seed", type=int, help="with --split: of all goals (default: as shipped, else 0)"
     )
@@ -71,14 +71,14 @@ def add_parser(commands: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate and print."""
-    from morphgen.rl.evaluation import as_data
-    from morphgen.rl.score_tables import require_table, score_table, summary, write_scores
+    from morphgen.rl.eval_report import require_table, score_table, summary, write_scores
+    from morphgen.rl.scores import scores_to_json
 
     if args.out is not None:
         require_table(args.out)
-    found = _references(args) if args.checkpoint in REFERENCES else _policies(args)
+    found = _baselines(args) if args.checkpoint in BASELINES else _policies(args)
     if args.json:
-        print(json.dumps({mode: as_data(scores) for mode, scores in found.items()}))
+        print(json.dumps({mode: scores_to_json(scores) for mode, scores in found.items()}))
     else:
         print(score_table(found))
         print(summary(found))
@@ -87,28 +87,30 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _references(args: argparse.Namespace) -> dict[str, list[Score]]:
+def _baselines(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.errors import TaskError
-    from morphgen.rl.evaluation import Exam, evaluate_reference
+    from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
 
     if not args.words:
-        raise TaskError(f"{args.checkpoint}: say on which robots, with --split")
+        raise TaskError(f"{args.checkpoint}: name its robots with --split")
     if args.mode or args.device != "cpu":
         option = "--mode" if args.mode else "--device"
         raise TaskError(f"{option} is for policies; {args.checkpoint} has none")
     sources = _sources(args)
-    exam = Exam(_episodes(args), args.sim or "pybullet", args.seed, args.workers)
+    config = EvalConfig(_episodes(args), args.sim or "pybullet", args.seed, args.workers)
     with closing(Shower()) as shower:
         found = [
-            evaluate_reference(args.checkpoint, source, exam, tell=shower.counting(source.side))
+            evaluate_baseline(
+                args.checkpoint, source, config, progress=shower.counting(source.side)
+            )
             for source in sources
         ]
     return {args.checkpoint: [score for scores in found for score in scores]}
 
 
 def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
+    from morphgen.rl.inference import MODES
     from morphgen.rl.runs import read_checkpoint
-    from morphgen.rl.trained import MODES
     from morphgen.rl.training import checkpoints, require_device
 
     require_words(args)
@@ -116,10 +118,10 @@ def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
     files = list(checkpoints(Path(args.checkpoint)))
     for file in files:
         config, learner = read_checkpoint(file)
-        if learner["update"] < config.updates:
+        if learner["update"] < config.num_updates:
             print(
-                f"morphgen: {file} is not at its end: update {learner['update']} of "
-                f"{config.updates}",
+                f"morphgen: {file} is not finished: update {learner['update']} of "
+                f"{config.num_updates}",
                 file=sys.stderr,
             )
     modes: tuple[Mode, ...] = (args.mode,) if args.mode else MODES
@@ -128,16 +130,21 @@ def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
 
 
 def _policy(
-    args: argparse.Namespace, files: list[Path], config: RunConfig, mode: Mode, told: Count
+    args: argparse.Namespace, files: list[Path], config: RunConfig, mode: Mode, start: StartProgress
 ) -> list[Score]:
     from morphgen.rl.evaluation import evaluate_checkpoints, evaluate_run
 
-    path, exam = Path(args.checkpoint), _exam(args, config)
+    path, eval_config = Path(args.checkpoint), _eval_config(args, config)
     if args.words:
         sources = _sources(args)
         found = [
             evaluate_checkpoints(
-                files, one, exam, mode, device=args.device, tell=told(f"{mode} on {one.side}")
+                files,
+                one,
+                eval_config,
+                mode,
+                device=args.device,
+                progress=start(f"{mode} on {one.side}"),
             )
             for one in sources
         ]
@@ -145,19 +152,26 @@ def _policy(
         sides: tuple[Side, ...] = ("train", "test") if config.source.split else ("train",)
         wanted = sides if args.on is None else (args.on,)
         found = [
-            evaluate_run(path, side, exam, mode, device=args.device, tell=told(f"{mode} on {side}"))
+            evaluate_run(
+                path,
+                side,
+                eval_config,
+                mode,
+                device=args.device,
+                progress=start(f"{mode} on {side}"),
+            )
             for side in wanted
         ]
     return [score for scores in found for score in scores]
 
 
-def _exam(args: argparse.Namespace, config: RunConfig) -> Exam:
+def _eval_config(args: argparse.Namespace, config: RunConfig) -> EvalConfig:
     from dataclasses import replace
 
-    from morphgen.rl.evaluation import exam_of
+    from morphgen.rl.evaluation import eval_config_of
 
-    exam = exam_of(config, _episodes(args), seed=args.seed, workers=args.workers)
-    return replace(exam, sim=args.sim) if args.sim else exam
+    found = eval_config_of(config, _episodes(args), seed=args.seed, workers=args.workers)
+    return replace(found, sim=args.sim) if args.sim else found
 
 
 def _episodes(args: argparse.Namespace) -> int:
@@ -169,9 +183,9 @@ def _episodes(args: argparse.Namespace) -> int:
     return episodes_for(args.steps, max(each.steps for each in default_configs()))
 
 
-def _sources(args: argparse.Namespace) -> list[Source]:
+def _sources(args: argparse.Namespace) -> list[RobotSource]:
     from morphgen.cli.train import source_of
-    from morphgen.rl.sources import other_side
+    from morphgen.rl.robot_source import other_side
 
     args.on, wanted = "train", args.on
     source = source_of(args.words, args)

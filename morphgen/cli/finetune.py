@@ -1,10 +1,10 @@
-"""``morphgen finetune``: go on learning with a trained policy, on other robots."""
+"""``morphgen finetune``: train a trained policy further, on other robots."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from morphgen.cli.options import Subparsers, add_library, add_sim
 from morphgen.cli.train import OF_NETWORKS, add_learning, require_words, trained
@@ -19,7 +19,7 @@ def add_parser(commands: Subparsers) -> None:
         "finetune",
         help="train a policy further, on the test robots of its split",
         description="Begin a run with the networks of a checkpoint. Agent and algorithm are the "
-        "checkpoint's unless said otherwise; optimiser and schedule begin anew.",
+        "checkpoint's unless given; optimiser and schedule begin anew.",
         epilog="example: morphgen finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test "
         "--steps 30000",
     )
@@ -39,12 +39,14 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
     add_sim(parser, None)
     parser.add_argument(
-        "--goal-seed", type=int, help="with --split: of all goals (default: as shipped, else 0)"
+        "--goal-seed",
+        type=int,
+        help="with --split: seed of all goals (default: as shipped, else 0)",
     )
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="default: finetuned/SIDE-seedN in the run's folder"
     )
-    parser.add_argument("--resume", action="store_true", help="go on with the run that is there")
+    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
     for name, meaning in OF_NETWORKS.items():
         parser.add_argument(
             f"--{name}",
@@ -56,7 +58,7 @@ def add_parser(commands: Subparsers) -> None:
         "--curriculum",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="push: bring the line to its place again (default: it is there from the start)",
+        help="push: move the line from near to far again (default: it stays at its final place)",
     )
     add_learning(parser, steps=30_000, envs=16)
     add_library(parser)
@@ -64,7 +66,7 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train and say where it is."""
+    """Train and print the path of the checkpoint."""
     from morphgen.errors import TaskError
     from morphgen.rl.runs import CHECKPOINT
     from morphgen.rl.training import checkpoints
@@ -86,27 +88,27 @@ def _config(file: Path, args: argparse.Namespace) -> RunConfig:
 
     from morphgen.cli.train import source_of
     from morphgen.errors import TaskError
+    from morphgen.rl.agent_spec import parse_constants
     from morphgen.rl.config import PPOConfig
+    from morphgen.rl.robot_source import other_side
     from morphgen.rl.runs import read_checkpoint
-    from morphgen.rl.sources import other_side
-    from morphgen.rl.variants import constants
 
     began, _ = read_checkpoint(file)
     source = source_of(args.words, args) if args.words else other_side(began.source, args.on)
-    changes = constants(args.set)
+    changes: dict[str, Any] = parse_constants(args.set)
     fixed = set(changes) - {field.name for field in fields(PPOConfig)}
     if fixed:
         raise TaskError(f"--set {min(fixed)}: the networks are those of the checkpoint")
     asked = {name: getattr(args, name) for name in OF_NETWORKS}
     changes |= {name: value for name, value in asked.items() if value is not None}
-    changes |= {"transitions": args.steps, "curriculum": args.curriculum}
+    changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
     return replace(
         began,
         source=source,
         ppo=replace(began.ppo, **changes),
         seed=args.seed,
         sim=args.sim or began.sim,
-        envs=args.envs,
+        num_envs=args.envs,
         device=args.device,
-        begin=str(file.resolve()),
+        initial_checkpoint=str(file.resolve()),
     )

@@ -1,4 +1,4 @@
-"""``morphgen play``: a robot at a task, with its results and a film."""
+"""``morphgen play``: run episodes of a robot, print results, and render a video."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli.options import Subparsers, add_library, add_sim, add_task
-from morphgen.rl.names import REFERENCES
+from morphgen.rl.baselines import BASELINES
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Episode
@@ -17,8 +17,8 @@ def add_parser(commands: Subparsers) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "play",
-        help="put a robot to work at a task, and film it",
-        description="Run episodes of one robot; print a line for each, and film them.",
+        help="run a controller on one robot, and render a video",
+        description="Run episodes of one robot; print a line for each, and render a video.",
         epilog="examples: morphgen play reach arm=ur5 ee=stick --policy ik --out ik.mp4; "
         "morphgen play push prims --policy scripted --episodes 3 --sim mujoco",
     )
@@ -34,37 +34,37 @@ def add_parser(commands: Subparsers) -> None:
         type=_policy,
         default="random",
         metavar="POLICY",
-        help="what acts: zero (nothing), random, ik (inverse kinematics, for reach), scripted (for "
-        "push), or a checkpoint or a run's folder (default: random)",
+        help="the controller: zero (no action), random, ik (inverse kinematics, for reach), "
+        "scripted (for push), or a checkpoint or a run's folder (default: random)",
     )
-    parser.add_argument("--out", metavar="FILE", type=Path, help="the film: .mp4 or .gif")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="the video: .mp4 or .gif")
     add_sim(parser)
     parser.add_argument("--episodes", type=int, default=1, help="default: 1")
-    parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--obstacles", action="store_true", help="among obstacles")
     parser.add_argument(
         "--kind",
         choices=["continuous", "discrete"],
-        help="of actions (default: a checkpoint's own, else continuous)",
+        help="kind of actions (default: that of the checkpoint, else continuous)",
     )
     add_library(parser)
     parser.set_defaults(run=run)
 
 
 def _policy(text: str) -> str:
-    if text not in REFERENCES and not Path(text).exists():
+    if text not in BASELINES and not Path(text).exists():
         raise argparse.ArgumentTypeError(
-            f"{text!r} is none of {', '.join(REFERENCES)}, and no file"
+            f"unknown policy {text!r}: expected one of {', '.join(BASELINES)}, or a path"
         )
     return text
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play, print a line an episode, and write the film."""
+    """Run the episodes, print a line for each, and write the video."""
     from collections import deque
 
     from morphgen.errors import TaskError
-    from morphgen.rl.play import FPS, controller, demands, play, require_policy
+    from morphgen.rl.play import FPS, controller, interface_of, play, require_policy
     from morphgen.tasks.gym_env import TaskEnv
     from morphgen.tasks.registry import TASKS
     from morphgen.tasks.renderer import require_film, write_film
@@ -76,15 +76,15 @@ def run(args: argparse.Namespace) -> int:
     require_policy(args.policy, args.task)
     if args.out is not None:
         require_film(args.out)
-    wanted = demands(args.policy)
+    interface = interface_of(args.policy)
     env = TaskEnv(
         args.task,
         " ".join(args.words),
         sim=args.sim,
         obstacles=args.obstacles,
-        kind=args.kind or wanted.kind,
-        observe=wanted.channels,
-        max_links=wanted.max_links,
+        kind=args.kind or interface.kind,
+        observe=interface.channels,
+        max_links=interface.max_links,
         library=args.library,
         render_mode=None if args.out is None else "rgb_array",
     )
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Report:
-    """Prints a line an episode."""
+    """Prints a line per episode."""
 
     def __init__(self, target: str) -> None:
         self._number, self._target = 0, target

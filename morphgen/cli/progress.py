@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from morphgen.rl.evaluation import Tell
+    from morphgen.rl.evaluation import Progress
     from morphgen.rl.report import Report
     from morphgen.rl.training import Part, Show
 
@@ -45,12 +45,12 @@ class Shower:
     def __call__(self, part: Part) -> Show:
         """Begin with a part."""
         self.close()
-        name = part.config.source.only or part.config.source.name
+        name = part.config.source.member or part.config.source.name
         if not sys.stderr.isatty():
             return lambda report, updates: _print(name, report, updates)
         from tqdm import tqdm
 
-        total = part.config.updates * part.config.ppo.steps * part.config.envs
+        total = part.config.num_updates * part.config.ppo.num_steps * part.config.num_envs
         self._bar = tqdm(
             total=total,
             desc=name,
@@ -61,7 +61,7 @@ class Shower:
         )
         return self._show
 
-    def counting(self, name: str) -> Tell:
+    def counting(self, name: str) -> Progress:
         """Begin with an evaluation; on no terminal it is a line a minute."""
         self.close()
         if not sys.stderr.isatty():

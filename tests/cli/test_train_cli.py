@@ -11,14 +11,14 @@ import pytest
 from commands import start, tree
 from morphgen.benchmark.split_file import write_split
 from morphgen.rl.recorders import METRICS, read_metrics
+from morphgen.rl.robot_source import specs_of
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
-from morphgen.rl.sources import specs_of
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.split_goals import read_goals
 from small_runs import equal, small_split, weights
 
 NETWORK = ("--set", "mlp_width=8")
-ROLLOUT = ("--set", "steps=8", "--set", "minibatches=2", "--set", "epochs=1")
+ROLLOUT = ("--set", "num_steps=8", "--set", "minibatches=2", "--set", "epochs=1")
 SMALL = ("--sim", "mujoco", "--envs", "4", *ROLLOUT, *NETWORK)
 RUN = ("train", "planar-cube", "task=reach", "--agent", "me-mlp", *SMALL)
 
@@ -126,8 +126,8 @@ def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_ya
     code, out, _ = run("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard")
     assert (code, out) == (0, f"a/finetuned/test-seed0/{CHECKPOINT}\n")
     tuned = read_config(Path("a/finetuned/test-seed0"))
-    assert (tuned.source.side, tuned.ppo.transitions, tuned.ppo.steps) == ("test", 32, 8)
-    assert tuned.begin.endswith(f"a/{CHECKPOINT}")
+    assert (tuned.source.side, tuned.ppo.total_timesteps, tuned.ppo.num_steps) == ("test", 32, 8)
+    assert tuned.initial_checkpoint.endswith(f"a/{CHECKPOINT}")
     assert read_config(Path("a")).ppo.curriculum
     assert not tuned.ppo.curriculum
     words = ("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard", "--out", "b")
@@ -147,7 +147,7 @@ def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_y
     words = ("train", home, "--agent", "me-mlp", *SMALL, "--steps", "32", "--no-tensorboard")
     assert run(*words, "--out", "a")[0] == 0
     source = read_config(Path("a")).source
-    assert (source.goal_seed, source.goals) == (5, str(home.resolve()))
+    assert (source.goal_seed, source.goal_dir) == (5, str(home.resolve()))
     shipped = read_goals(home, "train")
     for setting in specs_of(source, GoalConfig(5)):
         assert (setting.goals.q == shipped[setting.robot.name].q).all()
@@ -165,9 +165,9 @@ def test_training_may_have_more_goals_than_evaluations(run):
     for name, more in (("a", ()), ("b", ("--train-goals", "150"))):
         assert run(*RUN, "--steps", "32", "--no-tensorboard", "--out", name, *more)[0] == 0
         config = read_config(Path(name))
-        (setting,) = specs_of(config.source, GoalConfig(reach=config.reach))
+        (setting,) = specs_of(config.source, GoalConfig(tasks=config.tasks))
         found.append(len(setting.goals.q))
-        assert config.push.starts == found[-1]
+        assert {task.num_goals for task in config.tasks} == {found[-1]}
     assert found == [100, 150]
     _, out, _ = run("eval", "b", "--episodes", "1", "--json")
     _, chance, _ = run("eval", "a", "--episodes", "1", "--json")
@@ -192,11 +192,15 @@ def test_every_switch_is_a_flag(run, tmp_path):
     config = read_config(tmp_path / out.strip().removesuffix(f"/{CHECKPOINT}"))
     ppo, policy = config.ppo, config.policy
     assert (ppo.symlog, ppo.slow_critic, ppo.task_reweighting, ppo.curriculum) == (0, 0, 1, 0)
-    assert (policy.discrete, policy.mask_morphology, policy.mlp_width) == (False, True, 8)
-    assert policy.fixed_deviation
+    assert (policy.discrete, policy.proprioceptive_only, policy.network.mlp_width) == (
+        False,
+        True,
+        8,
+    )
+    assert policy.fixed_std
     assert policy.tool_position
     code, _, err = run(*RUN, "--steps", "32", "--fixed-deviation", "--out", "bins")
-    assert (code, "fixed-deviation: bins have no deviation" in err) == (2, True)
+    assert (code, "fixed-deviation: discrete actions have no" in err) == (2, True)
     assert not Path("bins").exists()
 
 
@@ -303,7 +307,7 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         (("train", "interpolation/arm3/reech"), "did you mean 'interpolation/arm3/reach'?"),
         (("train", "planar-cube"), "a robot needs task=reach or task=push"),
         (("train", "base=planar", "ee=cube"), "a robot needs its task"),
-        (("train", "planar-cube", "task=lift"), "task=reach or task=push"),
+        (("train", "planar-cube", "task=lift"), "unknown task 'lift'; valid: push, reach"),
         (("train", "interpolation/arm3/reach", "--obstacles"), "--obstacles is for one robot"),
         ((*RUN, "--agent", "me-tff"), "did you mean 'me-tf'?"),
         ((*RUN, "--agent", "se+magic"), "after se come switches"),
@@ -321,13 +325,13 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         ((*RUN, "--max-links", "1"), "--max-links 1: expected 2 or more"),
         (
             ("train", "planar-cube", "task=reach", "--no-discrete", "--set", "logit_scale=8"),
-            "--set logit_scale: numbers have no logits; it is for --discrete",
+            "--set logit_scale: continuous actions have no logits; it is for --discrete",
         ),
         ((*RUN, "--set", "logit_scale=8"), "--set logit_scale: me-mlp has none; valid for me-tf"),
         ((*RUN, "--set", "features=8"), "--set features: me-mlp has none; valid for me-tf"),
         ((*RUN, "--set", "mlp_layers=0"), "mlp_layers 0: expected 1 or more"),
         (("train", "interpolation/arm3/reach", "--envs", "9"), "fewer than the 10 robots"),
-        (("eval", "ik"), "say on which robots, with --split"),
+        (("eval", "ik"), "name its robots with --split"),
         (
             ("eval", "ik", "--split", "planar-cube", "task=reach", "--mode", "stochastic"),
             "--mode is for policies",
@@ -361,7 +365,9 @@ def test_folders_and_checkpoints_that_are_others_are_refused(run, refused, tmp_p
     )
     run(*RUN, "--steps", "32", "--out", "run", "--no-tensorboard")
     assert "say --resume" in refused(*RUN, "--steps", "32", "--out", "run")
-    assert "transitions 32, not 64" in refused(*RUN, "--steps", "64", "--out", "run", "--resume")
+    assert "total_timesteps 32, not 64" in refused(
+        *RUN, "--steps", "64", "--out", "run", "--resume"
+    )
     layout = ("eval", "run", "--split", "planar-cube", "task=reach", "--obstacles")
     assert "for other observations: obstacles 0, here 3" in refused(*layout, "--episodes", "1")
     assert "table.txt" in refused("eval", "run", "--out", "table.txt")

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from morphgen.rl import attention
+from morphgen.rl.agents import transformer
 
 N, HEADS, T, FEATURES = 5, 2, 7, 8
-WAYS = {"as here": attention.attend, "as on a GPU": attention.attend_to_few}
+WAYS = {"as here": transformer.attend, "as on a GPU": transformer.attend_to_few}
 
 
 def some(seed=0):

@@ -68,6 +68,8 @@ def test_a_process_compiles_learners_of_many_kinds(monkeypatch):
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
     for agent in ("se", "me-mlp", "me-tf"):
         for envs in (2, 4, 6):
-            config = PPOConfig(transitions=envs * 8, steps=8, minibatches=2, epochs=1, compile=True)
+            config = PPOConfig(
+                total_timesteps=envs * 8, num_steps=8, minibatches=2, epochs=1, compile=True
+            )
             Learner(OnALine(envs), PolicyConfig(agent), config).iterate()
     torch.compiler.reset()

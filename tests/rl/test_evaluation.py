@@ -9,23 +9,23 @@ import pytest
 
 from morphgen.errors import TaskError
 from morphgen.rl import evaluation
+from morphgen.rl.eval_report import score_table, summary, write_scores
 from morphgen.rl.evaluation import (
-    Exam,
-    as_data,
+    EvalConfig,
     episodes_for,
+    eval_config_of,
+    evaluate_baseline,
     evaluate_checkpoints,
-    evaluate_reference,
     evaluate_run,
-    exam_of,
 )
+from morphgen.rl.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs import read_checkpoint, write_checkpoint
-from morphgen.rl.score_tables import score_table, summary, write_scores
-from morphgen.rl.sources import other_side, robot_source, split_source
+from morphgen.rl.scores import scores_to_json
 from morphgen.rl.training import checkpoints, parts_of, train
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
-from small_runs import EXAM, QUIET, small_config, small_source
+from small_runs import EVAL, QUIET, small_config, small_source
 from splits import member, split
 
 pytestmark = pytest.mark.slow
@@ -35,12 +35,12 @@ pytestmark = pytest.mark.slow
 def run(tmp_path_factory):
     """Hardly trained, on the robots of a split."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    train(folder, small_config(small_source(), transitions=64), way=QUIET)
+    train(folder, small_config(small_source(), total_timesteps=64), execution=QUIET)
     return folder
 
 
 def test_the_random_controller_is_no_better_than_itself():
-    scores = evaluate_reference("random", small_source(), EXAM)
+    scores = evaluate_baseline("random", small_source(), EVAL)
     assert [each.side for each in scores] == ["train", "train"]
     for each in scores:
         assert (each.score, each.low, each.high) == (0, 0, 0)
@@ -52,7 +52,7 @@ def test_the_random_controller_is_no_better_than_itself():
 
 def test_inverse_kinematics_is_far_better():
     for side in ("train", "test"):
-        for each in evaluate_reference("ik", other_side(small_source(), side), EXAM):
+        for each in evaluate_baseline("ik", other_side(small_source(), side), EVAL):
             assert each.side == side
             assert each.success == 1
             assert each.distance < ReachConfig().near
@@ -63,20 +63,20 @@ def test_inverse_kinematics_is_far_better():
 
 def test_episodes_are_those_of_the_seed():
     source = small_source()
-    scores = [evaluate_reference("zero", source, replace(EXAM, seed=seed)) for seed in (0, 0, 1)]
+    scores = [evaluate_baseline("zero", source, replace(EVAL, seed=seed)) for seed in (0, 0, 1)]
     assert scores[0] == scores[1]
     assert scores[0][0].distance != scores[2][0].distance
 
 
 def test_mean_and_drawn_actions_are_each_the_same_again(run):
     modes = ("deterministic", "deterministic", "stochastic", "stochastic")
-    found = [evaluate_run(run, "train", EXAM, mode) for mode in modes]
+    found = [evaluate_run(run, "train", EVAL, mode) for mode in modes]
     assert found[0] == found[1] != found[2] == found[3]
     assert found[0][0].random == found[2][0].random
 
 
 def test_workers_change_nothing(run):
-    one, two = (evaluate_run(run, "test", replace(EXAM, workers=n), "stochastic") for n in (1, 2))
+    one, two = (evaluate_run(run, "test", replace(EVAL, workers=n), "stochastic") for n in (1, 2))
     assert one == two
 
 
@@ -87,17 +87,17 @@ def at_most(count, monkeypatch):
 
 
 def test_more_episodes_than_environments_are_rounds():
-    exam = replace(EXAM, episodes=35)
-    (score,) = evaluate_reference("zero", robot_source("planar-cube", "reach"), exam)
+    config = replace(EVAL, episodes=35)
+    (score,) = evaluate_baseline("zero", robot_source("planar-cube", "reach"), config)
     assert score.episodes == 36
     assert score.steps == 36 * 300
 
 
 def test_robots_that_do_not_fit_at_once_have_the_same_episodes(run, monkeypatch):
-    exam = replace(EXAM, episodes=5)
+    config = replace(EVAL, episodes=5)
     source = other_side(small_source(), "train")
-    whole = evaluate_run(run, "train", exam, "deterministic")
-    still = evaluate_reference("zero", source, exam)
+    whole = evaluate_run(run, "train", config, "deterministic")
+    still = evaluate_baseline("zero", source, config)
     made = []
 
     def noted(settings, num_envs, **options):
@@ -106,12 +106,12 @@ def test_robots_that_do_not_fit_at_once_have_the_same_episodes(run, monkeypatch)
 
     monkeypatch.setattr(evaluation, "batch_of", noted)
     at_most(4, monkeypatch)
-    evaluation._known.clear()
-    parts = evaluate_run(run, "train", exam, "deterministic")
+    evaluation._random_cache.clear()
+    parts = evaluate_run(run, "train", config, "deterministic")
     assert made[:3] == [(0, 4), (4, 4), (8, 2)]
     assert [each.raw for each in parts] == pytest.approx([each.raw for each in whole])
     assert [each.distance for each in parts] == pytest.approx([each.distance for each in whole])
-    assert [each.raw for each in evaluate_reference("zero", source, exam)] == pytest.approx(
+    assert [each.raw for each in evaluate_baseline("zero", source, config)] == pytest.approx(
         [each.raw for each in still]
     )
 
@@ -125,42 +125,46 @@ def test_ten_thousand_steps_are_34_episodes():
 
 def test_push_scores_its_success_rate_and_references_are_for_their_task():
     mixed = robot_source("prims", "push")
-    exam = Exam(episodes=3, sim="mujoco")
-    (zero,) = evaluate_reference("zero", mixed, exam)
+    config = EvalConfig(episodes=3, sim="mujoco")
+    (zero,) = evaluate_baseline("zero", mixed, config)
     assert (zero.task, zero.score, zero.success) == ("push", 0, 0)
     assert math.isnan(zero.relative_distance)
-    (scripted,) = evaluate_reference("scripted", mixed, exam)
+    (scripted,) = evaluate_baseline("scripted", mixed, config)
     assert scripted.score == scripted.raw == scripted.success > 0
     assert scripted.steps < 3 * 300
     with pytest.raises(TaskError, match="no robot is there to reach"):
-        evaluate_reference("ik", mixed, exam)
+        evaluate_baseline("ik", mixed, config)
     with pytest.raises(TaskError, match="did you mean 'scripted'"):
-        evaluate_reference("script", mixed, exam)
+        evaluate_baseline("script", mixed, config)
 
 
 def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
-    config = small_config(small_source(), agent="se", transitions=64)
-    train(tmp_path, config, way=QUIET)
-    own = evaluate_run(tmp_path, "train", EXAM, "deterministic")
-    names = [part.config.source.only for part in parts_of(tmp_path, config)]
+    config = small_config(small_source(), agent="se", total_timesteps=64)
+    train(tmp_path, config, execution=QUIET)
+    own = evaluate_run(tmp_path, "train", EVAL, "deterministic")
+    names = [part.config.source.member for part in parts_of(tmp_path, config)]
     assert sorted(each.robot for each in own) == sorted(names)
     assert [each.episodes for each in own] == [2, 2]
-    (test,) = evaluate_run(tmp_path, "test", EXAM, "deterministic")
+    (test,) = evaluate_run(tmp_path, "test", EVAL, "deterministic")
     assert (test.side, test.episodes) == ("test", 4)
     files = list(checkpoints(tmp_path))
-    assert evaluate_checkpoints(files, small_source(), EXAM, "deterministic") == own
+    assert evaluate_checkpoints(files, small_source(), EVAL, "deterministic") == own
     others = replace(small_source(), goal_seed=1)
-    again = evaluate_checkpoints(files, others, EXAM, "deterministic")
+    again = evaluate_checkpoints(files, others, EVAL, "deterministic")
     assert [(each.robot, each.episodes) for each in again] == [(e.robot, 2) for e in own]
     assert [each.score for each in again] != [each.score for each in own]
     source = other_side(small_source(), "test")
-    alone = [evaluate_checkpoints([file], source, EXAM, "deterministic")[0] for file in files]
+    alone = [evaluate_checkpoints([file], source, EVAL, "deterministic")[0] for file in files]
     assert test.score == pytest.approx(np.mean([each.score for each in alone]))
 
 
 @pytest.mark.parametrize(
     ("limit", "value", "calls", "whole"),
-    [("AT_ONCE", 34, 300, 6), ("AT_ONCE", 2, 600, 8), (None, 4, 600, 6)],
+    [
+        ("MAX_ENVS_PER_ROBOT", 34, 300, 6),
+        ("MAX_ENVS_PER_ROBOT", 2, 600, 8),
+        (None, 4, 600, 6),
+    ],
     ids=["at once", "in rounds", "in batches"],
 )
 def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
@@ -169,8 +173,8 @@ def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
     else:
         monkeypatch.setattr(evaluation, limit, value)
     seen = []
-    exam = replace(EXAM, episodes=3)
-    evaluate_reference("zero", small_source(), exam, tell=lambda *now: seen.append(now))
+    config = replace(EVAL, episodes=3)
+    evaluate_baseline("zero", small_source(), config, progress=lambda *now: seen.append(now))
     parts = [done for done, _ in seen]
     assert {total for _, total in seen} == {whole}
     assert len(parts) == calls
@@ -180,9 +184,9 @@ def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
 
 
 def test_of_policies_of_single_robots_it_tells_all_that_play(tmp_path):
-    train(tmp_path, small_config(small_source(), agent="se", transitions=64), way=QUIET)
+    train(tmp_path, small_config(small_source(), agent="se", total_timesteps=64), execution=QUIET)
     seen = []
-    evaluate_run(tmp_path, "test", EXAM, "deterministic", tell=lambda *now: seen.append(now))
+    evaluate_run(tmp_path, "test", EVAL, "deterministic", progress=lambda *now: seen.append(now))
     assert (len(seen), seen[300], seen[-1]) == (600, (pytest.approx(2 + 1 / 150), 4), (4, 4))
 
 
@@ -191,9 +195,9 @@ def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_
     learner["layout"]["obstacles"] = 0
     boxes = robot_source("planar-cube", "reach", obstacles=True)
     with pytest.raises(TaskError, match="the checkpoint is for other observations: obstacles 0, h"):
-        evaluate_checkpoints([run], boxes, EXAM, "deterministic")
+        evaluate_checkpoints([run], boxes, EVAL, "deterministic")
     write_checkpoint(tmp_path, config, learner)
-    evaluate_run(tmp_path, "test", EXAM, "deterministic")
+    evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
 def test_policies_for_other_observations_or_actions_are_not_evaluated_together(run, tmp_path):
@@ -212,7 +216,7 @@ def test_policies_for_other_observations_or_actions_are_not_evaluated_together(r
         }
         message = rf"^{other}: its policy .* than that of {run}: {difference[name]}; evaluate it on"
         with pytest.raises(TaskError, match=message):
-            evaluate_checkpoints([run, other], small_source(), EXAM, "deterministic")
+            evaluate_checkpoints([run, other], small_source(), EVAL, "deterministic")
 
 
 @pytest.mark.parametrize("agent", ["me-mlp", "se"])
@@ -226,33 +230,33 @@ def test_obstacles_may_be_on_one_side_or_around_one_robot_alone(agent, tmp_path)
     }.items():
         own = made("base=planar ee=cube", cube), made("base=gantry ee=cube", other)
         source = split_source(split(own, (made("base=gantry ee=plane", test),)))
-        config, folder = small_config(source, agent=agent, transitions=64), tmp_path / place
-        train(folder, config, way=QUIET)
+        config, folder = small_config(source, agent=agent, total_timesteps=64), tmp_path / place
+        train(folder, config, execution=QUIET)
         for part in parts_of(folder, config):
             assert read_checkpoint(part.folder)[1]["layout"]["obstacles"] == 3
         for side, count in (("train", 2), ("test", 1)):
-            assert len(evaluate_run(folder, side, EXAM, "deterministic")) == count
+            assert len(evaluate_run(folder, side, EVAL, "deterministic")) == count
 
 
 def test_one_robot_has_no_other_side(tmp_path):
-    train(tmp_path, small_config(transitions=32), way=QUIET)
-    assert len(evaluate_run(tmp_path, "train", EXAM, "deterministic")) == 1
+    train(tmp_path, small_config(total_timesteps=32), execution=QUIET)
+    assert len(evaluate_run(tmp_path, "train", EVAL, "deterministic")) == 1
     with pytest.raises(TaskError, match="nothing to test on"):
-        evaluate_run(tmp_path, "test", EXAM, "deterministic")
+        evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
 def test_an_evaluation_is_in_the_simulator_and_task_of_the_run(run):
     config, _ = read_checkpoint(run)
-    assert exam_of(config, 3) == Exam(3, "mujoco")
+    assert eval_config_of(config, 3) == EvalConfig(3, "mujoco")
     with pytest.raises(TaskError, match="0 episodes"):
-        Exam(episodes=0)
+        EvalConfig(episodes=0)
     with pytest.raises(TaskError, match="a seed from 0 to"):
-        Exam(seed=2**63)
+        EvalConfig(seed=2**63)
 
 
 def test_tables_hold_every_robot_and_mode(run, tmp_path):
     found = {
-        mode: evaluate_run(run, "train", EXAM, mode) for mode in ("deterministic", "stochastic")
+        mode: evaluate_run(run, "train", EVAL, mode) for mode in ("deterministic", "stochastic")
     }
     lines = score_table(found).splitlines()
     assert len(lines) == 2 + 4
@@ -266,7 +270,7 @@ def test_tables_hold_every_robot_and_mode(run, tmp_path):
     for suffix in (".csv", ".json", ".md"):
         write_scores(tmp_path / f"table{suffix}", found)
     stored = json.loads((tmp_path / "table.json").read_text())
-    assert stored["stochastic"] == as_data(found["stochastic"])
+    assert stored["stochastic"] == scores_to_json(found["stochastic"])
     rows = (tmp_path / "table.csv").read_text().splitlines()
     assert rows[0].startswith("mode,robot,side,task,episodes,steps,score,")
     assert len(rows) == 1 + 4

@@ -2,7 +2,7 @@
 
 import torch
 
-from morphgen.rl.gae import gae, next_values
+from morphgen.rl.ppo import gae
 
 GAMMA, LAM = 0.9, 0.5
 
@@ -19,7 +19,7 @@ def advantages(terminated, truncated, ahead=(20.0, 30.0, 40.0)):
         column(*terminated),
         column(*truncated),
         gamma=GAMMA,
-        lam=LAM,
+        gae_lambda=LAM,
     )
     return found[:, 0]
 
@@ -57,10 +57,10 @@ def test_environments_do_not_mix():
     over = torch.zeros(5, 3, dtype=torch.bool)
     over[2, 1] = True
     none = torch.zeros_like(over)
-    whole = gae(rewards, values, ahead, over, none, gamma=GAMMA, lam=LAM)
+    whole = gae(rewards, values, ahead, over, none, gamma=GAMMA, gae_lambda=LAM)
     for i in range(3):
         one = (each[:, i : i + 1] for each in (rewards, values, ahead, over, none))
-        torch.testing.assert_close(whole[:, i : i + 1], gae(*one, gamma=GAMMA, lam=LAM))
+        torch.testing.assert_close(whole[:, i : i + 1], gae(*one, gamma=GAMMA, gae_lambda=LAM))
 
 
 def test_with_lambda_1_returns_are_discounted_sums():
@@ -68,13 +68,5 @@ def test_with_lambda_1_returns_are_discounted_sums():
     values = torch.tensor([[5.0], [6.0], [7.0]])
     ahead = torch.tensor([[6.0], [7.0], [8.0]])
     none = torch.zeros(3, 1, dtype=torch.bool)
-    found = values + gae(rewards, values, ahead, none, none, gamma=GAMMA, lam=1.0)
+    found = values + gae(rewards, values, ahead, none, none, gamma=GAMMA, gae_lambda=1.0)
     assert torch.allclose(found[0, 0], torch.tensor(1 + 0.9 * 2 + 0.81 * 4 + 0.729 * 8))
-
-
-def test_next_values_are_those_of_the_observations_before_new_episodes():
-    values = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
-    cut = torch.tensor([[False, True], [False, False], [True, True]])
-    found = next_values(values, torch.tensor([7.0, 8.0]), cut, torch.tensor([20.0, 50.0, 60.0]))
-    assert found.tolist() == [[3.0, 20.0], [5.0, 6.0], [50.0, 60.0]]
-    assert values.tolist() == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]

@@ -8,10 +8,10 @@ from torch.distributions import Categorical, Independent, Normal
 from torch.nn import functional
 
 from morphgen.rl.heads import (
-    HIGH,
-    LOW,
+    INITIAL_LOG_STD,
+    MAX_LOG_STD,
+    MIN_LOG_STD,
     REST,
-    START,
     MaskedGaussian,
     MaskedMultiDiscrete,
     bounded_log_std,
@@ -78,25 +78,25 @@ def test_multi_discrete_draws_with_its_probabilities():
 
 def test_the_middle_is_the_mean_and_the_bin_nearest_to_it():
     head = gaussian()
-    assert head.middle()[MASK].equal(head.mean[MASK])
+    assert head.mode()[MASK].equal(head.mean[MASK])
     shares = {-1 / 16: 0.4, 1 / 2: 0.3, 1 / 4: 0.3}  # mean 0.2, where 1/4 is nearest
     probabilities = torch.tensor([shares.get(each, 1e-9) for each in BINS])
     bins = MaskedMultiDiscrete(probabilities.log().expand(*MASK.shape, len(BINS)), MASK)
-    assert set(bins.middle()[MASK].tolist()) == {BINS.index(1 / 4)}
+    assert set(bins.mode()[MASK].tolist()) == {BINS.index(1 / 4)}
 
 
 @pytest.mark.parametrize("chosen", range(len(BINS)))
 def test_the_middle_of_one_bin_is_that_bin(chosen):
     logits = 50.0 * functional.one_hot(torch.tensor(chosen), len(BINS)).float()
     bins = MaskedMultiDiscrete(logits.expand(*MASK.shape, len(BINS)), MASK)
-    assert set(bins.middle()[MASK].tolist()) == {chosen}
+    assert set(bins.mode()[MASK].tolist()) == {chosen}
 
 
 def test_links_that_do_not_move_rest():
     assert BINS[REST] == 0
-    for actions in (discrete().sample(seeded()), discrete().middle()):
+    for actions in (discrete().sample(seeded()), discrete().mode()):
         assert set(actions[~MASK].tolist()) == {REST}
-    for actions in (gaussian().sample(seeded()), gaussian().middle()):
+    for actions in (gaussian().sample(seeded()), gaussian().mode()):
         assert set(actions[~MASK].tolist()) == {0.0}
 
 
@@ -130,8 +130,8 @@ def test_garbage_behind_the_mask_changes_no_gradient(garbage):
 def test_log_std_starts_where_it_should_learns_and_stays_in_bounds():
     raw = torch.zeros(1, requires_grad=True)
     found = bounded_log_std(raw)
-    assert found.item() == pytest.approx(START, abs=1e-6)
+    assert found.item() == pytest.approx(INITIAL_LOG_STD, abs=1e-6)
     found.backward()
     assert raw.grad.item() > 0.1
     far = bounded_log_std(torch.tensor([-20.0, 20.0]))
-    torch.testing.assert_close(far, torch.tensor([LOW, HIGH]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(far, torch.tensor([MIN_LOG_STD, MAX_LOG_STD]), atol=1e-4, rtol=0)

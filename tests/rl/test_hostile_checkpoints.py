@@ -23,7 +23,7 @@ ENTER = "network.enter.weight"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "run"
-    train(folder, small_config(), way=QUIET)
+    train(folder, small_config(), execution=QUIET)
     return folder
 
 
@@ -86,7 +86,7 @@ def nested(levels, wide):
             lambda _, own: own["optimiser"]["state"][0]["exp_avg"].fill_(torch.inf),
             "exp_avg: 16 of 16 numbers are not finite",
         ),
-        (put("share", value=float("nan")), "learner.share is nan: not finite"),
+        (put("actor_lr_scale", value=float("nan")), "learner.actor_lr_scale is nan: not finite"),
         (
             put("actor", ENTER, value=torch.ones(3)),
             f"actor: {ENTER} has shape (3,) of torch.float32; expected (8, 104)",
@@ -106,20 +106,26 @@ def nested(levels, wide):
             "critic has 'more', which its sizes do not ask for",
         ),
         (
-            put("slow", "more", value=torch.ones(1)),
-            "slow has 'more', which its sizes do not ask for",
+            put("target_critic", "more", value=torch.ones(1)),
+            "target_critic has 'more', which its sizes do not ask for",
         ),
         (put("actor", value=3), "actor of its learner is 3"),
         (lambda _, own: own.pop("policy"), "its learner has no policy"),
         (
-            put("policy", "mlp_width", value=10**12),
+            put("policy", "network", "mlp_width", value=10**12),
             "mlp_width 1000000000000: expected at most 8192",
         ),
-        (put("policy", "mlp_layers", value=10**9), "mlp_layers 1000000000: expected at most 100"),
-        (put("policy", "mlp_width", value="abc"), "policy: mlp_width 'abc': expected int"),
+        (
+            put("policy", "network", "mlp_layers", value=10**9),
+            "mlp_layers 1000000000: expected at most 100",
+        ),
+        (
+            put("policy", "network", "mlp_width", value="abc"),
+            "policy: mlp_width 'abc': expected int",
+        ),
         (
             put("policy", "agent", value="hal"),
-            "policy: agent 'hal': expected Literal['se', 'me-mlp'",
+            "policy: unknown agent 'hal'; ",
         ),
         (put("policy", "colour", value=1), "policy: unknown entry 'colour'"),
         (put("config", "gamma", value="big"), "config: gamma 'big': expected float"),
@@ -149,11 +155,11 @@ def nested(levels, wide):
             put("batch", value=torch.empty(10**12, device="meta")),
             "_rebuild_meta_tensor_no_storage', which",
         ),
-        (put_run("envs", value="many"), "run: envs 'many': expected int"),
+        (put_run("num_envs", value="many"), "run: num_envs 'many': expected int"),
         (put_run("policy", value=[1]), "run: policy [1]: expected PolicyConfig"),
         (
             put_run("sim", value="gazebo"),
-            "run: sim 'gazebo': expected Literal['pybullet', 'mujoco']",
+            "unknown simulator 'gazebo'; valid: mujoco, pybullet",
         ),
         (put_run("ppo", "colour", value=1), "ppo: unknown entry 'colour'"),
         (lambda whole, _: whole["run"].pop("source"), "run: no source"),
@@ -278,7 +284,7 @@ def test_every_command_refuses_weights_that_are_not_finite(tmp_path, run, conten
     assert says in refusal(command, folder, capfd)
     assert not (tmp_path / "tuned").exists()
     with pytest.raises(TaskError, match=says):
-        train(folder, small_config(), resume=True, way=QUIET)
+        train(folder, small_config(), resume=True, execution=QUIET)
 
 
 def test_weights_that_are_not_finite_do_not_replace_the_last_checkpoint(run, tmp_path):

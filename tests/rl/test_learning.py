@@ -7,11 +7,12 @@ import pytest
 
 import morphgen
 from morphgen.model.robot import TOOL
+from morphgen.rl.baselines.simple import Random
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.inference import Policy, PolicyController
+from morphgen.rl.learner_state import state_of
 from morphgen.rl.ppo import Learner
-from morphgen.rl.references import Random
 from morphgen.rl.rollouts import run_episodes
-from morphgen.rl.trained import Policy
 from morphgen.tasks.make import make_batch
 
 
@@ -45,12 +46,12 @@ def test_an_arm_of_three_joints_learns_to_reach():
     assert successes(Random(0), robot) < 0.1
     policy = PolicyConfig("se", discrete=False)
     config = PPOConfig(
-        transitions=4_000_000,
-        steps=32,
+        total_timesteps=4_000_000,
+        num_steps=32,
         minibatches=8,
         gamma=0.95,
         learning_rate=5e-4,
-        target_kl=0.01,
+        desired_kl=0.01,
     )
     with closing(
         make_batch("reach", [robot], 512, sim="mujoco", kind="continuous", max_links=10)
@@ -58,5 +59,5 @@ def test_an_arm_of_three_joints_learns_to_reach():
         learner = Learner(batch, policy, config, seed=0)
         while not learner.done:
             learner.iterate()
-        learned = learner.checkpoint()
-    assert successes(Policy(learned, "deterministic", 0), robot) >= 0.8
+        learned = state_of(learner)
+    assert successes(PolicyController(Policy(learned, "deterministic", 0)), robot) >= 0.8

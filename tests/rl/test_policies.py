@@ -7,16 +7,11 @@ import torch
 
 from morphgen.benchmark.token_layout import POSITION
 from morphgen.errors import TaskError
-from morphgen.rl.config import AGENTS, PolicyConfig
-from morphgen.rl.policies import (
-    Entities,
-    layout_of,
-    make_networks,
-    require_layout,
-    rows_needed,
-    with_all_rows,
-    with_rows,
-)
+from morphgen.rl.agents import AGENTS, transformer
+from morphgen.rl.agents.encoder import Entities
+from morphgen.rl.config import PolicyConfig
+from morphgen.rl.observation_layout import layout_of, pad_links, require_layout, truncate_links
+from morphgen.rl.policies import make_networks, rows_needed
 
 N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
 COUNT = torch.tensor([6, 4, 1, 3])
@@ -76,15 +71,15 @@ def filled(seen, value):
     return {**seen, **values}
 
 
-def networks(agent="me-tf", seen=None, *, discrete=True, mask_morphology=False, lively=True):
+def networks(agent="me-tf", seen=None, *, discrete=True, proprioceptive_only=False, lively=True):
     """An actor and a critic; ``lively`` ones are as if they had learned. Logits are not scaled."""
     layout = layout_of(seen or observed())
     config = PolicyConfig(
         agent=agent,
         discrete=discrete,
-        mask_morphology=mask_morphology,
+        proprioceptive_only=proprioceptive_only,
         tool_position=layout.tool,
-        logit_scale=1.0,
+        network=transformer.Config(logit_scale=1.0) if agent == "me-tf" else None,
     )
     actor, critic = make_networks(config, layout, seed=0)
     if lively:
@@ -97,7 +92,7 @@ def networks(agent="me-tf", seen=None, *, discrete=True, mask_morphology=False, 
 def outputs(actor, critic, seen):
     """Actions, their probability, and values."""
     head = actor.distribution(seen)
-    return head.middle(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
+    return head.mode(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
 
 
 agents = pytest.mark.parametrize("agent", AGENTS)
@@ -182,10 +177,10 @@ def test_the_transformer_says_and_learns_the_same_without_rows_that_no_robot_has
     rows = rows_needed(PolicyConfig("me-tf"), seen)
     assert rows == COUNT[1:].max() == LINKS - 2
     found = []
-    for needed in (seen, with_rows(seen, rows)):
+    for needed in (seen, truncate_links(seen, rows)):
         actor, critic = networks("me-tf", seen, discrete=discrete)
         head = actor.distribution(needed)
-        actions = with_all_rows(head.middle(), LINKS)
+        actions = pad_links(head.mode(), LINKS)
         probable = head.log_prob(actions[:, : needed["links"].shape[1]])
         value = critic(needed)
         (probable + head.entropy() + value).sum().backward()
@@ -274,7 +269,7 @@ def test_morphology_is_hidden_if_asked_for(agent):
     bodies = other["tokens"].clone()
     bodies[..., POSITION.columns] = seen["tokens"][..., POSITION.columns]
     for masked in (True, False):
-        _, critic = networks(agent, seen, mask_morphology=masked)
+        _, critic = networks(agent, seen, proprioceptive_only=masked)
         assert critic(seen).equal(critic({**seen, "tokens": bodies})) == masked
         assert not critic(seen).isclose(critic({**seen, "tokens": positions})).any()
 
@@ -282,7 +277,7 @@ def test_morphology_is_hidden_if_asked_for(agent):
 def test_se_sees_no_morphology_and_is_the_mlp_otherwise():
     seen = observed()
     _, se = networks("se", seen)
-    _, mlp = networks("me-mlp", seen, mask_morphology=True)
+    _, mlp = networks("me-mlp", seen, proprioceptive_only=True)
     assert se(seen).equal(mlp(seen))
     assert not se(seen).isclose(networks("me-mlp", seen)[1](seen)).any()
 
@@ -319,11 +314,16 @@ def test_logits_begin_alike_and_those_of_the_transformer_go_farther_with_every_c
 ):
     factor = 16 if discrete and agent == "me-tf" else 1
     seen, layout = observed(), layout_of(observed())
+    sizes = [transformer.Config(logit_scale=scale) for scale in (1.0, 16.0)]
     plain, larger = (
         make_networks(
-            PolicyConfig(agent, discrete, tool_position=True, logit_scale=scale), layout, 0
+            PolicyConfig(
+                agent, discrete, tool_position=True, network=size if agent == "me-tf" else None
+            ),
+            layout,
+            0,
         )
-        for scale in (1.0, 16.0)
+        for size in sizes
     )
     torch.testing.assert_close(larger[0](seen), plain[0](seen))
     assert larger[1](seen).equal(plain[1](seen))
@@ -343,7 +343,7 @@ def test_all_actions_begin_alike_and_values_near_zero(agent):
     assert (spread - 1 / 11).abs().max() < 0.01
     assert critic(seen).abs().max() < 0.1
     calm, _ = networks(agent, seen, discrete=False, lively=False)
-    assert calm.distribution(seen).middle().abs().max() < 0.1
+    assert calm.distribution(seen).mode().abs().max() < 0.1
 
 
 def test_weights_follow_from_the_seed_and_leave_torchs_own_stream_alone():
@@ -434,7 +434,7 @@ def test_kinds_of_entities_are_matched_by_name(monkeypatch):
 def test_the_rows_of_kinds_in_a_checkpoint_keep_their_meaning(extras):
     """Each row is added to the vectors of one kind alone, in the order of older checkpoints."""
     seen = observed(extras=extras)
-    found = Entities(layout_of(seen), 8, blind=False)
+    found = Entities(layout_of(seen), 8, proprioceptive_only=False)
     with torch.no_grad():
         for project in found.project.values():
             project.weight.zero_()

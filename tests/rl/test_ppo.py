@@ -11,9 +11,17 @@ import torch
 from learners import SMALL, equal, learner, weights
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.learning_rates import KL_FACTOR, LEAST_SHARE, learning_rate, next_share
-from morphgen.rl.ppo import Learner, follow, policy_loss
-from morphgen.rl.report import explained_variance, outcome
+from morphgen.rl.ppo import (
+    KL_FACTOR,
+    MIN_ACTOR_LR_SCALE,
+    Learner,
+    ema_update,
+    learning_rate,
+    next_actor_lr_scale,
+    policy_loss,
+)
+from morphgen.rl.report import explained_variance
+from morphgen.rl.rollout_buffer import RolloutBuffer
 from morphgen.rl.symlog import symlog
 from on_a_line import OnALine
 
@@ -36,36 +44,36 @@ def test_the_learning_rate_falls_over_the_updates_that_happen():
     rates = []
     while not made.done:
         rates.append(made.iterate().learning_rate)
-    assert made.updates == 4
+    assert made.num_updates == 4
     assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
     assert learning_rate(SMALL, 4, 4) == 0
 
 
 def test_the_actors_share_of_the_rate_follows_the_divergence():
-    config = replace(SMALL, target_kl=0.01)
-    assert next_share(config, 1.0, 0.02) == 1 / KL_FACTOR
-    assert next_share(config, 0.5, 0.02) == 0.5 / KL_FACTOR
-    assert next_share(config, 0.5, 0.005) == 0.5 * KL_FACTOR
-    assert next_share(config, 1.0, 0.005) == 1
-    assert next_share(SMALL, 1.0, 9.9) == 1
+    config = replace(SMALL, desired_kl=0.01)
+    assert next_actor_lr_scale(config, 1.0, 0.02) == 1 / KL_FACTOR
+    assert next_actor_lr_scale(config, 0.5, 0.02) == 0.5 / KL_FACTOR
+    assert next_actor_lr_scale(config, 0.5, 0.005) == 0.5 * KL_FACTOR
+    assert next_actor_lr_scale(config, 1.0, 0.005) == 1
+    assert next_actor_lr_scale(SMALL, 1.0, 9.9) == 1
 
 
 def test_the_actors_share_of_the_rate_has_a_floor():
-    config, share = replace(SMALL, target_kl=0.01), 1.0
+    config, share = replace(SMALL, desired_kl=0.01), 1.0
     for _ in range(1000):
-        share = next_share(config, share, 9.9)
-    assert share == LEAST_SHARE > 0
+        share = next_actor_lr_scale(config, share, 9.9)
+    assert share == MIN_ACTOR_LR_SCALE > 0
     updates = 0
     while share < 1:
-        share, updates = next_share(config, share, 0.0), updates + 1
+        share, updates = next_actor_lr_scale(config, share, 0.0), updates + 1
     assert updates < 30, "it must rise again within a run"
 
 
 def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
-    options = {"learning_rate": 5e-3, "transitions": 30 * 64}
+    options = {"learning_rate": 5e-3, "total_timesteps": 30 * 64}
     divergence = {0: [], 0.01: []}
     for target, seed in product(divergence, range(4)):
-        made = learner(**options, target_kl=target, seed=seed)
+        made = learner(**options, desired_kl=target, seed=seed)
         first, *_ = (made.iterate() for _ in range(3))
         assert first.kl > 0.1
         divergence[target] += [made.iterate().kl for _ in range(7)]
@@ -85,17 +93,17 @@ def test_explained_variance_by_hand():
     assert explained_variance(returns, torch.ones(2, 2)) == 0
 
 
-def test_the_outcome_of_a_rollout_by_hand():
+def test_the_metrics_of_a_rollout_by_hand():
     true, false = True, False
-    tallied = {
-        "reward": torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]),
-        "score": torch.tensor([[0.0, 1.0, 2.0], [4.0, 3.0, 2.0]]),
-        "success": torch.tensor([[true, true, false], [false, false, true]]),
-        "terminated": torch.tensor([[true, false, false], [false, false, false]]),
-        "truncated": torch.tensor([[false, false, true], [false, true, true]]),
-        "unstable": torch.tensor([[false, false, true], [false, false, false]]),
-    }
-    found = outcome(tallied, torch.tensor([1, 0, 1]), 3)
+    observation = {"actions": torch.zeros(3, 4)}
+    buffer = RolloutBuffer(observation, 2, discrete=True, device=torch.device("cpu"))
+    buffer.reward[:] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    buffer.score[:] = torch.tensor([[0.0, 1.0, 2.0], [4.0, 3.0, 2.0]])
+    buffer.success[:] = torch.tensor([[true, true, false], [false, false, true]])
+    buffer.terminated[:] = torch.tensor([[true, false, false], [false, false, false]])
+    buffer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
+    buffer.unstable[:] = torch.tensor([[false, false, true], [false, false, false]])
+    found = buffer.metrics(torch.tensor([1, 0, 1]), 3)
     assert (found["reward"], found["score"]) == (3.5, 2.0)
     assert found["scores"][:2] == (2.0, 2.0)
     assert math.isnan(found["scores"][2])
@@ -106,8 +114,8 @@ def test_a_moving_average_by_hand():
     slow, fast = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
     slow.weight.data.fill_(1.0)
     fast.weight.data.fill_(3.0)
-    follow(slow, fast, 0.75)
-    follow(slow, fast, 0.75)
+    ema_update(slow, fast, 0.75)
+    ema_update(slow, fast, 0.75)
     assert slow.weight.item() == pytest.approx(0.75**2 * 1 + (1 - 0.75**2) * 3)
     assert fast.weight.item() == 3
 
@@ -121,9 +129,9 @@ def test_the_slow_critic_follows_every_gradient_step():
     assert moved
     for name in moved:
         fast = after[f"critic.{name}"]
-        wanted = torch.lerp(fast, before[f"slow.{name}"], made.config.slow_decay)
-        torch.testing.assert_close(after[f"slow.{name}"], wanted)
-    assert not equal({k: v for k, v in before.items() if k.startswith("slow")}, after)
+        wanted = torch.lerp(fast, before[f"target_critic.{name}"], made.config.slow_decay)
+        torch.testing.assert_close(after[f"target_critic.{name}"], wanted)
+    assert not equal({k: v for k, v in before.items() if k.startswith("target_critic")}, after)
 
 
 class Answers(torch.nn.Module):
@@ -138,15 +146,15 @@ class Answers(torch.nn.Module):
 def test_targets_by_hand(slow, logarithmic):
     # With lambda 0 a return is the reward and the discounted value of what the action led to.
     batch = OnALine(4, horizon=3)
-    made = learner(batch, slow_critic=slow, symlog=logarithmic, lam=0.0, minibatches=4)
+    made = learner(batch, slow_critic=slow, symlog=logarithmic, gae_lambda=0.0, minibatches=4)
     wrong = lambda seen: torch.full_like(seen["line"][:, 0], 99.0)  # noqa: E731
     right = lambda seen: symlog(Answers()(seen)) if logarithmic else Answers()(seen)  # noqa: E731
-    made.slow.forward, made.critic.forward = (right, wrong) if slow else (wrong, right)
+    made.target_critic.forward, made.critic.forward = (right, wrong) if slow else (wrong, right)
     steps = []
     step = batch.step
     batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
-    rollout, _ = made._collect(made._begin())
-    values, advantages, returns = made._targets(rollout)
+    made._collect_rollout()
+    values, advantages, returns = made._compute_returns()
     after = torch.stack([Answers()(each.final_observation) for each in steps])
     rewards = torch.stack([each.reward for each in steps])
     terminated = torch.stack([each.terminated for each in steps])
@@ -154,20 +162,20 @@ def test_targets_by_hand(slow, logarithmic):
     assert terminated.any()
     assert truncated.any()
     torch.testing.assert_close(returns, rewards + 0.99 * after * ~terminated, rtol=1e-4, atol=1e-4)
-    at = Answers()({"tokens": rollout.observation["tokens"].flatten(0, 1)}).reshape(8, 4)
+    at = Answers()({"tokens": made.buffer.observations["tokens"].flatten(0, 1)}).reshape(8, 4)
     torch.testing.assert_close(values, at, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(advantages, returns - values)
 
 
 @pytest.mark.parametrize("logarithmic", [True, False], ids=["symlog", "plain"])
 def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
-    options = {"epochs": 80, "minibatches": 1, "learning_rate": 3e-3, "gradient_clip": 10.0}
+    options = {"epochs": 80, "minibatches": 1, "learning_rate": 3e-3, "max_grad_norm": 10.0}
     made = learner(symlog=logarithmic, **options)
-    rollout, _ = made._collect(made._begin())
-    _, _, returns = made._targets(rollout)
-    made._learn(rollout)
+    made._collect_rollout()
+    _, _, returns = made._compute_returns()
+    made._learn()
     with torch.no_grad():
-        values = made.critic({k: v.flatten(0, 1) for k, v in rollout.observation.items()})
+        values = made.critic({k: v.flatten(0, 1) for k, v in made.buffer.observations.items()})
     wanted = (symlog(returns) if logarithmic else returns).flatten()
     other = (returns if logarithmic else symlog(returns)).flatten()
     assert (values - wanted).square().mean() < 0.2 * wanted.var()
@@ -177,8 +185,8 @@ def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
 def test_minibatches_hold_every_transition_once_an_epoch():
     made = learner(epochs=3)
     seen = []
-    descend = made._descend
-    made._descend = lambda obs, data: seen.append(data) or descend(obs, data)
+    step = made._gradient_step
+    made._gradient_step = lambda obs, data: seen.append(data) or step(obs, data)
     made.iterate()
     assert len(seen) == 3 * 4
     for epoch in range(3):
@@ -187,7 +195,7 @@ def test_minibatches_hold_every_transition_once_an_epoch():
         goals = torch.cat([each["advantage"] for each in seen[4 * epoch : 4 * epoch + 4]])
         assert goals.mean().item() == pytest.approx(0, abs=1e-5)
         assert goals.std().item() == pytest.approx(1, abs=1e-4)
-        bodies = torch.cat([each["body"] for each in seen[4 * epoch : 4 * epoch + 4]])
+        bodies = torch.cat([each["robot"] for each in seen[4 * epoch : 4 * epoch + 4]])
         assert torch.bincount(bodies).tolist() == [32, 32]
     first = torch.cat([each["advantage"] for each in seen[:4]])
     second = torch.cat([each["advantage"] for each in seen[4:8]])
@@ -198,13 +206,13 @@ def test_minibatches_hold_every_transition_once_an_epoch():
 def test_a_transition_keeps_its_observation_action_and_body_through_shuffling():
     made = learner()
     pairs = []
-    descend = made._descend
-    made._descend = lambda seen, data: pairs.append((seen, data)) or descend(seen, data)
+    step = made._gradient_step
+    made._gradient_step = lambda seen, data: pairs.append((seen, data)) or step(seen, data)
     made.iterate()
     for seen, data in pairs[:1]:
-        assert seen["object_mask"].equal(data["body"] == 1)
+        assert seen["object_mask"].equal(data["robot"] == 1)
         head = learner().actor.distribution(seen)
-        torch.testing.assert_close(head.log_prob(data["actions"]), data["log_prob"])
+        torch.testing.assert_close(head.log_prob(data["action"]), data["log_prob"])
 
 
 def test_before_the_first_step_no_ratio_is_clipped_and_kl_is_zero():
@@ -219,7 +227,7 @@ def test_before_the_first_step_no_ratio_is_clipped_and_kl_is_zero():
 
 
 def test_gradients_of_actor_and_critic_are_clipped_apart():
-    made = learner(gradient_clip=1e-3, epochs=1, minibatches=1)
+    made = learner(max_grad_norm=1e-3, epochs=1, minibatches=1)
     report = made.iterate()
     for network, norm in ((made.actor, "actor_gradient"), (made.critic, "critic_gradient")):
         left = torch.stack([each.grad.norm() for each in network.parameters()]).norm()
@@ -250,7 +258,7 @@ def test_a_report_says_what_happened():
 
 
 def test_entropy_grows_if_it_is_all_that_counts():
-    made = learner(discrete=False, entropy=10.0, learning_rate=1e-2)
+    made = learner(discrete=False, ent_coef=10.0, learning_rate=1e-2)
     reports = []
     while not made.done:
         reports.append(made.iterate())
@@ -259,17 +267,17 @@ def test_entropy_grows_if_it_is_all_that_counts():
 
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_deviation_is_learned_or_stays(fixed):
-    policy = PolicyConfig("me-mlp", discrete=False, fixed_deviation=fixed)
-    made = Learner(OnALine(8, kind="continuous"), policy, replace(SMALL, entropy=1.0))
+    policy = PolicyConfig("me-mlp", discrete=False, fixed_std=fixed)
+    made = Learner(OnALine(8, kind="continuous"), policy, replace(SMALL, ent_coef=1.0))
     reports = [made.iterate() for _ in range(3)]
-    assert made.actor.deviation.any() != fixed
+    assert made.actor.raw_log_std.any() != fixed
     assert (reports[0].entropy == pytest.approx(reports[2].entropy, rel=1e-6)) == fixed
 
 
 def test_robots_count_alike_or_with_random_weights_of_mean_one():
-    assert learner()._weights().tolist() == [1, 1]
+    assert learner()._robot_weights().tolist() == [1, 1]
     made = learner(task_reweighting=True)
-    drawn = torch.stack([made._weights() for _ in range(4000)])
+    drawn = torch.stack([made._robot_weights() for _ in range(4000)])
     assert (drawn > 0).all()
     torch.testing.assert_close(drawn.mean(dim=1), torch.ones(4000))
     torch.testing.assert_close(drawn.mean(dim=0), torch.ones(2), atol=0.05, rtol=0)
@@ -279,26 +287,26 @@ def test_robots_count_alike_or_with_random_weights_of_mean_one():
 
 
 def test_a_robot_without_weight_is_not_learned_from():
-    def steps(weight, **kept):
-        made = learner(epochs=1, minibatches=1, entropy=0.01)
-        made._weights = lambda: torch.tensor(weight)
-        learn = made._learn
+    def steps(weight, change=lambda buffer: None):
+        made = learner(epochs=1, minibatches=1, ent_coef=0.01)
+        made._robot_weights = lambda: torch.tensor(weight)
+        collect = made._collect_rollout
 
-        def other(rollout):
-            return learn(replace(rollout, **{k: v(rollout) for k, v in kept.items()}))
+        def other():
+            metrics = collect()
+            change(made.buffer)
+            return metrics
 
-        made._learn = other
+        made._collect_rollout = other
         made.iterate()
         return weights(made)
 
     # What pushers are said to have been likely to do does not matter if they weigh nothing.
-    def twisted(rollout):
-        log_prob = rollout.log_prob.clone()
-        log_prob[:, 1::2] -= 0.1
-        return log_prob
+    def twisted(buffer):
+        buffer.log_probs[:, 1::2] -= 0.1
 
-    assert equal(steps([2.0, 0.0]), steps([2.0, 0.0], log_prob=twisted))
-    assert not equal(steps([1.0, 1.0]), steps([1.0, 1.0], log_prob=twisted))
+    assert equal(steps([2.0, 0.0]), steps([2.0, 0.0], twisted))
+    assert not equal(steps([1.0, 1.0]), steps([1.0, 1.0], twisted))
 
 
 @pytest.mark.parametrize("moves", [True, False])
@@ -336,8 +344,8 @@ def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
     """Reports of a run on 32 points that learns fast."""
     batch = OnALine(32, kind="discrete" if discrete else "continuous")
     config = PPOConfig(
-        transitions=updates * 32 * 24,
-        steps=24,
+        total_timesteps=updates * 32 * 24,
+        num_steps=24,
         minibatches=4,
         learning_rate=1e-3,
         gamma=0.9,

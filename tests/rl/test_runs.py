@@ -13,6 +13,7 @@ import torch
 from commands import tree
 from learners import learner
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
+from morphgen.rl.learner_state import state_of
 from morphgen.rl.recorders import (
     METRICS,
     Metrics,
@@ -22,6 +23,7 @@ from morphgen.rl.recorders import (
     require_wandb,
 )
 from morphgen.rl.report import Report
+from morphgen.rl.robot_source import robot_source, specs_of
 from morphgen.rl.runs import (
     CHECKPOINT,
     CONFIG,
@@ -31,7 +33,6 @@ from morphgen.rl.runs import (
     read_config,
     write_checkpoint,
 )
-from morphgen.rl.sources import robot_source, specs_of
 from morphgen.rl.training import ROBOTS
 from morphgen.tasks.env_specs import GoalConfig
 from small_runs import small_config, small_source
@@ -54,7 +55,10 @@ def report(update, success=0.5):
 
 def test_a_config_is_saved_whole(tmp_path):
     config = replace(
-        small_config(small_source(), agent="se", gamma=0.9), device="cuda", begin="a.pt", whole=True
+        small_config(small_source(), agent="se", gamma=0.9),
+        device="cuda",
+        initial_checkpoint="a.pt",
+        full_budget=True,
     )
     open_run(tmp_path / "run", config, resume=False)
     assert read_config(tmp_path / "run") == config
@@ -131,7 +135,7 @@ def test_a_broken_config_is_refused(tmp_path, text):
 def test_a_checkpoint_tells_its_run(tmp_path):
     config = small_config(robot_source("planar-cube", "push", obstacles=True))
     write_checkpoint(
-        tmp_path, config, {**learner().checkpoint(), "update": 3, "weight": torch.ones(2)}
+        tmp_path, config, {**state_of(learner()), "update": 3, "weight": torch.ones(2)}
     )
     for path in (tmp_path, tmp_path / CHECKPOINT):
         run, found = read_checkpoint(path)
@@ -145,8 +149,8 @@ def test_a_run_of_another_format_is_refused(tmp_path):
     open_run(tmp_path, small_config(), resume=False)
     write_checkpoint(tmp_path, small_config(), {"update": 3})
     config = tmp_path / CONFIG
-    config.write_text(config.read_text().replace('"format": 2', '"format": 1'))
-    with pytest.raises(TaskError, match=r"config.json has format 1, and this morphgen reads 2"):
+    config.write_text(config.read_text().replace('"format": 3', '"format": 1'))
+    with pytest.raises(TaskError, match=r"config.json has format 1; expected 2 or 3"):
         read_config(tmp_path)
     data = torch.load(tmp_path / CHECKPOINT, weights_only=True)
     del data["sha256"]

@@ -15,41 +15,41 @@ from commands import tree
 from morphgen.errors import TaskError
 from morphgen.formats.files import LOCK
 from morphgen.rl import study
+from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.evaluation import Score
+from morphgen.rl.inference import MODES
 from morphgen.rl.recorders import METRICS
+from morphgen.rl.robot_source import members, other_side
 from morphgen.rl.runs import CHECKPOINT
-from morphgen.rl.score_tables import UNSTABLE
-from morphgen.rl.sources import members, other_side
 from morphgen.rl.study import (
     SCORES,
     agent_cell,
+    baseline_cells,
     matched_budget,
     read_scores,
-    reference_cells,
     work_here,
     work_on_ray,
 )
-from morphgen.rl.tables import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
-from morphgen.rl.trained import MODES
+from morphgen.rl.study_report import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
 from morphgen.rl.training import parts_of
-from small_runs import EXAM, QUIET, equal, small_config, small_source, weights
+from small_runs import EVAL, QUIET, equal, small_config, small_source, weights
 
 pytestmark = pytest.mark.slow
 
 
 def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1)):
     source = small_source()
-    made = reference_cells(folder, source, EXAM)
+    made = baseline_cells(folder, source, EVAL)
     for agent in agents:
         for seed in seeds:
-            config = small_config(source, agent=agent, seed=seed, transitions=64)
-            made.append(agent_cell(folder, agent, config, EXAM))
+            config = small_config(source, agent=agent, seed=seed, total_timesteps=64)
+            made.append(agent_cell(folder, agent, config, EVAL))
     return made
 
 
 def finished(cells):
     outcomes = list(work_here(cells, QUIET))
-    assert [each.why for each in outcomes] == [""] * len(cells)
+    assert [each.error for each in outcomes] == [""] * len(cells)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_a_cell_is_a_runs_folder_with_scores(whole):
 def test_what_is_done_is_not_done_again(whole, monkeypatch):
     folder = whole[0].folder.parents[2]
     before = tree(folder)
-    for name in ("train", "evaluate_run", "evaluate_reference"):
+    for name in ("train", "evaluate_run", "evaluate_baseline"):
         monkeypatch.delattr(study, name)
     finished(whole)
     assert tree(folder) == before
@@ -141,14 +141,14 @@ def test_a_cell_that_fails_is_told_and_does_not_stop_the_others(tmp_path):
     finished([other])
     (bad.folder / SCORES).unlink()
     outcomes = list(work_here([bad, good], QUIET))
-    assert "another run: ppo.gamma 0.5, not 0.99" in outcomes[0].why
-    assert outcomes[1].why == ""
+    assert "another run: ppo.gamma 0.5, not 0.99" in outcomes[0].error
+    assert outcomes[1].error == ""
     assert read_scores(bad) is None
 
 
 def test_scores_of_another_evaluation_are_not_mixed_in(whole):
     with pytest.raises(TaskError, match="of another evaluation"):
-        read_scores(replace(whole[0], exam=replace(EXAM, episodes=5)))
+        read_scores(replace(whole[0], eval_config=replace(EVAL, episodes=5)))
     for cell in (whole[0], whole[-1]):
         with pytest.raises(TaskError, match="of another set of robots"):
             read_scores(replace(cell, source=replace(cell.source, goal_seed=1)))
@@ -165,7 +165,7 @@ def test_what_nobody_foresaw_does_not_stop_the_others_either(tmp_path, monkeypat
 
     monkeypatch.setattr(study, "train", without_memory)
     outcomes = list(work_here([bad, good], QUIET))
-    assert [each.why for each in outcomes] == ["RuntimeError: CUDA out of memory", ""]
+    assert [each.error for each in outcomes] == ["RuntimeError: CUDA out of memory", ""]
     assert "Traceback" in capsys.readouterr().err
 
 
@@ -236,7 +236,7 @@ def test_a_table_says_how_many_episodes_became_unstable(tmp_path):
 def test_robots_of_se_on_the_test_robots_are_drawn_by_themselves(tmp_path):
     source = other_side(small_source(), "test")
     cells = [
-        agent_cell(tmp_path, "se@test", small_config(source, agent="se", seed=seed), EXAM)
+        agent_cell(tmp_path, "se@test", small_config(source, agent="se", seed=seed), EVAL)
         for seed in range(3)
     ]
     values = [(0, 10), (10, 0), (0, 10)]
@@ -303,8 +303,8 @@ def test_curves_are_of_those_that_learned(whole, tmp_path, monkeypatch):
 
 def test_an_agent_trained_on_the_test_robots_has_no_other_score(tmp_path):
     source = other_side(small_source(), "test")
-    config = small_config(source, agent="se", transitions=32)
-    cell = agent_cell(tmp_path, "se@test", config, EXAM)
+    config = small_config(source, agent="se", total_timesteps=32)
+    cell = agent_cell(tmp_path, "se@test", config, EVAL)
     finished([cell])
     found = results([cell])
     (row, _) = rows(found)
@@ -316,14 +316,14 @@ def test_an_agent_trained_on_the_test_robots_has_no_other_score(tmp_path):
 def test_an_agent_on_the_test_robots_has_as_much_data_of_each_as_on_the_train_robots():
     source = other_side(small_source(), "test")
     train, test = (len(members(other_side(source, side))) for side in ("train", "test"))
-    config = small_config(source, agent="se", transitions=6400)
+    config = small_config(source, agent="se", total_timesteps=6400)
     own = matched_budget(config)
-    assert own.ppo.transitions == -(-6400 * test // train)
-    assert own.envs == -(-config.envs * test // train)
+    assert own.ppo.total_timesteps == -(-6400 * test // train)
+    assert own.num_envs == -(-config.num_envs * test // train)
     (part, *_) = parts_of(Path("se"), replace(config, source=other_side(source, "train")))
     (alone, *_) = parts_of(Path("se@test"), own)
-    assert (alone.config.ppo, alone.config.envs) == (part.config.ppo, part.config.envs)
-    assert matched_budget(replace(config, whole=True)) == replace(config, whole=True)
+    assert (alone.config.ppo, alone.config.num_envs) == (part.config.ppo, part.config.num_envs)
+    assert matched_budget(replace(config, full_budget=True)) == replace(config, full_budget=True)
 
 
 @pytest.mark.slow
@@ -333,7 +333,7 @@ def test_ray_does_the_same(whole, tmp_path):
     for _ in range(2):
         outcomes = list(work_on_ray(None)(cells, QUIET))
         assert sorted(each.cell.agent for each in outcomes) == sorted(c.agent for c in cells)
-        assert all(each.why == "" for each in outcomes)
+        assert all(each.error == "" for each in outcomes)
     same = [cell for cell in whole if cell.seed != 1]
     for one, other in zip(same, cells, strict=True):
         assert repr(read_scores(one)) == repr(read_scores(other))

@@ -14,12 +14,13 @@ from commands import tree
 from morphgen.errors import BenchmarkError, FormatError, TaskError
 from morphgen.formats.files import alone
 from morphgen.rl import training
+from morphgen.rl.agents import mlp
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import METRICS, read_metrics
+from morphgen.rl.robot_source import robot_source, split_source
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
-from morphgen.rl.sources import robot_source, split_source
 from morphgen.rl.training import (
-    Way,
+    ExecutionConfig,
     checkpoints,
     parts_of,
     require_runnable,
@@ -58,7 +59,7 @@ def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
     (part,) = train(
         tmp_path / "a" / "run",
         config,
-        way=QUIET,
+        execution=QUIET,
         show=lambda part: lambda report, updates: seen.append((report.update, updates)),
     )
     assert part.folder == tmp_path / "a" / "run"
@@ -73,13 +74,13 @@ def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
 
 @pytest.mark.parametrize("stops", [(1,), (8,), (7, 13)], ids=str)
 def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp_path, stops):
-    config = small_config(small_source(), transitions=24 * 4 * 8, slow_critic=True)
-    train(tmp_path / "whole", config, way=QUIET)
-    assert config.updates == 24
+    config = small_config(small_source(), total_timesteps=24 * 4 * 8, slow_critic=True)
+    train(tmp_path / "whole", config, execution=QUIET)
+    assert config.num_updates == 24
     often = 6  # updates between its checkpoints
     for stop in stops:
         with pytest.raises(StoppedError):
-            train(tmp_path / "cut", config, resume=True, way=QUIET, show=stop_after(stop))
+            train(tmp_path / "cut", config, resume=True, execution=QUIET, show=stop_after(stop))
         saved = stop // often * often
         assert (tmp_path / "cut" / CHECKPOINT).exists() == (saved > 0)
         if saved:
@@ -89,7 +90,7 @@ def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp
         tmp_path / "cut",
         config,
         resume=True,
-        way=QUIET,
+        execution=QUIET,
         show=lambda part: lambda report, updates: first.append(report.update),
     )
     assert first[0] == stops[-1] // often * often + 1
@@ -108,8 +109,8 @@ def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp
     ],
 )
 def test_checkpoints_are_five_to_ten_episodes_apart_and_four_at_least(updates, steps, expected):
-    config = small_config(transitions=4 * steps * updates, steps=steps)
-    assert config.updates == updates
+    config = small_config(total_timesteps=4 * steps * updates, num_steps=steps)
+    assert config.num_updates == updates
     assert updates_between(config) == expected
 
 
@@ -118,68 +119,72 @@ def test_no_checkpoint_is_made_right_before_the_last(tmp_path, monkeypatch):
     monkeypatch.setattr(
         training, "write_checkpoint", lambda folder, config, state: made.append(state["update"])
     )
-    train(tmp_path, small_config(transitions=9 * 4 * 8), way=QUIET)
+    train(tmp_path, small_config(total_timesteps=9 * 4 * 8), execution=QUIET)
     assert made == [2, 4, 6, 9]
 
 
 def test_other_seeds_come_to_other_weights_and_other_workers_to_the_same(tmp_path):
-    ways = {"a": (0, QUIET), "b": (0, Way(2, tensorboard=False)), "c": (1, QUIET)}
-    for name, (seed, way) in ways.items():
-        train(tmp_path / name, small_config(seed=seed, transitions=64), way=way)
+    ways = {"a": (0, QUIET), "b": (0, ExecutionConfig(2, tensorboard=False)), "c": (1, QUIET)}
+    for name, (seed, execution) in ways.items():
+        train(tmp_path / name, small_config(seed=seed, total_timesteps=64), execution=execution)
     a, b, c = (weights(tmp_path / name) for name in ways)
     assert equal(a, b)
     assert not equal(a, c)
 
 
 def test_a_finished_run_is_not_trained_again(tmp_path):
-    config = small_config(transitions=64)
-    train(tmp_path / "run", config, way=QUIET)
+    config = small_config(total_timesteps=64)
+    train(tmp_path / "run", config, execution=QUIET)
     before = tree(tmp_path)
     never = stop_after(1)
-    assert train(tmp_path / "run", config, resume=True, way=QUIET, show=never)
+    assert train(tmp_path / "run", config, resume=True, execution=QUIET, show=never)
     with pytest.raises(TaskError, match="say --resume"):
-        train(tmp_path / "run", config, way=QUIET)
+        train(tmp_path / "run", config, execution=QUIET)
     assert tree(tmp_path) == before
 
 
 def test_se_trains_a_policy_for_each_robot_which_share_environments_and_transitions(tmp_path):
-    config = small_config(small_source(), agent="se", transitions=128)
-    parts = train(tmp_path / "run", config, way=QUIET)
+    config = small_config(small_source(), agent="se", total_timesteps=128)
+    parts = train(tmp_path / "run", config, execution=QUIET)
     names = [part.folder.name for part in parts]
-    assert [part.config.source.only for part in parts] == names
+    assert [part.config.source.member for part in parts] == names
     assert len(set(names)) == 2
-    assert [(part.config.envs, part.config.ppo.transitions) for part in parts] == [(2, 64)] * 2
+    assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in parts] == [
+        (2, 64)
+    ] * 2
     assert len({part.config.seed for part in parts} | {config.seed}) == 3
     assert [file.parent.name for file in checkpoints(tmp_path / "run")] == sorted(names)
     assert not equal(*(weights(part.folder) for part in parts))
-    whole = parts_of(tmp_path, replace(config, whole=True))
-    assert [(part.config.envs, part.config.ppo.transitions) for part in whole] == [(4, 128)] * 2
+    whole = parts_of(tmp_path, replace(config, full_budget=True))
+    assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in whole] == [
+        (4, 128)
+    ] * 2
 
 
 def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
-    config = small_config(small_source(), agent="se", transitions=128)
-    train(tmp_path / "whole", config, way=QUIET)
+    config = small_config(small_source(), agent="se", total_timesteps=128)
+    train(tmp_path / "whole", config, execution=QUIET)
     parts = parts_of(tmp_path / "cut", config)
     begun = []
 
     def show(part):
-        begun.append(part.config.source.only)
+        begun.append(part.config.source.member)
         return stop_after(1)(part) if len(begun) == 2 else lambda report, updates: None
 
     for _ in range(2):
         try:
-            train(tmp_path / "cut", config, resume=True, way=QUIET, show=show)
+            train(tmp_path / "cut", config, resume=True, execution=QUIET, show=show)
         except StoppedError:
             continue
-    first, second = (part.config.source.only for part in parts)
+    first, second = (part.config.source.member for part in parts)
     assert begun == [first, second, second]
     for part, same in zip(parts, parts_of(tmp_path / "whole", config), strict=True):
         assert equal(weights(part.folder), weights(same.folder))
 
 
 def test_a_run_of_se_with_robots_that_have_no_policy_yet_is_not_taken_for_whole(tmp_path):
-    config = small_config(small_source(), agent="se", transitions=64)
-    parts = train(tmp_path / "run", config, way=QUIET)
+    config = small_config(small_source(), agent="se", total_timesteps=64)
+    parts = train(tmp_path / "run", config, execution=QUIET)
     (parts[0].folder / CHECKPOINT).unlink()
     says = f"1 of its 2 robots have no policy yet, such as {parts[0].folder.name}"
     with pytest.raises(TaskError, match=says):
@@ -191,15 +196,15 @@ def test_a_robot_that_was_changed_since_is_another_run(tmp_path, monkeypatch):
     for words in ("base=planar ee=cube", "base=planar ee=plane"):
         body = replace(morphgen.compose(words), name="own")
         path = morphgen.write(body, "robots", picture=False)
-        config = small_config(robot_source(str(path), "reach"), transitions=64)
+        config = small_config(robot_source(str(path), "reach"), total_timesteps=64)
         if words.endswith("cube"):
             first = config
-            train(tmp_path / "run", config, way=QUIET)
+            train(tmp_path / "run", config, execution=QUIET)
     assert config.source.name == str(path.resolve())
-    with pytest.raises(TaskError, match="not the body that it was"):
-        train(tmp_path / "new", first, way=QUIET)
-    with pytest.raises(TaskError, match=r"another run: source\.body"):
-        train(tmp_path / "run", config, resume=True, way=QUIET)
+    with pytest.raises(TaskError, match="the robot has changed since the run began"):
+        train(tmp_path / "new", first, execution=QUIET)
+    with pytest.raises(TaskError, match=r"another run: source\.robot_hash"):
+        train(tmp_path / "run", config, resume=True, execution=QUIET)
 
 
 def test_an_agent_of_many_robots_and_one_robot_are_one_run(tmp_path):
@@ -208,39 +213,39 @@ def test_an_agent_of_many_robots_and_one_robot_are_one_run(tmp_path):
 
 
 def test_fine_tuning_begins_with_the_networks_of_a_checkpoint(tmp_path):
-    train(tmp_path / "first", small_config(transitions=64), way=QUIET)
+    train(tmp_path / "first", small_config(total_timesteps=64), execution=QUIET)
     config = replace(
-        small_config(transitions=32, learning_rate=1e-30, slow_critic=False),
-        begin=str(tmp_path / "first" / CHECKPOINT),
+        small_config(total_timesteps=32, learning_rate=1e-30, slow_critic=False),
+        initial_checkpoint=str(tmp_path / "first" / CHECKPOINT),
     )
-    train(tmp_path / "second", config, way=QUIET)
+    train(tmp_path / "second", config, execution=QUIET)
     assert equal(weights(tmp_path / "first"), weights(tmp_path / "second"))
     assert read_checkpoint(tmp_path / "second")[1]["update"] == 1
-    wider = replace(config, policy=replace(config.policy, mlp_width=16))
-    with pytest.raises(TaskError, match="mlp_width 8, here 16"):
-        train(tmp_path / "third", wider, way=QUIET)
+    wider = replace(config, policy=replace(config.policy, network=mlp.Config(4, 16, 1)))
+    with pytest.raises(TaskError, match=r"network .*8.*, here .*16"):
+        train(tmp_path / "third", wider, execution=QUIET)
     assert not (tmp_path / "third").exists()
 
 
 def test_what_cannot_begin_leaves_nothing(tmp_path):
     config = small_config()
     with pytest.raises(TaskError, match="--envs 0: expected 1 or more"):
-        replace(config, envs=0)
+        replace(config, num_envs=0)
     for wrong, says in (
-        (small_config(transitions=31), "an update takes 32 transitions"),
-        (replace(small_config(small_source()), envs=1), "--envs 1: fewer than the 2 robots"),
-        (small_config(small_source(), agent="se", transitions=30), "the share of "),
+        (small_config(total_timesteps=31), "an update takes 32 transitions"),
+        (replace(small_config(small_source()), num_envs=1), "--envs 1: fewer than the 2 robots"),
+        (small_config(small_source(), agent="se", total_timesteps=30), "the share of "),
         (replace(config, device="tpu"), "unknown device 'tpu'"),
         (replace(config, device="cudaX"), "unknown device 'cudaX'"),
         (small_config(minibatches=5), "equal minibatches"),
-        (replace(config, begin=str(tmp_path / "none.pt")), "no such checkpoint"),
+        (replace(config, initial_checkpoint=str(tmp_path / "none.pt")), "no such checkpoint"),
         (replace(config, policy=replace(POLICY, discrete=True), sim="bullet"), "did you mean"),
     ):
         with pytest.raises(TaskError, match=says):
-            train(tmp_path / "run", wrong, way=QUIET)
+            train(tmp_path / "run", wrong, execution=QUIET)
     assert tree(tmp_path) == {}
     with pytest.raises(TaskError, match="--workers 0"):
-        Way(0)
+        ExecutionConfig(0)
     with pytest.raises(TaskError, match="--seed -1"):
         replace(config, seed=-1)
     require_runnable(config)
@@ -248,36 +253,36 @@ def test_what_cannot_begin_leaves_nothing(tmp_path):
 
 def test_links_are_enough_for_what_it_is_tested_on_before_it_begins(tmp_path):
     long = split((member("base=planar ee=cube", task="reach"),), (member("chain beads=7"),))
-    config = small_config(split_source(long), transitions=64)
+    config = small_config(split_source(long), total_timesteps=64)
     with pytest.raises(BenchmarkError, match=r"test robot '.*' has 25 links, more than max_links"):
-        train(tmp_path / "run", config, way=QUIET)
+        train(tmp_path / "run", config, execution=QUIET)
     assert tree(tmp_path) == {}
-    train(tmp_path / "run", replace(config, max_links=25), way=QUIET)
+    train(tmp_path / "run", replace(config, max_links=25), execution=QUIET)
     assert read_checkpoint(tmp_path / "run")[1]["layout"]["links"] == 25
 
 
 def test_two_runs_do_not_write_to_one_folder(tmp_path):
-    config = small_config(transitions=64)
+    config = small_config(total_timesteps=64)
     with pytest.raises(StoppedError):
-        train(tmp_path / "run", config, way=QUIET, show=stop_after(1))
+        train(tmp_path / "run", config, execution=QUIET, show=stop_after(1))
     with alone(tmp_path / "run"), pytest.raises(FormatError, match="by another run"):
-        train(tmp_path / "run", config, resume=True, way=QUIET)
-    train(tmp_path / "run", config, resume=True, way=QUIET)
+        train(tmp_path / "run", config, resume=True, execution=QUIET)
+    train(tmp_path / "run", config, resume=True, execution=QUIET)
 
 
 def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(tmp_path):
-    config = small_config(transitions=64)
-    train(tmp_path / "wide", replace(config, max_links=30), way=QUIET)
-    train(tmp_path / "run", config, way=QUIET)
+    config = small_config(total_timesteps=64)
+    train(tmp_path / "wide", replace(config, max_links=30), execution=QUIET)
+    train(tmp_path / "run", config, execution=QUIET)
     _, learner = read_checkpoint(tmp_path / "wide")
     write_checkpoint(tmp_path / "run", config, learner | {"update": 1})
     with pytest.raises(TaskError, match="other observations: links 30, here 23"):
-        train(tmp_path / "run", config, resume=True, way=QUIET)
+        train(tmp_path / "run", config, resume=True, execution=QUIET)
 
 
 def test_first_episodes_do_not_all_end_at_once():
     batch = OnALine(8)
-    Learner(batch, replace(POLICY, discrete=True), replace(PPO, transitions=64))
+    Learner(batch, replace(POLICY, discrete=True), replace(PPO, total_timesteps=64))
     assert batch.spread
 
 
@@ -288,10 +293,10 @@ def test_nothing_on_the_way_needs_pybullet(tmp_path):
         "from pathlib import Path\n"
         "from morphgen.rl.evaluation import evaluate_run\n"
         "from morphgen.rl.training import train\n"
-        "from small_runs import EXAM, QUIET, small_config\n"
+        "from small_runs import EVAL, QUIET, small_config\n"
         "folder = Path(sys.argv[1])\n"
-        "train(folder, small_config(transitions=32), way=QUIET)\n"
-        "(score,) = evaluate_run(folder, 'train', EXAM, 'deterministic')\n"
+        "train(folder, small_config(total_timesteps=32), execution=QUIET)\n"
+        "(score,) = evaluate_run(folder, 'train', EVAL, 'deterministic')\n"
         "print(score.episodes)\n"
     )
     environment = {"PYTHONPATH": str(Path(__file__).parents[1])}

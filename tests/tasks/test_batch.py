@@ -12,7 +12,8 @@ from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import TOOL
-from morphgen.rl.references import InverseKinematics, Random, Zero
+from morphgen.rl.baselines.simple import Random, Zero
+from morphgen.rl.references import InverseKinematics
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace

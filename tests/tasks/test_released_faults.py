@@ -13,7 +13,7 @@ import torch
 import morphgen
 from goal_draws import draw_spec
 from morphgen.model.dynamics import actuation
-from morphgen.rl.references import Random
+from morphgen.rl.baselines.simple import Random
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.push.config import PushConfig

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from goal_draws import draw_spec
-from morphgen.rl.references import Random
+from morphgen.rl.baselines.simple import Random
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.observation import ObservationConfig

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morphgen.formats.bundle import write_bundle
-from morphgen.rl.sources import Source
+from morphgen.rl.robot_source import RobotSource
 from morphgen.viewer import rollout
 from plain_client import PlainClient
 from robots import arm
@@ -130,7 +130,7 @@ def test_a_checkpoint_names_no_robot_from_outside(viewer, folder, secret, monkey
     (folder / "runs").mkdir(exist_ok=True)
     (folder / "runs" / "some.pt").touch()
     for name in (f"{secret}/a.urdf", f"{secret}/a.grammar", f"{secret}"):
-        run = SimpleNamespace(source=Source(name, task="reach"))
+        run = SimpleNamespace(source=RobotSource(name, task="reach"))
         monkeypatch.setattr(rollout, "read_checkpoint", lambda path, run=run: (run, None))
         with PlainClient(viewer().port, "?play=&policy=runs/some.pt") as client:
             client.shows(NOTHING)

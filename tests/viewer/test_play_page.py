@@ -138,7 +138,7 @@ def test_addresses_that_play_nothing_say_why(see, query, why):
 
 
 def test_a_checkpoint_plays_the_body_it_was_trained_on(see, viewer, folder, tmp_path):
-    train(folder / "runs" / "small", small_config(small_source()), way=QUIET)
+    train(folder / "runs" / "small", small_config(small_source()), execution=QUIET)
     on = viewer("runs/small")
     page = see(on=on)
     page.wait_for_url(re.compile(r"play=reach&robot=derivation:.*policy=runs/small&seed=0"))

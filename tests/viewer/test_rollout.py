@@ -197,9 +197,9 @@ def test_one_that_cannot_play_does_not_keep_the_others_from_it(places, cache):
 
 
 def test_a_policy_that_sees_its_tool_is_shown_it(root, places, cache):
-    config = small_config(transitions=32)
+    config = small_config(total_timesteps=32)
     config = replace(config, policy=replace(config.policy, tool_position=True))
-    train(root / "run", config, way=QUIET)
+    train(root / "run", config, execution=QUIET)
     rollout = Rollout(Wanted("reach", (CUBE,), "run"), places)
     assert rollout.faults == {}
     assert rollout.advance()

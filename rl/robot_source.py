@@ -21,29 +21,29 @@ from morphgen.tasks.task import EnvSpec, GoalSet
 
 
 @dataclass(frozen=True)
-class Source:
-    """Robots at tasks, told in text alone, so that a run's folder says all of them."""
+class RobotSource:
+    """Robots with their tasks, described by text alone, so that a run's folder describes them."""
 
     name: str
-    """Of the split, or words of the robot, or the path of its file."""
+    """Name of the split, or words that describe one robot, or the path of its file."""
     split: str = ""
     """Text of the split's file; empty for one robot."""
     task: str | None = None
-    """Of the one robot; a split says it of each."""
+    """Task of the one robot; a split has a task for each of its robots."""
     obstacles: bool = False
-    """Of the one robot."""
+    """Whether the one robot is among obstacles."""
     side: Side = "train"
-    """Of the split."""
-    body: str = ""
-    """Hash of the one robot, empty in runs of before it was kept; a split has that of each."""
-    only: str | None = None
-    """The one member that is meant, if it is not all of the side."""
+    """Side of the split."""
+    robot_hash: str = ""
+    """Hash of the one robot; empty in runs from before it was kept. A split has one for each."""
+    member: str | None = None
+    """Name of the only member that is meant; None for all of the side."""
     goal_seed: int = 0
-    """Of goals, starts and obstacles."""
-    goals: str = ""
-    """The folder where the split is built with the goal sets that are meant; or they are drawn."""
+    """Seed of goals, starts and obstacles."""
+    goal_dir: str = ""
+    """Folder where the split is built with the goal sets to use; without it goals are sampled."""
     library: tuple[str, ...] = ()
-    """Folders of own parts."""
+    """Folders with further parts."""
 
 
 def split_source(
@@ -53,14 +53,14 @@ def split_source(
     goals: Path | None = None,
     library: tuple[Path, ...] = (),
     side: Side = "train",
-) -> Source:
-    """The robots of a side of a split; ``goals`` is the folder where it is built with its sets."""
-    return Source(
+) -> RobotSource:
+    """Return the robots of a side of a split; ``goals`` is the folder with its goal sets."""
+    return RobotSource(
         split.name,
         split_text(split),
         side=side,
         goal_seed=goal_seed,
-        goals=str(goals.resolve()) if goals is not None else "",
+        goal_dir=str(goals.resolve()) if goals is not None else "",
         library=tuple(str(folder.resolve()) for folder in library),
     )
 
@@ -72,24 +72,24 @@ def robot_source(
     obstacles: bool = False,
     goal_seed: int = 0,
     library: tuple[Path, ...] = (),
-) -> Source:
-    """One robot, which is whatever ``morphgen.tasks.robots.robot_of`` knows.
+) -> RobotSource:
+    """Return one robot, named in any way that ``morphgen.tasks.robots.robot_of`` reads.
 
     Raises:
         MorphgenError: As ``robot_of``.
     """
-    return Source(
+    return RobotSource(
         str(Path(robot).resolve()) if is_robot_file(robot) else robot,
         task=task,
         obstacles=obstacles,
-        body=robot_hash(robot_of(robot, library=library)),
+        robot_hash=robot_hash(robot_of(robot, library=library)),
         goal_seed=goal_seed,
         library=tuple(str(folder.resolve()) for folder in library),
     )
 
 
-def members(source: Source) -> tuple[Member, ...]:
-    """The split's members that are meant; none for one robot.
+def members(source: RobotSource) -> tuple[Member, ...]:
+    """Return the members of the split that are meant; none for one robot.
 
     Raises:
         BenchmarkError: If the split has no such member, or its text is malformed.
@@ -97,49 +97,49 @@ def members(source: Source) -> tuple[Member, ...]:
     if not source.split:
         return ()
     side = parse_split(source.split, Path(source.name)).split.side(source.side)
-    if source.only is None:
+    if source.member is None:
         return side
     names = [member.name for member in side]
-    if source.only not in names:
+    if source.member not in names:
         raise BenchmarkError(
-            f"split {source.name!r} has no {source.side} robot {source.only!r}"
-            f"{nearest(source.only, names)}"
+            f"split {source.name!r} has no {source.side} robot {source.member!r}"
+            f"{nearest(source.member, names)}"
         )
-    return tuple(member for member in side if member.name == source.only)
+    return tuple(member for member in side if member.name == source.member)
 
 
-def tasks_of(source: Source) -> tuple[str, ...]:
-    """The tasks of its robots, without repetition."""
+def tasks_of(source: RobotSource) -> tuple[str, ...]:
+    """Return the tasks of the robots, without repetition."""
     if source.task is not None:
         return (source.task,)
     return tuple(dict.fromkeys(member.task for member in members(source)))
 
 
-def apart(source: Source) -> Iterator[Source]:
-    """A source for each robot of a split's side."""
+def single_members(source: RobotSource) -> Iterator[RobotSource]:
+    """Yield a source for each robot of a split's side."""
     for member in members(source):
-        yield replace(source, only=member.name)
+        yield replace(source, member=member.name)
 
 
-def other_side(source: Source, side: Side) -> Source:
-    """The same split's whole side.
+def other_side(source: RobotSource, side: Side) -> RobotSource:
+    """Return a whole side of the same split.
 
     Raises:
         TaskError: If it is one robot, which has no other side.
     """
     if source.split:
-        return replace(source, side=side, only=None)
+        return replace(source, side=side, member=None)
     if side == "test":
         raise TaskError(f"{source.name!r} is one robot, no split: there is nothing to test on")
     return source
 
 
 @lru_cache(maxsize=64)
-def most_obstacles(source: Source, config: GoalConfig) -> int:
-    """Return how many obstacles the one robot has, or at most a robot of the split, either side.
+def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
+    """Return the largest number of obstacles of any robot, on both sides of the split.
 
     Args:
-        source: The robot or split.
+        source: One robot, or a split.
         config: Constants of the tasks.
     """
     if source.task is not None:
@@ -149,12 +149,12 @@ def most_obstacles(source: Source, config: GoalConfig) -> int:
     return max((config.of(member.task).obstacles for member in both if member.obstacles), default=0)
 
 
-def require_links(source: Source, max_links: int) -> None:
-    """Require that what is trained on one side of a split can be tested on the other.
+def require_links(source: RobotSource, max_links: int) -> None:
+    """Require that a policy trained on one side of a split can be tested on the other.
 
     Raises:
-        BenchmarkError: If a robot there has more links.
-        MorphgenError: If it cannot be made.
+        BenchmarkError: If a robot of the other side has more links.
+        MorphgenError: If a robot cannot be built.
     """
     if not source.split:
         return
@@ -165,32 +165,33 @@ def require_links(source: Source, max_links: int) -> None:
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
-def specs_of(source: Source, config: GoalConfig) -> list[EnvSpec]:
-    """The robots at their tasks; they are made once in a process.
+def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
+    """Return the robots with their tasks and scenes; each is built once per process.
 
     Args:
-        source: Which.
+        source: The robots.
         config: Constants of the tasks; the seed is the source's.
 
     Raises:
-        MorphgenError: If a robot cannot be made, is not the split's, or cannot do its task.
+        MorphgenError: If a robot cannot be built, has another hash than in the split, or cannot do
+            its task.
     """
     config = replace(config, seed=source.goal_seed)
     if source.split:
-        own = replace(source, split="", only=None)
+        own = replace(source, split="", member=None)
         return [_of_member(member, own, config) for member in members(source)]
     if source.task is None:
         raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
     robot = robot_of(source.name, library=map(Path, source.library))
-    if source.body not in ("", robot_hash(robot)):
-        raise TaskError(f"{source.name}: it is not the body that it was when the run began")
+    if source.robot_hash not in ("", robot_hash(robot)):
+        raise TaskError(f"{source.name}: the robot has changed since the run began")
     return [env_spec(robot, source.task, config, obstacles=source.obstacles)]
 
 
 @lru_cache(maxsize=64)
-def _of_member(member: Member, source: Source, config: GoalConfig) -> EnvSpec:
-    sets = _shipped(source.goals, source.side) if source.goals else None
-    shipped = shipped_set(sets, member.name, source.goals)
+def _of_member(member: Member, source: RobotSource, config: GoalConfig) -> EnvSpec:
+    sets = _shipped(source.goal_dir, source.side) if source.goal_dir else None
+    shipped = shipped_set(sets, member.name, source.goal_dir)
     library = default_library(tuple(map(Path, source.library)))
     return member_spec(member, library, config, shipped=shipped)
 

@@ -1,4 +1,4 @@
-"""The tables and figures of a study; what is missing is shown as missing."""
+"""Tables and curves of a study; missing scores are shown as missing."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
 from morphgen.formats.files import save
-from morphgen.rl.evaluation import Score, as_data
+from morphgen.rl.agents import AGENTS
+from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.intervals import Interval, iqm_interval
 from morphgen.rl.recorders import read_metrics
-from morphgen.rl.score_tables import UNSTABLE
-from morphgen.rl.sources import tasks_of
+from morphgen.rl.robot_source import tasks_of
+from morphgen.rl.scores import Score, scores_to_json
 from morphgen.rl.study import Cell, as_record
 from morphgen.rl.training import parts_of
 
@@ -39,50 +40,59 @@ HEADERS = (
 )
 
 Results = Mapping[Cell, Mapping[str, Sequence[Score]] | None]
-"""Scores of every cell by mode; None where they are missing."""
+"""Scores of every cell by mode; None for missing ones."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """A side's scores over seeds and robots."""
+    """Scores of one side over seeds and robots."""
 
     mean: float
+    """Mean score."""
     iqm: Interval
+    """Interquartile mean, with its interval."""
     success: float
+    """Mean success rate."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A run in training, by update."""
+    """Training curve of a run, by update."""
 
-    steps: list[float]
-    """Transitions."""
+    timesteps: list[float]
+    """Control steps of all environments so far."""
     scores: list[float]
-    whole: bool
-    """Whether it came to its end."""
+    """Mean score of a control step."""
+    complete: bool
+    """Whether the run came to its end."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """An agent on the robots of a split that are at one task."""
+    """Results of an agent on the robots of a split that do one task."""
 
     split: str
+    """Name of the split."""
     task: str
+    """The task."""
     agent: str
+    """Label of the agent."""
     mode: str
-    """Empty if nothing is there to know it by."""
+    """Mode of the policies; empty if all scores are missing."""
     seeds: tuple[int | None, ...]
+    """Seeds that are done."""
     missing: tuple[int | None, ...]
+    """Seeds that are missing."""
     groups: Mapping[Side, Group]
-    """Sides that there are scores of."""
+    """Scores of the sides that are evaluated."""
     sides: tuple[Side, ...]
-    """Sides that it is, or would be, evaluated on."""
+    """Sides that the agent is, or will be, evaluated on."""
     unstable: int = 0
-    """How many of its episodes ended because their simulation became unstable."""
+    """Number of episodes that ended because the simulation diverged."""
 
 
 def rows(results: Results) -> list[Row]:
-    """A row for every split, task, agent and mode, in the order of the cells."""
+    """Return a row for every split, task, agent and mode, in the order of the cells."""
     found = []
     lines = dict.fromkeys((cell.split, cell.agent) for cell in results)
     for split, agent in lines:
@@ -113,7 +123,7 @@ def rows(results: Results) -> list[Row]:
 
 
 def write_tables(folder: Path, results: Results) -> list[Path]:
-    """Write Markdown, JSON, CSV and curves.
+    """Write Markdown, JSON, CSV and curves; return their paths.
 
     Raises:
         FormatError: If one cannot be written.
@@ -128,7 +138,7 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
 
 
 def table_text(made: Sequence[Row]) -> str:
-    """Markdown: a table for each split and task."""
+    """Return Markdown with a table for each split and task."""
     parts = []
     for split in dict.fromkeys(row.split for row in made):
         own = [row for row in made if row.split == split]
@@ -147,7 +157,7 @@ def table_text(made: Sequence[Row]) -> str:
 
 
 def curves(results: Results) -> bytes:
-    """Scores while training, a panel a split: mean over seeds, and their range; PNG."""
+    """Return a PNG of training scores, a panel per split: mean over seeds, and their range."""
     from matplotlib.figure import Figure
 
     splits = list(dict.fromkeys(cell.split for cell in results))
@@ -162,11 +172,11 @@ def curves(results: Results) -> bytes:
             if not found:
                 panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
                 continue
-            steps = max((curve.steps for curve in found), key=len)
+            steps = max((curve.timesteps for curve in found), key=len)
             values = np.full((len(found), len(steps)), np.nan)
             for row, curve in zip(values, found, strict=True):
                 row[: len(curve.scores)] = curve.scores
-            done = sum(curve.whole for curve in found)
+            done = sum(curve.complete for curve in found)
             note = "" if done == len(own) else f" ({done} of {len(own)} seeds to the end)"
             (line,) = panel.plot(steps, np.nanmean(values, axis=0), label=agent + note)
             panel.fill_between(
@@ -184,7 +194,7 @@ def curves(results: Results) -> bytes:
 
 
 def _curve(cell: Cell) -> Curve | None:
-    """How the parts of a run learned, in the mean; None if nothing was learned."""
+    """Return the mean training curve of a run's parts; None if there are no metrics yet."""
     assert cell.config is not None
     runs = parts_of(cell.folder, cell.config)
     parts = [read_metrics(part.folder) for part in runs]
@@ -193,7 +203,7 @@ def _curve(cell: Cell) -> Curve | None:
         return None
     steps = [sum(part[i]["transitions"] for part in parts) for i in range(length)]
     scores = [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
-    return Curve(steps, scores, all(length == run.config.updates for run in runs))
+    return Curve(steps, scores, all(length == run.config.num_updates for run in runs))
 
 
 def _groups(
@@ -210,7 +220,9 @@ def _groups(
         scores = np.array([[each.score for each in seed] for seed in table])
         success = float(np.mean([each.success for seed in table for each in seed]))
         first = next(iter(there))
-        apart = first.agent.startswith("se") and side == first.source.side
+        apart = first.config is not None and AGENTS[first.config.policy.agent].per_robot
+        # Policies of single robots are independent samples on the robots that they learned.
+        apart = apart and side == first.source.side
         iqm = iqm_interval(scores, together=not apart)
         found[side] = Group(float(scores.mean()), iqm, success)
     return found
@@ -248,13 +260,13 @@ def _interval(found: Interval) -> str:
 def _cells(results: Results) -> list[dict[str, Any]]:
     return [
         as_record(cell)
-        | {"scores": None if scores is None else {m: as_data(s) for m, s in scores.items()}}
+        | {"scores": None if scores is None else {m: scores_to_json(s) for m, s in scores.items()}}
         for cell, scores in results.items()
     ]
 
 
 def _csv(results: Results) -> str:
-    """A line for every split, agent, seed, mode and robot; one that says so where none is."""
+    """Return a CSV line for every split, agent, seed, mode and robot, also for missing ones."""
     text = io.StringIO()
     names = ["split", "agent", "seed", "status", "mode", *(each.name for each in fields(Score))]
     writer = csv.DictWriter(text, names, lineterminator="\n")
@@ -264,7 +276,7 @@ def _csv(results: Results) -> str:
             writer.writerow(as_record(cell) | {"status": MISSING})
             continue
         for mode, own in scores.items():
-            for each in as_data(own):
+            for each in scores_to_json(own):
                 writer.writerow(as_record(cell) | {"status": "done", "mode": mode} | each)
     return text.getvalue()
 

@@ -1,4 +1,4 @@
-"""Scores of one policy as a table, for eyes and for files."""
+"""Tables of the scores of one policy, for the terminal and for files."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from tabulate import tabulate
 
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.files import save
-from morphgen.rl.evaluation import Score, as_data
+from morphgen.rl.scores import Score, scores_to_json
 
 SIDES = {"train": "MT", "test": "ZS"}
-"""What the paper calls the mean score of a side: multi-task and zero-shot."""
+"""The paper's names of the mean score of a side: multi-task and zero-shot."""
 HEADERS = ("robot", "side", "task", "mode", "score", "95%", "success", "raw", "random", "distance")
 UNSTABLE = "episodes that ended because their simulation became unstable"
 SUFFIXES = (".csv", ".json", ".md")
 
 Scores = Mapping[str, Sequence[Score]]
-"""By mode, or by the name of a reference."""
+"""Scores by mode, or by the name of a baseline."""
 
 
 def score_table(found: Scores, style: str = "simple") -> str:
-    """A line a robot and mode; ``style`` is one of tabulate's."""
+    """Return a table with a line per robot and mode; ``style`` is one of tabulate's."""
     rows = [_row(mode, each) for mode, scores in found.items() for each in scores]
     return tabulate(rows, HEADERS, tablefmt=style, disable_numparse=True)
 
 
 def summary(found: Scores) -> str:
-    """Mean scores of each side and task, a line a mode, and how many episodes were cut short."""
+    """Return a line per mode: mean scores of each side and task, and diverged episodes."""
     lines = []
     for mode, scores in found.items():
         groups = dict.fromkeys((each.side, each.task) for each in scores)
@@ -52,10 +52,10 @@ def summary(found: Scores) -> str:
 
 
 def require_table(path: Path) -> None:
-    """Require that a table can be written as what its name says.
+    """Require that a table can be written to a path.
 
     Raises:
-        TaskError: If not.
+        TaskError: If its suffix is unknown, or its folder is missing.
     """
     if path.suffix not in SUFFIXES:
         raise TaskError(
@@ -66,14 +66,14 @@ def require_table(path: Path) -> None:
 
 
 def write_scores(path: Path, found: Scores) -> None:
-    """Write CSV, JSON or Markdown, as the name says.
+    """Write CSV, JSON or Markdown, by the suffix of the path.
 
     Raises:
-        TaskError: If the name says none of these.
+        TaskError: If the suffix is another one.
         FormatError: If it cannot be written.
     """
     require_table(path)
-    data = {mode: as_data(scores) for mode, scores in found.items()}
+    data = {mode: scores_to_json(scores) for mode, scores in found.items()}
     if path.suffix == ".json":
         save(path, json.dumps(data, indent=2) + "\n")
     elif path.suffix == ".md":

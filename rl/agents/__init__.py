@@ -1,0 +1,96 @@
+"""Registry of agents: an agent is one module with its networks, and one row of ``AGENTS``.
+
+The registry imports nothing heavy, so that the command line lists agents at once. A module of an
+agent has two names: ``Config``, a ``NetworkConfig`` with the sizes of its networks, and
+``Network``, an ``encoder.Network`` that is built for the actor and for the critic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from importlib import import_module
+from typing import Any
+
+from morphgen.errors import TaskError, nearest
+
+MAX_WIDTH = 8192
+"""Largest width of a layer; the weights between two such layers take 256 MiB."""
+MAX_LAYERS = 100
+"""Largest number of layers of a network."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of an agent's networks: the base class, whose subclasses add the fields."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes.
+
+        Raises:
+            TaskError: If a size is out of its range.
+        """
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(field.default, int):
+                most = MAX_LAYERS if field.name.endswith("layers") else MAX_WIDTH
+                if value < 1:
+                    raise TaskError(f"{field.name} {value}: expected 1 or more")
+                if value > most:
+                    raise TaskError(f"{field.name} {value}: expected at most {most}")
+            elif not value > 0:
+                raise TaskError(f"{field.name} {value:g}: expected more than 0")
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A row of the registry: how an agent is trained, and the module that has its networks."""
+
+    module: str
+    """Import path of the module; it is imported when the agent is used."""
+    per_robot: bool = False
+    """Train one policy for each robot of a split, instead of one policy for all of them."""
+    proprioceptive_only: bool = False
+    """Hide the robot's morphology from the networks; joint positions stay visible."""
+
+    @property
+    def config(self) -> type[NetworkConfig]:
+        """Class with the sizes of the networks."""
+        found: type[NetworkConfig] = import_module(self.module).Config
+        return found
+
+    @property
+    def network(self) -> Any:  # noqa: ANN401
+        """Class of the torch module, a subclass of ``encoder.Network``."""
+        return import_module(self.module).Network
+
+
+AGENTS: dict[str, Agent] = {
+    "se": Agent("morphgen.rl.agents.mlp", per_robot=True, proprioceptive_only=True),
+    "me-mlp": Agent("morphgen.rl.agents.mlp"),
+    "me-tf": Agent("morphgen.rl.agents.transformer"),
+}
+"""Agents by name: ``se`` (single embodiment) learns one robot, ``me-...`` (multi) learn many."""
+
+
+def require_agent(name: str) -> Agent:
+    """Return the agent of a name.
+
+    Raises:
+        TaskError: If there is none.
+    """
+    if name not in AGENTS:
+        raise TaskError(f"unknown agent {name!r}{nearest(name, AGENTS)}")
+    return AGENTS[name]
+
+
+def network_fields() -> Iterator[tuple[str, float, tuple[str, ...]]]:
+    """Yield every size of every agent's networks: its name, its default, and its agents."""
+    defaults: dict[str, float] = {}
+    owners: dict[str, list[str]] = {}
+    for name, agent in AGENTS.items():
+        for field in fields(agent.config):
+            defaults.setdefault(field.name, field.default)  # type: ignore[arg-type]
+            owners.setdefault(field.name, []).append(name)
+    for field_name, agents in owners.items():
+        yield field_name, defaults[field_name], tuple(agents)

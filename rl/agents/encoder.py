@@ -1,0 +1,148 @@
+"""What networks of all agents share: the encoder of observations, and their interface.
+
+Padding is replaced by zeros before anything else: it has no influence on actions, values or
+gradients.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
+from morphgen.rl.observation_layout import Layout
+from morphgen.tasks.observation import Observation
+
+if TYPE_CHECKING:
+    from morphgen.rl.config import PolicyConfig
+
+ENTITIES = ("links", "goal", "object", "line", "obstacles", "cloud")
+"""Kinds of vectors, in the order of the vectors and of the rows of ``Entities.kind``.
+
+Checkpoints have the rows in this order, without the kinds that a layout lacks."""
+LAST_LAYER_SCALE = 0.01
+"""Factor on the initial weights of the last layer, so that all actions start out almost equally
+likely and values near zero."""
+
+
+class Network(nn.Module, ABC):
+    """A network from observations to numbers: for each link (actor), or one row (critic)."""
+
+    needs_all_links = True
+    """Whether the network needs all rows of links; otherwise rows that no robot uses are cut."""
+    logit_scale = 1.0
+    """Factor on the actor's logits."""
+
+    @abstractmethod
+    def __init__(self, config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> None:
+        """Build the network; ``outputs`` numbers ``per_link``, or for the whole observation."""
+        super().__init__()
+
+    @property
+    @abstractmethod
+    def last(self) -> nn.Linear:
+        """The last layer."""
+
+    @abstractmethod
+    def forward(self, observation: Observation) -> torch.Tensor:
+        """Return numbers of shape (n, L, outputs) per link, else (n, outputs)."""
+
+
+class Entities(nn.Module):
+    """Encode links, goal, object, line, obstacles and points as vectors of one size, links first.
+
+    The highest frequencies of the code of joint positions have many periods within one control
+    step: noise to an untrained network. The initial weights of a frequency are inversely
+    proportional to it, so that the initial policy is smooth.
+
+    The tool's position is part of the goal's and of the object's vector, so that the distance left
+    is a difference of numbers within one vector.
+    """
+
+    def __init__(self, layout: Layout, features: int, *, proprioceptive_only: bool) -> None:
+        super().__init__()
+        self.columns = POSITION.columns if proprioceptive_only else slice(0, layout.token)
+        """Columns of the link tokens that are encoded."""
+        link = self.columns.stop - self.columns.start + len(layout.channels)
+        self.tool = layout.tool
+        tool = 3 * layout.tool
+        sizes = {"links": link, "goal": 7 + tool, "object": 13 + tool, "line": 1}
+        if layout.obstacles:
+            sizes["obstacles"] = 13
+        self.cloud: nn.Module | None = None
+        if layout.points:
+            self.cloud = nn.Sequential(
+                nn.Linear(3, features), nn.SiLU(), nn.Linear(features, features)
+            )
+            sizes["cloud"] = features
+        self.channels = layout.channels
+        self.project = nn.ModuleDict(
+            {name: nn.Linear(size, features, bias=False) for name, size in sizes.items()}
+        )
+        smooth = torch.ones(link)
+        first = POSITION.start - self.columns.start
+        smooth[first : first + POSITION.size] = torch.from_numpy(
+            FREQUENCIES[0] / FREQUENCIES
+        ).repeat(2)
+        with torch.no_grad():
+            next(self.project["links"].parameters()).mul_(smooth)
+        self.kinds = tuple(name for name in ENTITIES if name in sizes)
+        """Name of each row of ``kind``."""
+        self.kind = nn.Parameter(0.02 * torch.randn(len(self.kinds), features))
+        self.count = layout.links + 3 + layout.obstacles + bool(layout.points)
+
+    def forward(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return vectors (n, T, features), zeros in the padding, and their mask (n, T), bool."""
+        entries = self._entries(observation)
+        vectors, masks = [], []
+        for name, kind in zip(self.kinds, self.kind, strict=True):
+            values, mask = entries[name]
+            visible = torch.where(mask[..., None], values, 0.0)
+            vectors.append(torch.where(mask[..., None], self.project[name](visible) + kind, 0.0))
+            masks.append(mask)
+        return torch.cat(vectors, dim=1), torch.cat(masks, dim=1)
+
+    def _entries(self, observation: Observation) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return values (n, k, size) and masks (n, k) of each kind."""
+        extra = [observation[name][..., None] for name in self.channels]
+        links = torch.cat([observation["tokens"][..., self.columns], *extra], dim=-1)
+        tool = [observation["tool"]] if self.tool else []
+        reach, push = observation["goal_mask"][:, None], observation["object_mask"][:, None]
+        entries = {
+            "links": (links, observation["links"]),
+            "goal": (torch.cat([observation["goal"], *tool], dim=-1)[:, None], reach),
+            "object": (torch.cat([observation["object"], *tool], dim=-1)[:, None], push),
+            "line": (observation["line"][:, None], push),
+        }
+        if "obstacles" in self.project:
+            entries["obstacles"] = (observation["obstacles"], observation["obstacle_mask"])
+        if self.cloud is not None:
+            points, mask = observation["points"], observation["point_mask"]
+            entries["cloud"] = _max_pool(self.cloud, points, mask)
+        return entries
+
+
+def last_layer(inputs: int, outputs: int) -> nn.Linear:
+    """Return a linear layer whose outputs start near zero; see ``LAST_LAYER_SCALE``."""
+    layer = nn.Linear(inputs, outputs)
+    with torch.no_grad():
+        layer.weight.mul_(LAST_LAYER_SCALE)
+        layer.bias.zero_()
+    return layer
+
+
+def _max_pool(
+    encode: nn.Module, points: torch.Tensor, mask: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the largest features of points (n, P, 3), as PointNet (Qi et al. 2017).
+
+    Returns:
+        Features (n, 1, features), and whether there is any point (n, 1).
+    """
+    features = encode(torch.where(mask[..., None], points, 0.0)).float()
+    lowest = torch.finfo(features.dtype).min
+    top = torch.where(mask[..., None], features, lowest).amax(dim=1, keepdim=True)
+    return top, mask.any(dim=1, keepdim=True)

@@ -1,0 +1,107 @@
+"""Act with a trained policy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from morphgen.rl.config import policy_from
+from morphgen.rl.observation_layout import (
+    layout_from,
+    layout_of,
+    pad_links,
+    require_layout,
+    truncate_links,
+)
+from morphgen.rl.policies import make_networks, rows_needed
+from morphgen.rl.runs import read_checkpoint
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.observation import Observation
+
+Mode = Literal["deterministic", "stochastic"]
+MODES: tuple[Mode, ...] = ("deterministic", "stochastic")
+"""How a policy acts: by the mean of its actions, or by sampling."""
+
+
+class Policy:
+    """A trained policy, from observations to actions.
+
+    It needs no environment::
+
+        policy = load_policy("runs/interpolation/arm3/reach/me-tf/seed0")
+        actions = policy.act(observation)
+    """
+
+    def __init__(self, learner: dict[str, Any], mode: Mode, seed: int, device: str = "cpu") -> None:
+        """Build the actor of a learner.
+
+        Args:
+            learner: State of a learner, as a checkpoint has it.
+            mode: Whether the policy acts by the mean of its actions, or samples them.
+            seed: Seed of the samples.
+            device: Device of the network.
+
+        Raises:
+            TaskError: If the state is of an agent that is unknown here.
+        """
+        self.layout = layout_from(learner["layout"])
+        """Layout of the observations that the policy was trained with."""
+        self.config = policy_from(learner["policy"])
+        self._device = torch.device(device)
+        actor, _ = make_networks(self.config, self.layout, 0)
+        actor.load_state_dict(learner["actor"])
+        self._actor = actor.to(self._device).eval()
+        self._deterministic = mode == "deterministic"
+        self._generator = torch.Generator(self._device).manual_seed(seed)
+
+    def require(self, observation: Observation) -> None:
+        """Require that an observation has the layout that the policy was trained with.
+
+        Raises:
+            TaskError: If it has another one.
+        """
+        require_layout(self.layout, layout_of(observation), "the checkpoint")
+
+    @torch.no_grad()
+    def act(self, observation: Observation) -> torch.Tensor:
+        """Return actions for observations, shape (n, L), on the device of the observations.
+
+        Args:
+            observation: Channels by name, tensors (n, ...), as ``TaskBatch`` returns them.
+
+        Raises:
+            TaskError: If the observations have another layout than those of the training.
+        """
+        self.require(observation)
+        needed = truncate_links(observation, rows_needed(self.config, observation))
+        head = self._actor.distribution({k: v.to(self._device) for k, v in needed.items()})
+        actions = head.mode() if self._deterministic else head.sample(self._generator)
+        return pad_links(actions, self.layout.links).to(observation["links"].device)
+
+
+def load_policy(
+    path: Path | str, mode: Mode = "deterministic", seed: int = 0, device: str = "cpu"
+) -> Policy:
+    """Load the policy of a checkpoint, or of a run's folder. Nothing in the file is executed.
+
+    Raises:
+        TaskError: If there is no checkpoint, or it is damaged or of another version.
+    """
+    return Policy(read_checkpoint(Path(path))[1], mode, seed, device)
+
+
+class PolicyController:
+    """Let a policy act in a batch as baselines do: it observes the batch, and acts on that."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return actions of all environments, shape (n, L).
+
+        Raises:
+            TaskError: If the batch has other observations than those of the training.
+        """
+        return self.policy.act(task.observe())

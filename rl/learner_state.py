@@ -1,0 +1,93 @@
+"""Save the state of a learner, resume it, and begin with the networks of another."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from torch import nn
+
+from morphgen.errors import TaskError
+from morphgen.rl.config import PPOConfig, policy_from
+from morphgen.rl.observation_layout import layout_from, require_layout
+from morphgen.rl.ppo import Learner
+
+
+def state_of(learner: Learner) -> dict[str, Any]:
+    """Return the state of training; ``torch.load`` reads it with ``weights_only``.
+
+    The learner does not change. The state of the simulator is not part of it: a resumed run begins
+    new episodes, and equals one that continued only if that one calls ``restart_episodes`` when the
+    state is saved.
+    """
+    weights = {name: net.state_dict() for name, net in _networks(learner).items()}
+    return {
+        **copy.deepcopy({**weights, "optimiser": learner.optimiser.state_dict()}),
+        "generators": {name: each.get_state() for name, each in learner.generators.items()},
+        "batch": learner.batch.state_dict(),
+        "actor_lr_scale": learner.actor_lr_scale,
+        "update": learner.update,
+        "updates": learner.num_updates,
+        "device": learner.device.type,
+        "layout": asdict(learner.layout),
+        "policy": asdict(learner.policy),
+        "config": asdict(learner.config),
+    }
+
+
+def resume(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Continue where a learner of the same batch, configuration and device stopped.
+
+    All environments begin new episodes.
+
+    Raises:
+        TaskError: If these are not the same; nothing is changed then.
+    """
+    _require_networks(learner, state)
+    ours = {
+        **asdict(learner.config),
+        "updates": learner.num_updates,
+        "device": learner.device.type,
+    }
+    stored = asdict(PPOConfig(**state["config"]))
+    _require_same({**stored, **{k: state[k] for k in ("updates", "device")}}, ours)
+    learner.batch.load_state_dict(state["batch"])
+    for name, network in _networks(learner).items():
+        network.load_state_dict(state[name])
+    learner.optimiser.load_state_dict(state["optimiser"])
+    for name, generator in learner.generators.items():
+        generator.set_state(state["generators"][name].cpu())
+    learner.update, learner.actor_lr_scale = state["update"], state["actor_lr_scale"]
+    learner.restart_episodes()
+
+
+def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Load the networks of a learner's state and nothing else of it, to fine-tune them.
+
+    Raises:
+        TaskError: If they are other networks, or for other observations.
+    """
+    _require_networks(learner, state)
+    for name, network in _networks(learner).items():
+        network.load_state_dict(state[name])
+
+
+def _networks(learner: Learner) -> dict[str, nn.Module]:
+    return {
+        "actor": learner.actor,
+        "critic": learner.critic,
+        "target_critic": learner.target_critic,
+    }
+
+
+def _require_networks(learner: Learner, state: Mapping[str, Any]) -> None:
+    require_layout(layout_from(state["layout"]), learner.layout, "the checkpoint")
+    _require_same(asdict(policy_from(state["policy"])), asdict(learner.policy))
+
+
+def _require_same(stored: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+    wrong = [f"{k} {stored.get(k)}, here {ours[k]}" for k in ours if stored.get(k) != ours[k]]
+    if wrong:
+        raise TaskError(f"the checkpoint is of another run: {'; '.join(wrong)}")
