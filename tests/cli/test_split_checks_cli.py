@@ -11,7 +11,7 @@ from morphgen.benchmark.built import load_built
 from morphgen.benchmark.paper import PAPER
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
-from morphgen.tasks import free_space, goals
+from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.split_goals import read_goals
 from splits import TEST, TRAIN, combined, member, split
 
@@ -228,7 +228,7 @@ def test_what_they_cannot_do_is_refused_in_a_line(run, write, tmp_path, argv, me
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """A cache of the test's own, but for fits."""
-    monkeypatch.setattr(goals, "user_cache_path", lambda name: tmp_path / "cache" / name)
+    monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
 
 
 def reaching(**more):

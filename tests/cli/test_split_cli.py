@@ -17,7 +17,7 @@ COMPOSITION += ("--from", "arm=lwr ee={plane,cube}")
 EXTRAPOLATION = ("split", "new", "extrapolation", "--train-category", "stick,nlink,prims")
 EXTRAPOLATION += ("--test-category", "chain", "--train", "6")
 TRAPS = {
-    "task": ("task: reach", "task: reech", "unknown 'reech'; did you mean 'reach'?"),
+    "task": ("task: reach", "task: push", "the file was changed since it was written"),
     "syntax": ("regime: ", "regime: [", "no valid YAML: "),
     "key": ("body: ", "boddy: ", "unknown key 'boddy'; did you mean 'body'?"),
     "robot": ("size=0.1", "size=0.2", "the file was changed since it was written"),

@@ -98,7 +98,7 @@ def test_a_file_that_cannot_be_played_is_refused(refused, tmp_path, name, why):
         (["arm=ur6"], "unknown arm 'ur6'"),
         (["--host", "8.8.8.8"], "cannot serve at '8.8.8.8'"),
         (["--host", "nosuch.invalid"], "cannot serve at"),
-        (["--port", "0"], "--port 0: expected 1 to 65535"),
+        (["--port", "0"], "argument --port: 0: expected a whole number, 1 to 65535"),
         (["--library", "nowhere"], "library folder"),
         (["--allow-origin", "null"], "--allow-origin 'null': expected a site"),
         (["--allow-origin", "http://box/page"], "without a path"),

@@ -209,9 +209,9 @@ SCRIPT = """
 import sys
 
 def main():
-    sys.path.insert(0, sys.argv[1])
+    sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tasks"]
     from scenes import push_scene
-    from tasks.test_bullet_workers import pids, starts
+    from test_bullet_workers import pids, starts
     from morphgen.tasks.sim.bullet import BulletSimulation
 
     simulation = BulletSimulation([push_scene(), push_scene(), push_scene()], processes=3)

@@ -102,7 +102,7 @@ def test_nothing_outside_is_read(places, place):
         (f"split:{SPLIT}@both/x", "expected split:NAME@train/ROBOT"),
         (f"split:{SPLIT}@test/chain-000009", "did you mean 'chain-000001'|no test robot"),
         ("split:nothing@test/x", "no such file"),
-        ("words:arm", "key=value|unknown grammar"),
+        ("words:arm", "'arm' is no part"),
     ],
 )
 def test_bad_places_say_why(places, place, why):
