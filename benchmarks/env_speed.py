@@ -169,7 +169,7 @@ def _hasty(rate: Rate, seconds: float) -> float:
 
 
 def _raw(task: str, robot: str, envs: int, seconds: float) -> float:
-    """Of the calls of ``stepSimulation`` that the same environments make."""
+    """Return the steps per second of PyBullet alone, stepped as the environments step it."""
     spent, calls = 0.0, 0
     with closing(make_batch(task, [robot], envs)) as batch:
         batch.reset(seed=0)
@@ -201,7 +201,7 @@ def _twice(
     envs: int,
     seconds: float,
 ) -> float:
-    """Of two processes at once, each with half of the environments."""
+    """Return the steps per second of two processes, each with half of the environments."""
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         for size in (1, envs // 2):  # both have loaded everything before the clock starts
             found = [pool.submit(one, task, robot, size, seconds) for _ in range(2)]
@@ -210,7 +210,7 @@ def _twice(
 
 
 def _peer(name: str, count: int, seconds: float) -> float:
-    """Of panda-gym with our steps."""
+    """Return the steps per second of panda-gym, with the control period of morphgen."""
     import gymnasium
 
     make = [partial(_panda, name)] * count

@@ -59,7 +59,7 @@ _FRAGMENT = re.compile(r"<link|<xacro:(?!macro|include|property|arg)\w")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a file."""
+    """Result of importing one file."""
 
     package: str
     file: str

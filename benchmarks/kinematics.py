@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 LINKS, JACOBIAN, POSITION = "links", "tool, Jacobian", "tool position"
 Call = Callable[[], object]
 Rows = dict[tuple[str, str], Call]
-"""What is computed, by whom, and how."""
+"""Calls to measure, by computation and library."""
 
 
 def main() -> int:

@@ -74,7 +74,7 @@ SE = PolicyConfig("se", discrete=False)
 SIZES = mlp.Config()
 PLAIN = PPOConfig(total_timesteps=10**9, symlog=False, slow_critic=False)
 ROBOTS, OBSTACLES = 10, 3
-"""Of the random rollouts."""
+"""Numbers of robots and of obstacles in the random rollouts."""
 
 
 def main() -> int:
@@ -294,7 +294,7 @@ def _learners(device: str, envs: int, rounds: int) -> list[Row]:
 
 
 class _RandomBatch:
-    """What a learner needs of a batch; everything in it is random."""
+    """A stand-in for ``TaskBatch`` whose observations and rewards are random."""
 
     kind = "discrete"
 

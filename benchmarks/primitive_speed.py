@@ -61,7 +61,7 @@ HOLD = 10
 TRIES = 32
 """Configurations that are drawn for each that is needed."""
 PRESS = 0.05
-"""How far below the table the lowest joint is when it is to press on it, metres."""
+"""Depth of the lowest joint below the table where the arm presses on it, metres."""
 CLEARANCE = 0.005
 """Height of the arm at home above the table, metres."""
 
@@ -97,7 +97,7 @@ class Speeds:
 
 
 Table = dict[str, dict[str, Speeds]]
-"""What a scene gave, by arm and simulator."""
+"""Speeds of one scene, by arm and simulator."""
 
 
 def main() -> int:

@@ -48,7 +48,7 @@ Row = dict[str, float | str]
 
 @dataclass(frozen=True)
 class Measuring:
-    """What every process does to a robot."""
+    """Measurement of one robot, as worker processes run it."""
 
     sims: tuple[str, ...]
     envs: int
@@ -57,7 +57,7 @@ class Measuring:
 
     @cached_property
     def library(self) -> Library:
-        """Where parts are."""
+        """Library of parts."""
         return default_library(())
 
     def __call__(self, member: Member) -> Row:

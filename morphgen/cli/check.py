@@ -19,6 +19,7 @@ from morphgen.cli.options import (
 from morphgen.errors import one_line
 
 if TYPE_CHECKING:
+    from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.findings import Finding
 
@@ -50,8 +51,9 @@ def run(args: argparse.Namespace) -> int:
     failing = ("error", "warning") if args.strict else ("error",)
     report: dict[str, dict[str, list[dict[str, object]]]] = {}
     failed = False
+    library = library_of(args)
     for source in sources_named(args):
-        findings, repaired = _checked(source, args)
+        findings, repaired = _checked(source, library, args)
         report[source.label] = {
             "findings": [finding.as_dict() for finding in findings],
             "repaired": [finding.as_dict() | {"repair": finding.repair} for finding in repaired],
@@ -65,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _checked(
-    source: RobotSource, args: argparse.Namespace
+    source: RobotSource, library: Library, args: argparse.Namespace
 ) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
     """Return a robot's findings, and those that its repair into ``--fix`` removed."""
     from morphgen.checks import check, fix
@@ -74,7 +76,7 @@ def _checked(
     from morphgen.grammar.robot_source import read_source
 
     try:
-        robot = read_source(source, library_of(args), args.root)
+        robot = read_source(source, library, args.root)
     except UnsoundError as error:
         return error.findings, ()
     folder = source.path if source.path is None or source.path.is_dir() else source.path.parent

@@ -22,6 +22,7 @@ from morphgen.cli.options import (
 
 if TYPE_CHECKING:
     from morphgen.checks.conformance import ConformanceReport
+    from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
 
 
@@ -53,8 +54,9 @@ def run(args: argparse.Namespace) -> int:
     from tabulate import tabulate
     from tqdm import tqdm
 
+    library = library_of(args)
     reports = {
-        source.label: _report(source, args)
+        source.label: _report(source, library, args)
         for source in tqdm(
             sources_named(args), unit="robot", leave=False, disable=args.json or None
         )
@@ -71,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(report.passed for report in reports.values()) else 1
 
 
-def _report(source: RobotSource, args: argparse.Namespace) -> ConformanceReport:
+def _report(source: RobotSource, library: Library, args: argparse.Namespace) -> ConformanceReport:
     """Load the bundle, or one that is written for it: loaders read files."""
     from morphgen.checks import check
     from morphgen.checks.conformance import conformance
@@ -80,7 +82,7 @@ def _report(source: RobotSource, args: argparse.Namespace) -> ConformanceReport:
 
     if source.path is not None and (source.path / CARD).is_file():
         return conformance(source.path, args.samples, args.seed)
-    robot = read_source(source, library_of(args), args.root)
+    robot = read_source(source, library, args.root)
     with TemporaryDirectory() as folder:
         bundle = bundle_folder(Path(folder), robot.name)
         write_bundle(robot, bundle, check(robot), picture=False)

@@ -234,11 +234,11 @@ def _targets(args: argparse.Namespace) -> list[Target]:
     """Return what is to be fitted: a part by its name, or robots."""
     from morphgen.errors import FormatError
     from morphgen.grammar.part import load_part
-    from morphgen.grammar.robot_source import read_source
+    from morphgen.grammar.robot_source import is_robot_file, read_source
 
     library = library_of(args)
     word = args.words[0]
-    if len(args.words) == 1 and word in library.paths and not Path(word).exists():
+    if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
         if args.root is not None:
             raise FormatError(f"--root {args.root}: only with a bundle, a URDF or a xacro")
         return [Target(word, load_part(library.manifest(word)).body, None, is_part=True)]

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from morphgen.tasks.registry import SIMULATORS, TASKS
+
 if TYPE_CHECKING:
     from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.robot import Robot
-
-from morphgen.tasks.registry import SIMULATORS, TASKS
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -112,14 +112,14 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
 
 
-def add_max_links(parser: argparse.ArgumentParser) -> None:
-    """Let the user choose how many links tokens are made for."""
+def add_max_links(parser: argparse.ArgumentParser, default: str = "23") -> None:
+    """Let the user choose how many links tokens are made for; the text names the default."""
     parser.add_argument(
         "--max-links",
         type=int,
         metavar="N",
         help="the most links that a robot of the study has; indices are divided by one less "
-        "(default: 23, or as many as the largest robot has)",
+        f"(default: {default})",
     )
 
 

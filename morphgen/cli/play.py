@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library, add_sim, add_task
+from morphgen.cli.options import Subparsers, add_library, add_robot, add_sim, add_task
 from morphgen.rl.baselines import BASELINES
 
 if TYPE_CHECKING:
@@ -23,12 +23,7 @@ def add_parser(commands: Subparsers) -> None:
         "morphgen play push prims --policy scripted --episodes 3 --sim mujoco",
     )
     add_task(parser, "task")
-    parser.add_argument(
-        "words",
-        nargs="+",
-        metavar="ROBOT",
-        help="words of morphgen compose, parts such as ur5-plane, a bundle's folder or a URDF",
-    )
+    add_robot(parser)
     parser.add_argument(
         "--policy",
         type=_policy,

@@ -61,7 +61,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     parser.add_argument("--csv", metavar="FILE", type=Path, help="write a line a pair")
     add_root(parser)
-    add_max_links(parser)
+    add_max_links(parser, "23, or as many as the largest robot has")
     add_library(parser)
     add_json(parser)
     parser.set_defaults(run=run)

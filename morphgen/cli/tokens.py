@@ -60,7 +60,7 @@ def add_parser(commands: Subparsers) -> None:
     parser.add_argument(
         "--out", metavar="FILE.npz", type=Path, help="write the tokens to this file"
     )
-    add_max_links(parser)
+    add_max_links(parser, "23, or as many as the largest robot has")
     add_root(parser)
     add_library(parser)
     add_json(parser)

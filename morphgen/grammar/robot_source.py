@@ -127,15 +127,16 @@ def is_robot_file(text: str) -> bool:
     A folder without robots does not hide a grammar or a part of the same name.
     """
     path = Path(text)
-    if (text.endswith(DESCRIPTION_SUFFIXES) and path.is_file()) or _holds_robots(path):
+    is_description = text.endswith(DESCRIPTION_SUFFIXES) and path.is_file()
+    if is_description or (path.is_dir() and _holds_robots(path)):
         return True
     if "=" in text or text.partition(" ")[0].endswith(GRAMMAR_SUFFIX):
         return False
     return "/" in text or text in (".", "..") or text.endswith(DESCRIPTION_SUFFIXES)
 
 
-def _holds_robots(path: Path) -> bool:
-    return path.is_dir() and next(_robots_in(path), None) is not None
+def _holds_robots(folder: Path) -> bool:
+    return _is_robot(folder) or _is_set(folder) or any(map(_is_robot, folder.iterdir()))
 
 
 def _robots_at(path: Path) -> list[Path]:
@@ -154,7 +155,7 @@ def _robots_in(folder: Path) -> Iterator[Path]:
     """Robots of a folder: itself, those of a set, or the bundles in it."""
     if _is_robot(folder):
         yield folder
-    elif (folder / INDEX).is_file() or (folder / SETTINGS).is_file():
+    elif _is_set(folder):
         yield from (folder / record["name"] for record in read_index(folder))
     else:
         yield from (child for child in sorted(folder.iterdir()) if _is_robot(child))
@@ -162,6 +163,10 @@ def _robots_in(folder: Path) -> Iterator[Path]:
 
 def _is_robot(folder: Path) -> bool:
     return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
+
+
+def _is_set(folder: Path) -> bool:
+    return (folder / INDEX).is_file() or (folder / SETTINGS).is_file()
 
 
 def _requested(words: Sequence[str]) -> RobotSource:

@@ -382,6 +382,12 @@ def test_a_wrong_request_is_refused(refused, words, message):
     assert message in refused("fit", *words.split())
 
 
+def test_a_folder_of_a_parts_name_does_not_hide_the_part(run, tmp_path):
+    (tmp_path / "plane").mkdir()
+    code, out, _ = run("fit", "plane", "--json")
+    assert (code, [link["link"] for link in json.loads(out)["links"]]) == (0, ["plate"])
+
+
 def test_a_mesh_is_not_written_as_a_robot(refused, box):
     message = refused("fit", box, "--out", "made")
     assert "link.stl is a mesh" in message
