@@ -46,7 +46,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.fitting.link import FitOptions, fit_solid
-from morphgen.fitting.quality import Array, quality
+from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
 from morphgen.formats.fits import shapes_key, shapes_to_fit
 from morphgen.grammar.library import default_library
@@ -54,6 +54,7 @@ from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.mesh import is_flat, load_mesh
+from morphgen.typing import Array
 
 T = TypeVar("T")
 FOUR = ("ur5", "panda", "xarm7", "jaco2")

@@ -24,7 +24,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tabulate import tabulate
 
 import morphgen
@@ -33,8 +32,8 @@ from morphgen.formats.urdf_text import urdf_text
 from morphgen.model import kinematics, kinematics_torch
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Robot
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 LINKS, JACOBIAN, POSITION = "links", "tool, Jacobian", "tool position"
 Call = Callable[[], object]
 Rows = dict[tuple[str, str], Call]

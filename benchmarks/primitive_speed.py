@@ -33,7 +33,6 @@ from importlib.util import find_spec
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from tabulate import tabulate
 from tqdm import tqdm
 
@@ -50,9 +49,8 @@ from morphgen.model.kinematics import (
     random_configurations,
 )
 from morphgen.model.robot import Robot, sorted_pair
+from morphgen.typing import Array
 from worlds import Make, MujocoWorld, PybulletWorld, World
-
-Array = NDArray[np.float64]
 
 LEG = 200
 """Steps from one random configuration to the next."""

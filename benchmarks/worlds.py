@@ -9,15 +9,13 @@ from typing import Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.mjcf import TIMESTEP, to_spec
 from morphgen.formats.quiet import quiet
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import DEFAULT_EFFORT, Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 TABLE_SIZE = (3.0, 3.0, 0.5)
 """Edges of the table, centred below the root, metres."""

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from morphgen.model.inverse_kinematics import MAX_STEP
 from morphgen.model.inverse_kinematics_torch import step_to_pose
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.bodies import Bodies
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 class OneTool:

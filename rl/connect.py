@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from morphgen.typing import Array
+
 FreePart = Callable[[Array, Array], float]
 """Which part of the straight way between two configurations, shape (dof,), is free: 1 if all."""
 

@@ -16,8 +16,7 @@ from morphgen.rl.connect import FreePart, Tree, connected, explored, shortened
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 ALONG = 6
 """Free ways along a tree that are compared."""

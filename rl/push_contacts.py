@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.tasks.free_space import FreeSpace
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 NEARER = np.arange(0.05, 2.0, 0.1)
 """How far the block is moved to the robot to see where they touch, in its edges."""

@@ -20,8 +20,7 @@ from morphgen.tasks.push.feasibility import free_within
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import GRAVITY
 from morphgen.tasks.task import EnvSpec
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 SPEED = 0.006
 """Largest way of the tool in a control step while it pushes, metres: 0.3 m/s."""

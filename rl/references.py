@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from morphgen.model.inverse_kinematics_torch import solve_position_ik
 from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
@@ -14,8 +13,7 @@ from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 STARTS = 16
 """Configurations from which inverse kinematics is tried for every goal."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.model.kinematics import bounds
 from morphgen.model.robot import Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:

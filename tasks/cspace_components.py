@@ -20,8 +20,7 @@ from scipy import ndimage
 from morphgen.checks.self_collision import SelfCollision, ignored_pairs
 from morphgen.model.kinematics import bounds, moved_by, random_configurations, whole_turns
 from morphgen.model.robot import TOOL, Pair, Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 CELL = 0.1
 """Width of a grid cell, rad or m."""

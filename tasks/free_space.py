@@ -18,8 +18,7 @@ from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
 from morphgen.model.rotation import Vec3, normalized, to_rpy
 from morphgen.tasks.sim.base import Scene
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 TRIES = 1000
 """Configurations tested for each free one that is needed, before giving up."""

@@ -22,8 +22,8 @@ from morphgen.benchmark.contents import sided
 from morphgen.benchmark.split import Side, Split
 from morphgen.tasks.goal_making import SplitGoals
 from morphgen.tasks.task import GoalSet
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Told = tuple[Side, str, str]
 """Side and name of a robot, and what is the case."""

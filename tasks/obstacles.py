@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError
@@ -14,8 +13,6 @@ from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
-
-Array = NDArray[np.float64]
 
 KEPT = 0.5
 """Share of otherwise free configurations that obstacles must leave free."""

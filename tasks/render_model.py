@@ -18,8 +18,8 @@ from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import Marker
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]
 
 BLOCK = "block"

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.sim.base import Block, Scene
+from morphgen.typing import Array
 
 if TYPE_CHECKING:  # goals are drawn by processes that need no torch, which takes seconds to load
     import torch
-
-Array = NDArray[np.float64]
 
 
 class TaskConfig(Protocol):

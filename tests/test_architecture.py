@@ -15,6 +15,7 @@ from morphgen.cli import EXTRAS
 PACKAGE = Path(morphgen.__file__).parent
 PACKAGES = (
     "errors",
+    "typing",
     "processes",
     "model",
     "formats",

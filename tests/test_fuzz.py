@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import morphgen
-from fuzzing import MEMORY_MIB, Runner
+from helpers.fuzzing import MEMORY_MIB, Runner
 from morphgen.grammar.model import grammar_names
 
 TEMPLATES = Path(morphgen.__file__).parents[1] / "templates"

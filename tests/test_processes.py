@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 
+from helpers.worker_functions import die, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.processes import CHUNK, mapped
-from work import die, fail, power
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

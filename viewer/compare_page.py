@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from morphgen.benchmark.similarity import MEASURES, features
 from morphgen.benchmark.tokens import MAX_LINKS, tokens
@@ -22,6 +21,7 @@ from morphgen.formats.fits import are_primitives, read_stored, stored_fit
 from morphgen.grammar.library import Library
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Robot
+from morphgen.typing import Array
 from morphgen.viewer import browser, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.joint_roles import all_roles, roles, scaled, with_roles
@@ -41,8 +41,6 @@ from morphgen.viewer.robot_view import (
 )
 from morphgen.viewer.session import Session, in_worker, later, say, set_value, show_state, when
 from morphgen.viewer.token_figure import tokens_png
-
-Array = NDArray[np.float64]
 
 MOST = 4
 """Robots that are compared at once."""

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from morphgen.typing import Array
 from morphgen.viewer.address import Address
-
-Array = NDArray[np.float64]
 
 _COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
 _SIDE = 480

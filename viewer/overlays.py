@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import TOOL, Robot
+from morphgen.typing import Array
 from morphgen.viewer.robot_view import RobotView, robot_extent
-
-Array = NDArray[np.float64]
 
 POINTS = 12_000
 """Of a workspace."""

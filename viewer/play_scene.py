@@ -8,15 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
+from morphgen.typing import Array
 from morphgen.viewer.episode import Episode, Track
 from morphgen.viewer.robot_view import Rgb, RobotView, add_robot, move, robot_bounds
 
-Array = NDArray[np.float64]
 Position = tuple[float, float, float]
 
 NODE = "/play"

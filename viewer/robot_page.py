@@ -6,7 +6,6 @@ from html import escape
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollision
@@ -15,6 +14,7 @@ from morphgen.formats.bundle import CARD, file_findings, split_colours
 from morphgen.model.kinematics import bounds, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
+from morphgen.typing import Array
 from morphgen.viewer import markup, overlays, robot_tables
 from morphgen.viewer.address import Address
 from morphgen.viewer.listings import neighbours
@@ -44,8 +44,6 @@ from morphgen.viewer.session import (
     set_value,
     when,
 )
-
-Array = NDArray[np.float64]
 
 SIDE = 390.0
 """Width of the panel, pixels."""

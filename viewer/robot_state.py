@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from morphgen.checks.self_collision import SelfCollision
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose
 from morphgen.model.robot import Robot
+from morphgen.typing import Array
 from morphgen.viewer import markup, overlays, robot_tables
 from morphgen.viewer.overlays import Overlays
 from morphgen.viewer.robot_view import (
@@ -25,8 +25,6 @@ from morphgen.viewer.session import (
     show_state,
     soon,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)

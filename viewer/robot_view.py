@@ -8,15 +8,15 @@ from typing import Literal, get_args
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from morphgen.model.geometry import Pose, Shape
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Inertial, Link, Robot
+from morphgen.typing import Array
 from morphgen.viewer.shapes import Triangles, ellipsoid, triangles
 
-Array = NDArray[np.float64]
 Rgb = tuple[int, int, int]
 Layer = Literal["visual", "collision", "primitives", "inertia"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.benchmark.audit import Audit, audited
 from morphgen.benchmark.similarity import MEASURES, Features
@@ -18,9 +17,8 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.typing import Array
 from morphgen.viewer.workers import Workers
-
-Array = NDArray[np.float64]
 
 LARGEST = 60
 """The most robots of which every pair is compared; a map of more could not be read."""

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from morphgen.benchmark.token_layout import LAYOUT
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 SAME = 1e-6
 """Difference up to which two numbers are the same."""

@@ -19,8 +19,7 @@ from morphgen.benchmark.tokens import tokens
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.robot import Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _README = """\
 # {name}

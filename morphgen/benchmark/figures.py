@@ -17,11 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
 
 from morphgen.benchmark.scaling_map import ScalingMap
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
 from morphgen.benchmark.split import COMPOSED, Member, Regime, Split
@@ -19,8 +19,6 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.parameters import MOUNT_YAW
 from morphgen.model.findings import Finding
-
-Array = NDArray[np.float64]
 
 NOTHING = "none"
 """The part that stands for no end-effector."""

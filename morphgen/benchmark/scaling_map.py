@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _NOTHING = 1e-12
 """Eigenvalues are nothing below this share of the largest squared distance."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.benchmark.token_layout import MAX_LINKS, POSITION
 from morphgen.benchmark.tokens import tokens
@@ -16,8 +15,7 @@ from morphgen.benchmark.workspace import Workspace, overlap, workspace
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.benchmark.similarity import MEASURES, Features, features
 from morphgen.benchmark.split import Member, Split, robot_hash
@@ -24,8 +23,7 @@ from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.processes import Progress, mapped, unseen
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from morphgen.model import rotation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Pose, Primitive, Sphere
 from morphgen.model.robot import JointKind
 from morphgen.model.rotation import Vec3
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 TOKEN_SIZE = 48
 MAX_LINKS = 23

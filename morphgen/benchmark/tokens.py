@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from morphgen.benchmark import token_layout as layout
 from morphgen.benchmark.token_layout import LAYOUT, MAX_LINKS, TOKEN_SIZE, Field, npz, padded
@@ -17,6 +17,7 @@ from morphgen.formats.rounding import as_written
 from morphgen.model.geometry import IDENTITY, Shape
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import TOOL, Frame, Joint, Link, Robot
+from morphgen.typing import Array
 
 __all__ = [
     "LAYOUT",
@@ -31,7 +32,6 @@ __all__ = [
     "tokens",
 ]
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -14,8 +14,7 @@ from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Pose, Shap
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Joint, Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 KIND, AXIS, LENGTH, SHAPE, SIZE = 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 16
 """What two matched joints and their links can differ in, and what each difference costs at most."""

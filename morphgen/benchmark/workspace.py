@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.geometry import Pose
@@ -19,8 +18,7 @@ from morphgen.model.kinematics import (
 )
 from morphgen.model.robot import TOOL, Robot
 from morphgen.model.rotation import Vec3
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 SAMPLES = 65_536
 CELLS = 10

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.checks.readers import LOADERS, Loader, Reading
 from morphgen.errors import FormatError
@@ -15,8 +14,7 @@ from morphgen.formats.bundle import read_bundle
 from morphgen.formats.mujoco_urdf import BOUND_MASS
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import Frame, Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5
 """Largest distance of a loader's tool from ours, metres."""

@@ -27,8 +27,8 @@ from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 _Triangles: TypeAlias = Array
 """Corners, shape (n, 3, 3), metres."""
 

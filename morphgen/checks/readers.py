@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.errors import FormatError
 from morphgen.formats.quiet import quiet
 from morphgen.model.geometry import Pose
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from morphgen.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.token_layout import Array
     from morphgen.model.geometry import Shape
     from morphgen.model.robot import Robot
+    from morphgen.typing import Array
 
 HEADERS = (
     "#",

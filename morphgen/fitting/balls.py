@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _ON_BALL = 1e-12
 """Relative excess of squared distance at which a point is on a ball."""

@@ -6,14 +6,12 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morphgen.fitting.kinds import Kind
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, Quat, normalized
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _DECIMALS = 9
 """Decimals beyond which rotations turn alike far."""

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 DIRECTIONS = 64
 """Rays from every point."""

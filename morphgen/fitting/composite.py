@@ -22,8 +22,8 @@ from scipy.stats import qmc
 from morphgen.fitting.canonical import canonical, rounded
 from morphgen.fitting.kinds import KINDS, Kind
 from morphgen.model.geometry import Box, Cylinder, Pose, Primitive, Shape, Sphere, volume
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 """Of a box: where its sides are, lower and upper along x, then y, then z. Of a cylinder along z:
 centre x, y, radius, lower and upper end. Of a sphere: centre x, y, z, radius. Metres."""

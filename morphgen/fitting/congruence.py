@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from morphgen.fitting.canonical import canonical
 from morphgen.model.geometry import Mesh, Pose, Shape
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _TRIES = 2000
 """Pairs of landmarks that are tried, each as a rotation and as a mirroring."""

@@ -27,8 +27,7 @@ from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
 from morphgen.model.mesh import is_flat
 from morphgen.model.rotation import Quat
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _DECIMALS = 6
 """Of dimensions and positions in metres."""

@@ -11,8 +11,8 @@ from morphgen.errors import FitError
 from morphgen.fitting.enclose import enclose
 from morphgen.fitting.quality import signed_distance
 from morphgen.fitting.search import Sampled
-from morphgen.fitting.soft_iou import Array
 from morphgen.model.geometry import Shape
+from morphgen.typing import Array
 
 CLUSTERINGS = 3
 """Ways of cutting a solid that are tried."""

@@ -8,7 +8,8 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from morphgen.fitting.kinds import KINDS
-from morphgen.fitting.soft_iou import Array, Candidates, covered, overlaps
+from morphgen.fitting.soft_iou import Candidates, covered, overlaps
+from morphgen.typing import Array
 
 TRIM = 0.03
 """Share of a cloud's points that a guess leaves out at either end of an axis."""

@@ -13,15 +13,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
 from morphgen.errors import FitError
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Shape, Sphere, volume
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Body = Box | Cylinder | Capsule
 """A sphere is a capsule of no length."""
 Placed = tuple[Array, Array]

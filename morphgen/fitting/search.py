@@ -18,10 +18,11 @@ from morphgen.errors import FitError
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
 from morphgen.fitting.kinds import KINDS
-from morphgen.fitting.soft_iou import Array, Candidates, ascend, overlaps
+from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import normalized
+from morphgen.typing import Array
 
 COARSE_POINTS = 2**11
 NEAR_POINTS, FAR_POINTS = 2**14, 2**12

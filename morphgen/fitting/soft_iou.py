@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 _BUNCH = 96
 """Primitives times thousand points that are evaluated together; bounds memory."""

@@ -26,8 +26,8 @@ from morphgen.fitting.cavities import Cavities
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.mesh import FLAT, is_flat, load_mesh
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Method = Literal["watertight", "repaired", "winding", "filled", "hull"]
 """What made a solid of the triangles, from best to worst: nothing was needed; pieces were turned
 outwards, welded or their small holes filled; it is open, and the winding number decides; it is a

@@ -9,15 +9,13 @@ import mujoco
 import numpy as np
 import trimesh
 from lxml import etree
-from numpy.typing import NDArray
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.mesh import hull, load_mesh
 from morphgen.model.robot import Joint
+from morphgen.typing import Array
 
 MeshFile = Callable[[Mesh], str]
-Array = NDArray[np.float64]
-
 FLAT = 1e-5
 """Extent below which a collision hull counts as flat, metres; MuJoCo refuses flat hulls."""
 FLAT_THICKNESS = 1e-4

@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import TOOL, Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 class MujocoKinematics:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from morphgen.model.kinematics import forward_kinematics, link_jacobians
 from morphgen.model.robot import Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 BANDWIDTH = 30.0
 """Natural frequency of the position control that the gains give, rad/s."""

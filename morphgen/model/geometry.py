@@ -8,13 +8,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.model import rotation
 from morphgen.model.rotation import Quat, Vec3
+from morphgen.typing import Array
 
 Rgba = tuple[float, float, float, float]
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

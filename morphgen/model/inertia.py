@@ -11,7 +11,6 @@ from functools import lru_cache
 import manifold3d
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from morphgen.errors import RobotError
 from morphgen.model.geometry import (
@@ -26,8 +25,8 @@ from morphgen.model.geometry import (
 )
 from morphgen.model.mesh import hull, load_mesh
 from morphgen.model.robot import Inertial, Link
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 _SEGMENTS = 48
 
 

@@ -6,13 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from morphgen.model.kinematics import bounds, frame_jacobian, frame_pose
 from morphgen.model.robot import TOOL, Robot
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 DAMPING = 0.02
 """Damping of positions [joint units per metre]; of ``solve_pose_ik`` relative to the largest

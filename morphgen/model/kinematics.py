@@ -14,8 +14,7 @@ from morphgen.model import rotation
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Quat, Vec3
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 def bounds(robot: Robot) -> Array:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from morphgen.model.robot import TOOL, Robot
 from morphgen.model.rotation_torch import cross_matrices
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Device = torch.device | str
 
 

@@ -16,8 +16,7 @@ from morphgen.tasks.obstacles import draw_obstacles
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.region import Region, draw_blocks, yawed
 from morphgen.tasks.sim.base import Block, Scene
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 LAYOUTS = 8
 """Number of obstacle layouts that are drawn before giving up."""

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import workspace
 from morphgen.errors import TaskError
@@ -18,8 +17,7 @@ from morphgen.model.kinematics import (
 )
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.push.config import PushConfig
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 FULL_REACH = 0.4
 """Robots that reach less have everything scaled down, metres."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
@@ -20,8 +19,7 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.feasibility import CLOSE, FeasibilityTest, clear_obstacles
 from morphgen.tasks.push.region import Region, draw_blocks, push_region
 from morphgen.tasks.sim.base import Block, Scene
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 TRIES = 30
 """Poses of the block tried for each start that is needed, before giving up."""

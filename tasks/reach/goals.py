@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
@@ -22,8 +21,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.obstacles import draw_obstacles
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 EXACT = 1e-6
 """Largest deviation of a goal from the tool of its configuration, metres and of a quaternion."""

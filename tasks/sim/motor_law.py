@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
 from morphgen.model.robot import Joint, Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 LAG = 2 / BANDWIDTH + TIMESTEP * SUBSTEPS
 """Seconds by which a joint is behind a target that moves steadily, at most, in steps."""

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.tasks.sim.motor_law import GAIN, LAG, speed_limit
 from morphgen.tasks.sim.mujoco_gather import Gathered
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 
 def _mean_acceleration() -> tuple[float, float]:

@@ -17,8 +17,8 @@ from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
 from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 PASSIVE = 0.2

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor, wait
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from morphgen.checks.mujoco_warnings import caught
 from morphgen.errors import SimulationError, UnstableError
@@ -18,8 +17,8 @@ from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_state import State
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 
 

@@ -8,12 +8,10 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from morphgen.tasks.sim.mujoco_gather import Gathered
 from morphgen.tasks.sim.mujoco_model import World
-
-Array = NDArray[np.float64]
+from morphgen.typing import Array
 
 MAX_SPEED = 1e4
 """Velocity from which a simulation counts as exploded, SI units."""

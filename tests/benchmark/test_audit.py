@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import NEAR, Near, audit
 from morphgen.benchmark.similarity import MEASURES, cosine, features, tree_distance
 from morphgen.benchmark.split import member_robot
@@ -15,7 +16,6 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.model import find_grammar, load_grammar
 from morphgen.grammar.sampling import draw
-from splits import LIBRARY, TEST, TRAIN, combined, member, split
 
 
 def found(made, **options):

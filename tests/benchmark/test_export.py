@@ -12,7 +12,8 @@ import numpy as np
 import pandas
 import pytest
 
-from commands import start, tree
+from helpers.commands import start, tree
+from helpers.splits import LIBRARY, combined, member, split
 from morphgen.benchmark.built import Robots
 from morphgen.benchmark.contents import BUNDLED, Settings
 from morphgen.benchmark.export import build, load_built
@@ -24,7 +25,6 @@ from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_robot
 from morphgen.grammar.robot_set import light_urdf
-from splits import LIBRARY, combined, member, split
 
 LIGHT = Settings(light=True)
 

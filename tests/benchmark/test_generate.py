@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 import morphgen
-from grammars import grammar, shipped
+from helpers.grammars import grammar, shipped
 from morphgen.benchmark import bodies, generate
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.bodies import Composed, Drawn, Maker, make_all

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import morphgen
+from helpers.robots import arm
 from morphgen.benchmark import similarity
 from morphgen.benchmark.similarity import (
     MEASURES,
@@ -23,7 +24,6 @@ from morphgen.benchmark.tokens import padded, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Mesh, Shape
-from robots import arm
 
 REQUESTS = ("arm=lwr ee=plane", "arm=lwr ee=claw", "arm3", "chain beads=2", "cubes")
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.robots import arm
 from morphgen.benchmark.split import (
     COMPOSED,
     Member,
@@ -22,7 +23,6 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape
 from morphgen.model.robot import Frame, Link, Mimic
-from robots import arm
 
 LIBRARY = default_library()
 

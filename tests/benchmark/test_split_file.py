@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from commands import tree
+from helpers.commands import tree
 from morphgen.benchmark.split import Member, Split, split_id
 from morphgen.benchmark.split_file import (
     find_split,

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.splits import LIBRARY, combined, member, split
 from morphgen.benchmark.paper import PAPER, figures_of, robot_set
 from morphgen.benchmark.similarity import cosine, features
 from morphgen.benchmark.split import member_robot
@@ -13,7 +14,6 @@ from morphgen.benchmark.statistics import statistics
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import reach
-from splits import LIBRARY, combined, member, split
 
 
 def test_counts_are_means_over_the_robots_of_a_side():

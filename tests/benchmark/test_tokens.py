@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.robots import arm
+from helpers.tokens import arm_tokens, field_of, shapes_of
 from morphgen.benchmark.token_layout import decode_position, encode_position
 from morphgen.benchmark.tokens import (
     LAYOUT,
@@ -25,8 +27,6 @@ from morphgen.errors import BenchmarkError, RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
-from robots import arm
-from some_tokens import arm_tokens, field_of, shapes_of
 
 
 def hinge(kind="revolute", limits=(-1.0, 1.0), **changes):

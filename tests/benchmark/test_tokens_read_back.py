@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import morphgen
+from helpers.robots import arm
+from helpers.tokens import arm_tokens, field_of, shapes_of
 from morphgen.benchmark.tokens import (
     padded,
     robot_of_tokens,
@@ -23,8 +25,6 @@ from morphgen.model import rotation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
-from robots import arm
-from some_tokens import arm_tokens, field_of, shapes_of
 
 COMPOSED = (
     "arm=ur5 ee=plane",

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import morphgen
+from helpers.robots import arm
 from morphgen.benchmark.tree_distance import (
     FIXED,
     change_costs,
@@ -23,7 +24,6 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import Joint, Link, Robot
 from morphgen.model.scaling import scaled
-from robots import arm
 
 BLOCK = Shape(Box((0.1, 0.2, 0.3)))
 AXES = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, 0.6, 0.8))

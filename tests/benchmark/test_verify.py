@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.splits import LIBRARY, TRAIN, combined, member, split
 from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
 from morphgen.benchmark.split import split_id
@@ -15,7 +16,6 @@ from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.benchmark.token_layout import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
-from splits import LIBRARY, TRAIN, combined, member, split
 
 LIGHT = Settings(light=True)
 

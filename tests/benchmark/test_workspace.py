@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import morphgen
+from helpers.robots import arm
 from morphgen.benchmark.workspace import overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, frame_positions, random_configurations, reach
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.scaling import scaled
-from robots import arm
 
 LWR = "arm=lwr ee=plane"
 

@@ -5,13 +5,13 @@ from importlib.util import find_spec
 
 import pytest
 
+from helpers.robots import arm, rod
 from morphgen.checks import conformance as module
 from morphgen.checks.conformance import compare, conformance
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import write_bundle
 from morphgen.model.geometry import Capsule, Pose, Shape
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
-from robots import arm, rod
 
 LOADERS = ["yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio"]
 

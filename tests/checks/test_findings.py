@@ -5,12 +5,21 @@ from dataclasses import replace
 import mujoco
 import pytest
 
-from broken import MESHES, ROBOTS, hinge, sound, sound_mesh, with_body, with_end, with_joint
+from helpers.faulty_robots import (
+    MESHES,
+    ROBOTS,
+    hinge,
+    sound,
+    sound_mesh,
+    with_body,
+    with_end,
+    with_joint,
+)
+from helpers.robots import arm
 from morphgen.checks import check, shapes
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Inertial, Link, Mimic, Robot
 from morphgen.model.tree import renamed
-from robots import arm
 
 
 def found(robot: Robot, code: str) -> Finding:

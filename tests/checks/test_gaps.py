@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from broken import hinge, sound, with_end, with_link
+from helpers.faulty_robots import hinge, sound, with_end, with_link
 from morphgen.checks import check, gaps
 from morphgen.checks.gaps import MAX_GAP, check_links_apart
 from morphgen.grammar.library import default_library

@@ -5,14 +5,22 @@ from dataclasses import replace
 
 import pytest
 
-from broken import FLAT_INERTIA, MESHES, ROBOTS, sound, with_body, with_joint, with_link
+from helpers.faulty_robots import (
+    FLAT_INERTIA,
+    MESHES,
+    ROBOTS,
+    sound,
+    with_body,
+    with_joint,
+    with_link,
+)
+from helpers.robots import arm
 from morphgen.checks import check, fix, shapes
 from morphgen.checks.inertia import DEFAULT_DENSITY
 from morphgen.checks.names import safe_names
 from morphgen.model.inertia import inertial_of
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Robot
 from morphgen.model.tree import renamed
-from robots import arm
 
 
 def keys(robot: Robot) -> set[tuple[str, str]]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.robots import arm
 from morphgen.checks.self_collision import (
     PENETRATION,
     SelfCollision,
@@ -19,7 +20,6 @@ from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
-from robots import arm
 
 BALL = (Shape(Sphere(0.05)),)
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from commands import tree
+from helpers.commands import tree
 from morphgen.cli import main
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import ENVIRONMENT

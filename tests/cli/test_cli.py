@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from broken import sound, with_joint
-from commands import start, tree
+from helpers.commands import start, tree
+from helpers.faulty_robots import sound, with_joint
+from helpers.parts import PINCER, write_part
+from helpers.robots import arm
 from morphgen import cli
 from morphgen.cli import main
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.library import ENVIRONMENT
-from parts import PINCER, write_part
-from robots import arm
 
 COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
 

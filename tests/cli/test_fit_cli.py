@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from commands import tree
+from helpers.commands import tree
+from helpers.parts import write_part
+from helpers.robots import arm
 from morphgen.fitting import parts as fitting_parts
 from morphgen.formats import bundle
 from morphgen.formats.bundle import read_bundle, write_bundle
@@ -18,8 +20,6 @@ from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import Link
-from parts import write_part
-from robots import arm
 
 FIGURES = {
     "iou",

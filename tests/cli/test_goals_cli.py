@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from commands import start
+from helpers.commands import start
+from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
 from morphgen.benchmark.split_file import split_text
 from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.registry import TASKS
-from splits import LIBRARY, TEST, TRAIN, member, split
 
 
 @pytest.fixture(autouse=True)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from commands import start, tree
-from grammars import CATEGORIES
+from helpers.commands import start, tree
+from helpers.grammars import CATEGORIES
+from helpers.parts import PINCER, write_part
 from morphgen.formats.bundle import read_bundle
 from morphgen.grammar.library import ENVIRONMENT
-from parts import PINCER, write_part
 
 GRAMMAR = """\
 # a plate or a cube on a gantry

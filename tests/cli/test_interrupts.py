@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from commands import heed_ctrl_c
+from helpers.commands import heed_ctrl_c
+from helpers.runs import small_split
 from morphgen.benchmark.split_file import split_text
-from small_runs import small_split
 
 COMMANDS = {
     "sample": ["sample", "chain", "-n", 40, "--jobs", 2, "--light", "--out", "out"],

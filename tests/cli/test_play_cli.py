@@ -5,7 +5,7 @@ import re
 import imageio.v2 as imageio
 import pytest
 
-from commands import tree
+from helpers.commands import tree
 
 LINE = re.compile(
     r"episode (\d+): (success|failure), (\d+\.\d{3}) m from the (goal|line), "

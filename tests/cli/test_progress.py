@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from helpers.runs import small_config
 from morphgen.cli import progress
 from morphgen.cli.progress import Shower
 from morphgen.rl.report import Report
-from small_runs import small_config
 
 FLOATS = [each.name for each in fields(Report) if each.type == "float"]
 REPORT = Report(

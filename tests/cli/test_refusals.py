@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from commands import start, tree
+from helpers.commands import start, tree
+from helpers.parts import write_part
+from helpers.robots import arm
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar import library
-from parts import write_part
-from robots import arm
 
 LINK = '<link name="a">{}</link>'
 SHAPE = '<visual><geometry><mesh filename="{}"/></geometry></visual>'

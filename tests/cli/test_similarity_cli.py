@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import morphgen
-from commands import tree
+from helpers.commands import tree
+from helpers.robots import arm
 from morphgen.benchmark.similarity import MEASURES, features, matrix
 from morphgen.cli import similarity as command
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
-from robots import arm
 
 ARGUMENTS = ("robots", "--measure", "all")
 

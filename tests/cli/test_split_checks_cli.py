@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from commands import tree
+from helpers.commands import tree
+from helpers.splits import TEST, TRAIN, combined, member, split
 from morphgen.benchmark.built import load_built
 from morphgen.benchmark.paper import PAPER
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
 from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.split_goals import read_goals
-from splits import TEST, TRAIN, combined, member, split
 
 
 @pytest.fixture

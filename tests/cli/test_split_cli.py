@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from commands import tree
+from helpers.commands import tree
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import ENVIRONMENT

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import morphgen
-from commands import tree
+from helpers.commands import tree
+from helpers.robots import arm
 from morphgen.benchmark.tokens import LAYOUT, robot_of_tokens, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
-from robots import arm
 
 WORDS = ("base=gantry", "ee=plane")
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from commands import start, tree
+from helpers.commands import start, tree
+from helpers.runs import equal, small_split, weights
 from morphgen.benchmark.split_file import write_split
 from morphgen.rl.recorders import METRICS, read_metrics
 from morphgen.rl.robot_source import specs_of
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.split_goals import read_goals
-from small_runs import equal, small_split, weights
 
 NETWORK = ("--set", "mlp_width=8")
 ROLLOUT = ("--set", "num_steps=8", "--set", "minibatches=2", "--set", "epochs=1")

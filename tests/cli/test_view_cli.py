@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from commands import start
+from helpers.commands import start
+from helpers.robots import arm
+from helpers.viser_client import PlainClient
 from morphgen.formats.bundle import write_bundle
-from plain_client import PlainClient
-from robots import arm
 
 
 def address(process):

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
@@ -16,8 +15,8 @@ from morphgen.fitting.solid import solid_of
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Shape, Sphere, dimensions, volume
+from morphgen.typing import Array
 
-Array = NDArray[np.float64]
 GEOMETRY: dict[Kind, type] = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
 CUBE = np.array(list(itertools.product((0.0, 0.1), repeat=3)))
 ROUNDING = 1.001

@@ -8,12 +8,12 @@ import pytest
 import trimesh
 from PIL import Image
 
+from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats import bundle
 from morphgen.formats.bundle import file_findings, read_bundle, write_bundle
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.robot import Link, Robot
-from robots import arm
 
 
 def files(folder):

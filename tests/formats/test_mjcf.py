@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.robots import arm, rod
 from morphgen.errors import FormatError
 from morphgen.formats.mjcf import mjcf_text, to_spec
 from morphgen.formats.mjcf_elements import FLAT_THICKNESS
@@ -20,7 +21,6 @@ from morphgen.model.kinematics import (
     random_configurations,
 )
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
-from robots import arm, rod
 
 
 def no_file(mesh):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import morphgen
+from helpers.robots import arm
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.rounding import as_written, rounded_pose
 from morphgen.formats.urdf_text import number
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Robot
 from morphgen.model.rotation import to_matrix
-from robots import arm
 
 RNG = np.random.default_rng(0)
 NEAR_GIMBAL = [

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_robot
 from morphgen.formats.urdf import UnsoundError, read_urdf, with_frames
@@ -12,7 +13,6 @@ from morphgen.formats.urdf_text import number, urdf_text
 from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.kinematics import frame_pose, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
-from robots import arm
 
 
 def no_mesh(mesh):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
+from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults, variables
 from morphgen.grammar.choosers import Random

@@ -2,7 +2,7 @@
 
 import pytest
 
-from grammars import CATEGORIES, LIBRARY, benchmark_counts, shipped, unphysical
+from helpers.grammars import CATEGORIES, LIBRARY, benchmark_counts, shipped, unphysical
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.formats.bundle import read_bundle, write_bundle

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.parts import write_part
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.checks.self_collision import self_collisions
@@ -19,7 +20,6 @@ from morphgen.grammar.request import default_name, parse_request
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, frame_pose, random_configurations
 from morphgen.model.robot import Inertial
-from parts import write_part
 
 LIBRARY = default_library()
 PAPER_ARMS = ("ur5", "panda", "kinova_gen3", "jaco2", "xarm7", "lwr", "yumi_right", "widowx")

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grammars import LIBRARY
+from helpers.grammars import LIBRARY
+from helpers.robots import arm
 from morphgen.errors import GrammarError
 from morphgen.grammar.compose import join
 from morphgen.grammar.conditions import (
@@ -17,7 +18,6 @@ from morphgen.grammar.conditions import (
 )
 from morphgen.grammar.request import parse_request
 from morphgen.grammar.syntax import parse_condition
-from robots import arm
 
 
 def true_of(text, robot):

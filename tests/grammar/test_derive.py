@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
+from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.choosers import First, Random, Recorded
 from morphgen.grammar.derive import EndlessError, derive

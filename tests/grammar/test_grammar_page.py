@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from grammars import LIBRARY, shipped, unphysical
+from helpers.grammars import LIBRARY, shipped, unphysical
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults
 from morphgen.grammar.choosers import Random

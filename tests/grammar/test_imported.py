@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from broken import with_joint
+from helpers.faulty_robots import with_joint
+from helpers.parts import PINCER
+from helpers.robots import arm
 from morphgen.checks import check
 from morphgen.checks.self_collision import self_collisions
 from morphgen.errors import FormatError
@@ -14,8 +16,6 @@ from morphgen.grammar.imported import import_robot
 from morphgen.model.geometry import IDENTITY, Box
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.tree import renamed
-from parts import PINCER
-from robots import arm
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from helpers.parts import write_part
 from morphgen.checks import check
 from morphgen.errors import PartError
 from morphgen.grammar.catalogue import catalogue
@@ -15,7 +16,6 @@ from morphgen.grammar.manifest import KINDS
 from morphgen.grammar.part import load_part
 from morphgen.grammar.request import default_name, parse_request
 from morphgen.model.kinematics import forward_kinematics
-from parts import write_part
 
 LIBRARY = default_library()
 REQUESTS = {"base": "base={} arm=ur5", "arm": "arm={}", "ee": "arm=ur5 ee={}"}

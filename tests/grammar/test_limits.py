@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from grammars import LIBRARY, grammar
+from helpers.grammars import LIBRARY, grammar
 from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import faults
 from morphgen.grammar.choosers import First, Random

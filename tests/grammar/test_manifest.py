@@ -2,9 +2,9 @@
 
 import pytest
 
+from helpers.parts import MANIFEST, write_part
 from morphgen.errors import PartError
 from morphgen.grammar.manifest import PackageSource, Placement, read_manifest
-from parts import MANIFEST, write_part
 
 REAL = {
     "file": None,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
+from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.grammar.choosers import First
 from morphgen.grammar.derive import derive

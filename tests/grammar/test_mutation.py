@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from grammars import CATEGORIES, LIBRARY, grammar, shipped
+from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.formats.card import rounded
 from morphgen.grammar import mutation

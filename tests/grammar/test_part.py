@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from helpers.parts import PINCER, write_part
 from morphgen.errors import PartError
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.xacro import Expansion
@@ -13,7 +14,6 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, scaled_shape
-from parts import PINCER, write_part
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from grammars import LIBRARY, grammar, shipped
+from helpers.grammars import LIBRARY, grammar, shipped
 from morphgen.errors import MorphgenError
 from morphgen.grammar.choosers import First
 from morphgen.grammar.derive import derive

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from commands import tree
-from grammars import shipped
+from helpers.commands import tree
+from helpers.grammars import shipped
 from morphgen.errors import MorphgenError
 from morphgen.grammar.model import grammar_text
 from morphgen.grammar.ray_workers import make_on_ray

@@ -11,8 +11,8 @@ from pathlib import Path
 import pandas
 import pytest
 
-from commands import start, tree
-from grammars import shipped
+from helpers.commands import start, tree
+from helpers.grammars import shipped
 from morphgen.errors import FormatError
 from morphgen.grammar.model import grammar_text
 from morphgen.grammar.robot_set import (

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from grammars import LIBRARY, grammar, shipped, unphysical
+from helpers.grammars import LIBRARY, grammar, shipped, unphysical
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.urdf_text import urdf_text

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers.robots import arm
 from morphgen.api import compose
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import (
@@ -17,7 +18,6 @@ from morphgen.model.dynamics import (
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
-from robots import arm
 
 
 def random_robot(rng):

@@ -7,14 +7,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from kinematic_backends import BACKENDS, backend
+from helpers.kinematic_backends import BACKENDS, backend
+from helpers.robots import arm
+from helpers.scenes import robot
 from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.inverse_kinematics_torch import solve_position_ik, step_to_pose
 from morphgen.model.kinematics import bounds, frame_pose, moved_by, random_configurations
 from morphgen.model.kinematics_torch import frame_pose as frame_poses
 from morphgen.model.rotation_torch import quaternion_matrices, quaternions, rotation_vectors
-from robots import arm
-from scenes import robot
 
 UR5, PANDA, GANTRY, CHAIN, CLAW = ROBOTS = [
     robot(words)

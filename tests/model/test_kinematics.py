@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from helpers.robots import arm
 from morphgen.api import compose
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
@@ -19,7 +20,6 @@ from morphgen.model.kinematics import (
     whole_turns,
 )
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
-from robots import arm
 
 
 def planar(lengths=(0.5, 0.3)):

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import morphgen
-from kinematic_backends import BACKENDS, TorchBackend, backend
+from helpers.kinematic_backends import BACKENDS, TorchBackend, backend
+from helpers.robots import arm
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.geometry import Pose
@@ -20,7 +21,6 @@ from morphgen.model.kinematics_torch import (
     tool_chain,
 )
 from morphgen.model.robot import Frame, Link, Mimic, Robot
-from robots import arm
 
 WORDS = (
     "arm=ur5 ee=plane",

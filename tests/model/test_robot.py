@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from helpers.robots import arm
 from morphgen.errors import RobotError
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.tree import renamed, subtree
-from robots import arm
 
 
 def test_two_links_of_one_name():

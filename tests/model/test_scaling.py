@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.robots import arm
 from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import inertial_of
 from morphgen.model.kinematics import forward_kinematics, frame_pose
 from morphgen.model.robot import Link
 from morphgen.model.scaling import scaled
-from robots import arm
 
 STRAIGHT = np.zeros(4)
 

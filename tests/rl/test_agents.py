@@ -7,6 +7,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from helpers.runs import QUIET, small_config
 from morphgen.errors import TaskError
 from morphgen.rl.agent_spec import parse_agent, parse_agents, parse_constants
 from morphgen.rl.agents import AGENTS, Agent, NetworkConfig, encoder
@@ -14,7 +15,6 @@ from morphgen.rl.config import PolicyConfig
 from morphgen.rl.inference import load_policy
 from morphgen.rl.runs import read_checkpoint
 from morphgen.rl.training import train
-from small_runs import QUIET, small_config
 
 
 @dataclass(frozen=True)

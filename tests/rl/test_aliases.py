@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
+from helpers.runs import EVAL, QUIET, equal, small_config, weights
 from morphgen.errors import TaskError
 from morphgen.rl.agent_spec import parse_constants
 from morphgen.rl.agents import AGENTS
@@ -14,7 +15,6 @@ from morphgen.rl.config import PPOConfig, policy_from
 from morphgen.rl.runs import CHECKPOINT, CONFIG, read_checkpoint, read_config
 from morphgen.rl.study import SCORES, agent_cell, read_scores
 from morphgen.rl.training import train
-from small_runs import EVAL, QUIET, equal, small_config, weights
 
 OTHER_SIZES = {
     "se": ("features", "layers", "heads", "feedforward", "decoder", "logit_scale"),

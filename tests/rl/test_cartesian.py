@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from helpers.scenes import robot
 from morphgen.rl.cartesian import OneTool
 from morphgen.tasks.bodies import bodies_of
-from scenes import robot
 
 
 def test_a_tool_that_is_the_wrong_way_round_turns():

@@ -4,10 +4,10 @@ import copy
 
 import pytest
 
-from learners import equal, learner, stored, untimed, weights
+from helpers.learners import equal, learner, stored, untimed, weights
+from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.learner_state import load_networks, resume, state_of
-from on_a_line import OnALine
 
 
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])

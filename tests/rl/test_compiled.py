@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch._dynamo.exc import TorchDynamoException
 
-from learners import learner
+from helpers.learners import learner
+from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
-from on_a_line import OnALine
 
 CPU = torch.device("cpu")
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.runs import EVAL, QUIET, small_config, small_source
+from helpers.splits import member, split
 from morphgen.errors import TaskError
 from morphgen.rl import evaluation
 from morphgen.rl.eval_report import score_table, summary, write_scores
@@ -25,8 +27,6 @@ from morphgen.rl.training import checkpoints, parts_of, train
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
-from small_runs import EVAL, QUIET, small_config, small_source
-from splits import member, split
 
 pytestmark = pytest.mark.slow
 

@@ -5,11 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from helpers.scenes import ball
 from morphgen.model.geometry import Pose
 from morphgen.rl.free_ways import STRIDE, FreeWays, Price
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
-from scenes import ball
 
 NO_HURRY = np.array([np.inf, np.inf])
 UR5, PANDA = "arm=ur5 ee=plane", "arm=panda ee=panda_hand"

@@ -10,12 +10,12 @@ import zipfile
 import pytest
 import torch
 
+from helpers.runs import QUIET, equal, small_config, weights
 from morphgen.cli import main
 from morphgen.errors import TaskError
 from morphgen.rl import checkpoint_file
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, write_checkpoint
 from morphgen.rl.training import train
-from small_runs import QUIET, equal, small_config, weights
 
 ENTER = "network.enter.weight"
 

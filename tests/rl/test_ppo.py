@@ -8,7 +8,8 @@ from statistics import median
 import pytest
 import torch
 
-from learners import SMALL, equal, learner, weights
+from helpers.learners import SMALL, equal, learner, weights
+from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import (
@@ -23,7 +24,6 @@ from morphgen.rl.ppo import (
 from morphgen.rl.report import explained_variance
 from morphgen.rl.rollout_buffer import RolloutBuffer
 from morphgen.rl.symlog import symlog
-from on_a_line import OnALine
 
 
 def test_policy_loss_by_hand():

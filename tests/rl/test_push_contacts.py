@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from helpers.scenes import ball
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import Link
 from morphgen.rl.push_contacts import leaning, poised
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
-from scenes import ball
 
 
 def test_contacts_are_where_the_block_would_be_touched():

@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from goal_draws import draw_spec
+from helpers.goal_sets import draw_spec
+from helpers.scenes import robot
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
 from morphgen.rl import push_plans
@@ -18,7 +19,6 @@ from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from scenes import robot
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.scenes import robot
 from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.kinematics import bounds
 from morphgen.model.robot import Frame, Joint, Link, Robot
@@ -21,7 +22,6 @@ from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
-from scenes import robot
 
 REACH, PUSH = ReachConfig(goals=10), PushConfig(starts=4)
 CLAW, CHAIN = "arm=arm3 ee=claw", "nlink"

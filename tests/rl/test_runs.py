@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from commands import tree
-from learners import learner
+from helpers.commands import tree
+from helpers.learners import learner
+from helpers.runs import small_config, small_source
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.rl.learner_state import state_of
 from morphgen.rl.recorders import (
@@ -35,7 +36,6 @@ from morphgen.rl.runs import (
 )
 from morphgen.rl.training import ROBOTS
 from morphgen.tasks.env_specs import GoalConfig
-from small_runs import small_config, small_source
 
 
 def report(update, success=0.5):

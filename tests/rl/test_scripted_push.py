@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.scenes import robot
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.push_plans import PushPlanner
 from morphgen.rl.scripted_push import PLANS, RISE, ScriptedPush
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from scenes import robot
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)

@@ -11,7 +11,8 @@ import pytest
 from filelock import FileLock
 from PIL import Image
 
-from commands import tree
+from helpers.commands import tree
+from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
 from morphgen.errors import TaskError
 from morphgen.formats.files import LOCK
 from morphgen.rl import study
@@ -32,7 +33,6 @@ from morphgen.rl.study import (
 )
 from morphgen.rl.study_report import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
 from morphgen.rl.training import parts_of
-from small_runs import EVAL, QUIET, equal, small_config, small_source, weights
 
 pytestmark = pytest.mark.slow
 

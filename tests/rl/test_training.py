@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 import morphgen
-from commands import tree
+from helpers.commands import tree
+from helpers.line_batch import OnALine
+from helpers.runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
+from helpers.splits import member, split
 from morphgen.errors import BenchmarkError, FormatError, TaskError
 from morphgen.formats.files import alone
 from morphgen.rl import training
@@ -27,9 +30,6 @@ from morphgen.rl.training import (
     train,
     updates_between,
 )
-from on_a_line import OnALine
-from small_runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
-from splits import member, split
 
 TIMED = ("collect_seconds", "learn_seconds", "steps_per_second")
 
@@ -294,7 +294,7 @@ def test_nothing_on_the_way_needs_pybullet(tmp_path):
         "from pathlib import Path\n"
         "from morphgen.rl.evaluation import evaluate_run\n"
         "from morphgen.rl.training import train\n"
-        "from small_runs import EVAL, QUIET, small_config\n"
+        "from helpers.runs import EVAL, QUIET, small_config\n"
         "folder = Path(sys.argv[1])\n"
         "train(folder, small_config(total_timesteps=32), execution=QUIET)\n"
         "(score,) = evaluate_run(folder, 'train', EVAL, 'deterministic')\n"

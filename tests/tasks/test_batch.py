@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import morphgen
-from goal_draws import draw_spec
+from helpers.goal_sets import draw_spec
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions

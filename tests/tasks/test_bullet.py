@@ -7,11 +7,11 @@ import pybullet
 import pytest
 import torch
 
-from bullets import PUSHING, client_of, reset, starts, state, touching, wander
+from helpers.pybullet_states import PUSHING, client_of, reset, starts, state, touching, wander
+from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 from morphgen.errors import SimulationError, UnstableError
 from morphgen.tasks.sim import bullet_files
 from morphgen.tasks.sim.bullet import BulletSimulation
-from scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 
 
 def test_tensors_are_padded_and_stay_the_same(simulate):

@@ -7,13 +7,13 @@ import pybullet
 import pytest
 import torch
 
-from bullets import client_of, reset, touching
+from helpers.pybullet_states import client_of, reset, touching
+from helpers.robots import arm
+from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, Block, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import FRICTION
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
-from robots import arm
-from scenes import push_scene, robot
 
 
 def block_scene(friction=1.0, height=0.5, mass=0.1):

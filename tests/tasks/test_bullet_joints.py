@@ -7,15 +7,15 @@ import pybullet
 import pytest
 import torch
 
-from bullets import client_of, reset
+from helpers.pybullet_states import client_of, reset
+from helpers.robots import arm
+from helpers.scenes import push_scene, reach_scene, real_arm_scene, robot
 from morphgen.model.dynamics import BANDWIDTH, mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, forward_kinematics, frame_pose, movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import OVERSPEED
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
-from robots import arm
-from scenes import push_scene, reach_scene, real_arm_scene, robot
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])

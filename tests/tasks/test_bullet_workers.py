@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from bullets import state
-from commands import heed_ctrl_c
+from helpers.commands import heed_ctrl_c
+from helpers.pybullet_states import state
+from helpers.scenes import mixed_scenes, push_scene
 from morphgen.errors import SimulationError, UnstableError
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.sim.bullet import BulletSimulation, divide
-from scenes import mixed_scenes, push_scene
 
 TESTS = Path(__file__).parents[1]
 
@@ -210,7 +210,7 @@ import sys
 
 def main():
     sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tasks"]
-    from scenes import push_scene
+    from helpers.scenes import push_scene
     from test_bullet_workers import pids, starts
     from morphgen.tasks.sim.bullet import BulletSimulation
 

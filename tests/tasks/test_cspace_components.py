@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from goal_draws import draw_goals
+from helpers.goal_sets import draw_goals
+from helpers.scenes import ball, robot
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
@@ -17,7 +18,6 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
-from scenes import ball, robot
 
 ACROSS = ((0.5, 0.0), (0.12, 6.0))
 GAP = (((0.5, -1.2), (0.1, 2.0)), ((0.5, 1.2), (0.1, 2.0)))

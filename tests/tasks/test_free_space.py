@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers.scenes import push_scene, reach_scene, real_arm_scene
 from morphgen.checks.self_collision import PENETRATION
 from morphgen.errors import BenchmarkError
 from morphgen.formats.mjcf import to_spec
@@ -16,7 +17,6 @@ from morphgen.tasks import free_space as module
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.sim.level_links import level_links
-from scenes import push_scene, reach_scene, real_arm_scene
 
 DEEP, SHALLOW = 2 * PENETRATION, PENETRATION / 2
 HALF_TURN = Pose.from_xyz_rpy((0.0, 0.0, 1.0), (np.pi, 0.0, 0.0))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.split_file import read_split
 from morphgen.tasks.env_specs import GoalConfig
@@ -14,7 +15,6 @@ from morphgen.tasks.goal_leaks import NEAR
 from morphgen.tasks.goal_making import gathered, split_goals
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from splits import LIBRARY, TEST, TRAIN, member, split
 
 RECIPE = GoalConfig(0, (ReachConfig(goals=12), PushConfig(starts=4)))
 REACH = "train", "gantry-plane"

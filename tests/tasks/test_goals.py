@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from goal_draws import draw_goals
+from helpers.goal_sets import draw_goals
+from helpers.robots import arm
+from helpers.scenes import robot
 from morphgen.benchmark.workspace import shoulder, workspace
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import BenchmarkError, TaskError
@@ -23,8 +25,6 @@ from morphgen.tasks.reach import goals as module
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
-from robots import arm
-from scenes import robot
 
 CONFIG = ReachConfig(goals=12)
 LIFTED = -0.4

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.scenes import robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, forward_kinematics
 from morphgen.tasks.sim.base import Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from scenes import robot
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 from morphgen.tasks.sim.bullet import BulletSimulation

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.robots import arm, finger
+from helpers.scenes import robot
 from morphgen.model.dynamics import BANDWIDTH, actuation, mass_matrix
 from morphgen.tasks.sim.motor_law import (
     FASTEST_SLIDE,
@@ -15,8 +17,6 @@ from morphgen.tasks.sim.motor_law import (
     MotorForces,
     speed_limit,
 )
-from robots import arm, finger
-from scenes import robot
 
 PLENTY = 1e9
 

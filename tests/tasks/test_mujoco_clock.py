@@ -6,9 +6,9 @@ import mujoco
 import pytest
 import torch
 
+from helpers.scenes import reach_scene
 from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from scenes import reach_scene
 
 STEP = mujoco.mjtTimer.mjTIMER_STEP
 

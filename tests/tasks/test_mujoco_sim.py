@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.robots import arm
+from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.checks.self_collision import attached_pairs
 from morphgen.errors import SimulationError, UnstableError
 from morphgen.model.dynamics import BANDWIDTH
@@ -18,8 +20,6 @@ from morphgen.tasks.sim import mujoco_model
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
-from robots import arm
-from scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 
 NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
 OUTPUTS = ("q", "qd", "block_pose", "block_velocity")

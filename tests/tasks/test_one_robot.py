@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import morphgen
+from helpers.splits import member, split
 from morphgen.benchmark.split import robot_hash
 from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.robots import robot_of
-from splits import member, split
 
 WORDS = "arm=ur5 ee=stick"
 CONFIG = ReachConfig(goals=8)

@@ -5,7 +5,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from goal_draws import draw_goals
+from helpers.goal_sets import draw_goals
+from helpers.scenes import robot
 from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
@@ -18,7 +19,6 @@ from morphgen.tasks.push.feasibility import CLOSE
 from morphgen.tasks.push.region import effective_reach, push_region
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import Block, Scene
-from scenes import robot
 
 CONFIG = PushConfig(starts=5)
 ARMS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm=arm3 ee=claw")

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.robots import finger
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.sim.base import GRAVITY, Block, Scene
 from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from robots import finger
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 from morphgen.tasks.sim.bullet import BulletSimulation

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import morphgen
-from goal_draws import draw_spec
+from helpers.goal_sets import draw_spec
 from morphgen.model.dynamics import actuation
 from morphgen.rl.baselines.simple import Random
 from morphgen.tasks.free_space import FreeSpace

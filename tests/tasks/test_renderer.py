@@ -7,7 +7,8 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from goal_draws import draw_spec
+from helpers.goal_sets import draw_spec
+from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
 from morphgen.tasks import renderer
@@ -17,7 +18,6 @@ from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.renderer import Moment, Renderer, moment, require_film, write_film
 from morphgen.tasks.robots import robot_of
 from morphgen.tasks.sim.base import Block, Scene
-from robots import arm
 
 SIZE = (160, 120)
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.robots import arm
+from helpers.scenes import robot
 from morphgen.checks.self_collision import ignored_pairs
 from morphgen.model.dynamics import mass_matrix
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.robots import robot_of
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
-from robots import arm
-from scenes import robot
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain"])

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 import morphgen
+from helpers.robots import arm
 from morphgen.benchmark.split import robot_hash
 from morphgen.errors import CompositionError, FormatError, PartError
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.geometry import Mesh
 from morphgen.tasks.robots import robot_of
-from robots import arm
 
 
 @pytest.mark.parametrize(

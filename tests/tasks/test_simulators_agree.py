@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import bounds, frame_pose
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
 from morphgen.tasks.sim.base import Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from scenes import push_scene, robot
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 from morphgen.tasks.sim.bullet import BulletSimulation

@@ -11,7 +11,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from commands import tree
+from helpers.commands import tree
+from helpers.scenes import robot
+from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.built import load_built
 from morphgen.benchmark.contents import Settings
 from morphgen.benchmark.export import build
@@ -28,8 +30,6 @@ from morphgen.tasks.reach import goals as reach_goals
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.split_goals import read_goals, read_split_goals, write_goals
-from scenes import robot
-from splits import LIBRARY, TEST, TRAIN, member, split
 
 RECIPE = GoalConfig(0, (ReachConfig(goals=12), PushConfig(starts=4)))
 

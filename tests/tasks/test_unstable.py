@@ -6,7 +6,7 @@ import mujoco
 import pytest
 import torch
 
-from goal_draws import draw_spec
+from helpers.goal_sets import draw_spec
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.make import batch_of
@@ -18,7 +18,7 @@ from morphgen.tasks.robots import robot_of
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
-from bullets import client_of
+from helpers.pybullet_states import client_of
 
 REACH, PUSH = ReachConfig(goals=5), PushConfig(starts=5)
 CHANNELS = ObservationConfig(velocity=True, previous_action=True, tool=True)

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from helpers.robots import arm
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
 from morphgen.viewer.app import serve
-from robots import arm
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 import morphgen.viewer
+from helpers.robots import arm
+from helpers.viser_client import PlainClient
 from morphgen.cli import build_parser
 from morphgen.formats.bundle import write_bundle
-from plain_client import PlainClient
-from robots import arm
 
 PROSE = ("itself",)
 """Words that stand after the name of the package where no command is meant."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from helpers.robots import arm
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
@@ -21,7 +22,6 @@ from morphgen.viewer.compare_page import (
 from morphgen.viewer.drawings import heatmap_svg, map_svg
 from morphgen.viewer.joint_roles import all_roles, roles, scaled, with_roles
 from morphgen.viewer.token_figure import differences, tokens_png
-from robots import arm
 
 LIBRARY = default_library()
 

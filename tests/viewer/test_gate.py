@@ -7,10 +7,10 @@ import pytest
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 
+from helpers.viser_client import PlainClient
 from morphgen.errors import MorphgenError
 from morphgen.viewer.gate import Gate, gate_of, refusal
 from morphgen.viewer.server import start_server
-from plain_client import PlainClient
 
 HUB = "https://hub.example.com"
 

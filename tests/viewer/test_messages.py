@@ -3,8 +3,8 @@
 import msgspec
 import pytest
 
+from helpers.viser_client import CAMERA, PlainClient
 from morphgen.viewer.messages import message_fault
-from plain_client import CAMERA, PlainClient
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from helpers.robots import arm
+from helpers.viser_client import PlainClient
 from morphgen.formats.bundle import write_bundle
 from morphgen.rl.robot_source import RobotSource
 from morphgen.viewer import rollout
-from plain_client import PlainClient
-from robots import arm
 
 WORD = "tellnobody"
 DEEP = "a=b[c:" * 1000 + "a=b" + "]" * 1000

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.robots import arm
 from morphgen.benchmark.split import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
@@ -25,7 +26,6 @@ from morphgen.viewer.places import (
     split_at,
 )
 from morphgen.viewer.targets import target_address
-from robots import arm
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import time
 import pytest
 import zstandard
 
+from helpers.runs import QUIET, small_config, small_source
 from morphgen.rl.training import train
 from morphgen.viewer.episode import read_episode, score_until
-from small_runs import QUIET, small_config, small_source
 
 pytestmark = pytest.mark.slow
 

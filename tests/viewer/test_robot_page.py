@@ -11,6 +11,7 @@ import zipfile
 import pytest
 from PIL import Image
 
+from helpers.robots import arm
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollision
 from morphgen.formats.bundle import read_bundle, write_bundle
@@ -18,7 +19,6 @@ from morphgen.model.kinematics import frame_pose
 from morphgen.viewer.places import read_place
 from morphgen.viewer.robot_state import joints_text
 from morphgen.viewer.robot_view import RED
-from robots import arm
 
 ARM = "?robot=robots/some-arm"
 

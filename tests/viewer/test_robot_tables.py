@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.robots import arm
 from morphgen.model.robot import Inertial
 from morphgen.viewer.robot_page import free_configuration
 from morphgen.viewer.robot_state import joints_text, parse_joints
@@ -18,7 +19,6 @@ from morphgen.viewer.robot_tables import (
     summary,
 )
 from morphgen.viewer.robot_view import inertia_semi_axes, robot_bounds
-from robots import arm
 
 
 def test_joints_are_grouped_by_their_part():

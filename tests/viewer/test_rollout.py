@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import zstandard
 
+from helpers.robots import arm
+from helpers.runs import QUIET, small_config
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
@@ -24,8 +26,6 @@ from morphgen.viewer.play_files import recording, renderer_of
 from morphgen.viewer.play_scene import GAP, area, places_in_grid
 from morphgen.viewer.rollout import Recorded, Rollout, Wanted, simulators
 from morphgen.viewer.targets import target_address
-from robots import arm
-from small_runs import QUIET, small_config
 
 CUBE = "words:base=planar ee=cube"
 

@@ -11,6 +11,8 @@ from dataclasses import replace
 import pytest
 import trimesh
 
+from helpers.robots import arm
+from helpers.viser_client import PlainClient
 from morphgen.benchmark.split import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
@@ -19,8 +21,6 @@ from morphgen.viewer import archives, uploads
 from morphgen.viewer.downloads import bundle_files, zipped
 from morphgen.viewer.places import PlaceError, Places, read_place
 from morphgen.viewer.uploads import UploadError, keep
-from plain_client import PlainClient
-from robots import arm
 
 URDF = b'<robot name="r"><link name="a"/></robot>'
 MESHED = (

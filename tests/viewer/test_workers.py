@@ -5,8 +5,8 @@ import time
 
 import pytest
 
+from helpers.worker_functions import die_later, power
 from morphgen.viewer.workers import WorkerDied, Workers
-from work import die_later, power
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ from dataclasses import asdict, replace
 
 import torch
 
+from helpers.line_batch import OnALine
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
-from on_a_line import OnALine
 
 SMALL = PPOConfig(total_timesteps=4 * 8 * 8, num_steps=8, epochs=2, minibatches=4, desired_kl=0)
 """Four updates of eight environments."""

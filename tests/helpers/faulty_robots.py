@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from helpers.robots import arm
 from morphgen.model.geometry import Box, Capsule, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import inertial_of, with_inertia
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 from morphgen.model.tree import renamed
-from robots import arm
 
 FLAT_INERTIA = (1e-3, 0.0, 0.0, 1e-3, 0.0, 2.5e-3)
 

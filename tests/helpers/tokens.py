@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
+from helpers.robots import arm
 from morphgen.benchmark.tokens import LAYOUT, tokens
-from robots import arm
 
 FIELDS = {field.name: field.columns for field in LAYOUT}
 

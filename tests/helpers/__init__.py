@@ -1,0 +1,1 @@
+"""What tests share: robots, scenes, runs and clients, built in code."""
