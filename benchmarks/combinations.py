@@ -1,10 +1,10 @@
-"""Every arm of the paper with every end-effector: composed, checked, loaded everywhere.
+"""Compose, check and load every arm of the paper with every end-effector.
 
     python benchmarks/combinations.py [--arms ur5,panda] [--ees plane] [--samples 100] [--out DIR]
 
-Prints a row a combination: findings, self-collision pairs ignored, the largest disagreement of
-each loader in tool position. Exit code 1 if a loader disagrees or a check finds an error; a warning
-is named, and stands on the robot's card.
+Prints one row per combination: the findings, the number of ignored self-collision pairs, and for
+each loader the largest error of the tool position. The exit code is 1 if a loader disagrees or a
+check finds an error. Warnings are listed and written on the robot's card.
 """
 
 from __future__ import annotations

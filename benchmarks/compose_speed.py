@@ -1,11 +1,12 @@
-"""How long composing takes, beside robosuite in the same run.
+"""Time of composing a robot, compared with robosuite in the same run.
 
     python benchmarks/compose_speed.py [--repeats 200]
 
-In memory: an arm with an end-effector to URDF text, parts loaded once, with primitive shapes and
-with meshes; robosuite's `add_gripper` and `get_xml` on models loaded once, too. Whole process: a
-cold `morphgen compose`, with bundle and picture, and `morphgen --help`. Medians of the repeats.
-robosuite comes with `pip install morphgen[bench]`; its row is left out, and told, without it.
+In memory: compose an arm with an end-effector and write URDF text, with the parts loaded before,
+once with primitive shapes and once with meshes; robosuite's `add_gripper` and `get_xml`, with the
+models loaded before. Whole process: a cold `morphgen compose`, which writes a bundle and a picture,
+and `morphgen --help`. Prints medians. robosuite comes with `pip install morphgen[bench]`; without
+it the script prints that its row is missing.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def _process(arguments: list[str]) -> float:
 
 
 def _median(once: Callable[[], object], repeats: int) -> float:
-    """Median time of a call after one to warm up, ms."""
+    """Return the median time of a call [ms], after one call that is not counted."""
     once()
     times = []
     for _ in range(repeats):

@@ -1,12 +1,11 @@
-"""Random actions for minutes: nothing that is not finite, no leak, no process left behind.
+"""Soak test: random actions for minutes, watching for NaN, memory leaks and orphan processes.
 
     python benchmarks/soak.py [SPLIT] [--minutes 10] [--envs 40] [--sim pybullet] [--workers 2]
 
-Steps the robots that a split trains on, among obstacles, whatever the split says of them. Every
-observation and reward is tested. Resident memory of this process and of its workers is told after
-a tenth of the time and at the end; the exit code is 1 if something was not finite, if a simulation
-became unstable, if memory grew by more than a twentieth in between, or if a worker outlived the
-batch.
+Steps the train robots of a split among obstacles, even if the split's tasks have none. Tests every
+observation and reward. Prints the resident memory of this process and its workers after a tenth of
+the time and at the end. The exit code is 1 if a value was not finite, if a simulation diverged, if
+memory grew by more than a twentieth in between, or if a worker outlived the batch.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.speed import random_actions
 
 GROWTH = 1.05
-"""Memory at the end over that after a tenth of the time, at most."""
+"""Largest accepted ratio of the memory at the end to the memory after a tenth of the time."""
 
 
 def main() -> int:
@@ -54,13 +53,13 @@ def main() -> int:
     left = [process.pid for process in multiprocessing.active_children()]
     print(f"{steps:,} steps of {args.envs} environments in {args.minutes:g} minutes, {args.sim}")
     print(f"memory after a tenth: {early / 2**20:,.0f} MB; at the end: {late / 2**20:,.0f} MB")
-    print(f"steps with something that is not finite: {lost}; processes left behind: {len(left)}")
-    print(f"episodes whose simulation became unstable: {unstable}")
+    print(f"steps with non-finite values: {lost}; orphan processes: {len(left)}")
+    print(f"diverged episodes: {unstable}")
     return int(lost > 0 or unstable > 0 or late > GROWTH * early or bool(left))
 
 
 def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int, int]:
-    """Steps, memory after a tenth and at the end, steps not finite, and episodes unstable."""
+    """Return steps, early and final memory [bytes], non-finite steps and diverged episodes."""
     actions = random_actions(batch, 1000, seed=0)
     batch.reset()
     steps = lost = early = unstable = 0
@@ -78,13 +77,13 @@ def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int, int]:
 
 
 def _is_finite(step: Step) -> bool:
-    told = [step.reward, step.distance, step.score, *step.terms.values()]
-    seen = [*step.observation.values(), *step.final_observation.values()]
-    return all(bool(each.isfinite().all()) for each in (*told, *seen))
+    results = [step.reward, step.distance, step.score, *step.terms.values()]
+    observations = [*step.observation.values(), *step.final_observation.values()]
+    return all(bool(values.isfinite().all()) for values in (*results, *observations))
 
 
 def _memory() -> int:
-    """Resident memory of this process and its children, bytes, as Linux tells it."""
+    """Return the resident memory of this process and its children [bytes], from /proc."""
     pids = ["self", *(str(process.pid) for process in multiprocessing.active_children())]
     pages = [int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids]
     return sum(pages) * 4096

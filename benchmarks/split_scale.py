@@ -1,10 +1,10 @@
-"""Splits of many bodies: what making, auditing, building and verifying them takes, and their size.
+"""Time and size of large splits: generating, auditing, building and verifying them.
 
     python benchmarks/split_scale.py [--train 10,100,1000] [--jobs 1] [--light]
 
-Extrapolation from stick, nlink and prims to chain, the train robots of a smaller split being the
-first of a larger one. The splits are made once, for the largest size. Every step is the function
-behind its command, in temporary folders; loading morphgen is not counted.
+Extrapolation from stick, nlink and prims to chain. The splits are generated once, for the largest
+size; a smaller split has the first train robots of the larger one. Each step calls the function
+behind its command, in a temporary folder. Importing morphgen is not counted.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _row(split: Split, args: argparse.Namespace) -> tuple[dict[str, object], boo
 
 
 def _timed(work: Callable[[], T]) -> tuple[float, T]:
-    """Seconds that a piece of work takes, and its result."""
+    """Return the duration of a call [s] and its result."""
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result

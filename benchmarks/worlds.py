@@ -1,4 +1,4 @@
-"""A robot with a fixed base in MuJoCo and in PyBullet, alone or above a table; for benchmarks."""
+"""Minimal simulations of one fixed-base robot in MuJoCo and PyBullet, with or without a table."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from morphgen.model.robot import DEFAULT_EFFORT, Robot
 from morphgen.typing import Array
 
 TABLE_SIZE = (3.0, 3.0, 0.5)
-"""Edges of the table, centred below the root, metres."""
+"""Edge lengths of the table, centred below the root link [m]."""
 
 
 class World(Protocol):
-    """A robot in a simulator."""
+    """One robot in one simulator."""
 
     def reset(self) -> None:
-        """Put the robot home, at rest."""
+        """Set the home configuration with zero velocities."""
 
     def hold(self, target: Array, steps: int) -> None:
-        """Step with a target position of every independent joint, shape (dof,)."""
+        """Run simulation steps with target positions of the independent joints, shape (dof,)."""
 
     def touches(self) -> bool:
-        """Whether there is a contact."""
+        """Return whether any contact exists."""
 
     def is_stable(self) -> bool:
-        """Whether nothing has exploded since the reset."""
+        """Return whether the state has stayed finite since the reset."""
 
     def close(self) -> None:
-        """Free the simulator."""
+        """Release the simulator."""
 
 
 Make = Callable[..., World]
-"""Makes a world of a robot, with the height of the table's top; None for no table."""
+"""Create a world from a robot and the height of the table top [m], or None for no table."""
 
 
 class MujocoWorld:
-    """A robot as its MJCF says, in MuJoCo."""
+    """A robot simulated in MuJoCo from its MJCF."""
 
     def __init__(self, robot: Robot, table_top: float | None) -> None:
         spec = to_spec(robot)
@@ -59,29 +59,29 @@ class MujocoWorld:
         self._data = mujoco.MjData(self._model)
 
     def reset(self) -> None:
-        """Put the robot home, at rest."""
+        """Set the home configuration with zero velocities."""
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
 
     def hold(self, target: Array, steps: int) -> None:
-        """Step with a target position of every independent joint, shape (dof,)."""
+        """Run simulation steps with target positions of the independent joints, shape (dof,)."""
         self._data.ctrl[:] = target
         mujoco.mj_step(self._model, self._data, nstep=steps)
 
     def touches(self) -> bool:
-        """Whether there is a contact."""
+        """Return whether any contact exists."""
         return bool(self._data.ncon > 0)
 
     def is_stable(self) -> bool:
-        """Whether nothing has exploded since the reset."""
+        """Return whether the state has stayed finite since the reset."""
         return not self._data.warning.number.any()
 
     def close(self) -> None:
-        """Free the simulator."""
+        """Release the simulator."""
         del self._data, self._model
 
 
 class PybulletWorld:
-    """A robot as its URDF says, in PyBullet, less the pairs that it ignores."""
+    """A robot simulated in PyBullet from its URDF, without contacts of its ignored pairs."""
 
     def __init__(self, robot: Robot, table_top: float | None) -> None:
         with quiet(), tempfile.TemporaryDirectory() as scratch:
@@ -110,19 +110,19 @@ class PybulletWorld:
             half = [edge / 2 for edge in TABLE_SIZE]
             box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
             centre = [0, 0, table_top - half[2]]
-            # MuJoCo does not test what stands still against it either.
+            # Neither does MuJoCo test the fixed root link against the table.
             self._ignore(
                 -1, pybullet.createMultiBody(0, box, basePosition=centre, **self._client), -1
             )
 
     def reset(self) -> None:
-        """Put the robot home, at rest."""
+        """Set the home configuration with zero velocities."""
         home = movable_positions(self._robot, self._robot.home).tolist()
         for joint, position in zip(self._joints, home, strict=True):
             self._bullet.resetJointState(self._body, joint, position, **self._client)
 
     def hold(self, target: Array, steps: int) -> None:
-        """Step with a target position of every independent joint, shape (dof,)."""
+        """Run simulation steps with target positions of the independent joints, shape (dof,)."""
         self._bullet.setJointMotorControlArray(
             self._body,
             self._joints,
@@ -135,18 +135,18 @@ class PybulletWorld:
             self._bullet.stepSimulation(**self._client)
 
     def touches(self) -> bool:
-        """Whether there is a contact."""
+        """Return whether any contact exists."""
         normal_force = 9
         points = self._bullet.getContactPoints(**self._client)
         return any(point[normal_force] > 0 for point in points)
 
     def is_stable(self) -> bool:
-        """Whether nothing has exploded since the reset."""
+        """Return whether the state has stayed finite since the reset."""
         states = self._bullet.getJointStates(self._body, self._joints, **self._client)
         return bool(np.isfinite([state[:2] for state in states]).all())
 
     def close(self) -> None:
-        """Free the simulator."""
+        """Release the simulator."""
         self._bullet.disconnect(**self._client)
 
     def _ignore(self, link: int, other_body: int, other_link: int) -> None:
