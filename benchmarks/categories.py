@@ -120,10 +120,10 @@ def _row(
         seconds += time.perf_counter() - start
         robot = drawn.robot
         links[len(robot.links)] += 1
-        movable[len(robot.movable)] += 1
+        movable[len(robot.movable_joints)] += 1
         rejected.update(drawn.rejected)
         wanted = SPEC[category].counts(drawn.derivation)
-        as_specified &= len(robot.links) in wanted[0] and len(robot.movable) in wanted[1]
+        as_specified &= len(robot.links) in wanted[0] and len(robot.movable_joints) in wanted[1]
         folder = write_bundle(robot, out / category, drawn.findings, picture=False)
         clean &= all(finding.severity == "info" for finding in check(read_bundle(folder)))
         report = conformance(folder, args.samples, 0)

@@ -83,8 +83,8 @@ def _numpy(robot: Robot, q: Array) -> Rows:
 
 
 def _torch(robot: Robot, q: Array, dtype: torch.dtype, device: str) -> Rows:
-    tree = kinematics_torch.kinematic_tree([robot], dtype=dtype, device=device)
-    chain = kinematics_torch.tool_chain([robot], dtype=dtype, device=device)
+    tree = kinematics_torch.compile_tree([robot], dtype=dtype, device=device)
+    chain = kinematics_torch.compile_chain([robot], dtype=dtype, device=device)
     rows = torch.zeros(len(q), dtype=torch.int64, device=device)
     values = torch.from_numpy(q).to(device, dtype)
     positions = kinematics_torch.FramePositions(chain, rows)
@@ -99,7 +99,7 @@ def _torch(robot: Robot, q: Array, dtype: torch.dtype, device: str) -> Rows:
 def _mujoco(robot: Robot, q: Array) -> Rows:
     compiled = MujocoKinematics(robot)
     model, data = compiled.model, compiled.data
-    columns = [model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable]
+    columns = [model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable_joints]
     qpos = np.tile(data.qpos, (len(q), 1))
     qpos[:, columns] = movable_positions(robot, q)
     linear, angular = np.zeros((2, 3, model.nv))
@@ -128,7 +128,7 @@ def _pinocchio(robot: Robot, q: Array) -> Rows:
     bare = robot.with_links([replace(link, visuals=(), collisions=()) for link in robot.links])
     model = pinocchio.buildModelFromXML(urdf_text(bare, str))
     data = model.createData()
-    names = (robot.joints[k].name for k in robot.movable)
+    names = (robot.joints[k].name for k in robot.movable_joints)
     v = np.zeros((len(q), model.nv))
     v[:, [model.idx_vs[model.getJointId(name)] for name in names]] = movable_positions(robot, q)
     neutral = pinocchio.neutral(model)

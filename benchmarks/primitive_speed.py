@@ -37,7 +37,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 import morphgen
-from morphgen.checks.self_collision import SelfCollision
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.fitting.replace_collision import as_primitives, with_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import are_primitives
@@ -181,7 +181,7 @@ def _targets(arm: Arm, table_top: float | None, steps: int, seed: int) -> Array:
     legs = -(-steps // LEG)
     free = random_configurations(arm.meshes, TRIES * legs, np.random.default_rng(seed))
     for robot in (arm.meshes, arm.primitives):
-        free = free[[not pairs for pairs in SelfCollision(robot).each(free)]]
+        free = free[[not pairs for pairs in SelfCollisionChecker(robot).each(free)]]
     if len(free) < legs:
         raise RuntimeError(f"{arm.name} collides with itself nearly everywhere")
     corners = free[:legs].copy()

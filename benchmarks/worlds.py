@@ -101,7 +101,7 @@ class PybulletWorld:
         infos = [pybullet.getJointInfo(self._body, i, **self._client) for i in range(count)]
         joints = {info[1].decode(): info[0] for info in infos}
         links = {robot.root.name: -1} | {info[12].decode(): info[0] for info in infos}
-        movable = [robot.joints[k] for k in robot.movable]
+        movable = [robot.joints[k] for k in robot.movable_joints]
         self._joints = [joints[joint.name] for joint in movable]
         self._efforts = [joint.effort or DEFAULT_EFFORT for joint in movable]
         for a, b in robot.ignore_pairs:

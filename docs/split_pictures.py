@@ -14,8 +14,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from morphgen.benchmark.figures import MapPanel, Panel, heatmap_png, map_png
-from morphgen.benchmark.scaling_map import scaling_map
-from morphgen.benchmark.similarity import MEASURES, distances, features, matrix
+from morphgen.benchmark.similarity import (
+    MEASURES,
+    classical_mds,
+    features,
+    similarity_matrix,
+    to_distances,
+)
 from morphgen.benchmark.split import Member, member_robot
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.fitting.token_shapes import token_shapes
@@ -42,12 +47,12 @@ def main() -> int:
         found.append(features(robot, token_shapes(robot, library.folders)))
     names = [each.name for each in found]
     measure = MEASURES[args.measure]
-    values = matrix(found, args.measure)
+    values = similarity_matrix(found, args.measure)
     title = f"{args.measure}: {measure.meaning}"
     args.out.mkdir(parents=True, exist_ok=True)
     heat = heatmap_png(names, [Panel(title, values, measure.larger_is_more_alike)])
     (args.out / "heatmap.png").write_bytes(heat)
-    placed = scaling_map(distances(values, args.measure))
+    placed = classical_mds(to_distances(values, args.measure))
     (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, placed)]))
     print(f"{len(names)} bodies: {args.out}/heatmap.png, {args.out}/map.png")
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from morphgen.model.inverse_kinematics import MAX_STEP
-from morphgen.model.inverse_kinematics_torch import step_to_pose
+from morphgen.model.inverse_kinematics_torch import pose_ik_step
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.bodies import Bodies
 from morphgen.typing import Array
@@ -37,13 +37,13 @@ class OneTool:
             q: Where to start, shape (n, dof).
             position: Shape (n, 3), metres.
             rotation: Shape (n, 3, 3).
-            iterations: Of ``step_to_pose``.
+            iterations: Of ``pose_ik_step``.
         """
         body, rows = self._rows(q)
         goal, turned = (torch.from_numpy(each).to(rows) for each in (position, rotation))
         limits = self._bodies.lower[body], self._bodies.upper[body]
         for _ in range(iterations):
-            target = step_to_pose(self._bodies.chain, body, rows, goal, turned, limits)
+            target = pose_ik_step(self._bodies.chain, body, rows, goal, turned, limits)
             rows = rows + (target - rows).clamp(-MAX_STEP, MAX_STEP)
         return rows[:, : self._dof].double().cpu().numpy()
 

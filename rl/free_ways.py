@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.model.kinematics import bounds, unwound
+from morphgen.model.kinematics import joint_limits, unwrap_joints
 from morphgen.rl.connect import FreePart, Tree, connected, explored, shortened
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
@@ -82,7 +82,7 @@ class FreeWays:
         self._space, self._step = space, step
         robot = space.scene.robot
         self._moves = np.ones(robot.dof, dtype=np.bool_) if moves is None else moves
-        self._home, self._bounds = np.array(robot.home), bounds(robot)
+        self._home, self._bounds = np.array(robot.home), joint_limits(robot)
         self._seed = int(rng.integers(2**63))
         self._stops, _ = space.draw(STOPS * ATTEMPTS, rng)
 
@@ -123,7 +123,7 @@ class FreeWays:
 
         first = STOPS * (attempt % ATTEMPTS)
         drawn = np.array([self._home, *self._stops[first : first + STOPS]])
-        drawn = unwound(self._space.scene.robot, start, drawn)
+        drawn = unwrap_joints(self._space.scene.robot, start, drawn)
         stops = [np.where(self._moves, stop, start) for stop in drawn]
         price = price or Price(np.zeros(len(ends)), np.full(len(ends), np.inf))
         ways = self._ways(start, ends, vias, stops, price)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from morphgen.model.dynamics import actuation
 from morphgen.model.inverse_kinematics import solve_position_ik
-from morphgen.model.kinematics import frame_jacobian, unwound
+from morphgen.model.kinematics import frame_jacobian, unwrap_joints
 from morphgen.rl.cartesian import OneTool
 from morphgen.rl.free_ways import FreeWays, Price, Way
 from morphgen.rl.push_contacts import Poised, leaning, poised, touches
@@ -225,12 +225,12 @@ class PushPlanner:
 
     def _behind(self, q: Array, block: Array) -> Array:
         """Free configurations with the tool behind the block, shape (n, dof)."""
-        bank = unwound(self._robot, q, self._bank)
+        bank = unwrap_joints(self._robot, q, self._bank)
         quick = np.argsort(self._ways.steps(q, bank), kind="stable")[:_QUICKEST]
         start, goal = self._near_behind(bank, self._tools, block, quick)
         start[::2, self._others] = q[self._others]
         start[1::2, self._others] = np.array(self._robot.home)[self._others]
-        return unwound(self._robot, q, self._free_behind(start, goal, block))
+        return unwrap_joints(self._robot, q, self._free_behind(start, goal, block))
 
     def _near_behind(
         self, q: Array, tools: Array, block: Array, more: NDArray[np.intp]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from morphgen.model.inverse_kinematics_torch import step_to_pose
+from morphgen.model.inverse_kinematics_torch import pose_ik_step
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.free_ways import Routes, shares_to
 from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
@@ -220,7 +220,7 @@ def _pushed(
     on = torch.where(lead < state.lead, SPEED, 0.0)
     goal += torch.stack([aside.clamp(-SPEED, SPEED), on, torch.zeros_like(on)], dim=1)
     goal[:, 2] = state.height
-    wanted = step_to_pose(
+    wanted = pose_ik_step(
         task.bodies.chain,
         task.body,
         task.targets,

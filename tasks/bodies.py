@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from morphgen.benchmark.token_layout import POSITION
-from morphgen.benchmark.tokens import MAX_LINKS, padded, tokens
+from morphgen.benchmark.tokens import MAX_LINKS, pad_tokens, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.model.kinematics import bounds, moved_by
-from morphgen.model.kinematics_torch import ToolChain, tool_chain
+from morphgen.model.kinematics import driving_joints, joint_limits
+from morphgen.model.kinematics_torch import FrameChain, compile_chain
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
 
@@ -50,7 +50,7 @@ class Bodies:
     """Links whose position wraps, shape (R, L), bool."""
     moving: torch.Tensor
     """Links that a joint moves, mimic ones among them, shape (R, L), bool."""
-    chain: ToolChain
+    chain: FrameChain
     """The joints between the root and the tool of each robot."""
 
     @property
@@ -110,27 +110,27 @@ def bodies_of(
         name: torch.from_numpy(np.stack([row[name] for row in rows])).to(device) for name in rows[0]
     }
     made = {k: v.float() if v.is_floating_point() else v for k, v in made.items()}
-    return Bodies(tuple(robots), chain=tool_chain(robots, device=device), **made)
+    return Bodies(tuple(robots), chain=compile_chain(robots, device=device), **made)
 
 
 def _body(
     robot: Robot, folders: Sequence[Path], max_links: int, joints: int
 ) -> dict[str, np.ndarray]:
-    made, links = padded(
+    made, links = pad_tokens(
         tokens(robot, token_shapes(robot, folders), max_links=max_links), max_links
     )
     made[:, POSITION.columns] = 0
     dof = robot.dof
     limits = np.zeros((joints, 2))
-    limits[:dof] = bounds(robot)
+    limits[:dof] = joint_limits(robot)
     home = np.zeros(joints)
     home[:dof] = robot.home
     joint_of_link, link_of_joint = np.full(max_links, -1), np.zeros(joints, dtype=np.int64)
-    for i, k in enumerate(robot.independent):
+    for i, k in enumerate(robot.independent_joints):
         joint_of_link[k + 1] = i
         link_of_joint[i] = k + 1
     moves_tool = np.zeros(joints, dtype=bool)
-    moves_tool[[*moved_by(robot, robot.joints_to(robot.frame(TOOL).link))]] = True
+    moves_tool[[*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))]] = True
     return {
         "tokens": made,
         "links": links,
@@ -147,7 +147,7 @@ def _body(
 
 def _steps(robot: Robot, joints: int) -> np.ndarray:
     steps = np.zeros(joints)
-    for i, k in enumerate(robot.independent):
+    for i, k in enumerate(robot.independent_joints):
         joint = robot.joints[k]
         most = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
         steps[i] = min(most, joint.velocity * CONTROL_PERIOD) if joint.velocity else most
@@ -159,9 +159,9 @@ def _scales(robot: Robot, max_links: int, joints: int) -> dict[str, np.ndarray]:
     matrix, offset = robot.mimic_map
     to_link, at_link = np.zeros((max_links, joints)), np.zeros(max_links)
     turns, moving = np.zeros(max_links, dtype=bool), np.zeros(max_links, dtype=bool)
-    for row, k in enumerate(robot.movable):
+    for row, k in enumerate(robot.movable_joints):
         joint = robot.joints[k]
-        low, high = joint.bounds
+        low, high = joint.effective_limits
         half, middle = (high - low) / 2, (high + low) / 2
         to_link[k + 1, : robot.dof] = matrix[row] / half
         at_link[k + 1] = (offset[row] - middle) / half

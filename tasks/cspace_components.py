@@ -17,8 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from morphgen.checks.self_collision import SelfCollision, ignored_pairs
-from morphgen.model.kinematics import bounds, moved_by, random_configurations, whole_turns
+from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
+from morphgen.model.kinematics import (
+    driving_joints,
+    joint_limits,
+    periodic_joints,
+    random_configurations,
+)
 from morphgen.model.robot import TOOL, Pair, Robot
 from morphgen.typing import Array
 
@@ -62,13 +67,13 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
     Raises:
         MeshError: If a collision mesh cannot be read.
     """
-    tested = SelfCollision(robot, ignored_pairs(robot))
+    tested = SelfCollisionChecker(robot, untested_pairs(robot))
     q = random_configurations(robot, SAMPLES, np.random.default_rng(0))
     times = Counter(pair for found in tested.each(q) for pair in found)
     between: dict[tuple[int, ...], list[Pair]] = defaultdict(list)
     for pair in sorted(pair for pair, count in times.items() if count >= OFTEN * SAMPLES):
         between[_between(robot, *pair)].append(pair)
-    of_tool = {*moved_by(robot, robot.joints_to(robot.frame(TOOL).link))}
+    of_tool = {*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))}
     candidates = [(k, pairs) for k, pairs in between.items() if 0 < len(k) <= 2 and {*k} <= of_tool]
     planes = [_plane(robot, tested, k, pairs) for k, pairs in candidates]
     return tuple(each for each in planes if each is not None)
@@ -101,14 +106,14 @@ def _is_outside(plane: JointPlane, q: Array) -> bool:
 
 def _between(robot: Robot, a: str, b: str) -> tuple[int, ...]:
     """Return the independent joints that move one of two links relative to the other."""
-    return moved_by(robot, {*robot.joints_to(a)} ^ {*robot.joints_to(b)})
+    return driving_joints(robot, {*robot.joint_chain(a)} ^ {*robot.joint_chain(b)})
 
 
 def _plane(
-    robot: Robot, tested: SelfCollision, joints: tuple[int, ...], pairs: Sequence[Pair]
+    robot: Robot, tested: SelfCollisionChecker, joints: tuple[int, ...], pairs: Sequence[Pair]
 ) -> JointPlane | None:
     columns = [*joints]
-    lower, upper = bounds(robot).T[:, columns]
+    lower, upper = joint_limits(robot).T[:, columns]
     count = np.clip(np.ceil((upper - lower) / CELL), FEWEST, MOST).astype(int)
     middles = [
         lo + (np.arange(n) + 0.5) / n * (up - lo)
@@ -117,13 +122,13 @@ def _plane(
     q = np.tile(robot.home, (int(count.prod()), 1))
     q[:, columns] = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(len(q), -1)
     free = np.array([not found.keys() & {*pairs} for found in tested.each(q)]).reshape(count)
-    continuous = [robot.joints[robot.independent[j]].kind == "continuous" for j in joints]
+    continuous = [robot.joints[robot.independent_joints[j]].kind == "continuous" for j in joints]
     components = _components(free, continuous)
     if components.max() < 2:
         return None
     largest = int(np.bincount(components[components > 0]).argmax())
     nearest = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
-    turns = np.where(whole_turns(robot)[columns], 2 * np.pi, 0.0)
+    turns = np.where(periodic_joints(robot)[columns], 2 * np.pi, 0.0)
     main = components[tuple(nearest)] == largest
     return JointPlane(tuple(pairs), joints, lower, upper, main, tuple(turns.tolist()))
 

@@ -10,13 +10,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.checks.self_collision import SelfCollision, ignored_pairs
+from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.kinematics import random_configurations
-from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
-from morphgen.model.rotation import Vec3, normalized, to_rpy
+from morphgen.model.rotation import Vec3, normalize, to_rpy
+from morphgen.model.tree import rigid_groups
 from morphgen.tasks.sim.base import Scene
 from morphgen.typing import Array
 
@@ -45,7 +45,7 @@ class FreeSpace:
     """A scene's robot, ground and obstacles, compiled once and tested at many configurations.
 
     A configuration is free if nothing penetrates (deeper than ``self_collision.PENETRATION``):
-    links each other, but for ``ignored_pairs``; links the ground, but for the root link and
+    links each other, but for ``untested_pairs``; links the ground, but for the root link and
     those fixed to it; any link an obstacle. Nor is the point of the tool in an obstacle, also where
     no link is, as between the fingers of a hand. The block, which can be pushed, is an obstacle
     where a pose of it is given, and nowhere else; it may stand on the ground, or in it.
@@ -65,7 +65,7 @@ class FreeSpace:
         taken = {link.name for link in scene.robot.links}
         self._obstacles = [_unused(f"obstacle{k}", taken) for k in range(len(scene.obstacles))]
         self._block = _unused("block", taken)
-        self._tested = SelfCollision(_with_surroundings(scene, self._obstacles, self._block))
+        self._tested = SelfCollisionChecker(_with_surroundings(scene, self._obstacles, self._block))
 
     def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Whether configurations are free.
@@ -196,7 +196,7 @@ class FreeSpace:
             )
         if not np.isfinite(blocks).all():
             raise ValueError("a pose of the block is not finite")
-        turns = [to_rpy(normalized((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
+        turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
         return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
 
 
@@ -225,7 +225,7 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Ro
         attached.append(
             Joint(_unused(f"to_{name}", joints), "prismatic", world.name, name, limits=(0.0, 0.0))
         )
-    ignored = [*ignored_pairs(robot), *combinations([link.name for link in still], 2)]
+    ignored = [*untested_pairs(robot), *combinations([link.name for link in still], 2)]
     moved: list[Link] = []
     if scene.block is not None:
         if scene.ground is not None:

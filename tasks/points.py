@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.model.rotation_torch import quaternion_matrices
+from morphgen.model.rotation_torch import matrix_from_quaternion
 from morphgen.tasks.sim.base import Block, Scene
 
 NOISE = 0.005
@@ -63,7 +63,7 @@ class PointClouds:
         Args:
             block_pose: Of the blocks, shape (n, 7).
         """
-        R = quaternion_matrices(block_pose[:, 3:])
+        R = matrix_from_quaternion(block_pose[:, 3:])
         carried = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
         return torch.where(self._on_block[..., None], carried, self._local)
 

@@ -75,7 +75,7 @@ def render_model(
     for marker in markers:
         bodies[marker.name] = _add_marker(spec, marker)
     model = spec.compile()
-    at = [int(model.joint(robot.joints[k].name).qposadr[0]) for k in robot.movable]
+    at = [int(model.joint(robot.joints[k].name).qposadr[0]) for k in robot.movable_joints]
     mocap = {name: int(model.body_mocapid[body.id]) for name, body in bodies.items()}
     return RenderModel(model, np.array(at, dtype=np.int64), mocap, points)
 

@@ -12,7 +12,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.parameters import resolve_values
 from morphgen.grammar.part import load_part
-from morphgen.model.inertia import inertial_of, union_moments
+from morphgen.model.inertia import inertial_from_density, union_integrals
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Robot
 
@@ -60,7 +60,7 @@ def test_masses_of_a_template_follow_from_its_shapes(manifest):
         pytest.skip("its pole has a mass of its own, see below")
     for link in load_part(manifest).body.links:
         shapes = link.collisions or link.visuals
-        mass = union_moments(shapes).volume * manifest.density if shapes else 0.0
+        mass = union_integrals(shapes).volume * manifest.density if shapes else 0.0
         assert (link.inertial.mass if link.inertial else 0.0) == pytest.approx(mass)
 
 
@@ -68,7 +68,9 @@ def test_masses_of_a_template_follow_from_its_shapes(manifest):
 def test_the_pole_of_a_cartpole_has_the_inertia_of_its_shapes(values):
     pole = load_part(LIBRARY.manifest("cartpole"), values).body.link("pole")
     assert pole.inertial.mass == values.get("mass", 1)
-    solid = inertial_of(pole.collisions, pole.inertial.mass / union_moments(pole.collisions).volume)
+    solid = inertial_from_density(
+        pole.collisions, pole.inertial.mass / union_integrals(pole.collisions).volume
+    )
     assert pole.inertial.com == pytest.approx(solid.com, abs=1e-6)
     assert pole.inertial.inertia == pytest.approx(solid.inertia, rel=1e-6, abs=1e-9)
 
@@ -224,7 +226,7 @@ def test_a_category_has_the_links_and_joints_of_the_benchmark_and_is_sound(name)
     rng = np.random.default_rng(0)
     for u in (0.0, 0.5, 1.0, rng, rng, rng):
         robot = join(derivation(steps, u), LIBRARY, "robot")
-        assert (len(robot.links), len(robot.movable)) == counts
+        assert (len(robot.links), len(robot.movable_joints)) == counts
         assert troubles(robot) == []
 
 
@@ -233,7 +235,7 @@ def test_a_category_has_the_links_and_joints_of_the_benchmark_and_is_sound(name)
 def test_joints_can_hold_twice_what_hangs_on_them(name, u):
     robot = join(derivation(CATEGORIES[name][0], u), LIBRARY, "robot")
     load = gravity_load(robot, random_configurations(robot, 200, np.random.default_rng(0)))
-    effort = np.array([robot.joints[k].effort for k in robot.independent])
+    effort = np.array([robot.joints[k].effort for k in robot.independent_joints])
     assert (effort >= 2 * load).all()
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from morphgen.model.kinematics import bounds
+from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 
@@ -19,9 +19,9 @@ def roles(robot: Robot) -> list[str]:
     """
     on_way: list[int] = []
     if any(frame.name == TOOL for frame in robot.frames):
-        row = {k: i for i, k in enumerate(robot.movable)}
+        row = {k: i for i, k in enumerate(robot.movable_joints)}
         gains, _ = robot.mimic_map
-        path = [k for k in robot.joints_to(robot.frame(TOOL).link) if k in row]
+        path = [k for k in robot.joint_chain(robot.frame(TOOL).link) if k in row]
         on_way = [int(column) for k in path for column in gains[row[k]].nonzero()[0]]
     on_way = list(dict.fromkeys(on_way))
     others = [i for i in range(robot.dof) if i not in on_way]
@@ -38,7 +38,7 @@ def all_roles(robots: Sequence[Robot]) -> list[str]:
 
 def scaled(robot: Robot, q: Array) -> Array:
     """Positions as shares of the ranges: -1 at the lower bound, 1 at the upper, shape (dof,)."""
-    low, high = bounds(robot).T
+    low, high = joint_limits(robot).T
     half = np.where(high > low, (high - low) / 2, 1.0)
     return np.asarray((q - (low + high) / 2) / half)
 
@@ -54,7 +54,7 @@ def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
     Returns:
         Shape (dof,), within the bounds.
     """
-    low, high = bounds(robot).T
+    low, high = joint_limits(robot).T
     found = np.array(q, dtype=np.float64)
     for i, role in enumerate(roles(robot)):
         if role in values:

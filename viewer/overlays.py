@@ -48,7 +48,7 @@ def show_joint_axes(overlays: Overlays) -> None:
     view = overlays.view
     length = 0.14 * robot_extent(view.robot)
     nodes = overlays.nodes.setdefault("joint axes", [])
-    for k in view.robot.movable:
+    for k in view.robot.movable_joints:
         joint = view.robot.joints[k]
         arrow = np.array([[np.zeros(3), length * np.array(joint.unit_axis)]])
         nodes.append(

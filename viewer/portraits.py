@@ -14,7 +14,7 @@ from pathlib import Path
 from PIL import Image
 from platformdirs import user_cache_path
 
-from morphgen.benchmark.survey import facts_of
+from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
@@ -74,7 +74,7 @@ def thumbnail_of_picture(path: Path) -> str:
 def _made(place: str, places: Places) -> Portrait:
     robot = read_place(place, places)
     loud = sorted({finding.code for finding in check(robot) if finding.severity != "info"})
-    known = facts_of(robot)
+    known = robot_stats(robot)
     has_tool = any(frame.name == "tool" for frame in robot.frames)
     facts: dict[str, object] = {
         "dof": known.dof,

@@ -8,10 +8,10 @@ import numpy as np
 import viser
 
 from morphgen.checks import check
-from morphgen.checks.self_collision import SelfCollision
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import CARD, file_findings, split_colours
-from morphgen.model.kinematics import bounds, random_configurations, reach
+from morphgen.model.kinematics import joint_limits, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
@@ -102,7 +102,7 @@ def add_floor(scene: viser.SceneApi, size: float) -> None:
 
 
 def free_configuration(
-    tested: SelfCollision, robot: Robot, rng: np.random.Generator
+    tested: SelfCollisionChecker, robot: Robot, rng: np.random.Generator
 ) -> Array | None:
     """A random configuration without self-collision; None if none is found."""
     for _ in range(TRIES // 10):
@@ -147,11 +147,11 @@ def _add_moves(page: RobotPage) -> None:
     page.texts["collisions"] = gui.add_html("")
     page.sliders = []
     handles: dict[int, viser.GuiSliderHandle[float]] = {}
-    limits = bounds(robot)
+    limits = joint_limits(robot)
     for chain in robot_tables.chains(robot):
         with gui.add_folder(chain.title):
             for row in chain.rows:
-                joint = robot.joints[robot.independent[row]]
+                joint = robot.joints[robot.independent_joints[row]]
                 low, high = (float(value) for value in limits[row])
                 handles[row] = gui.add_slider(
                     robot_tables.short_name(joint, chain),
@@ -201,7 +201,7 @@ def _apply_address(page: RobotPage) -> None:
 def _go(page: RobotPage, where: str) -> None:
     if where == "random free":
         if page.tested is None:
-            page.tested = SelfCollision(page.robot)
+            page.tested = SelfCollisionChecker(page.robot)
         q = free_configuration(page.tested, page.robot, np.random.default_rng())
         if q is None:
             notify(
@@ -210,7 +210,7 @@ def _go(page: RobotPage, where: str) -> None:
             return
     else:
         rest = np.array(page.robot.home) if where == "home" else np.zeros(page.robot.dof)
-        q = np.clip(rest, *bounds(page.robot).T)
+        q = np.clip(rest, *joint_limits(page.robot).T)
     set_configuration(page, q)
 
 
@@ -235,7 +235,7 @@ def _examine(page: RobotPage) -> None:
     )
     say(session, "")
     try:
-        page.tested = SelfCollision(page.robot)
+        page.tested = SelfCollisionChecker(page.robot)
     except MorphgenError as error:
         why = escape(session.places.told(error))
         text = f'<div class="dim">collisions cannot be tested: {why}</div>'

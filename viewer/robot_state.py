@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import viser
 
-from morphgen.checks.self_collision import SelfCollision
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup, overlays, robot_tables
@@ -44,7 +44,7 @@ class RobotPage:
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     gizmo: viser.TransformControlsHandle | None = None
     dragged: bool = False
-    tested: SelfCollision | None = None
+    tested: SelfCollisionChecker | None = None
 
 
 def set_configuration(page: RobotPage, q: Array) -> None:
@@ -69,7 +69,7 @@ def parse_joints(text: str, robot: Robot) -> Array | None:
         return None
     if q.shape != (robot.dof,) or not np.isfinite(q).all():
         return None
-    return np.asarray(np.clip(q, *bounds(robot).T))
+    return np.asarray(np.clip(q, *joint_limits(robot).T))
 
 
 def show_moved(page: RobotPage) -> None:

@@ -35,7 +35,7 @@ def chains(robot: Robot) -> list[Chain]:
     titles = {str(part["label"]): f"{part['label']}: {part['part']}" for part in parts}
     labels = sorted(titles, key=len, reverse=True)
     found: dict[str, list[int]] = {}
-    for row, k in enumerate(robot.independent):
+    for row, k in enumerate(robot.independent_joints):
         name = robot.joints[k].name
         label = next((each for each in labels if name.startswith(f"{each}_")), "")
         found.setdefault(titles.get(label, "joints"), []).append(row)
@@ -50,7 +50,7 @@ def short_name(joint: Joint, chain: Chain) -> str:
 def joint_hint(joint: Joint) -> str:
     """A joint's kind and limits in a line."""
     position, effort, speed = _UNITS.get(joint.kind, _TURNS)
-    low, high = joint.bounds
+    low, high = joint.effective_limits
     parts = [f"{joint.name}: {joint.kind}"]
     parts.append(f"{low:.4g} to {high:.4g} {position}" if joint.limits else "no limits")
     if joint.effort is not None:
@@ -72,7 +72,7 @@ def summary(robot: Robot, reach: float | None) -> str:
     facts = [f"{len(robot.links)} links", f"{robot.dof} DoF", f"{robot.mass:.3g} kg"]
     if reach is not None:
         facts.append(f"reach {reach:.3g} m")
-    mimics = len(robot.movable) - robot.dof
+    mimics = len(robot.movable_joints) - robot.dof
     if mimics:
         facts.insert(2, f"{mimics} mimic joint{'s' if mimics > 1 else ''}")
     return " · ".join(facts)

@@ -11,8 +11,7 @@ from typing import cast
 import viser
 
 from morphgen.benchmark.audit import Audit
-from morphgen.benchmark.scaling_map import scaling_map
-from morphgen.benchmark.similarity import MEASURES, distances
+from morphgen.benchmark.similarity import MEASURES, classical_mds, to_distances
 from morphgen.benchmark.split import REGIMES, SIDES, Member, Split, split_id
 from morphgen.viewer import gallery, markup
 from morphgen.viewer.address import Address
@@ -163,7 +162,7 @@ def _draw(page: SplitPage) -> None:
     measure = MEASURES[page.measure.value]
     values = found.matrices[measure.name]
     names = [member.name for member in found.members]
-    flat = scaling_map(distances(values, measure.name))
+    flat = classical_mds(to_distances(values, measure.name))
     places = _member_places(page, found.members, found.sides)
     page.texts["map"].content = markup.framed(
         f'<div class="dim">{measure.meaning}; {flat.kept:.0%} of the variation shown; '

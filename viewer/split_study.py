@@ -11,8 +11,14 @@ import numpy as np
 from morphgen.benchmark.audit import Audit, audited
 from morphgen.benchmark.similarity import MEASURES, Features
 from morphgen.benchmark.split import SIDES, Member, Split
-from morphgen.benchmark.statistics import summed_up
-from morphgen.benchmark.survey import Examined, Fault, Survey, Surveyed, examined
+from morphgen.benchmark.statistics import summarize_survey
+from morphgen.benchmark.survey import (
+    Fault,
+    MeasuredRobot,
+    SplitSurvey,
+    SurveyedRobot,
+    measure_robot,
+)
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
@@ -71,28 +77,30 @@ def study(
     return workers.result(workers.submit(conclude, split, found, folders))
 
 
-def examine(derivation: str, folders: tuple[Path, ...], max_links: int) -> Examined | Fault:
+def examine(derivation: str, folders: tuple[Path, ...], max_links: int) -> MeasuredRobot | Fault:
     """Compose and measure a robot."""
     try:
         robot = compose(parse_derivation(derivation), Library(folders), "robot")
-        return examined(robot, folders, max_links)
+        return measure_robot(robot, folders, max_links)
     except MorphgenError as error:
         return Fault("body-broken", str(error))
 
 
 def conclude(
-    split: Split, found: Mapping[str, Examined | Fault], folders: tuple[Path, ...]
+    split: Split, found: Mapping[str, MeasuredRobot | Fault], folders: tuple[Path, ...]
 ) -> Study:
     """Compare the robots, and audit and sum up the split."""
     sided = [(side, member) for side in SIDES for member in split.side(side)]
-    sound = [(side, m) for side, m in sided if isinstance(found[m.derivation], Examined)]
-    known = [each.features for _, m in sound if isinstance(each := found[m.derivation], Examined)]
+    sound = [(side, m) for side, m in sided if isinstance(found[m.derivation], MeasuredRobot)]
+    known = [
+        each.features for _, m in sound if isinstance(each := found[m.derivation], MeasuredRobot)
+    ]
     matrices = {name: _matrix(known, name) for name in MEASURES}
     survey = _survey(split, found, [m for _, m in sound], matrices)
     whole = len(sound) == len(sided)
     return Study(
         audited(survey, Library(folders)),
-        summed_up(survey) if whole else {},
+        summarize_survey(survey) if whole else {},
         tuple(member for _, member in sound),
         tuple(side for side, _ in sound),
         matrices,
@@ -110,10 +118,10 @@ def _matrix(known: Sequence[Features], measure: str) -> Array:
 
 def _survey(
     split: Split,
-    found: Mapping[str, Examined | Fault],
+    found: Mapping[str, MeasuredRobot | Fault],
     sound: Sequence[Member],
     matrices: Mapping[str, Array],
-) -> Survey:
+) -> SplitSurvey:
     """What the audit asks for, of what is known here."""
     places = [id(member) for member in sound]
     shape = (len(split.train), len(split.test), len(MEASURES))
@@ -124,10 +132,10 @@ def _survey(
                 row, column = places.index(id(a)), places.index(id(b))
                 likeness[i, j] = [matrices[name][row, column] for name in MEASURES]
 
-    def surveyed(member: Member) -> Surveyed | Fault:
+    def surveyed(member: Member) -> SurveyedRobot | Fault:
         each = found[member.derivation]
-        return each.surveyed if isinstance(each, Examined) else each
+        return each.surveyed if isinstance(each, MeasuredRobot) else each
 
-    return Survey(
+    return SplitSurvey(
         split, tuple(map(surveyed, split.train)), tuple(map(surveyed, split.test)), likeness
     )

@@ -12,7 +12,7 @@ from morphgen.benchmark.extrapolation import parse_bound
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.similarity import MEASURES
 from morphgen.benchmark.split import SIDES, Member, Side, Split
-from morphgen.benchmark.survey import Fault, Survey, Surveyed, survey
+from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
@@ -120,10 +120,10 @@ def audit(
     Raises:
         BenchmarkError: If ``jobs`` is below 1, or what the split says of its making is malformed.
     """
-    return audited(survey(split, library, jobs=jobs, progress=progress), library, near)
+    return audited(survey_split(split, library, jobs=jobs, progress=progress), library, near)
 
 
-def audited(found: Survey, library: Library, near: Near = NEAR) -> Audit:
+def audited(found: SplitSurvey, library: Library, near: Near = NEAR) -> Audit:
     """The audit of a split that was surveyed; see ``audit``."""
     split = found.split
     findings = [
@@ -142,7 +142,7 @@ def audited(found: Survey, library: Library, near: Near = NEAR) -> Audit:
     return Audit(split.name, (*left, *unused), known, tuple(_neighbours(found)))
 
 
-def _robot_findings(found: Survey) -> Iterator[Finding]:
+def _robot_findings(found: SplitSurvey) -> Iterator[Finding]:
     """Robots that are not to be had, or not as they were."""
     for side, member, robot in _robots(found):
         if isinstance(robot, Fault):
@@ -152,7 +152,7 @@ def _robot_findings(found: Survey) -> Iterator[Finding]:
             yield _finding("body-changed", side, member, why)
 
 
-def _leaks(found: Survey, near: Near) -> Iterator[Finding]:
+def _leaks(found: SplitSurvey, near: Near) -> Iterator[Finding]:
     """Test robots that are in train, or nearly."""
     split = found.split
     names = {member.name: member for member in split.train}
@@ -193,11 +193,11 @@ def _repeated(split: Split) -> Iterator[Finding]:
                 yield replace(_finding("body-repeated", side, member, why), severity="warning")
 
 
-def _regime_findings(found: Survey, library: Library) -> tuple[Finding, ...]:
+def _regime_findings(found: SplitSurvey, library: Library) -> tuple[Finding, ...]:
     """What is against the regime, of the robots that can be composed."""
     sound: dict[Side, list[Member]] = {"train": [], "test": []}
     for side, member, robot in _robots(found):
-        if isinstance(robot, Surveyed):
+        if isinstance(robot, SurveyedRobot):
             sound[side].append(member)
     if not sound["train"]:
         return ()
@@ -205,7 +205,7 @@ def _regime_findings(found: Survey, library: Library) -> tuple[Finding, ...]:
     return regime_findings(split, library)
 
 
-def _bound_findings(found: Survey) -> Iterator[Finding]:
+def _bound_findings(found: SplitSurvey) -> Iterator[Finding]:
     """Test robots that are not as alike to train as the split was made to be."""
     text = found.split.made.get("similarity")
     if text is None:
@@ -224,7 +224,7 @@ def _bound_findings(found: Survey) -> Iterator[Finding]:
             yield _finding("similarity-bound", "test", member, why)
 
 
-def _neighbours(found: Survey) -> Iterator[Neighbour]:
+def _neighbours(found: SplitSurvey) -> Iterator[Neighbour]:
     train, test = found.split.train, found.split.test
     for j, member in enumerate(test):
         for name, measure in MEASURES.items():
@@ -235,8 +235,11 @@ def _neighbours(found: Survey) -> Iterator[Neighbour]:
             yield Neighbour(member.name, name, train[best].name, float(values[best]))
 
 
-def _robots(found: Survey) -> Iterator[tuple[Side, Member, Surveyed | Fault]]:
-    robots: Mapping[Side, Sequence[Surveyed | Fault]] = {"train": found.train, "test": found.test}
+def _robots(found: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
+    robots: Mapping[Side, Sequence[SurveyedRobot | Fault]] = {
+        "train": found.train,
+        "test": found.test,
+    }
     for side in SIDES:
         for member, robot in zip(found.split.side(side), robots[side], strict=True):
             yield side, member, robot

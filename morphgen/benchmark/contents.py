@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.built import BUNDLES, FORMAT, ROBOTS, SETTINGS, SPLIT, SUMS, TOKENS, Record
 from morphgen.benchmark.split import Member, Side, Split, split_id
-from morphgen.benchmark.survey import facts_of
-from morphgen.benchmark.token_layout import LAYOUT, padded
+from morphgen.benchmark.survey import robot_stats
+from morphgen.benchmark.token_layout import LAYOUT, pad_tokens
 from morphgen.benchmark.tokens import tokens
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
@@ -94,7 +94,7 @@ def body_of(robot: Robot, folders: Sequence[Path], max_links: int) -> Body:
         BenchmarkError: If the robot has more links.
     """
     table = tokens(robot, token_shapes(robot, folders), max_links=max_links)
-    return Body(facts_of(robot).as_dict(), table)
+    return Body(robot_stats(robot).as_dict(), table)
 
 
 def bodies(split: Split) -> list[Member]:
@@ -153,7 +153,7 @@ def records_text(split: Split, known: Mapping[str, Body]) -> str:
 def token_tables(split: Split, known: Mapping[str, Body]) -> tuple[Array, NDArray[np.bool_]]:
     """Tokens (n, max_links, 48) and mask (n, max_links) of all members."""
     tables = [known[member.body].tokens for _, member in sided(split)]
-    both = [padded(table, split.max_links) for table in tables]
+    both = [pad_tokens(table, split.max_links) for table in tables]
     return np.array([table for table, _ in both]), np.array([mask for _, mask in both])
 
 

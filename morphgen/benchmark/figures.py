@@ -18,7 +18,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
 
-from morphgen.benchmark.scaling_map import ScalingMap
+from morphgen.benchmark.similarity import MdsMap
 from morphgen.typing import Array
 
 P = ParamSpec("P")
@@ -59,7 +59,7 @@ class MapPanel:
     """A map to draw."""
 
     title: str
-    map: ScalingMap
+    map: MdsMap
     """Of n points."""
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from morphgen.benchmark.split import Member, Split
-from morphgen.benchmark.survey import Facts, Fault, Survey, Surveyed, survey
+from morphgen.benchmark.survey import Fault, RobotStats, SplitSurvey, SurveyedRobot, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, unseen
@@ -32,18 +34,18 @@ def statistics(
         split: The split.
         library: Where its parts are.
         jobs: Processes.
-        progress: As ``survey`` tells it.
+        progress: As ``survey_split`` tells it.
 
     Returns:
-        Plain data, see ``summed_up``.
+        Plain data, see ``summarize_survey``.
 
     Raises:
         BenchmarkError: If a robot cannot be composed, or a side is empty.
     """
-    return summed_up(survey(split, library, jobs=jobs, progress=progress))
+    return summarize_survey(survey_split(split, library, jobs=jobs, progress=progress))
 
 
-def summed_up(found: Survey) -> dict[str, object]:
+def summarize_survey(found: SplitSurvey) -> dict[str, object]:
     """Figures of a split that was surveyed.
 
     Returns:
@@ -71,7 +73,7 @@ def mean_and_range(values: Sequence[float]) -> dict[str, float]:
 
 
 def _side(
-    split: Split, members: Sequence[Member], found: Iterable[Surveyed | Fault]
+    split: Split, members: Sequence[Member], found: Iterable[SurveyedRobot | Fault]
 ) -> dict[str, object]:
     if not members:
         raise BenchmarkError(f"split {split.name!r} has a side without robots")
@@ -89,5 +91,45 @@ def _side(
     }
 
 
-def _column(facts: Sequence[Facts], key: str) -> list[float]:
+def _column(facts: Sequence[RobotStats], key: str) -> list[float]:
     return [float(getattr(fact, key)) for fact in facts]
+
+
+PAPER_TABLE = "AnyBody (arXiv 2505.14986), table 'Statistics about benchmark tasks'"
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A row of the paper's table: means over the train robots."""
+
+    title: str
+    """As the paper calls the set."""
+    links: float
+    movable: float
+    movable_to_tool: float | None
+    """None where the paper has a dash."""
+    cosine: float
+    """Mean over test and train robots."""
+
+
+PAPER: Mapping[str, PaperRow] = MappingProxyType(
+    {
+        "interpolation/arm3": PaperRow("Arm-3", 10, 9, 4, 0.80),
+        "interpolation/panda": PaperRow("Panda", 11, 9, 7, 0.76),
+        "composition/ee-arm": PaperRow("EE Arm", 8.5, 5.9, 5.6, 0.47),
+        "composition/ee-task": PaperRow("EE-Task", 7.75, 5.25, None, 0.49),
+        "extrapolation/primitives": PaperRow("Primitives", 6.60, 4.60, 4.60, 0.45),
+        "extrapolation/arms": PaperRow("Robot Arms", 14.70, 8.5, 6.6, 0.42),
+    }
+)
+"""The paper's figures by the set of robots: a scenario's name without its task."""
+
+
+def paper_row(split: str) -> PaperRow | None:
+    """The paper's figures for a scenario, such as ``extrapolation/arms/reach``; None if none."""
+    return PAPER.get(robot_set(split))
+
+
+def robot_set(split: str) -> str:
+    """The robots of a scenario: its name without the task, which other tasks share."""
+    return "/".join(split.split("/")[:2])

@@ -27,7 +27,7 @@ from morphgen.typing import Array
 
 
 @dataclass(frozen=True)
-class Facts:
+class RobotStats:
     """What tables say of a robot."""
 
     links: int
@@ -57,29 +57,29 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class SurveyedRobot:
     """A robot of a split as it is composed today."""
 
     body: str
     """Its hash."""
-    facts: Facts
+    facts: RobotStats
 
 
 @dataclass(frozen=True, eq=False)
-class Examined:
+class MeasuredRobot:
     """What is known of a robot of a split."""
 
-    surveyed: Surveyed
+    surveyed: SurveyedRobot
     features: Features
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
+class SplitSurvey:
     """What was found of a split's robots, in the order of the split."""
 
     split: Split
-    train: tuple[Surveyed | Fault, ...]
-    test: tuple[Surveyed | Fault, ...]
+    train: tuple[SurveyedRobot | Fault, ...]
+    test: tuple[SurveyedRobot | Fault, ...]
     likeness: Array
     """Of every train robot to every test robot by every measure, in the order of ``MEASURES``,
     shape (n_train, n_test, n_measures); NaN where one of the two has a fault."""
@@ -89,12 +89,12 @@ class Survey:
         return self.likeness[:, :, tuple(MEASURES).index(measure)]
 
 
-def facts_of(robot: Robot) -> Facts:
+def robot_stats(robot: Robot) -> RobotStats:
     """Count and measure a robot."""
     known = Properties(robot)
-    return Facts(
+    return RobotStats(
         len(robot.links),
-        len(robot.movable),
+        len(robot.movable_joints),
         int(known.movable_to_tool),
         robot.dof,
         float(rounded(known.reach) or 0.0),
@@ -102,7 +102,7 @@ def facts_of(robot: Robot) -> Facts:
     )
 
 
-def examined(robot: Robot, folders: Sequence[Path], max_links: int) -> Examined | Fault:
+def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> MeasuredRobot | Fault:
     """Measure a robot, unless it has more links than its split allows.
 
     Args:
@@ -116,11 +116,15 @@ def examined(robot: Robot, folders: Sequence[Path], max_links: int) -> Examined 
     if len(robot.links) > max_links:
         why = f"it has {len(robot.links)} links, more than max_links {max_links}"
         return Fault("links-many", why)
-    surveyed = Surveyed(robot_hash(robot), facts_of(robot))
-    return Examined(surveyed, features(robot, token_shapes(robot, folders), max_links=max_links))
+    surveyed = SurveyedRobot(robot_hash(robot), robot_stats(robot))
+    return MeasuredRobot(
+        surveyed, features(robot, token_shapes(robot, folders), max_links=max_links)
+    )
 
 
-def survey(split: Split, library: Library, *, jobs: int = 1, progress: Progress = unseen) -> Survey:
+def survey_split(
+    split: Split, library: Library, *, jobs: int = 1, progress: Progress = unseen
+) -> SplitSurvey:
     """Compose, measure and compare a split's robots; what is named twice is composed once a side.
 
     Args:
@@ -141,7 +145,7 @@ def survey(split: Split, library: Library, *, jobs: int = 1, progress: Progress 
     rows, columns = _places(split.train, trains), _places(split.test, tests)
     shape = (len(trains), len(tests), len(MEASURES))
     likeness = np.array([values for _, values in trained]).reshape(shape)
-    return Survey(
+    return SplitSurvey(
         split,
         tuple(trained[row][0] for row in rows),
         tuple(_surveyed(tested[column]) for column in columns),
@@ -171,7 +175,7 @@ class _Examination:
     def library(self) -> Library:
         return Library(self.folders)
 
-    def __call__(self, member: Member) -> Examined | Fault:
+    def __call__(self, member: Member) -> MeasuredRobot | Fault:
         try:
             parsed = parse_derivation(member.derivation)
             missing = {node.part for node in parsed.walk()} - self.library.paths.keys()
@@ -179,7 +183,7 @@ class _Examination:
                 hints = (f"{part!r}{nearest(part, self.library.paths)}" for part in sorted(missing))
                 return Fault("part-missing", f"the library has no part {' and no '.join(hints)}")
             robot = compose(parsed, self.library, member.name)
-            return examined(robot, self.folders, self.max_links)
+            return measure_robot(robot, self.folders, self.max_links)
         except MorphgenError as error:
             return Fault("body-broken", str(error))
 
@@ -191,7 +195,7 @@ class _Comparison:
     examination: _Examination
     tests: tuple[Features | None, ...]
 
-    def __call__(self, member: Member) -> tuple[Surveyed | Fault, Array]:
+    def __call__(self, member: Member) -> tuple[SurveyedRobot | Fault, Array]:
         found = self.examination(member)
         values = np.full((len(self.tests), len(MEASURES)), np.nan)
         if isinstance(found, Fault):
@@ -202,9 +206,9 @@ class _Comparison:
         return found.surveyed, values
 
 
-def _surveyed(found: Examined | Fault) -> Surveyed | Fault:
-    return found.surveyed if isinstance(found, Examined) else found
+def _surveyed(found: MeasuredRobot | Fault) -> SurveyedRobot | Fault:
+    return found.surveyed if isinstance(found, MeasuredRobot) else found
 
 
-def _features_of(found: Examined | Fault) -> Features | None:
-    return found.features if isinstance(found, Examined) else None
+def _features_of(found: MeasuredRobot | Fault) -> Features | None:
+    return found.features if isinstance(found, MeasuredRobot) else None

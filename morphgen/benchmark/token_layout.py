@@ -104,7 +104,7 @@ def require_finite(tokens: Array, what: str, links: Sequence[str]) -> None:
         raise BenchmarkError(f"{what}: link {links[row]}: {field.name}: {numbers} is not finite")
 
 
-def padded(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
+def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
     """Tokens with rows of zeros below, so that robots of several sizes share a batch.
 
     Args:
@@ -123,7 +123,7 @@ def padded(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
     return np.pad(tokens, widths), np.arange(max_links) < n_links
 
 
-def npz(tokens: Array, links: Sequence[str], name: str, max_links: int = MAX_LINKS) -> bytes:
+def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = MAX_LINKS) -> bytes:
     """A file for ``numpy.load``: a robot's tokens and what is needed to understand them.
 
     Arrays: ``tokens`` (..., n_links, 48), names of ``links`` (n_links,), names of the fields in
@@ -236,7 +236,7 @@ def encode_pose(pose: Pose) -> tuple[float, ...]:
     Raises:
         ValueError: If the quaternion is zero or not finite.
     """
-    return (*pose.position, *rotation.normalized(pose.quaternion))
+    return (*pose.position, *rotation.normalize(pose.quaternion))
 
 
 def decode_pose(numbers: Array) -> Pose:
@@ -249,7 +249,7 @@ def decode_pose(numbers: Array) -> Pose:
     norm = math.hypot(w, a, b, c)
     if abs(norm - 1) > TOLERANCE:
         raise ValueError(f"the quaternion {_listed((w, a, b, c))} is of length {norm:g}, not 1")
-    return Pose((x, y, z), rotation.normalized((w, a, b, c)))
+    return Pose((x, y, z), rotation.normalize((w, a, b, c)))
 
 
 def decode_axis(numbers: Array) -> Vec3:

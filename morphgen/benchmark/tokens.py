@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.benchmark import token_layout as layout
-from morphgen.benchmark.token_layout import LAYOUT, MAX_LINKS, TOKEN_SIZE, Field, npz, padded
+from morphgen.benchmark.token_layout import (
+    LAYOUT,
+    MAX_LINKS,
+    TOKEN_SIZE,
+    Field,
+    pad_tokens,
+    tokens_npz,
+)
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.formats.rounding import as_written
 from morphgen.model.geometry import IDENTITY, Shape
@@ -24,12 +31,12 @@ __all__ = [
     "MAX_LINKS",
     "TOKEN_SIZE",
     "Field",
-    "joint_codes",
-    "npz",
-    "padded",
-    "robot_of_tokens",
-    "scaled_positions",
+    "encode_joint_positions",
+    "normalize_positions",
+    "pad_tokens",
+    "robot_from_tokens",
     "tokens",
+    "tokens_npz",
 ]
 
 T = TypeVar("T")
@@ -67,7 +74,7 @@ def tokens(
                 + nearest(name, robot.link_index)
             )
     robot = as_written(robot)  # one robot has one token matrix, composed or read back
-    codes = joint_codes(robot, robot.home if q is None else q)
+    codes = encode_joint_positions(robot, robot.home if q is None else q)
     tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
     body = np.zeros((len(robot.links), TOKEN_SIZE))
     body[:, layout.INDEX.start] = np.arange(len(robot.links)) / (max_links - 1)
@@ -86,7 +93,7 @@ def tokens(
     return made
 
 
-def joint_codes(robot: Robot, q: ArrayLike) -> Array:
+def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
     """What changes of the tokens as a robot moves: the numbers of ``joint position``.
 
     Args:
@@ -100,13 +107,13 @@ def joint_codes(robot: Robot, q: ArrayLike) -> Array:
         BenchmarkError: If a position is not finite or a joint has no range.
         ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
-    x = scaled_positions(robot, q)
+    x = normalize_positions(robot, q)
     codes = np.zeros((*x.shape[:-1], len(robot.links), layout.POSITION.size))
-    codes[..., [k + 1 for k in robot.movable], :] = layout.encode_position(x)
+    codes[..., [k + 1 for k in robot.movable_joints], :] = layout.encode_position(x)
     return codes
 
 
-def scaled_positions(robot: Robot, q: ArrayLike) -> Array:
+def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
     """Positions of the movable joints: -1 at the lower limit, 1 at the upper, outside beyond.
 
     Continuous joints, and revolute ones without limits, are wrapped to (-pi, pi] and divided by
@@ -117,15 +124,15 @@ def scaled_positions(robot: Robot, q: ArrayLike) -> Array:
         q: Independent joint positions, shape (..., dof), rad or m.
 
     Returns:
-        In the order of ``robot.movable``, shape (..., n_movable).
+        In the order of ``robot.movable_joints``, shape (..., n_movable).
 
     Raises:
         BenchmarkError: If a position is not finite or a joint has no range.
         ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
-    joints = [robot.joints[k] for k in robot.movable]
+    joints = [robot.joints[k] for k in robot.movable_joints]
     for joint in joints:
-        low, high = joint.bounds
+        low, high = joint.effective_limits
         if not 0 < high - low < math.inf:
             raise BenchmarkError(
                 f"robot {robot.name!r}: joint {joint.name!r}: limits ({low:g}, {high:g}) leave no "
@@ -137,14 +144,14 @@ def scaled_positions(robot: Robot, q: ArrayLike) -> Array:
         raise BenchmarkError(
             f"robot {robot.name!r}: joint {joints[lost[0, -1]].name!r}: q is not finite"
         )
-    bounds = np.array([joint.bounds for joint in joints]).reshape(-1, 2)
+    bounds = np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
     turns = np.array([_turns_freely(joint) for joint in joints], dtype=bool)
     wrapped = positions - math.tau * np.ceil((positions - math.pi) / math.tau)
     half = (bounds[:, 1] - bounds[:, 0]) / 2
     return np.asarray((np.where(turns, wrapped, positions) - bounds.mean(axis=1)) / half)
 
 
-def robot_of_tokens(
+def robot_from_tokens(
     tokens: ArrayLike, name: str, *, max_links: int = MAX_LINKS
 ) -> tuple[Robot, dict[str, Shape]]:
     """The robot that tokens describe; the inverse of ``tokens``.

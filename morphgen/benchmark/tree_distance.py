@@ -30,7 +30,7 @@ _DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
-class KinematicTree:
+class LabelledTree:
     """A robot as an ordered tree of labelled nodes, in postorder; lengths over its reach.
 
     A node is a link with the joint that attaches it. The last node is the ground, which every tree
@@ -61,7 +61,7 @@ class KinematicTree:
         return tuple(sorted({leaf: node for node, leaf in enumerate(self.leftmost)}.values()))
 
 
-def kinematic_tree(robot: Robot, shapes: Mapping[str, Shape], reach: float) -> KinematicTree:
+def labelled_tree(robot: Robot, shapes: Mapping[str, Shape], reach: float) -> LabelledTree:
     """A robot as a tree for ``normalised_distance``.
 
     Links without a shape on fixed joints are frames, no bodies: what hangs on them hangs on the
@@ -143,7 +143,7 @@ def _shape_kind(shape: Shape | None) -> int:
     raise ValueError("a mesh is no primitive; morphgen.fitting.token_shapes.token_shapes gives one")
 
 
-def _in_postorder(nodes: list[_Node], above: list[int]) -> KinematicTree:
+def _in_postorder(nodes: list[_Node], above: list[int]) -> LabelledTree:
     """The tree of nodes, each of which comes after the one above it; the first is the ground."""
     children: list[list[int]] = [[] for _ in nodes]
     keys: list[tuple[object, ...]] = [()] * len(nodes)
@@ -158,7 +158,7 @@ def _in_postorder(nodes: list[_Node], above: list[int]) -> KinematicTree:
             children[above[node]].append(node)
     order = below[0]
     ordered = [nodes[node] for node in order]
-    return KinematicTree(
+    return LabelledTree(
         np.array([node.kind for node in ordered]),
         np.array([node.axis for node in ordered]),
         np.array([node.length for node in ordered]),
@@ -168,7 +168,7 @@ def _in_postorder(nodes: list[_Node], above: list[int]) -> KinematicTree:
     )
 
 
-def normalised_distance(a: KinematicTree, b: KinematicTree) -> float:
+def normalised_distance(a: LabelledTree, b: LabelledTree) -> float:
     """How different two bodies are, in [0, 1].
 
     With the edit distance d and the costs |a| and |b| to insert all of a tree,
@@ -186,7 +186,7 @@ def normalised_distance(a: KinematicTree, b: KinematicTree) -> float:
     return 2 * distance / total if total else 0.0
 
 
-def edit_distance(a: KinematicTree, b: KinematicTree) -> float:
+def edit_distance(a: LabelledTree, b: LabelledTree) -> float:
     """The least cost to insert, delete and change nodes until one tree is the other.
 
     Zhang and Shasha, Simple fast algorithms for the editing distance between trees and related
@@ -218,7 +218,7 @@ def edit_distance(a: KinematicTree, b: KinematicTree) -> float:
     return float(subtree[-1][-1])
 
 
-def change_costs(a: KinematicTree, b: KinematicTree) -> Array:
+def change_costs(a: LabelledTree, b: LabelledTree) -> Array:
     """Cost to make every node of one tree any node of the other, in [0, 1], shape (n_a, n_b).
 
     A sum of metrics, so itself one: whether the kind of joint is another; the angle between the

@@ -10,10 +10,10 @@ import numpy as np
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
-    bounds,
     forward_kinematics,
     frame_positions,
     joint_axes,
+    joint_limits,
     reach,
 )
 from morphgen.model.robot import TOOL, Robot
@@ -82,7 +82,7 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
     return Workspace(_density(points / farthest), centre, farthest)
 
 
-def overlap(a: Workspace, b: Workspace) -> float:
+def density_overlap(a: Workspace, b: Workspace) -> float:
     """Share of configurations whose tools are in the same place, in [0, 1].
 
     The sum over all cells of the smaller density (histogram intersection: Swain and Ballard, Color
@@ -106,7 +106,7 @@ def shoulder(robot: Robot) -> Vec3:
             without a range.
     """
     path = _tool_path(robot)
-    T_root_link = forward_kinematics(robot, bounds(robot).mean(axis=1))
+    T_root_link = forward_kinematics(robot, joint_limits(robot).mean(axis=1))
     tool = robot.frame(TOOL)
     T_root_tool = T_root_link[robot.link_index[tool.link]] @ tool.T_link_frame.matrix
     anchors, directions = joint_axes(robot, T_root_link)
@@ -135,14 +135,14 @@ def _tool_path(robot: Robot) -> tuple[int, ...]:
             f"robot {robot.name!r} has no frame {TOOL!r}{nearest(TOOL, names)}; name the link at "
             "its working point: morphgen import FILE --tool LINK"
         )
-    path = robot.joints_to(robot.frame(TOOL).link)
+    path = robot.joint_chain(robot.frame(TOOL).link)
     if not _moving(robot, path):
         raise BenchmarkError(
             f"robot {robot.name!r}: no joint moves its tool, which is on link "
             f"{robot.frame(TOOL).link!r}; place the frame on a link that moves"
         )
-    for k in robot.independent:
-        low, high = robot.joints[k].bounds
+    for k in robot.independent_joints:
+        low, high = robot.joints[k].effective_limits
         if not 0 <= high - low < np.inf:
             raise BenchmarkError(
                 f"robot {robot.name!r}: joint {robot.joints[k].name!r}: limits ({low:g}, {high:g}) "
@@ -153,7 +153,7 @@ def _tool_path(robot: Robot) -> tuple[int, ...]:
 
 def _moving(robot: Robot, path: Sequence[int]) -> list[int]:
     """Positions in q of the joints that move the tool, the nearest to the root first."""
-    row = {k: i for i, k in enumerate(robot.movable)}
+    row = {k: i for i, k in enumerate(robot.movable_joints)}
     gains, _ = robot.mimic_map
     found = [int(column) for k in path if k in row for column in gains[row[k]].nonzero()[0]]
     return list(dict.fromkeys(found))
@@ -162,7 +162,7 @@ def _moving(robot: Robot, path: Sequence[int]) -> list[int]:
 def _configurations(robot: Robot, path: tuple[int, ...], samples: int) -> Array:
     """Uniform draws for the joints that move the tool, any for the others, shape (dof, n)."""
     moving = _moving(robot, path)
-    low, high = bounds(robot)[moving].T[..., None]
+    low, high = joint_limits(robot)[moving].T[..., None]
     q = np.zeros((robot.dof, samples))
     q[moving] = low + (high - low) * np.random.default_rng(_SEED).random((len(moving), samples))
     return q

@@ -56,7 +56,7 @@ CHECKS: tuple[Check, ...] = (
 
 _RANK = {"error": 0, "warning": 1, "info": 2}
 
-__all__ = ["CHECKS", "Check", "check", "fix", "with_repairs"]
+__all__ = ["CHECKS", "Check", "check", "fix", "record_repairs"]
 
 
 def check(
@@ -67,7 +67,7 @@ def check(
     Args:
         robot: The body.
         tool_required: Whether a missing or motionless tool is a finding; not so for a part.
-        home_tested: Whether it is known that nothing collides at home, as after ``survey``.
+        home_tested: Whether it is known that nothing collides at home, as after ``survey_split``.
 
     Returns:
         Findings by severity, code and place; the same robot gives the same ones.
@@ -103,10 +103,10 @@ def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
         The repaired body, whose provenance names the repairs, and the findings that are gone.
     """
     gone = tuple(f for f in check(robot, tool_required=False) if f.fixable)
-    return (with_repairs(repaired(robot), gone) if gone else robot), gone
+    return (record_repairs(repaired(robot), gone) if gone else robot), gone
 
 
-def with_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:
+def record_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:
     """A copy whose provenance, and with it its card, names repairs after those that it names.
 
     What was repaired in its file is no finding any more: nothing written of the robot has it.

@@ -96,7 +96,7 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
 def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> ConformanceRow:
     if find_spec(loader.module) is None:
         return ConformanceRow(loader.name, None, message="not installed")
-    names = [robot.joints[k].name for k in robot.movable]
+    names = [robot.joints[k].name for k in robot.movable_joints]
     positions = dict(zip(names, movable_positions(robot, q).T, strict=True))
     try:
         reading = loader.read(folder, frame, positions, len(q))
@@ -110,7 +110,7 @@ def _judged(robot: Robot, loader: str, frame: str, q: Array, reading: Reading) -
     offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
     position_error = float(np.linalg.norm(offset, axis=1).max(initial=0.0))
     rotation_error = _angle(reading.T_root_frame[:, :3, :3], expected[:, :3, :3])
-    ours = {robot.joints[k].name for k in robot.movable}
+    ours = {robot.joints[k].name for k in robot.movable_joints}
     theirs = set(reading.joints)
     faults = []
     if missing := sorted(ours - theirs):

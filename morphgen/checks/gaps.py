@@ -52,7 +52,7 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
     Shapes that cannot be read are left out, and a robot whose joints cannot be placed at home is
     not tested.
     """
-    placeable = all(is_axis_valid(robot.joints[k]) for k in robot.movable)
+    placeable = all(is_axis_valid(robot.joints[k]) for k in robot.movable_joints)
     if not placeable or not np.isfinite(movable_positions(robot, robot.home)).all():
         return
     T_root_link = forward_kinematics(robot, np.array(robot.home))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from morphgen.checks.joints import is_axis_valid
-from morphgen.checks.self_collision import SelfCollision, ignored_pairs
+from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.checks.solids import is_sound
 from morphgen.model.findings import Finding
 from morphgen.model.kinematics import movable_positions
@@ -21,11 +21,11 @@ def check_self_collision(robot: Robot) -> Iterator[Finding]:
     Neighbours across a joint and ``robot.ignore_pairs`` are left out, and so are shapes that
     cannot be read. A robot whose joints cannot be placed at home is not tested.
     """
-    placeable = all(is_axis_valid(robot.joints[k]) for k in robot.movable)
+    placeable = all(is_axis_valid(robot.joints[k]) for k in robot.movable_joints)
     if not placeable or not np.isfinite(movable_positions(robot, robot.home)).all():
         return
     touchable = robot.with_links(map(_sound, robot.links))
-    tested = SelfCollision(touchable, ignored_pairs(touchable))
+    tested = SelfCollisionChecker(touchable, untested_pairs(touchable))
     for (a, b), depth in sorted(tested.penetrations([robot.home])[0].items()):
         yield Finding(
             "self-collision",

@@ -10,8 +10,8 @@ import numpy as np
 from morphgen.checks.solids import body_shapes, solid_of
 from morphgen.model.findings import Finding
 from morphgen.model.inertia import bounding_box
-from morphgen.model.rigid import RigidGroup, rigid_groups
 from morphgen.model.robot import Inertial, Link, Robot
+from morphgen.model.tree import RigidGroup, rigid_groups
 
 DEFAULT_DENSITY = 1000.0
 """Density of a link whose source gives no mass, kg/m^3."""

@@ -138,7 +138,7 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
 
 def check_home(robot: Robot) -> Iterator[Finding]:
     """Find home positions outside the limits."""
-    for k, position in zip(robot.independent, robot.home, strict=True):
+    for k, position in zip(robot.independent_joints, robot.home, strict=True):
         joint = robot.joints[k]
         lower, upper = reachable(joint)
         if not (math.isfinite(position) and lower <= position <= upper):
@@ -205,4 +205,4 @@ def _limits_in_words(joint: Joint) -> str:
 
 
 def _movable(robot: Robot) -> Iterator[Joint]:
-    return (robot.joints[k] for k in robot.movable)
+    return (robot.joints[k] for k in robot.movable_joints)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from morphgen.checks.solids import is_scale_valid
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Mesh
-from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import Robot
+from morphgen.model.tree import rigid_groups
 
 PYBULLET_LINKS = 127
 """Links below the root that PyBullet 3.2.7 holds; of more it answers nothing."""
@@ -16,7 +16,9 @@ PYBULLET_LINKS = 127
 
 def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:
     """Tell which joints a URDF loader may leave without their leader."""
-    followers = [robot.joints[k].name for k in robot.movable if robot.joints[k].mimic is not None]
+    followers = [
+        robot.joints[k].name for k in robot.movable_joints if robot.joints[k].mimic is not None
+    ]
     if followers:
         yield Finding(
             "mimic-ignored-by-loaders",

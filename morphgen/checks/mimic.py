@@ -25,13 +25,13 @@ def check_mimic(robot: Robot) -> Iterator[Finding]:
 def check_mimic_range(robot: Robot) -> Iterator[Finding]:
     """Find followers that their leaders' ranges send past their own limits."""
     matrix, offset = robot.mimic_map
-    for row, k in enumerate(robot.movable):
+    for row, k in enumerate(robot.movable_joints):
         follower = robot.joints[k]
         lower, upper = reachable(follower)
         leaders = np.flatnonzero(matrix[row]).tolist()
         if follower.mimic is None or not leaders or not math.isfinite(upper - lower):
             continue
-        leader = robot.joints[robot.independent[leaders[0]]]
+        leader = robot.joints[robot.independent_joints[leaders[0]]]
         gain = float(matrix[row, leaders[0]])
         low, high = sorted(gain * q + float(offset[row]) for q in reachable(leader))
         slack = RANGE_TOLERANCE * (upper - lower)

@@ -25,7 +25,6 @@ from morphgen.checks.joints import (
 from morphgen.checks.names import named, safe_names
 from morphgen.checks.solids import solid_of
 from morphgen.model.inertia import with_inertia
-from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
@@ -34,7 +33,7 @@ from morphgen.model.robot import (
     Link,
     Robot,
 )
-from morphgen.model.tree import renamed
+from morphgen.model.tree import rename, rigid_groups
 
 
 def repaired(robot: Robot) -> Robot:
@@ -44,7 +43,7 @@ def repaired(robot: Robot) -> Robot:
     joints = tuple(_joint(joint, locked=joint.name in locked) for joint in robot.joints)
     home = tuple(
         _nearest_reachable(joints[k], position)
-        for k, position in zip(robot.independent, robot.home, strict=True)
+        for k, position in zip(robot.independent_joints, robot.home, strict=True)
         if joints[k].name not in locked
     )
     links = tuple(_link(link, moves=link.name in moving) for link in robot.links)
@@ -100,7 +99,7 @@ def _renamed(robot: Robot) -> Robot:
     names = named(robot)
     reserved = {"world"} if robot.link_index.get("world", 0) > 0 else ()
     frame = safe_names(names["frame"])
-    safe = renamed(robot, safe_names(names["link"], reserved), safe_names(names["joint"]))
+    safe = rename(robot, safe_names(names["link"], reserved), safe_names(names["joint"]))
     return replace(
         safe,
         name=safe_names(names["robot"])[robot.name],

@@ -7,6 +7,7 @@ that these robots run in.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -15,7 +16,6 @@ import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.checks.mujoco_warnings import caught
 from morphgen.errors import RobotError
 from morphgen.formats.mjcf_elements import (
     Meshes,
@@ -25,8 +25,8 @@ from morphgen.formats.mjcf_elements import (
 )
 from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
 from morphgen.model.kinematics import movable_positions, random_configurations
-from morphgen.model.rigid import RigidGroup, rigid_groups
 from morphgen.model.robot import Pair, Robot, sorted_pair
+from morphgen.model.tree import RigidGroup, rigid_groups
 
 PENETRATION = 1e-4
 """Depth from which an overlap counts as penetration, metres; faces that only meet do not."""
@@ -42,7 +42,7 @@ _NUDGES = (0.0, *(sign * 10.0**k for k in range(-9, -4) for sign in (1, -1)))
 parallel slides stay as they are: the least that helps, and nothing as far as depths that count."""
 
 
-class SelfCollision:
+class SelfCollisionChecker:
     """A robot's collision shapes, compiled once and tested at many configurations."""
 
     def __init__(self, robot: Robot, ignore: Iterable[Pair] | None = None) -> None:
@@ -62,7 +62,8 @@ class SelfCollision:
         self._data = mujoco.MjData(self._model)
         self._links = [int(self._model.body(i).name) for i in self._model.geom_bodyid.tolist()]
         self._addresses = np.array(
-            [self._model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable], np.intp
+            [self._model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable_joints],
+            np.intp,
         )
         self._shares = np.linspace(1.0, 0.5, len(self._addresses))
 
@@ -114,7 +115,7 @@ class SelfCollision:
         for nudge in _NUDGES:
             self._data.qpos[self._addresses] = positions + nudge * self._shares
             mujoco.mj_kinematics(self._model, self._data)
-            with caught() as told:
+            with capture_mujoco_warnings() as told:
                 mujoco.mj_collision(self._model, self._data)
             if not any(_GAVE_UP in each for each in told):
                 return
@@ -125,7 +126,7 @@ class SelfCollision:
 
 
 @dataclass(frozen=True)
-class Survey:
+class CollisionSurvey:
     """The pairs whose contact is no self-collision, and why home is without any."""
 
     ignored: tuple[Pair, ...]
@@ -148,7 +149,7 @@ def self_collisions(robot: Robot, q: ArrayLike) -> list[dict[Pair, float]]:
         MeshError: If a collision mesh cannot be read.
         ValueError: If ``q`` has another shape.
     """
-    return SelfCollision(robot).penetrations(q)
+    return SelfCollisionChecker(robot).penetrations(q)
 
 
 def ignore_pairs(
@@ -183,34 +184,34 @@ def ignore_pairs(
     Raises:
         MeshError: If a collision mesh cannot be read.
     """
-    return survey(robot, known=known, check=check, samples=samples, seed=seed).ignored
+    return survey_collisions(robot, known=known, check=check, samples=samples, seed=seed).ignored
 
 
-def survey(
+def survey_collisions(
     robot: Robot,
     *,
     known: Iterable[Pair] = (),
     check: Callable[[str, str], bool] | None = None,
     samples: int = SAMPLES,
     seed: int = 0,
-) -> Survey:
+) -> CollisionSurvey:
     """What ``ignore_pairs`` returns, with what it saw at home; see there."""
-    ignored = {sorted_pair(*pair) for pair in known} | set(attached_pairs(robot))
+    ignored = {sorted_pair(*pair) for pair in known} | set(adjacent_pairs(robot))
     left = set(_pairs(_touchable(robot))) - ignored
     if not left:
-        return Survey(tuple(sorted(ignored)), {})
-    tested = SelfCollision(robot, ignored)
+        return CollisionSurvey(tuple(sorted(ignored)), {})
+    tested = SelfCollisionChecker(robot, ignored)
     (at_home,) = tested.penetrations([robot.home])
     ignored.update(at_home)
     left = {pair for pair in left - ignored if check is None or check(*pair)}
     if left and robot.dof:
         q = random_configurations(robot, samples, np.random.default_rng(seed))
         ignored.update(_mostly_penetrating(tested, q, left))
-    return Survey(tuple(sorted(ignored)), at_home)
+    return CollisionSurvey(tuple(sorted(ignored)), at_home)
 
 
 def _mostly_penetrating(
-    tested: SelfCollision, q: NDArray[np.float64], pairs: set[Pair]
+    tested: SelfCollisionChecker, q: NDArray[np.float64], pairs: set[Pair]
 ) -> set[Pair]:
     """Those of the pairs that penetrate in at least ``MOSTLY`` of the configurations.
 
@@ -227,15 +228,15 @@ def _mostly_penetrating(
     return set(apart)
 
 
-def ignored_pairs(robot: Robot) -> tuple[Pair, ...]:
+def untested_pairs(robot: Robot) -> tuple[Pair, ...]:
     """Pairs of links that nothing tests: those the robot ignores, and neighbours across joints.
 
     Robots that morphgen made ignore neighbours already; one that was read as it stands may not.
     """
-    return tuple(sorted({*robot.ignore_pairs, *attached_pairs(robot)}))
+    return tuple(sorted({*robot.ignore_pairs, *adjacent_pairs(robot)}))
 
 
-def attached_pairs(robot: Robot) -> tuple[Pair, ...]:
+def adjacent_pairs(robot: Robot) -> tuple[Pair, ...]:
     """Pairs of links in one rigid body or across one movable joint, sorted.
 
     Only links with collision shapes are named. A rigid body without any is passed through, so
@@ -306,3 +307,15 @@ def _model(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
         raise RobotError(
             f"robot {robot.name!r} has a shape or depth that MuJoCo refuses: {error}"
         ) from error
+
+
+@contextmanager
+def capture_mujoco_warnings() -> Iterator[list[str]]:
+    """Collect warnings while this lasts; they are MuJoCo's own, of all threads."""
+    told: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(told.append)
+    try:
+        yield told
+    finally:
+        mujoco.set_mju_user_warning(before)

@@ -10,7 +10,7 @@ from morphgen.checks.solids import is_scale_valid, is_sound, mesh_fault
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.inertia import bounding_box
-from morphgen.model.mesh import MAX_STL_FACES, hull, load_mesh
+from morphgen.model.mesh import MAX_STL_FACES, convex_hull, load_mesh
 from morphgen.model.robot import Robot
 
 EXTENT_RANGE = (1e-3, 10.0)
@@ -90,7 +90,7 @@ def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Findin
     if fault is not None:
         yield Finding("mesh-unreadable", "error", where, fault, "export the mesh again")
         return
-    flat = mesh_fault(mesh, reader=hull) if collides else None
+    flat = mesh_fault(mesh, reader=convex_hull) if collides else None
     if flat is not None:
         yield Finding("mesh-flat", "error", where, flat, "collide with a thin box instead")
     faces = len(load_mesh(mesh).faces)

@@ -9,8 +9,8 @@ import numpy as np
 
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Geometry, Mesh, Shape, dimensions
-from morphgen.model.inertia import bounding_box, inertial_of
-from morphgen.model.mesh import hull, load_mesh
+from morphgen.model.inertia import bounding_box, inertial_from_density
+from morphgen.model.mesh import convex_hull, load_mesh
 from morphgen.model.robot import Inertial, Link
 
 FLATNESS = 1e-9
@@ -21,7 +21,7 @@ def is_sound(geometry: Geometry) -> bool:
     """Whether a geometry can be measured: positive dimensions, or a mesh that has a hull."""
     if not isinstance(geometry, Mesh):
         return all(math.isfinite(size) and size > 0 for size in dimensions(geometry))
-    return is_scale_valid(geometry) and mesh_fault(geometry, reader=hull) is None
+    return is_scale_valid(geometry) and mesh_fault(geometry, reader=convex_hull) is None
 
 
 def is_scale_valid(mesh: Mesh) -> bool:
@@ -48,6 +48,6 @@ def solid_of(link: Link) -> Inertial | None:
     shapes = body_shapes(link)
     if not shapes or not all(is_sound(shape.geometry) for shape in shapes):
         return None
-    solid = inertial_of(shapes, density=1.0)
+    solid = inertial_from_density(shapes, density=1.0)
     extent = float(np.ptp(bounding_box(shapes), axis=0).max())
     return solid if solid.mass > FLATNESS * extent**3 else None

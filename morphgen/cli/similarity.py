@@ -69,7 +69,7 @@ def add_parser(commands: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare, print, draw, write."""
-    from morphgen.benchmark.similarity import measure_named
+    from morphgen.benchmark.similarity import get_measure
     from morphgen.errors import BenchmarkError
 
     measures = MEASURES[:-1] if args.measure == "all" else (args.measure,)
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         found = {
             name: {
-                "larger_is_more_alike": measure_named(name).larger_is_more_alike,
+                "larger_is_more_alike": get_measure(name).larger_is_more_alike,
                 "matrix": matrices[name].tolist(),
             }
             for name in measures
@@ -146,7 +146,7 @@ def _names(robots: Sequence[Features], sources: Sequence[RobotSource]) -> list[s
 def _matrices(robots: Sequence[Features], measures: Sequence[str], *, quiet: bool) -> Matrices:
     from tqdm import tqdm
 
-    from morphgen.benchmark.similarity import matrix
+    from morphgen.benchmark.similarity import similarity_matrix
 
     pairs = len(measures) * len(robots) * (len(robots) + 1) // 2
     hidden = quiet or None
@@ -155,14 +155,14 @@ def _matrices(robots: Sequence[Features], measures: Sequence[str], *, quiet: boo
         def show(done: int) -> None:
             bar.update(done)
 
-        return {name: matrix(robots, name, show) for name in measures}
+        return {name: similarity_matrix(robots, name, show) for name in measures}
 
 
 def _text(names: Sequence[str], measure: str, matrices: Matrices) -> str:
     """What is printed of a measure."""
-    from morphgen.benchmark.similarity import measure_named
+    from morphgen.benchmark.similarity import get_measure
 
-    about = measure_named(measure)
+    about = get_measure(measure)
     better = "larger" if about.larger_is_more_alike else "smaller"
     title = f"{_title(measure)}; {better} is more alike"
     table = _whole if len(names) <= WHOLE else _nearest
@@ -182,10 +182,10 @@ def _nearest(names: Sequence[str], measure: str, matrices: Matrices) -> str:
     import numpy as np
     from tabulate import tabulate
 
-    from morphgen.benchmark.similarity import distances
+    from morphgen.benchmark.similarity import to_distances
 
     values = matrices[measure]
-    apart = distances(values, measure)
+    apart = to_distances(values, measure)
     np.fill_diagonal(apart, np.inf)
     others = (values.sum(axis=1) - values.diagonal()) / (len(names) - 1)
     rows = [
@@ -222,10 +222,10 @@ def _write(args: argparse.Namespace, names: Sequence[str], matrices: Matrices) -
 
 def _heatmap(names: Sequence[str], matrices: Matrices) -> bytes:
     from morphgen.benchmark.figures import Panel, heatmap_png
-    from morphgen.benchmark.similarity import measure_named
+    from morphgen.benchmark.similarity import get_measure
 
     panels = [
-        Panel(_title(name), values, measure_named(name).larger_is_more_alike)
+        Panel(_title(name), values, get_measure(name).larger_is_more_alike)
         for name, values in matrices.items()
     ]
     return heatmap_png(names, panels)
@@ -233,20 +233,19 @@ def _heatmap(names: Sequence[str], matrices: Matrices) -> bytes:
 
 def _map(names: Sequence[str], matrices: Matrices) -> bytes:
     from morphgen.benchmark.figures import MapPanel, map_png
-    from morphgen.benchmark.scaling_map import scaling_map
-    from morphgen.benchmark.similarity import distances
+    from morphgen.benchmark.similarity import classical_mds, to_distances
 
     panels = [
-        MapPanel(_title(name), scaling_map(distances(values, name)))
+        MapPanel(_title(name), classical_mds(to_distances(values, name)))
         for name, values in matrices.items()
     ]
     return map_png(names, panels)
 
 
 def _title(measure: str) -> str:
-    from morphgen.benchmark.similarity import measure_named
+    from morphgen.benchmark.similarity import get_measure
 
-    return f"{measure}: {measure_named(measure).meaning}"
+    return f"{measure}: {get_measure(measure).meaning}"
 
 
 def _csv(names: Sequence[str], matrices: Matrices) -> bytes:

@@ -22,8 +22,8 @@ from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, li
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit, Near
-    from morphgen.benchmark.paper import Figures
     from morphgen.benchmark.split import Split
+    from morphgen.benchmark.statistics import PaperRow
     from morphgen.model.findings import Finding
     from morphgen.tasks.goal_making import SplitGoals
 
@@ -262,9 +262,8 @@ def run_stats(args: argparse.Namespace) -> int:
     """Print the table."""
     from tabulate import tabulate
 
-    from morphgen.benchmark.paper import SOURCE, figures_of
     from morphgen.benchmark.split_file import read_split, split_names
-    from morphgen.benchmark.statistics import statistics
+    from morphgen.benchmark.statistics import PAPER_TABLE, paper_row, statistics
 
     library = library_of(args)
     rows = _same_robots([read_split(name) for name in args.splits or split_names()])
@@ -279,17 +278,17 @@ def run_stats(args: argparse.Namespace) -> int:
                 "robots": title,
                 "splits": [split.name for split in splits],
                 "ours": figures,
-                "paper": asdict(theirs) if (theirs := figures_of(title)) else None,
+                "paper": asdict(theirs) if (theirs := paper_row(title)) else None,
             }
             for title, splits, figures in found
         ]
-        print(json.dumps({"rows": data, "paper": SOURCE}))
+        print(json.dumps({"rows": data, "paper": PAPER_TABLE}))
         return 0
     lines = [_stats_row(title, figures) for title, _, figures in found]
     style = "github" if args.markdown else "simple"
     print(tabulate(lines, "keys", tablefmt=style, disable_numparse=True))
     print("\nlinks, joints, mass: mean over the train robots; cosine: of test and train robots")
-    print(f"in parentheses: {SOURCE}")
+    print(f"in parentheses: {PAPER_TABLE}")
     return 0
 
 
@@ -310,10 +309,10 @@ def _common(names: Sequence[str]) -> str:
 
 
 def _stats_row(title: str, figures: Mapping[str, Any]) -> dict[str, str]:
-    from morphgen.benchmark.paper import figures_of
+    from morphgen.benchmark.statistics import paper_row
 
     train, cosine = figures["train"], figures["cosine"]
-    theirs = figures_of(title)
+    theirs = paper_row(title)
     row = {"robots": title, "train": train["robots"], "test": figures["test"]["robots"]}
     for key in ("links", "movable", "movable_to_tool"):
         row[key.replace("_", " ")] = _beside(f"{train[key]:.4g}", theirs, key)
@@ -324,7 +323,7 @@ def _stats_row(title: str, figures: Mapping[str, Any]) -> dict[str, str]:
     return row
 
 
-def _beside(ours: str, theirs: Figures | None, key: str) -> str:
+def _beside(ours: str, theirs: PaperRow | None, key: str) -> str:
     """Our figure, the paper's in parentheses if there is one."""
     if theirs is None:
         return ours

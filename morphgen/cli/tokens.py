@@ -113,20 +113,20 @@ def _run_layout(args: argparse.Namespace) -> int:
 
 
 def _write(path: Path, tokens: Array, robot: Robot, max_links: int) -> None:
-    from morphgen.benchmark.tokens import npz
+    from morphgen.benchmark.tokens import tokens_npz
     from morphgen.formats.files import save
 
-    save(path, npz(tokens, [link.name for link in robot.links], robot.name, max_links))
+    save(path, tokens_npz(tokens, [link.name for link in robot.links], robot.name, max_links))
 
 
 def _text(tokens: Array, robot: Robot, max_links: int) -> str:
     """A row a link, read back from the tokens."""
     from tabulate import tabulate
 
-    from morphgen.benchmark.tokens import robot_of_tokens
+    from morphgen.benchmark.tokens import robot_from_tokens
 
-    read, shapes = robot_of_tokens(tokens, robot.name, max_links=max_links)
-    home = dict(zip(read.independent, read.home, strict=True))
+    read, shapes = robot_from_tokens(tokens, robot.name, max_links=max_links)
+    home = dict(zip(read.independent_joints, read.home, strict=True))
     tools = {frame.link for frame in read.frames}
     rows = []
     for i, link in enumerate(read.links):

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from morphgen.checks.self_collision import SelfCollision, ignored_pairs
+from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics, random_configurations
@@ -71,11 +71,13 @@ def agreement(
     Returns:
         How the primitives agree with the meshes, and how the meshes' convex hulls do.
     """
-    ignored = {*ignored_pairs(meshes), *primitives.ignore_pairs}
+    ignored = {*untested_pairs(meshes), *primitives.ignore_pairs}
     q = random_configurations(meshes, n, np.random.default_rng(seed))
     truth = np.array(list(_mesh_collisions(meshes, ignored, q)))
     first, second = (
-        _counts(truth, np.array([bool(pairs) for pairs in SelfCollision(robot, ignored).each(q)]))
+        _counts(
+            truth, np.array([bool(pairs) for pairs in SelfCollisionChecker(robot, ignored).each(q)])
+        )
         for robot in (primitives, meshes)
     )
     return first, second

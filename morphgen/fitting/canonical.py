@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from morphgen.fitting.kinds import Kind
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
-from morphgen.model.rotation import IDENTITY, Quat, normalized
+from morphgen.model.rotation import IDENTITY, Quat, normalize
 from morphgen.typing import Array
 
 _DECIMALS = 9
@@ -62,14 +62,14 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
         alike = R @ _QUARTER_TURNS
         best = alike[np.argmax(np.trace(alike, axis1=1, axis2=2).round(_DECIMALS))]
         w, x, y, z = Rotation.from_matrix(best).as_quat(scalar_first=True).tolist()
-        return normalized((w, x, y, z))
+        return normalize((w, x, y, z))
     x, y, z = R[:, 2].tolist()
     if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
         x, y, z = -x, -y, -z
-    return normalized((1 + z, -y, x, 0.0))
+    return normalize((1 + z, -y, x, 0.0))
 
 
 def rounded(quaternion: Quat) -> Quat:
     """The same rotation to nine decimals, beyond which fits differ from machine to machine."""
-    w, x, y, z = (round(value, _QUATERNION_DECIMALS) for value in normalized(quaternion))
-    return normalized((w, x, y, z))
+    w, x, y, z = (round(value, _QUATERNION_DECIMALS) for value in normalize(quaternion))
+    return normalize((w, x, y, z))

@@ -24,8 +24,7 @@ from morphgen.formats.fits import (
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
-from morphgen.model.fits import Stored, StoredFit
-from morphgen.model.geometry import Shape
+from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Robot
 from morphgen.processes import mapped
 
@@ -82,7 +81,7 @@ def store_part(manifest: Manifest) -> Path:
     return path
 
 
-def fits_of(robot: Robot, report: FitReport, stored: Stored) -> dict[str, StoredFit]:
+def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, StoredFit]:
     """The fits of a report by link; tokens are those of the robot, if fits of it are known.
 
     Args:

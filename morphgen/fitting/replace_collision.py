@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.checks.self_collision import survey
+from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import FitError
 from morphgen.formats.fits import VERSION, fit_of, has_meshes, read_stored, shapes_key
 from morphgen.formats.rounding import as_written
-from morphgen.model.fits import Stored, StoredFit
-from morphgen.model.geometry import Shape
+from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
 
 
@@ -85,11 +84,11 @@ def with_primitives(
     """
     links = tuple(_with_collision(link, primitives.get(link.name), visual) for link in robot.links)
     made = as_written(replace(robot, links=links, ignore_pairs=()))
-    return replace(made, ignore_pairs=survey(made).ignored)
+    return replace(made, ignore_pairs=survey_collisions(made).ignored)
 
 
 def stored_primitives(
-    robot: Robot, stored: Stored
+    robot: Robot, stored: StoredFits
 ) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
     """Primitives by link as they were fitted before, and the links of which nothing is stored."""
     fits = _known_fits(robot, stored)
@@ -105,7 +104,7 @@ def stored_primitives(
     return found, missing
 
 
-def _known_fits(robot: Robot, stored: Stored) -> dict[str, StoredFit]:
+def _known_fits(robot: Robot, stored: StoredFits) -> dict[str, StoredFit]:
     """Fits of links with collision shapes that the robot brings or that are stored."""
     found = {link.name: fit_of(link.collisions, robot, stored) for link in robot.links}
     return {name: fit for name, fit in found.items() if fit}

@@ -21,7 +21,7 @@ from morphgen.fitting.kinds import KINDS
 from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
-from morphgen.model.rotation import normalized
+from morphgen.model.rotation import normalize
 from morphgen.typing import Array
 
 COARSE_POINTS = 2**11
@@ -84,7 +84,7 @@ class Sampled:
                     geometry = Sphere(x)
             a, b, c = np.round(centre, DIGITS).tolist()
             w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
-            pose = Pose((a, b, c), normalized((w, i, j, k)))
+            pose = Pose((a, b, c), normalize((w, i, j, k)))
             found.append(canonical(Shape(geometry, pose)))
         return tuple(found)
 

@@ -25,7 +25,7 @@ from morphgen.errors import FitError
 from morphgen.fitting.cavities import Cavities
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
-from morphgen.model.mesh import FLAT, is_flat, load_mesh
+from morphgen.model.mesh import FLATNESS_TOLERANCE, is_flat, load_mesh
 from morphgen.typing import Array
 
 Method = Literal["watertight", "repaired", "winding", "filled", "hull"]
@@ -189,7 +189,7 @@ def _turned_outwards(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
     local = corners - middle[piece][:, None]
     volumes = np.einsum("ij,ij->i", local[:, 0], np.cross(local[:, 1], local[:, 2])) / 6
     # A flat piece has no inside to turn away from.
-    least = FLAT * np.bincount(piece, turned.area_faces) ** 1.5
+    least = FLATNESS_TOLERANCE * np.bincount(piece, turned.area_faces) ** 1.5
     inverted = (np.bincount(piece, volumes) < -least)[piece]
     if not inverted.any():
         return turned, turned is not mesh

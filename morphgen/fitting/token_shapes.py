@@ -25,8 +25,8 @@ from morphgen.formats.fits import (
     shapes_scale,
 )
 from morphgen.formats.rounding import rounded_shapes
-from morphgen.model.geometry import Shape, scaled_shape
-from morphgen.model.inertia import union_moments
+from morphgen.model.geometry import Shape, scale_shape
+from morphgen.model.inertia import union_integrals
 from morphgen.model.robot import Robot
 
 _KEPT = "tokens-4"
@@ -75,8 +75,8 @@ def _main_primitive(shapes: Sequence[Shape]) -> Shape | None:
     """The shape that the others hardly add to, if it is a primitive."""
     if not are_primitives(shapes):
         return None
-    largest = max(shapes, key=lambda shape: union_moments([shape]).volume)
-    share = union_moments([largest]).volume / union_moments(shapes).volume
+    largest = max(shapes, key=lambda shape: union_integrals([shape]).volume)
+    share = union_integrals([largest]).volume / union_integrals(shapes).volume
     return largest if share >= NEARLY else None
 
 
@@ -87,11 +87,11 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
     if path.is_file():
         try:
             data = read_json(path)
-            return None if data is None else scaled_shape(shape_of(data), factor)
+            return None if data is None else scale_shape(shape_of(data), factor)
         except (FormatError, KeyError, TypeError, ValueError) as error:
             raise FormatError(f"{path}: no fitted primitive: {error!r}; delete it") from error
     shape = _fitted(shapes)
-    data = None if shape is None else shape_data(scaled_shape(shape, 1 / factor))
+    data = None if shape is None else shape_data(scale_shape(shape, 1 / factor))
     try:
         keep(path, json.dumps(data))
     except OSError as error:

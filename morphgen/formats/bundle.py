@@ -25,8 +25,7 @@ from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import own_frames, read_urdf, with_frames
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
-from morphgen.model.fits import Stored
-from morphgen.model.geometry import Mesh, Shape
+from morphgen.model.geometry import Mesh, Shape, StoredFits
 from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts
 from morphgen.model.robot import Link, Robot
 
@@ -119,7 +118,7 @@ def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     return replace(apply_card(robot, card, place), fits=_read_fits(folder))
 
 
-def _read_fits(folder: Path) -> Stored:
+def _read_fits(folder: Path) -> StoredFits:
     path = folder / FITS
     if not path.exists():
         return {}

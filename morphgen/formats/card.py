@@ -47,12 +47,12 @@ def card_of(
         bytes anywhere.
     """
     has_tool = any(frame.name == "tool" for frame in robot.frames)
-    joints = [robot.joints[k] for k in robot.independent]
+    joints = [robot.joints[k] for k in robot.independent_joints]
     return {
         "format": CARD_FORMAT,
         "name": robot.name,
         "links": len(robot.links),
-        "movable": len(robot.movable),
+        "movable": len(robot.movable_joints),
         "dof": robot.dof,
         "mass": rounded(robot.mass),
         "reach": rounded(reach(robot)) if has_tool and robot.dof else None,
@@ -126,7 +126,7 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
             raise FormatError(f"{origin}: parts: expected objects with label and part")
     try:
         home = card["home"]
-        positions = tuple(float(home[robot.joints[k].name]) for k in robot.independent)
+        positions = tuple(float(home[robot.joints[k].name]) for k in robot.independent_joints)
         if not all(map(math.isfinite, positions)):
             raise ValueError("a position at home is not finite")
         return replace(

@@ -20,7 +20,6 @@ from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import number
-from morphgen.model.fits import Stored, StoredFit
 from morphgen.model.geometry import (
     Box,
     Capsule,
@@ -30,7 +29,9 @@ from morphgen.model.geometry import (
     Pose,
     Shape,
     Sphere,
-    scaled_shape,
+    StoredFit,
+    StoredFits,
+    scale_shape,
 )
 from morphgen.model.robot import Link, Robot
 
@@ -46,7 +47,7 @@ _LONGEST = 200
 """Letters of a malformed entry that an error shows."""
 
 
-def stored_fit(shapes: Sequence[Shape], stored: Stored) -> StoredFit | None:
+def stored_fit(shapes: Sequence[Shape], stored: StoredFits) -> StoredFit | None:
     """What is stored for shapes, or for the same ones at another scale.
 
     Raises:
@@ -56,7 +57,7 @@ def stored_fit(shapes: Sequence[Shape], stored: Stored) -> StoredFit | None:
     return fit and fit.scaled(shapes_scale(shapes))
 
 
-def fit_of(shapes: Sequence[Shape], robot: Robot, stored: Stored) -> StoredFit | None:
+def fit_of(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> StoredFit | None:
     """The fit of a link's collision shapes: what its robot brings, or for meshes what is stored.
 
     Raises:
@@ -86,7 +87,7 @@ def shapes_key(shapes: Sequence[Shape]) -> str:
         FormatError: If a mesh file cannot be read.
     """
     factor = 1 / shapes_scale(shapes)
-    text = "\n".join(sorted(_shape_text(scaled_shape(shape, factor)) for shape in shapes))
+    text = "\n".join(sorted(_shape_text(scale_shape(shape, factor)) for shape in shapes))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

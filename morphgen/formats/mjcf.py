@@ -176,13 +176,13 @@ def _write_constraints(root: etree._Element, robot: Robot) -> None:
         etree.SubElement(contact, "exclude", body1=a, body2=b)
     equality = etree.SubElement(root, "equality")
     matrix, offset = robot.mimic_map
-    for row, k in enumerate(robot.movable):
+    for row, k in enumerate(robot.movable_joints):
         joint = robot.joints[k]
         if joint.mimic is None:
             continue
         element = etree.SubElement(equality, "joint", name=f"{joint.name}_mimic", joint1=joint.name)
         for column in np.flatnonzero(matrix[row]).tolist():
-            element.set("joint2", robot.joints[robot.independent[column]].name)
+            element.set("joint2", robot.joints[robot.independent_joints[column]].name)
         element.set("polycoef", join([offset[row], matrix[row].sum(), 0, 0, 0]))
 
 
@@ -206,7 +206,7 @@ def _write_actuators(root: etree._Element, robot: Robot, gains: tuple[Actuation,
 
 def _write_home(root: etree._Element, robot: Robot, world: etree._Element) -> None:
     values = movable_positions(robot, robot.home).tolist()
-    positions = {robot.joints[k].name: q for k, q in zip(robot.movable, values, strict=True)}
+    positions = {robot.joints[k].name: q for k, q in zip(robot.movable_joints, values, strict=True)}
     key = etree.SubElement(etree.SubElement(root, "keyframe"), "key", name="home")
     if positions:
         key.set("qpos", join(positions[joint.get("name", "")] for joint in world.iter("joint")))

@@ -11,7 +11,7 @@ import trimesh
 from lxml import etree
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.mesh import hull, load_mesh
+from morphgen.model.mesh import convex_hull, load_mesh
 from morphgen.model.robot import Joint
 from morphgen.typing import Array
 
@@ -53,7 +53,7 @@ class Meshes:
         for (mesh, collision), name in self._names.items():
             if name in self._vertices:
                 continue
-            triangles = hull(mesh) if collision else load_mesh(mesh)
+            triangles = convex_hull(mesh) if collision else load_mesh(mesh)
             vertices = np.asarray(triangles.vertices, dtype=np.float64)
             missing = max(0, 4 - len(vertices))
             spec.add_mesh(

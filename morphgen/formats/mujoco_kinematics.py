@@ -31,7 +31,7 @@ class MujocoKinematics:
         self._robot = robot
         self.model = to_spec(robot.with_links(bare)).compile()
         self.data = mujoco.MjData(self.model)
-        names = (robot.joints[k].name for k in robot.movable)
+        names = (robot.joints[k].name for k in robot.movable_joints)
         self._address = [self.model.joint(name).qposadr[0] for name in names]
 
     def frame_pose(self, q: Array, frame: str = TOOL) -> Array:

@@ -111,7 +111,7 @@ def _render_pybullet(
                 pybullet.getJointInfo(body, i, physicsClientId=client)[1].decode(): i
                 for i in range(pybullet.getNumJoints(body, physicsClientId=client))
             }
-            for k, position in zip(robot.movable, movable_positions(robot, q), strict=True):
+            for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
                 pybullet.resetJointState(
                     body, index[robot.joints[k].name], float(position), physicsClientId=client
                 )
@@ -142,7 +142,7 @@ def _render_mujoco(
 
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     data = mujoco.MjData(model)
-    for k, position in zip(robot.movable, movable_positions(robot, q), strict=True):
+    for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
         data.qpos[model.joint(robot.joints[k].name).qposadr[0]] = position
     mujoco.mj_forward(model, data)
     model.vis.global_.fovy = _FOV

@@ -29,7 +29,7 @@ from morphgen.model.robot import (
     Mimic,
     Robot,
 )
-from morphgen.model.rotation import Vec3, normalized
+from morphgen.model.rotation import Vec3, normalize
 
 _TURN_DECIMALS = 10
 """Decimals of a quaternion over its largest entry. Three angles of 12 digits lose up to 1.5e-11."""
@@ -60,7 +60,7 @@ def rounded_pose(pose: Pose) -> Pose:
         return pose
     lead = next(value for value in entries if abs(value) > most - _LARGEST)
     w, x, y, z = (round(value / lead, _TURN_DECIMALS) for value in entries)
-    return Pose(_vector(pose.position), normalized((w, x, y, z)))
+    return Pose(_vector(pose.position), normalize((w, x, y, z)))
 
 
 def rounded_axis(joint: Joint) -> Vec3:

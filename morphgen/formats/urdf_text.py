@@ -73,7 +73,7 @@ def _write_own(root: etree._Element, robot: Robot) -> None:
     if not (robot.home or robot.frames):
         return
     own = etree.SubElement(root, OWN)
-    for row, position in zip(robot.independent, robot.home, strict=True):
+    for row, position in zip(robot.independent_joints, robot.home, strict=True):
         home = {"joint": robot.joints[row].name, "position": number(position)}
         etree.SubElement(own, "home", home)
     for frame in robot.frames:

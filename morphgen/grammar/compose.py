@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from morphgen.checks.self_collision import Survey, ignore_pairs, survey
+from morphgen.checks.self_collision import CollisionSurvey, ignore_pairs, survey_collisions
 from morphgen.errors import CompositionError, nearest
 from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
@@ -203,7 +203,7 @@ def _provenance(placed: Iterable[Placed]) -> list[dict[str, object]]:
     ]
 
 
-def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Survey:
+def survey_of(robot: Robot, derivation: Derivation, library: Library) -> CollisionSurvey:
     """Which contacts of a joined robot are no self-collision.
 
     Those of each real part, as it is made, are known from before; all others are tested. Parts
@@ -222,11 +222,15 @@ def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Survey:
         if not manifest.is_template:
             pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(load_part(manifest))]
             known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
-    found = survey(robot, known=known, check=lambda a, b: owner[a] != owner[b] or a in tested)
+    found = survey_collisions(
+        robot, known=known, check=lambda a, b: owner[a] != owner[b] or a in tested
+    )
     faulty = {
         (a, b) for (a, b), depth in found.at_home.items() if owner[a] != owner[b] and depth > TOUCH
     }
-    return Survey(tuple(pair for pair in found.ignored if pair not in faulty), found.at_home)
+    return CollisionSurvey(
+        tuple(pair for pair in found.ignored if pair not in faulty), found.at_home
+    )
 
 
 @lru_cache(maxsize=256)

@@ -55,14 +55,16 @@ class Properties:
     @cached_property
     def movable(self) -> float:
         """Joints that move, mimic joints among them."""
-        return len(self._robot.movable)
+        return len(self._robot.movable_joints)
 
     @cached_property
     def movable_to_tool(self) -> float:
         """Movable joints between the root and the tool; 0 without a tool."""
         robot = self._robot
         link = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
-        return 0 if link is None else sum(robot.joints[k].is_movable for k in robot.joints_to(link))
+        return (
+            0 if link is None else sum(robot.joints[k].is_movable for k in robot.joint_chain(link))
+        )
 
     @cached_property
     def height(self) -> float:

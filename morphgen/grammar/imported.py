@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.checks import fix, with_repairs
+from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import FormatError, nearest
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read_urdf
 from morphgen.model.robot import Frame, Robot
-from morphgen.model.tree import renamed, subtree
+from morphgen.model.tree import rename, subtree
 
 
 def import_robot(
@@ -59,7 +59,7 @@ def import_robot(
     robot = replace(
         robot, name=robot.name if name is None else name, provenance={"source": path.name}
     )
-    robot = with_repairs(robot, robot.source_findings)
+    robot = record_repairs(robot, robot.source_findings)
     if repair:
         robot, _ = fix(robot)
     return replace(robot, ignore_pairs=ignore_pairs(robot))
@@ -67,7 +67,7 @@ def import_robot(
 
 def _without_name_clash(robot: Robot) -> Robot:
     """A link ``tool`` becomes ``tool_link``: a bundle's URDF has a link for the frame itself."""
-    return renamed(
+    return rename(
         robot,
         {"tool": "tool_link"} if "tool" in robot.link_index else {},
         {"tool_joint": "tool_link_joint"} if "tool_joint" in robot.joint_index else {},

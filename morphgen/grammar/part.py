@@ -19,10 +19,9 @@ from morphgen.formats.xacro_compile import CompiledXacro, compile_xacro
 from morphgen.grammar.manifest import Manifest, Number, PackageSource, Placement
 from morphgen.grammar.parameters import resolve_values
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
-from morphgen.model.inertia import inertial_of_mass, with_inertia
+from morphgen.model.inertia import inertial_from_mass, with_inertia
 from morphgen.model.robot import Frame, Link, Robot
-from morphgen.model.scaling import scaled
-from morphgen.model.tree import renamed, subtree
+from morphgen.model.tree import rename, scale_links, subtree
 
 _examined: WeakSet[CompiledXacro] = WeakSet()
 _EXPRESSION = re.compile(r"\$\{(.*)\}")
@@ -87,7 +86,7 @@ def _load(frozen: _Frozen) -> Part:
     body = _with_frames(body, manifest, values)
     body = _with_scaling(body, manifest, values)
     links = safe_names(link.name for link in body.links)
-    body = renamed(body, links, safe_names(joint.name for joint in body.joints))
+    body = rename(body, links, safe_names(joint.name for joint in body.joints))
     has_tool = manifest.tool is not None
     return Part(
         manifest,
@@ -125,7 +124,7 @@ def _with_scaling(body: Robot, manifest: Manifest, values: Mapping[str, float]) 
                 f"{nearest(scaling.parameter, values)}"
             )
         factors[link] = values[scaling.parameter]
-    return scaled(body, factors, {link: each.face for link, each in manifest.scaling.items()})
+    return scale_links(body, factors, {link: each.face for link, each in manifest.scaling.items()})
 
 
 def _read_source(manifest: Manifest, values: Mapping[str, float]) -> Robot:
@@ -167,7 +166,7 @@ def _with_motion(body: Robot, manifest: Manifest, values: Mapping[str, float]) -
                 raise PartError(
                     f"{manifest.path}: {key}: no joint {name!r}{nearest(name, body.joint_index)}"
                 )
-    independent = [body.joints[k].name for k in body.independent]
+    independent = [body.joints[k].name for k in body.independent_joints]
     for name in manifest.home:
         if name not in independent:
             raise PartError(f"{manifest.path}: home: {name!r} does not move by itself")
@@ -212,7 +211,7 @@ def _with_body(link: Link, manifest: Manifest) -> Link:
         link = replace(link, collisions=tuple(replace(shape, rgba=None) for shape in link.visuals))
     if link.name in manifest.mass:
         mass = manifest.mass[link.name]
-        return replace(link, inertial=inertial_of_mass(link, mass) if mass else None)
+        return replace(link, inertial=inertial_from_mass(link, mass) if mass else None)
     if manifest.density is not None and link.inertial is None:
         return with_inertia(link, manifest.density)
     return link

@@ -210,7 +210,7 @@ def _record(drawn: Sample) -> Record:
         "derivation": str(drawn.derivation),
         "dof": robot.dof,
         "links": len(robot.links),
-        "movable": len(robot.movable),
+        "movable": len(robot.movable_joints),
         "reach": rounded(drawn.properties.reach),
         "mass": rounded(robot.mass),
         "findings": sorted({finding.code for finding in drawn.findings}),

@@ -13,20 +13,20 @@ from morphgen.typing import Array
 
 BANDWIDTH = 30.0
 """Natural frequency of the position control that the gains give, rad/s."""
-REFLECTED = 0.05
+MIN_RELATIVE_INERTIA = 0.05
 """Least inertia of a joint, relative to the robot's largest of its kind, turning or sliding.
 
 Geared motors add their rotor's inertia, times the square of the gear ratio, to the joint; a wrist
 with the gains of its own few grams would give way to a touch. Descriptions hardly ever name it.
 """
-MOTOR_INERTIA = 0.02
+MIN_ROTATIONAL_INERTIA = 0.02
 """Least inertia of a joint that turns, kg m^2.
 
 For bodies that are light everywhere: what the motor of a small hobby arm adds would otherwise be
 left out, and the friction of a block of 0.1 kg turn the wrist that pushes it. MuJoCo Menagerie
 (SO-ARM100, UR10e) has 0.1 in every joint.
 """
-MIN_INERTIA = 1e-5
+MIN_SLIDING_MASS = 1e-5
 """Least inertia of a joint that slides, kg."""
 
 
@@ -59,7 +59,7 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """
     T_root_link = forward_kinematics(robot, np.asarray(q, dtype=np.float64))
     J_root_link = link_jacobians(robot, T_root_link)
-    M = np.zeros((len(robot.movable),) * 2)
+    M = np.zeros((len(robot.movable_joints),) * 2)
     for i, link in enumerate(robot.links):
         if link.inertial is None or link.inertial.mass == 0:
             continue
@@ -78,13 +78,15 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
 
     Stiffness is omega^2 I and damping 2 omega I (critical), with omega = ``BANDWIDTH`` and I
     the joint's diagonal entry of the joint-space inertia at home, with the motor's: see
-    ``REFLECTED`` and ``MOTOR_INERTIA``.
+    ``MIN_RELATIVE_INERTIA`` and ``MIN_ROTATIONAL_INERTIA``.
     """
     inertia = np.diag(mass_matrix(robot, robot.home))
-    slides = np.array([robot.joints[k].kind == "prismatic" for k in robot.independent], dtype=bool)
+    slides = np.array(
+        [robot.joints[k].kind == "prismatic" for k in robot.independent_joints], dtype=bool
+    )
     least = np.zeros(robot.dof)
-    for kind, floor in ((slides, MIN_INERTIA), (~slides, MOTOR_INERTIA)):
-        least[kind] = max(REFLECTED * inertia[kind].max(initial=0.0), floor)
+    for kind, floor in ((slides, MIN_SLIDING_MASS), (~slides, MIN_ROTATIONAL_INERTIA)):
+        least[kind] = max(MIN_RELATIVE_INERTIA * inertia[kind].max(initial=0.0), floor)
     total = np.maximum(inertia, least)
     return tuple(
         Actuation(
@@ -96,6 +98,6 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
             velocity=robot.joints[k].velocity,
         )
         for k, value, added in zip(
-            robot.independent, total.tolist(), (total - inertia).tolist(), strict=True
+            robot.independent_joints, total.tolist(), (total - inertia).tolist(), strict=True
         )
     )

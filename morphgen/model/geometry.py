@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -62,7 +63,7 @@ class Pose:
         """The transform from a to b."""
         inverse = rotation.conjugate(self.quaternion)
         x, y, z = rotation.rotate(inverse, self.position)
-        return Pose((-x, -y, -z), rotation.normalized(inverse))
+        return Pose((-x, -y, -z), rotation.normalize(inverse))
 
     def apply(self, point: Vec3) -> Vec3:
         """Coordinates in a of a point given in b."""
@@ -159,19 +160,19 @@ def dimensions(primitive: Primitive) -> tuple[float, ...]:
             return (radius, length)
 
 
-def scaled_shape(shape: Shape, factor: float) -> Shape:
+def scale_shape(shape: Shape, factor: float) -> Shape:
     """Return the shape scaled uniformly about the origin of its link's frame."""
     return replace(
         shape,
         geometry=_geometry(shape.geometry, factor),
-        T_link_shape=scaled_pose(shape.T_link_shape, factor),
+        T_link_shape=scale_pose(shape.T_link_shape, factor),
     )
 
 
 def _geometry(geometry: Geometry, factor: float) -> Geometry:
     match geometry:
         case Box(size):
-            return Box(scaled_vector(size, factor))
+            return Box(scale_vector(size, factor))
         case Sphere(radius):
             return Sphere(factor * radius)
         case Cylinder(radius, length):
@@ -179,14 +180,39 @@ def _geometry(geometry: Geometry, factor: float) -> Geometry:
         case Capsule(radius, length):
             return Capsule(factor * radius, factor * length)
         case Mesh():
-            return replace(geometry, scale=scaled_vector(geometry.scale, factor))
+            return replace(geometry, scale=scale_vector(geometry.scale, factor))
 
 
-def scaled_pose(pose: Pose, factor: float) -> Pose:
+def scale_pose(pose: Pose, factor: float) -> Pose:
     """Return the pose with its position multiplied by a factor."""
-    return pose if factor == 1.0 else Pose(scaled_vector(pose.position, factor), pose.quaternion)
+    return pose if factor == 1.0 else Pose(scale_vector(pose.position, factor), pose.quaternion)
 
 
-def scaled_vector(vector: Vec3, factor: float) -> Vec3:
+def scale_vector(vector: Vec3, factor: float) -> Vec3:
     """Return the vector multiplied by a factor."""
     return (factor * vector[0], factor * vector[1], factor * vector[2])
+
+
+@dataclass(frozen=True)
+class StoredFit:
+    """The fit of a link's collision shapes, in the link frame."""
+
+    link: str
+    token: Shape
+    """The one primitive that overlaps most."""
+    collision: tuple[Shape, ...]
+    """A few, for physics."""
+    token_iou: float
+    collision_iou: float
+
+    def scaled(self, factor: float) -> StoredFit:
+        """The fit of the shapes, larger or smaller."""
+        return replace(
+            self,
+            token=scale_shape(self.token, factor),
+            collision=tuple(scale_shape(shape, factor) for shape in self.collision),
+        )
+
+
+StoredFits = Mapping[str, StoredFit]
+"""Fits by ``morphgen.formats.fits.shapes_key``: a hash of the shapes that were fitted."""

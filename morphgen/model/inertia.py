@@ -23,7 +23,7 @@ from morphgen.model.geometry import (
     Sphere,
     volume,
 )
-from morphgen.model.mesh import hull, load_mesh
+from morphgen.model.mesh import convex_hull, load_mesh
 from morphgen.model.robot import Inertial, Link
 from morphgen.typing import Array
 
@@ -31,7 +31,7 @@ _SEGMENTS = 48
 
 
 @dataclass(frozen=True)
-class Moments:
+class VolumeIntegrals:
     """Volume integrals of a solid about the link's origin, in link axes."""
 
     volume: float
@@ -41,18 +41,18 @@ class Moments:
     second: Array
     """Integral of x x^T, shape (3, 3), m^5."""
 
-    def __add__(self, other: Moments) -> Moments:
-        return Moments(
+    def __add__(self, other: VolumeIntegrals) -> VolumeIntegrals:
+        return VolumeIntegrals(
             self.volume + other.volume, self.first + other.first, self.second + other.second
         )
 
-    def __sub__(self, other: Moments) -> Moments:
-        return Moments(
+    def __sub__(self, other: VolumeIntegrals) -> VolumeIntegrals:
+        return VolumeIntegrals(
             self.volume - other.volume, self.first - other.first, self.second - other.second
         )
 
 
-def inertial_of(shapes: Sequence[Shape], density: float) -> Inertial:
+def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
     """Mass properties of solid shapes of one density, where they overlap counted once.
 
     Closed forms for primitives; a closed mesh counts as its volume, an open one as its convex
@@ -68,7 +68,7 @@ def inertial_of(shapes: Sequence[Shape], density: float) -> Inertial:
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    moments = union_moments(shapes)
+    moments = union_integrals(shapes)
     if moments.volume <= 0:
         return Inertial(0.0)
     com = moments.first / moments.volume
@@ -81,37 +81,37 @@ def inertial_of(shapes: Sequence[Shape], density: float) -> Inertial:
 def with_inertia(link: Link, density: float) -> Link:
     """The link with mass properties of its collision shapes (its visuals if it has none)."""
     shapes = link.collisions or link.visuals
-    return replace(link, inertial=inertial_of(shapes, density)) if shapes else link
+    return replace(link, inertial=inertial_from_density(shapes, density)) if shapes else link
 
 
-def inertial_of_mass(link: Link, mass: float) -> Inertial:
+def inertial_from_mass(link: Link, mass: float) -> Inertial:
     """Mass properties of a link's shapes, scaled to a mass.
 
     Raises:
         RobotError: If the link has no shapes to take the inertia from.
     """
-    unit = inertial_of(link.collisions or link.visuals, 1.0)
+    unit = inertial_from_density(link.collisions or link.visuals, 1.0)
     if unit.mass <= 0:
         raise RobotError(f"link {link.name!r} has no volume to give {mass:g} kg an inertia")
     return Inertial.from_matrix(mass, unit.com, unit.matrix * (mass / unit.mass))
 
 
-def union_moments(shapes: Sequence[Shape]) -> Moments:
+def union_integrals(shapes: Sequence[Shape]) -> VolumeIntegrals:
     """Volume integrals of the union of shapes about the link's origin; memoised."""
     return _union_moments(_uncoloured(shapes), _stamps(shapes))
 
 
 @lru_cache(maxsize=4096)
-def _union_moments(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> Moments:
+def _union_moments(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> VolumeIntegrals:
     """The integrals while mesh files are as at their stamps."""
     del stamps
-    total = Moments(0.0, np.zeros(3), np.zeros((3, 3)))
+    total = VolumeIntegrals(0.0, np.zeros(3), np.zeros((3, 3)))
     for shape in shapes:
         total += _moments(shape)
     if not _may_overlap(shapes):
         return total
     solids = [_manifold(shape) for shape in shapes]
-    apart = Moments(0.0, np.zeros(3), np.zeros((3, 3)))
+    apart = VolumeIntegrals(0.0, np.zeros(3), np.zeros((3, 3)))
     for solid in solids:
         apart += _mesh_moments(_as_trimesh(solid))
     union = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
@@ -133,7 +133,7 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
             mesh.apply_translation(-np.asarray(mesh.bounds).mean(axis=0))
         case Mesh():
             mesh = load_mesh(geometry)
-            mesh = mesh if mesh.is_volume else hull(geometry)
+            mesh = mesh if mesh.is_volume else convex_hull(geometry)
     return mesh
 
 
@@ -193,14 +193,14 @@ def _may_overlap(shapes: Sequence[Shape]) -> bool:
     )
 
 
-def _moments(shape: Shape) -> Moments:
+def _moments(shape: Shape) -> VolumeIntegrals:
     geometry, T = shape.geometry, shape.T_link_shape.matrix
     if isinstance(geometry, Mesh):
         return _mesh_moments(_placed(shape))
     v = volume(geometry)
     R, p = T[:3, :3], T[:3, 3]
     local = np.diag(_central_second(geometry))
-    return Moments(v, v * p, R @ local @ R.T + v * np.outer(p, p))
+    return VolumeIntegrals(v, v * p, R @ local @ R.T + v * np.outer(p, p))
 
 
 def _central_second(geometry: Box | Sphere | Cylinder | Capsule) -> tuple[float, float, float]:
@@ -220,14 +220,14 @@ def _central_second(geometry: Box | Sphere | Cylinder | Capsule) -> tuple[float,
             return (side, side, along)
 
 
-def _mesh_moments(mesh: trimesh.Trimesh) -> Moments:
+def _mesh_moments(mesh: trimesh.Trimesh) -> VolumeIntegrals:
     v = float(mesh.volume)
     if v <= 0:
-        return Moments(0.0, np.zeros(3), np.zeros((3, 3)))
+        return VolumeIntegrals(0.0, np.zeros(3), np.zeros((3, 3)))
     com = np.asarray(mesh.center_mass)
     inertia = np.asarray(mesh.moment_inertia) / mesh.density
     central = np.trace(inertia) / 2 * np.eye(3) - inertia
-    return Moments(v, v * com, central + v * np.outer(com, com))
+    return VolumeIntegrals(v, v * com, central + v * np.outer(com, com))
 
 
 def _placed(shape: Shape) -> trimesh.Trimesh:

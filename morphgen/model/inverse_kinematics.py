@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from morphgen.model.kinematics import bounds, frame_jacobian, frame_pose
+from morphgen.model.kinematics import frame_jacobian, frame_pose, joint_limits
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 
@@ -68,7 +68,7 @@ def solve_position_ik(
     Raises:
         RobotError: If the robot has no tool.
     """
-    low, high = bounds(robot).T
+    low, high = joint_limits(robot).T
     q = np.clip(q, low, high)
     for _ in range(iterations):
         T_root_tool, J_root_tool = frame_jacobian(robot, q)
@@ -102,7 +102,7 @@ def solve_pose_ik(
     Raises:
         RobotError: If there is no such frame.
     """
-    low, high = bounds(robot).T
+    low, high = joint_limits(robot).T
     current = best = np.clip(np.asarray(q, dtype=np.float64), low, high)
     least = np.inf
     weights = np.repeat([1.0, rotation_weight], 3)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 
 from morphgen.model.inverse_kinematics import DAMPING, MAX_STEP
-from morphgen.model.kinematics_torch import ToolChain, frame_jacobian, frame_pose
-from morphgen.model.rotation_torch import rotation_vectors
+from morphgen.model.kinematics_torch import FrameChain, frame_jacobian, frame_pose
+from morphgen.model.rotation_torch import rotvec_from_matrix
 
 ROTATION_DAMPING = 0.1
 """Damping of rotations [joint units per radian]."""
@@ -35,7 +35,7 @@ def dls_step(J: torch.Tensor, error: torch.Tensor, damping: float) -> torch.Tens
 
 
 def solve_position_ik(
-    chain: ToolChain,
+    chain: FrameChain,
     robot_index: torch.Tensor,
     q: torch.Tensor,
     positions: torch.Tensor,
@@ -68,8 +68,8 @@ def solve_position_ik(
     return q, positions - frame_pose(chain, robot_index, q)[:, :3, 3]
 
 
-def step_to_pose(
-    chain: ToolChain,
+def pose_ik_step(
+    chain: FrameChain,
     robot_index: torch.Tensor,
     q: torch.Tensor,
     positions: torch.Tensor,
@@ -100,7 +100,7 @@ def step_to_pose(
     """
     T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
     shift = (positions - T_root_tool[:, :3, 3])[..., None]
-    turn = rotation_vectors(rotations @ T_root_tool[:, :3, :3].transpose(1, 2))[..., None]
+    turn = rotvec_from_matrix(rotations @ T_root_tool[:, :3, :3].transpose(1, 2))[..., None]
     lower, upper = limits
     eye = torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
     target, moves = q, torch.ones_like(q, dtype=torch.bool)

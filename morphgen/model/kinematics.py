@@ -17,35 +17,37 @@ from morphgen.model.rotation import Quat, Vec3
 from morphgen.typing import Array
 
 
-def bounds(robot: Robot) -> Array:
+def joint_limits(robot: Robot) -> Array:
     """Lower and upper bound of every independent joint, shape (dof, 2), rad or m.
 
     Joints without limits get one turn about zero (1 m for prismatic ones).
     """
-    return np.array([robot.joints[k].bounds for k in robot.independent]).reshape(-1, 2)
+    return np.array([robot.joints[k].effective_limits for k in robot.independent_joints]).reshape(
+        -1, 2
+    )
 
 
 def random_configurations(robot: Robot, n: int, rng: np.random.Generator) -> Array:
     """Configurations drawn uniformly between the bounds, shape (n, dof)."""
-    limits = bounds(robot)
+    limits = joint_limits(robot)
     return rng.uniform(limits[:, 0], limits[:, 1], size=(n, robot.dof))
 
 
-def moved_by(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
+def driving_joints(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
     """Independent joints, 0 to dof - 1, that are among some of all joints, or that these follow."""
     matrix, _ = robot.mimic_map
-    rows = [i for i, k in enumerate(robot.movable) if k in joints]
+    rows = [i for i, k in enumerate(robot.movable_joints) if k in joints]
     return tuple(np.flatnonzero((matrix[rows] != 0).any(axis=0)).tolist())
 
 
-def whole_turns(robot: Robot) -> NDArray[np.bool_]:
+def periodic_joints(robot: Robot) -> NDArray[np.bool_]:
     """Joints that are as they were after a whole turn, shape (dof,): no other joint follows one."""
     followed = (robot.mimic_map[0] != 0).sum(axis=0) > 1
-    kinds = np.array([robot.joints[k].kind for k in robot.independent])
+    kinds = np.array([robot.joints[k].kind for k in robot.independent_joints])
     return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~followed)
 
 
-def unwound(robot: Robot, start: ArrayLike, q: ArrayLike) -> Array:
+def unwrap_joints(robot: Robot, start: ArrayLike, q: ArrayLike) -> Array:
     """The same poses of all links, with joints turned as little as may be.
 
     Args:
@@ -58,8 +60,8 @@ def unwound(robot: Robot, start: ArrayLike, q: ArrayLike) -> Array:
         turns to where they are nearest to the start within their bounds.
     """
     start, q = np.asarray(start, dtype=np.float64), np.asarray(q, dtype=np.float64)
-    lower, upper = bounds(robot).T
-    turns = np.round((start - q) / (2 * np.pi)) * whole_turns(robot)
+    lower, upper = joint_limits(robot).T
+    turns = np.round((start - q) / (2 * np.pi)) * periodic_joints(robot)
     least, most = ((bound - q) / (2 * np.pi) for bound in (lower, upper))
     return np.asarray(q + 2 * np.pi * np.clip(turns, np.ceil(least), np.floor(most)))
 
@@ -72,7 +74,7 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
         q: Independent joint positions, shape (..., dof), rad or m.
 
     Returns:
-        Positions in the order of ``robot.movable``, shape (..., n_movable).
+        Positions in the order of ``robot.movable_joints``, shape (..., n_movable).
 
     Raises:
         ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
@@ -101,7 +103,7 @@ def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
     batch = positions.shape[:-1]
     T_root_link = np.empty((*batch, len(robot.links), 4, 4))
     T_root_link[..., 0, :, :] = np.eye(4)
-    column = {k: i for i, k in enumerate(robot.movable)}
+    column = {k: i for i, k in enumerate(robot.movable_joints)}
     for k, joint in enumerate(robot.joints):
         T = T_root_link[..., robot.parents[k + 1], :, :] @ joint.T_parent_joint.matrix
         if joint.is_movable:
@@ -132,7 +134,7 @@ def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
         Anchors [m] and unit axes, both (..., n_links, 3); zeros where no joint moves the link.
     """
     anchors, axes = np.zeros((2, *T_root_link.shape[:-2], 3))
-    for k in robot.movable:
+    for k in robot.movable_joints:
         anchors[..., k + 1, :] = T_root_link[..., k + 1, :3, 3]
         axes[..., k + 1, :] = T_root_link[..., k + 1, :3, :3] @ robot.joints[k].unit_axis
     return anchors, axes
@@ -162,9 +164,9 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Arr
     T_root_frame = T_root_link[..., robot.link_index[named.link], :, :] @ named.T_link_frame.matrix
     anchors, axes = joint_axes(robot, T_root_link)
     matrix, _ = robot.mimic_map
-    row = {k: i for i, k in enumerate(robot.movable)}
+    row = {k: i for i, k in enumerate(robot.movable_joints)}
     jacobian = np.zeros((*T_root_frame.shape[:-2], 6, robot.dof))
-    for k in robot.joints_to(named.link):
+    for k in robot.joint_chain(named.link):
         if k not in row:
             continue
         axis, by_leader = axes[..., k + 1, :], matrix[row[k]]
@@ -191,8 +193,8 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
         movable joint, mimic joints as joints of their own.
     """
     anchors, axes = joint_axes(robot, T_root_link)
-    jacobians = np.zeros((*T_root_link.shape[:-2], 6, len(robot.movable)))
-    column = {k: i for i, k in enumerate(robot.movable)}
+    jacobians = np.zeros((*T_root_link.shape[:-2], 6, len(robot.movable_joints)))
+    column = {k: i for i, k in enumerate(robot.movable_joints)}
     for k, joint in enumerate(robot.joints):
         jacobians[..., k + 1, :, :] = jacobians[..., robot.parents[k + 1], :, :]
         if joint.kind == "prismatic":
@@ -222,11 +224,11 @@ def frame_positions(robot: Robot, q: Array, frame: str = "tool") -> Array:
         RobotError: If there is no such frame.
     """
     gains, offsets = robot.mimic_map
-    row = {k: i for i, k in enumerate(robot.movable)}
+    row = {k: i for i, k in enumerate(robot.movable_joints)}
     points = np.zeros((3, q.shape[1]))
     named = robot.frame(frame)
     T_joint_point = named.T_link_frame
-    for k in reversed(robot.joints_to(named.link)):
+    for k in reversed(robot.joint_chain(named.link)):
         joint = robot.joints[k]
         if joint.is_movable:
             gain, position = gains[row[k]], offsets[row[k]]
@@ -254,7 +256,7 @@ def _turn_from_z(axis: Vec3) -> Quat:
     x, y, z = axis
     if z < -0.5:  # near the opposite of z: half a turn about x first
         return rotation.multiply((0.0, 1.0, 0.0, 0.0), _turn_from_z((x, -y, -z)))
-    return rotation.normalized((1 + z, -y, x, 0.0))
+    return rotation.normalize((1 + z, -y, x, 0.0))
 
 
 def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6) -> float:
@@ -273,7 +275,7 @@ def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6
         RobotError: If the robot has no such frame.
     """
     rng = np.random.default_rng(0)
-    limits = bounds(robot)
+    limits = joint_limits(robot)
     q = random_configurations(robot, samples, rng)
     distance = _distance(robot, q, frame)
     keep = np.argsort(-distance, kind="stable")[:8]
@@ -299,9 +301,9 @@ def _distance(robot: Robot, q: Array, frame: str) -> Array:
     """
     positions = movable_positions(robot, q)
     named = robot.frame(frame)
-    column = {k: i for i, k in enumerate(robot.movable)}
+    column = {k: i for i, k in enumerate(robot.movable_joints)}
     point = np.broadcast_to(np.array(named.T_link_frame.position), (*q.shape[:-1], 3))
-    for k in reversed(robot.joints_to(named.link)):
+    for k in reversed(robot.joint_chain(named.link)):
         joint = robot.joints[k]
         if joint.is_movable:
             point = _moved(point, joint.kind, joint.unit_axis, positions[..., column[k], None])

@@ -1,7 +1,7 @@
 """Kinematics of many robots in one batch of torch tensors, differentiable, on any device.
 
 The functions have the names and results of ``morphgen.model.kinematics``. Robots are compiled once:
-``kinematic_tree`` for the poses of all links, ``tool_chain`` for the pose and the Jacobian of one
+``compile_tree`` for the poses of all links, ``compile_chain`` for the pose and the Jacobian of one
 frame, which is several times as fast because only joints between the root and the frame count.
 Loops go over levels of the tree, never over environments.
 
@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.robot import TOOL, Robot
-from morphgen.model.rotation_torch import cross_matrices
+from morphgen.model.rotation_torch import skew
 from morphgen.typing import Array
 
 Device = torch.device | str
@@ -50,7 +50,7 @@ class JointTensors:
         of the axis: the first is multiplied by the sine of a revolute joint's position, or by the
         position of a prismatic one, and the second by one minus the cosine.
         """
-        cross = cross_matrices(self.axis)
+        cross = skew(self.axis)
         turns = ~self.is_prismatic[..., None, None]
         first, second = (torch.zeros_like(self.T_parent_joint) for _ in range(2))
         first[..., :3, :3] = cross * turns
@@ -87,7 +87,7 @@ class KinematicTree:
 
 
 @dataclass(frozen=True, eq=False)
-class ToolChain:
+class FrameChain:
     """The joints between the root and one frame of R robots, fixed joints folded into the next.
 
     Chains are padded at their root end to D joints.
@@ -99,7 +99,7 @@ class ToolChain:
     """Pose of the frame in the frame of the last joint, shape (R, 4, 4)."""
 
 
-def kinematic_tree(
+def compile_tree(
     robots: Sequence[Robot],
     *,
     max_links: int | None = None,
@@ -137,7 +137,7 @@ def kinematic_tree(
         start += width
     movable = np.zeros((len(robots), links), dtype=np.bool_)
     for row, robot in zip(movable, robots, strict=True):
-        row[[k + 1 for k in robot.movable]] = True
+        row[[k + 1 for k in robot.movable_joints]] = True
     counts = np.array([len(robot.links) for robot in robots])
     rows = [
         [(None, np.eye(4)), *((k, joint.T_parent_joint.matrix) for k, joint in joints)]
@@ -152,13 +152,13 @@ def kinematic_tree(
     )
 
 
-def tool_chain(
+def compile_chain(
     robots: Sequence[Robot],
     frame: str = TOOL,
     *,
     dtype: torch.dtype = torch.float32,
     device: Device = "cpu",
-) -> ToolChain:
+) -> FrameChain:
     """Compile robots for ``frame_jacobian``, ``frame_pose`` and ``FramePositions``.
 
     Args:
@@ -174,7 +174,7 @@ def tool_chain(
     for robot in robots:
         named = robot.frame(frame)
         T, row = np.eye(4), []
-        for k in robot.joints_to(named.link):
+        for k in robot.joint_chain(named.link):
             T = T @ robot.joints[k].T_parent_joint.matrix
             if robot.joints[k].is_movable:
                 row.append((k, T))
@@ -183,7 +183,7 @@ def tool_chain(
         ends.append(T @ named.T_link_frame.matrix)
     depth = max(1, *map(len, rows))
     joints = _joint_tensors(robots, rows, depth, dtype, device, pad_front=True)
-    return ToolChain(joints, torch.from_numpy(np.array(ends)).to(device, dtype))
+    return FrameChain(joints, torch.from_numpy(np.array(ends)).to(device, dtype))
 
 
 def forward_kinematics(
@@ -226,13 +226,13 @@ def joint_axes(
     return T_root_link[..., :3, 3] * moves, axes * moves
 
 
-def frame_pose(chain: ToolChain, robot_index: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+def frame_pose(chain: FrameChain, robot_index: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     """Return ``T_root_tool``, shape (n, 4, 4); arguments as for ``frame_jacobian``."""
     return _chain_frames(chain, robot_index, q)[-1]
 
 
 def frame_jacobian(
-    chain: ToolChain, robot_index: torch.Tensor, q: torch.Tensor
+    chain: FrameChain, robot_index: torch.Tensor, q: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the pose and the geometric Jacobian of the chain's frame in the root frame.
 
@@ -266,7 +266,7 @@ class FramePositions:
     A point is carried from the frame to the root, joint by joint, instead of multiplying poses.
     """
 
-    def __init__(self, chain: ToolChain, robot_index: torch.Tensor) -> None:
+    def __init__(self, chain: FrameChain, robot_index: torch.Tensor) -> None:
         """Prepare; arguments as for ``frame_jacobian``."""
         joints = chain.joints
         parts = torch.stack([joints.T_parent_joint, *joints.motion])[:, robot_index, :, :3]
@@ -292,13 +292,13 @@ class FramePositions:
         return point.T
 
 
-def frame_positions(chain: ToolChain, robot_index: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+def frame_positions(chain: FrameChain, robot_index: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     """Return the frames' positions in their root frames, shape (n, 3), metres."""
     return FramePositions(chain, robot_index)(q)
 
 
 def _chain_frames(
-    chain: ToolChain, robot_index: torch.Tensor, q: torch.Tensor
+    chain: FrameChain, robot_index: torch.Tensor, q: torch.Tensor
 ) -> list[torch.Tensor]:
     """Return T_root_joint after each joint's motion, then T_root_tool; D + 1 of (n, 4, 4)."""
     steps = chain.joints.transforms(robot_index, q)
@@ -324,7 +324,7 @@ def _joint_tensors(
     gain, offset = np.zeros((*size, max(robot.dof for robot in robots))), np.zeros(size)
     for r, (robot, row) in enumerate(zip(robots, rows, strict=True)):
         matrix, shift = robot.mimic_map
-        place = {k: i for i, k in enumerate(robot.movable)}
+        place = {k: i for i, k in enumerate(robot.movable_joints)}
         for i, (k, T_parent_joint) in enumerate(row, length - len(row) if pad_front else 0):
             T[r, i] = T_parent_joint
             if k in place:

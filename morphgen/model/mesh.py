@@ -36,9 +36,9 @@ from trimesh.visual import TextureVisuals
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Mesh, Rgba
 from morphgen.model.mesh_files import (
-    MOST_FACES,
-    MOST_PIXELS,
-    Companions,
+    MAX_FACES,
+    MAX_PIXELS,
+    FolderResolver,
     require_bounded,
     require_readable,
     without_materials,
@@ -69,9 +69,9 @@ _UNREADABLE = (
 _Triangles: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices (n, 3) and faces (m, 3)."""
 
-LARGEST_COORDINATE = 1e9
+MAX_COORDINATE = 1e9
 """Coordinate beyond which a mesh file is taken to be broken, in its own unit or metres."""
-FLAT = 1e-7
+FLATNESS_TOLERANCE = 1e-7
 """Thickness below which points are flat, relative to their size."""
 MAX_STL_FACES = 200_000
 """Triangles of the largest STL that MuJoCo reads."""
@@ -121,7 +121,7 @@ def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
     return tuple(group.part for group in _groups(str(path.absolute()), _stamp(path)))
 
 
-def hull(mesh: Mesh) -> trimesh.Trimesh:
+def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
     """Return the convex hull of a mesh, metres; memoised, so treat it as read-only.
 
     Raises:
@@ -135,7 +135,7 @@ def is_flat(points: NDArray[np.float64]) -> bool:
     if len(points) < 4:
         return True
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[2] <= FLAT * spread[0])
+    return bool(spread[2] <= FLATNESS_TOLERANCE * spread[0])
 
 
 @lru_cache(maxsize=512)
@@ -192,8 +192,8 @@ def _read(path: Path) -> list[tuple[Rgba | None, _Triangles]]:
         scene = _scene(path)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
         faces = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in placed)
-        if faces > MOST_FACES:
-            raise ValueError(f"{faces} triangles; at most {MOST_FACES} are read")
+        if faces > MAX_FACES:
+            raise ValueError(f"{faces} triangles; at most {MAX_FACES} are read")
         return [
             (_colour(geometry), _in_scene(geometry, T_scene_node))
             for T_scene_node, name in placed
@@ -205,7 +205,7 @@ def _read(path: Path) -> list[tuple[Rgba | None, _Triangles]]:
 
 
 def _scene(path: Path) -> trimesh.Scene:
-    scene = trimesh.load_scene(path, process=False, resolver=Companions(path.parent))
+    scene = trimesh.load_scene(path, process=False, resolver=FolderResolver(path.parent))
     if path.suffix.lower() == ".dae" and not scene.geometry:
         # pycollada drops a geometry with its material, as where a texture's image is not declared.
         plain = io.BytesIO(without_materials(path))
@@ -223,8 +223,8 @@ def _in_scene(geometry: trimesh.Trimesh, T_scene_node: NDArray[np.float64]) -> _
     vertices = trimesh.transform_points(geometry.vertices, T_scene_node) * _unit(geometry)
     if not np.isfinite(vertices[faces]).all():
         raise ValueError("a vertex is not finite")
-    if np.abs(vertices[faces]).max(initial=0.0) > LARGEST_COORDINATE:
-        raise ValueError(f"a vertex is beyond {LARGEST_COORDINATE:g} m")
+    if np.abs(vertices[faces]).max(initial=0.0) > MAX_COORDINATE:
+        raise ValueError(f"a vertex is beyond {MAX_COORDINATE:g} m")
     mirrored = np.linalg.det(T_scene_node[:3, :3]) < 0
     return vertices, faces[:, ::-1] if mirrored else faces
 
@@ -246,7 +246,7 @@ def _colour(geometry: trimesh.Trimesh) -> Rgba | None:
         if visual.uv is None or image is None:
             rgba = material.main_color
         else:
-            if math.prod(image.size) > MOST_PIXELS:
+            if math.prod(image.size) > MAX_PIXELS:
                 raise ValueError(f"a texture of {image.size[0]} x {image.size[1]} pixels")
             colours = material.to_color(visual.uv)
             rgba = np.mean(colours, axis=0)

@@ -11,11 +11,11 @@ from typing import Any
 import trimesh
 from lxml import etree
 
-LARGEST_FILE = 128 * 2**20
+MAX_FILE_SIZE = 128 * 2**20
 """Bytes of the largest mesh file, or texture or material beside it, that is read."""
-MOST_FACES = 5_000_000
+MAX_FACES = 5_000_000
 """Triangles of the largest mesh that is read, every instance counted."""
-MOST_PIXELS = 2**26
+MAX_PIXELS = 2**26
 """Pixels of the largest texture that is read."""
 _MOST_ENTRIES = 20_000_000
 """Entries in all accessors of the largest glTF file that is read."""
@@ -23,7 +23,7 @@ _MOST_INSTANCES = 100_000
 """Nodes of the largest COLLADA scene that is read, every instance counted."""
 
 
-class Companions(trimesh.resolvers.Resolver):
+class FolderResolver(trimesh.resolvers.Resolver):
     """The files that a mesh file names: regular ones in its own folder or below, nothing else."""
 
     def __init__(self, folder: Path) -> None:
@@ -46,7 +46,7 @@ class Companions(trimesh.resolvers.Resolver):
         """No names: what a mesh file does not name is not looked for."""
         return []
 
-    def namespaced(self, namespace: str) -> Companions:
+    def namespaced(self, namespace: str) -> FolderResolver:
         """The same files: no reader looks into folders that the mesh file does not name."""
         del namespace
         return self
@@ -62,7 +62,7 @@ class Companions(trimesh.resolvers.Resolver):
 
 
 def require_readable(path: Path) -> None:
-    """Require a regular file of at most ``LARGEST_FILE`` bytes.
+    """Require a regular file of at most ``MAX_FILE_SIZE`` bytes.
 
     Raises:
         OSError: If there is none, or it may not be read.
@@ -71,8 +71,8 @@ def require_readable(path: Path) -> None:
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise ValueError(f"{path.name!r} is no regular file")
-    if status.st_size > LARGEST_FILE:
-        raise ValueError(f"{path.name!r} holds {status.st_size} bytes; at most {LARGEST_FILE}")
+    if status.st_size > MAX_FILE_SIZE:
+        raise ValueError(f"{path.name!r} holds {status.st_size} bytes; at most {MAX_FILE_SIZE}")
 
 
 def require_bounded(path: Path) -> None:

@@ -17,7 +17,7 @@ from morphgen.model.geometry import IDENTITY, Pose, Shape
 from morphgen.model.rotation import Vec3
 
 if TYPE_CHECKING:
-    from morphgen.model.fits import Stored
+    from morphgen.model.geometry import StoredFits
 
 JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "continuous", "prismatic", "fixed")
@@ -128,7 +128,7 @@ class Joint:
         return (self.axis[0] / length, self.axis[1] / length, self.axis[2] / length)
 
     @property
-    def bounds(self) -> tuple[float, float]:
+    def effective_limits(self) -> tuple[float, float]:
         """Range to draw positions from: the limits, or one turn (1 m) about zero without."""
         if self.limits is not None and self.kind != "continuous":
             return self.limits
@@ -163,7 +163,7 @@ class Robot:
     """Where the body comes from, ready for its card: derivation, parts, licences."""
     source_findings: tuple[Finding, ...] = ()
     """What was suspicious, mended or left out when the robot's file was read."""
-    fits: Stored = field(default_factory=dict)
+    fits: StoredFits = field(default_factory=dict)
     """Primitives that are known of its links' collision shapes, by the content of these."""
 
     def __repr__(self) -> str:
@@ -237,12 +237,12 @@ class Robot:
         return (-1, *(self.link_index[joint.parent] for joint in self.joints))
 
     @cached_property
-    def movable(self) -> tuple[int, ...]:
+    def movable_joints(self) -> tuple[int, ...]:
         """Indices of the joints that move, mimic joints among them."""
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_movable)
 
     @cached_property
-    def independent(self) -> tuple[int, ...]:
+    def independent_joints(self) -> tuple[int, ...]:
         """Indices of the joints that move by themselves; ``q`` is in this order."""
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_independent)
 
@@ -252,10 +252,10 @@ class Robot:
 
         Matrix (n_movable, dof) and offset (n_movable,).
         """
-        column = {self.joints[k].name: i for i, k in enumerate(self.independent)}
-        matrix = np.zeros((len(self.movable), self.dof))
-        offset = np.zeros(len(self.movable))
-        for row, k in enumerate(self.movable):
+        column = {self.joints[k].name: i for i, k in enumerate(self.independent_joints)}
+        matrix = np.zeros((len(self.movable_joints), self.dof))
+        offset = np.zeros(len(self.movable_joints))
+        for row, k in enumerate(self.movable_joints):
             joint, gain, shift = self.joints[k], 1.0, 0.0
             while joint.mimic is not None:
                 shift += gain * joint.mimic.offset
@@ -266,7 +266,7 @@ class Robot:
             offset[row] = shift
         return matrix, offset
 
-    def joints_to(self, link: str) -> tuple[int, ...]:
+    def joint_chain(self, link: str) -> tuple[int, ...]:
         """Indices of the joints on the way from the root to a link.
 
         Raises:
@@ -281,7 +281,7 @@ class Robot:
     @property
     def dof(self) -> int:
         """Number of independent joints."""
-        return len(self.independent)
+        return len(self.independent_joints)
 
     @property
     def mass(self) -> float:

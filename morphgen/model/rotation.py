@@ -12,7 +12,7 @@ _GIMBAL, _NEAR_GIMBAL = 1e-12, 1e-3
 """Cosines of the pitch from which on yaw is zero, and roll and yaw depend on each other."""
 
 
-def normalized(q: Quat) -> Quat:
+def normalize(q: Quat) -> Quat:
     """Scale to unit length and choose the sign with w >= 0 (first non-zero entry positive).
 
     Raises:
@@ -34,7 +34,7 @@ def multiply(a: Quat, b: Quat) -> Quat:
     """Hamilton product: the rotation b followed by the rotation a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
-    return normalized(
+    return normalize(
         (
             aw * bw - ax * bx - ay * by - az * bz,
             aw * bx + ax * bw + ay * bz - az * by,
@@ -78,19 +78,19 @@ def from_matrix(rows: tuple[Vec3, Vec3, Vec3]) -> Quat:
     pivots = (trace, a, e, i)
     largest = pivots.index(max(pivots))
     if largest == 0:
-        return normalized((1 + trace, h - f, c - g, d - b))
+        return normalize((1 + trace, h - f, c - g, d - b))
     if largest == 1:
-        return normalized((h - f, 1 + a - e - i, b + d, c + g))
+        return normalize((h - f, 1 + a - e - i, b + d, c + g))
     if largest == 2:
-        return normalized((c - g, b + d, 1 + e - a - i, f + h))
-    return normalized((d - b, c + g, f + h, 1 + i - a - e))
+        return normalize((c - g, b + d, 1 + e - a - i, f + h))
+    return normalize((d - b, c + g, f + h, 1 + i - a - e))
 
 
 def from_rpy(rpy: Vec3) -> Quat:
     """Quaternion of URDF's fixed-axis roll, pitch, yaw: Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, cp, cy = (math.cos(angle / 2) for angle in rpy)
     sr, sp, sy = (math.sin(angle / 2) for angle in rpy)
-    return normalized(
+    return normalize(
         (
             cr * cp * cy + sr * sp * sy,
             sr * cp * cy - cr * sp * sy,

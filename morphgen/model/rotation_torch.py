@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 
-def quaternions(R: torch.Tensor) -> torch.Tensor:
+def quaternion_from_matrix(R: torch.Tensor) -> torch.Tensor:
     """Return rotation matrices (..., 3, 3) as unit quaternions (w, x, y, z), w >= 0, (..., 4).
 
     By the method of Bar-Itzhack, New method for extracting the quaternion from a rotation matrix,
@@ -23,27 +23,27 @@ def quaternions(R: torch.Tensor) -> torch.Tensor:
     return torch.where(q[..., :1] < 0, -q, q)
 
 
-def quaternion_matrices(quaternion: torch.Tensor) -> torch.Tensor:
+def matrix_from_quaternion(quaternion: torch.Tensor) -> torch.Tensor:
     """Return unit quaternions (w, x, y, z), shape (..., 4), as rotation matrices (..., 3, 3)."""
     w, v = quaternion[..., :1, None], quaternion[..., 1:]
-    cross = cross_matrices(v)
+    cross = skew(v)
     eye = torch.eye(3, device=quaternion.device)
     return eye + 2 * w * cross + 2 * cross @ cross
 
 
-def cross_matrices(v: torch.Tensor) -> torch.Tensor:
+def skew(v: torch.Tensor) -> torch.Tensor:
     """Return the matrices K (..., 3, 3) with K u = v x u for vectors v (..., 3)."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*x.shape, 3, 3)
 
 
-def rotation_vectors(R: torch.Tensor) -> torch.Tensor:
+def rotvec_from_matrix(R: torch.Tensor) -> torch.Tensor:
     """Return rotation matrices (n, 3, 3) as rotation vectors, angle times axis, (n, 3), rad.
 
     This is the logarithm of the unit quaternion, which is well-conditioned at 0 and at pi.
     """
-    quaternion = quaternions(R)
+    quaternion = quaternion_from_matrix(R)
     w, v = quaternion[:, :1], quaternion[:, 1:]
     sine = torch.linalg.vector_norm(v, dim=1, keepdim=True)
     angle = 2 * torch.atan2(sine, w)

@@ -147,7 +147,7 @@ def _tools(robot: Robot, *, sliding: bool = True) -> Array:
     """Return positions of the tool at random configurations, in the root frame, shape (3, n)."""
     q = random_configurations(robot, _SAMPLES, np.random.default_rng(_SEED))
     if not sliding:
-        slides = [robot.joints[k].kind == "prismatic" for k in robot.independent]
+        slides = [robot.joints[k].kind == "prismatic" for k in robot.independent_joints]
         q[:, slides] = np.array(robot.home)[slides]
     return frame_positions(robot, np.ascontiguousarray(q.T))
 
@@ -157,7 +157,7 @@ def _directions(robot: Robot) -> int:
     _, directions = joint_axes(robot, forward_kinematics(robot, np.array(robot.home)))
     axes = [
         directions[k + 1, :2]
-        for k in robot.joints_to(robot.frame(TOOL).link)
+        for k in robot.joint_chain(robot.frame(TOOL).link)
         if robot.joints[k].kind == "prismatic"
     ]
     return int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) if axes else 0

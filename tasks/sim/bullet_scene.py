@@ -10,8 +10,8 @@ from typing import Any
 from morphgen.errors import MissingDependencyError, SimulationError
 from morphgen.formats.quiet import quiet
 from morphgen.model.geometry import Pose
-from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import Robot
+from morphgen.model.tree import rigid_groups
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
 
@@ -137,9 +137,11 @@ class BulletScene:
         infos = [pybullet.getJointInfo(self.robot, i, **self._client) for i in range(count)]
         joints = {info[1].decode(): info[0] for info in infos}
         links = {body.root.name: -1} | {info[12].decode(): info[0] for info in infos}
-        self.driven = [joints[body.joints[k].name] for k in body.movable]
-        self.efforts = [_effort(body, k) for k in body.movable]
-        fastest = max((body.joints[k].velocity or math.inf for k in body.movable), default=math.inf)
+        self.driven = [joints[body.joints[k].name] for k in body.movable_joints]
+        self.efforts = [_effort(body, k) for k in body.movable_joints]
+        fastest = max(
+            (body.joints[k].velocity or math.inf for k in body.movable_joints), default=math.inf
+        )
         if math.isfinite(fastest):
             pybullet.changeDynamics(
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client

@@ -60,12 +60,12 @@ class MotorForces:
         for robot in robots:
             if id(robot) not in known:
                 known[id(robot)] = _inertia(robot)
-            start, end = len(farthest), len(farthest) + len(robot.movable)
+            start, end = len(farthest), len(farthest) + len(robot.movable_joints)
             self._pull[: robot.dof, start:end] = GAIN * known[id(robot)]
             self._row[: robot.dof, start:end] = [
-                [start + robot.movable.index(k)] for k in robot.independent
+                [start + robot.movable_joints.index(k)] for k in robot.independent_joints
             ]
-            farthest.extend(LAG * speed_limit(robot.joints[k]) for k in robot.movable)
+            farthest.extend(LAG * speed_limit(robot.joints[k]) for k in robot.movable_joints)
         self._farthest = np.array(farthest)
 
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:

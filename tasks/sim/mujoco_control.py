@@ -76,7 +76,7 @@ class PositionControl:
             self._products.append((world.model, one, force, acceleration))
             self._compliance[i, : world.robot.dof] = 1 / world.model.actuator_gainprm[:, 0]
             self._farthest[i, : world.robot.dof] = [
-                LAG * speed_limit(world.robot.joints[k]) for k in world.robot.independent
+                LAG * speed_limit(world.robot.joints[k]) for k in world.robot.independent_joints
             ]
             matrix, _ = world.robot.mimic_map
             rows, columns = np.nonzero(matrix)

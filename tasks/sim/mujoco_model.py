@@ -49,7 +49,7 @@ class World:
     robot: Robot
     model: mujoco.MjModel
     movable_q_at: Indices
-    """Where ``qpos`` has the movable joints, in the order of ``robot.movable``."""
+    """Where ``qpos`` has the movable joints, in the order of ``robot.movable_joints``."""
     movable_qd_at: Indices
     """Where ``qvel`` has them."""
     q_at: Indices
@@ -93,7 +93,7 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     priority: the block's friction counts whatever it touches, an obstacle's for links, and links
     have 1 on the ground and on each other.
 
-    Which links touch each other is up to ``ignored_pairs`` alone: MuJoCo's own exception for
+    Which links touch each other is up to ``untested_pairs`` alone: MuJoCo's own exception for
     neighbours is off. It never tests what stands still against what stands still: the root link
     and those fixed to it do not touch the ground, obstacles or a block without mass.
 
@@ -197,14 +197,14 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
     body = _add_block(spec, scene.block) if scene.block is not None else None
     model = spec.compile()
-    joints = {k: model.joint(robot.joints[k].name) for k in robot.movable}
+    joints = {k: model.joint(robot.joints[k].name) for k in robot.movable_joints}
     return World(
         robot,
         model,
-        movable_q_at=_addresses(joints[k].qposadr for k in robot.movable),
-        movable_qd_at=_addresses(joints[k].dofadr for k in robot.movable),
-        q_at=_addresses(joints[k].qposadr for k in robot.independent),
-        qd_at=_addresses(joints[k].dofadr for k in robot.independent),
+        movable_q_at=_addresses(joints[k].qposadr for k in robot.movable_joints),
+        movable_qd_at=_addresses(joints[k].dofadr for k in robot.movable_joints),
+        q_at=_addresses(joints[k].qposadr for k in robot.independent_joints),
+        qd_at=_addresses(joints[k].dofadr for k in robot.independent_joints),
         block=body.id if body is not None else None,
     )
 

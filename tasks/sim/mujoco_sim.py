@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import torch
 
-from morphgen.checks.mujoco_warnings import caught
+from morphgen.checks.self_collision import capture_mujoco_warnings
 from morphgen.errors import SimulationError, UnstableError
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
@@ -148,7 +148,7 @@ class MujocoSimulation:
             env = int(np.flatnonzero(~np.isfinite(self._targets).all(axis=1))[0])
             raise ValueError(f"{self._where(env)}: a target is not finite")
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
-        with np.errstate(invalid="ignore", over="ignore"), caught():
+        with np.errstate(invalid="ignore", over="ignore"), capture_mujoco_warnings():
             self._control.controls(
                 self._targets, *self._state.joints(), self._state.velocities, out=self._controls
             )

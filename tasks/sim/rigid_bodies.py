@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from morphgen.checks.self_collision import ignored_pairs
+from morphgen.checks.self_collision import untested_pairs
 from morphgen.model.geometry import IDENTITY, Pose
-from morphgen.model.rigid import rigid_groups
 from morphgen.model.robot import Inertial, Link, Robot, sorted_pair
+from morphgen.model.tree import rigid_groups
 
 _Piece = tuple[Pose, Link]
 
@@ -29,7 +29,7 @@ def rigid_bodies(robot: Robot) -> Robot:
         A robot whose ``ignore_pairs`` also name the pairs that no simulator should test: links of
         one rigid part and neighbours across a movable joint.
     """
-    ignored = set(ignored_pairs(robot))
+    ignored = set(untested_pairs(robot))
     partners = _partners(robot, ignored)
     holder = {robot.root.name: robot.root.name}
     pieces: dict[str, list[_Piece]] = {robot.root.name: [(IDENTITY, robot.root)]}

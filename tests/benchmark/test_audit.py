@@ -9,7 +9,7 @@ from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import NEAR, Near, audit
 from morphgen.benchmark.similarity import MEASURES, cosine, features, tree_distance
 from morphgen.benchmark.split import member_robot
-from morphgen.benchmark.survey import survey
+from morphgen.benchmark.survey import survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
@@ -70,7 +70,7 @@ def test_a_body_that_is_nearly_in_train_is_a_leak():
 
 def test_nearness_needs_both_measures():
     made = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
-    likeness = survey(made, LIBRARY)
+    likeness = survey_split(made, LIBRARY)
     tree, alike = likeness.of("tree")[0, 0], likeness.of("cosine")[0, 0]
     for near, expected in (
         (Near(tree * 1.01, alike - 1e-12), True),
@@ -213,7 +213,7 @@ def test_a_category_that_is_trained_is_no_extrapolation():
 
 
 def test_a_bound_on_likeness_that_was_promised_is_tested():
-    likeness = survey(combined(), LIBRARY).of("cosine").max()
+    likeness = survey_split(combined(), LIBRARY).of("cosine").max()
     for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
         made = combined(made={"similarity": bound})
         codes = {code for code, _ in found(made)}
@@ -260,9 +260,9 @@ def test_progress_is_told_and_processes_change_nothing():
 def test_a_derivation_that_two_members_share_is_composed_once():
     made = combined(train=[*TRAIN, member(TRAIN[0], "reaching", task="reach")])
     seen = []
-    survey(made, LIBRARY, progress=lambda done, total: seen.append(total))
+    survey_split(made, LIBRARY, progress=lambda done, total: seen.append(total))
     assert seen == [4] * 4
-    both = survey(made, LIBRARY)
+    both = survey_split(made, LIBRARY)
     assert both.train[0] == both.train[3]
     np.testing.assert_array_equal(both.likeness[0], both.likeness[3])
 

@@ -19,7 +19,7 @@ from morphgen.benchmark.contents import BUNDLED, Settings
 from morphgen.benchmark.export import build, load_built
 from morphgen.benchmark.split import member_robot
 from morphgen.benchmark.split_file import read_split, write_split
-from morphgen.benchmark.token_layout import padded
+from morphgen.benchmark.token_layout import pad_tokens
 from morphgen.benchmark.tokens import tokens
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.fitting.token_shapes import token_shapes
@@ -88,7 +88,7 @@ def test_tokens_are_those_of_the_robots(whole, made):
         assert data["columns"].tolist()[0] == [0, 1]
         for i, one in enumerate((*made.train, *made.test)):
             robot = member_robot(one, LIBRARY)
-            table, mask = padded(tokens(robot, token_shapes(robot)), 23)
+            table, mask = pad_tokens(tokens(robot, token_shapes(robot)), 23)
             assert data["names"][i] == one.name
             np.testing.assert_array_equal(data["tokens"][i], table)
             np.testing.assert_array_equal(data["mask"][i], mask)

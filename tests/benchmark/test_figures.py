@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from morphgen.benchmark.figures import NAMED, WRITTEN, MapPanel, Panel, heatmap_png, map_png
-from morphgen.benchmark.scaling_map import scaling_map
+from morphgen.benchmark.similarity import classical_mds
 
 
 def names(n):
@@ -22,7 +22,7 @@ def panel(n, title="tree", larger=False):
 
 
 def map_panel(n, title="tree"):
-    return MapPanel(title, scaling_map(panel(n).values))
+    return MapPanel(title, classical_mds(panel(n).values))
 
 
 def drawings(n):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from morphgen.benchmark.scaling_map import scaling_map
+from morphgen.benchmark.similarity import classical_mds
 
 NUMBERS = st.floats(-10, 10, width=32)
 PLANES = st.integers(1, 8).flatmap(lambda n: arrays(np.float64, (n, 2), elements=NUMBERS))
@@ -19,14 +19,14 @@ def apart(points):
 @given(PLANES)
 @settings(deadline=None)
 def test_points_of_a_plane_keep_their_distances(points):
-    found = scaling_map(apart(points))
+    found = classical_mds(apart(points))
     np.testing.assert_allclose(apart(found.points), apart(points), atol=1e-5)
     assert found.kept == pytest.approx(1)
     np.testing.assert_allclose(found.points.mean(axis=0), 0, atol=1e-5)
 
 
 def test_the_first_axis_varies_most_and_its_farthest_point_is_on_the_right():
-    found = scaling_map(apart(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 5.0], [0.5, 2.0]])))
+    found = classical_mds(apart(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 5.0], [0.5, 2.0]])))
     assert np.ptp(found.points[:, 0]) > np.ptp(found.points[:, 1])
     assert found.points[:, 0].argmax() == 2
     np.testing.assert_allclose(np.sort(found.points[:, 0])[-1], np.abs(found.points[:, 0]).max())
@@ -35,13 +35,13 @@ def test_the_first_axis_varies_most_and_its_farthest_point_is_on_the_right():
 def test_the_order_of_robots_only_reorders_the_points():
     points = np.random.default_rng(1).normal(size=(9, 4))
     shuffle = np.random.default_rng(2).permutation(9)
-    found, other = scaling_map(apart(points)), scaling_map(apart(points[shuffle]))
+    found, other = classical_mds(apart(points)), classical_mds(apart(points[shuffle]))
     np.testing.assert_allclose(other.points, found.points[shuffle], atol=1e-9)
 
 
 def test_what_does_not_fit_is_not_counted_as_kept():
     box = np.array([[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)], dtype=float)
-    found = scaling_map(apart(box))
+    found = classical_mds(apart(box))
     assert found.kept == pytest.approx((9 + 4) / (9 + 4 + 1))
 
 
@@ -49,19 +49,19 @@ def test_distances_that_fit_into_no_space_count_against_the_map():
     star = np.array([[0, 1, 1, 1], [1, 0, 2, 2], [1, 2, 0, 2], [1, 2, 2, 0]], dtype=float)
     values = np.linalg.eigvalsh(-(np.eye(4) - 0.25) @ (star**2) @ (np.eye(4) - 0.25) / 2)
     assert values.min() < -0.1
-    found = scaling_map(star)
+    found = classical_mds(star)
     assert found.kept == pytest.approx(np.sort(values)[-2:].sum() / np.abs(values).sum())
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_bodies_that_are_all_alike_are_one_point(n):
-    found = scaling_map(np.zeros((n, n)))
+    found = classical_mds(np.zeros((n, n)))
     np.testing.assert_array_equal(found.points, np.zeros((n, 2)))
     assert found.kept == 1.0
 
 
 def test_two_bodies_are_as_far_as_they_are():
-    found = scaling_map([[0.0, 0.4], [0.4, 0.0]])
+    found = classical_mds([[0.0, 0.4], [0.4, 0.0]])
     np.testing.assert_allclose(found.points, [[0.2, 0.0], [-0.2, 0.0]], atol=1e-12)
 
 
@@ -79,4 +79,4 @@ def test_two_bodies_are_as_far_as_they_are():
 )
 def test_what_are_no_distances_is_refused(wrong):
     with pytest.raises(ValueError, match="distances"):
-        scaling_map(wrong)
+        classical_mds(wrong)

@@ -13,14 +13,14 @@ from morphgen.benchmark.similarity import (
     MEASURES,
     Measure,
     cosine,
-    distances,
     features,
-    matrix,
-    measure_named,
+    get_measure,
+    similarity_matrix,
+    to_distances,
     tree_distance,
     workspace_overlap,
 )
-from morphgen.benchmark.tokens import padded, tokens
+from morphgen.benchmark.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Mesh, Shape
@@ -57,7 +57,9 @@ def test_a_body_is_most_like_itself(some):
 
 def test_the_cosine_is_that_of_flattened_padded_tokens_without_q():
     robots = [morphgen.compose(request) for request in REQUESTS[:3]]
-    flat = [padded(tokens(robot, token_shapes(robot)), 23)[0][:, :32].ravel() for robot in robots]
+    flat = [
+        pad_tokens(tokens(robot, token_shapes(robot)), 23)[0][:, :32].ravel() for robot in robots
+    ]
     for (a, u), (b, v) in itertools.combinations(zip(robots, flat, strict=True), 2):
         expected = u @ v / np.sqrt((u @ u) * (v @ v))
         found = cosine(features(a, token_shapes(a)), features(b, token_shapes(b)))
@@ -89,7 +91,7 @@ def test_bodies_of_more_than_23_links_need_a_common_maximum():
 
 @pytest.mark.parametrize("name", MEASURES)
 def test_a_matrix_is_symmetric_and_holds_what_the_measure_says(some, name):
-    values = matrix(some, name)
+    values = similarity_matrix(some, name)
     function = MEASURES[name].function
     assert values.shape == (5, 5)
     np.testing.assert_array_equal(values, values.T)
@@ -106,16 +108,16 @@ def test_every_pair_is_compared_once(some, monkeypatch):
 
     monkeypatch.setattr(similarity, "MEASURES", {"count": Measure("count", count, True, "")})
     told = []
-    values = matrix(some, "count", told.append)
+    values = similarity_matrix(some, "count", told.append)
     assert len(asked) == len(set(asked)) == sum(told) == 15
     np.testing.assert_array_equal(values, values.T)
-    assert matrix([], "count").shape == (0, 0)
+    assert similarity_matrix([], "count").shape == (0, 0)
 
 
 def test_distances_are_zero_to_oneself_and_grow_as_bodies_differ(some):
     for name in MEASURES:
-        values = matrix(some, name)
-        apart = distances(values, name)
+        values = similarity_matrix(some, name)
+        apart = to_distances(values, name)
         assert (apart >= 0).all()
         assert not apart.diagonal().any()
         order = np.argsort(values[0, 1:] * (-1 if MEASURES[name].larger_is_more_alike else 1))
@@ -123,7 +125,7 @@ def test_distances_are_zero_to_oneself_and_grow_as_bodies_differ(some):
 
 
 def test_an_unknown_measure_is_told_the_valid_ones(some):
-    for ask in (lambda: matrix(some, "cosin"), lambda: measure_named("cosin")):
+    for ask in (lambda: similarity_matrix(some, "cosin"), lambda: get_measure("cosin")):
         with pytest.raises(
             BenchmarkError, match=r"'cosin'; did you mean 'cosine'\? valid: cosine, tree, workspace"
         ):

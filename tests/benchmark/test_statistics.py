@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, combined, member, split
-from morphgen.benchmark.paper import PAPER, figures_of, robot_set
 from morphgen.benchmark.similarity import cosine, features
 from morphgen.benchmark.split import member_robot
 from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.benchmark.statistics import statistics
+from morphgen.benchmark.statistics import PAPER, paper_row, robot_set, statistics
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import reach
@@ -78,11 +77,11 @@ def test_every_row_of_the_paper_has_scenarios_and_few_scenarios_no_row():
     sets = {robot_set(name) for name in split_names()}
     assert set(PAPER) <= sets
     assert sets - set(PAPER) == {"extrapolation/arms-small"}
-    assert figures_of("extrapolation/arms/push") is PAPER["extrapolation/arms"]
-    assert figures_of("mine/arms/push") is None
+    assert paper_row("extrapolation/arms/push") is PAPER["extrapolation/arms"]
+    assert paper_row("mine/arms/push") is None
 
 
 @pytest.mark.parametrize("name", ["extrapolation/primitives/reach", "composition/ee-task"])
 def test_scenarios_of_templates_and_few_meshes_have_the_papers_counts(name):
-    ours, theirs = statistics(read_split(name), LIBRARY)["train"], figures_of(name)
+    ours, theirs = statistics(read_split(name), LIBRARY)["train"], paper_row(name)
     assert (ours["links"], ours["movable"]) == (theirs.links, theirs.movable)

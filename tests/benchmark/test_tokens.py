@@ -16,12 +16,12 @@ from morphgen.benchmark.tokens import (
     LAYOUT,
     MAX_LINKS,
     TOKEN_SIZE,
-    joint_codes,
-    npz,
-    padded,
-    robot_of_tokens,
-    scaled_positions,
+    encode_joint_positions,
+    normalize_positions,
+    pad_tokens,
+    robot_from_tokens,
     tokens,
+    tokens_npz,
 )
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
@@ -129,14 +129,14 @@ def test_indices_are_divided_by_the_largest_that_there_can_be():
     ],
 )
 def test_q_is_scaled_by_the_joints_range(robot, q, x):
-    found = scaled_positions(robot, np.array(q)[:, None])
+    found = normalize_positions(robot, np.array(q)[:, None])
     np.testing.assert_allclose(found[:, 0], x, atol=1e-12)
 
 
 def test_mimic_joints_follow_their_leader():
     robot = arm()
     q = random_configurations(robot, 20, np.random.default_rng(0))
-    x = scaled_positions(robot, q)
+    x = normalize_positions(robot, q)
     np.testing.assert_allclose(x[:, 3], (q[:, 3] - 0.02) / 0.02)
     np.testing.assert_allclose(x[:, 4], (-q[:, 3] + 0.02) / 0.02)
 
@@ -154,8 +154,8 @@ def test_tokens_are_batched_over_q():
     q = random_configurations(robot, 12, np.random.default_rng(0)).reshape(3, 4, 4)
     made = tokens(robot, shapes_of(robot), q)
     assert made.shape == (3, 4, 6, 48)
-    assert joint_codes(robot, q).shape == (3, 4, 6, 16)
-    np.testing.assert_array_equal(made[..., 32:], joint_codes(robot, q))
+    assert encode_joint_positions(robot, q).shape == (3, 4, 6, 16)
+    np.testing.assert_array_equal(made[..., 32:], encode_joint_positions(robot, q))
     np.testing.assert_array_equal(made[2, 1], tokens(robot, shapes_of(robot), q[2, 1]))
     np.testing.assert_array_equal(arm_tokens(), tokens(robot, shapes_of(robot), robot.home))
     assert tokens(robot, {}, np.zeros((0, 4))).shape == (0, 6, 48)
@@ -164,7 +164,7 @@ def test_tokens_are_batched_over_q():
 def test_a_robot_of_one_link_has_one_token():
     made = tokens(Robot("r", (Link("a"),)), {"a": Shape(Sphere(0.1))})
     assert made.shape == (1, 48)
-    back, shapes = robot_of_tokens(made, "r")
+    back, shapes = robot_from_tokens(made, "r")
     assert (back.dof, shapes) == (0, {"link0": Shape(Sphere(0.1))})
 
 
@@ -210,19 +210,19 @@ def test_a_zero_axis_and_a_q_of_another_robot_are_refused():
 
 def test_padding_adds_rows_of_zeros_and_a_mask():
     made = np.stack([arm_tokens()] * 3)
-    all_, mask = padded(made, 9)
+    all_, mask = pad_tokens(made, 9)
     assert all_.shape == (3, 9, 48)
     assert mask.tolist() == [True] * 6 + [False] * 3
     np.testing.assert_array_equal(all_[:, mask], made)
     assert not all_[:, ~mask].any()
     with pytest.raises(BenchmarkError, match="has 6 links, more than max_links 5"):
-        padded(made, 5)
+        pad_tokens(made, 5)
 
 
 def test_a_file_of_tokens_is_the_same_bytes_and_needs_no_pickle():
     links = [link.name for link in arm().links]
-    content = npz(arm_tokens(), links, "arm", 23)
-    assert content == npz(arm_tokens(), links, "arm", 23)
+    content = tokens_npz(arm_tokens(), links, "arm", 23)
+    assert content == tokens_npz(arm_tokens(), links, "arm", 23)
     with np.load(io.BytesIO(content), allow_pickle=False) as data:
         np.testing.assert_array_equal(data["tokens"], arm_tokens())
         assert data["links"].tolist() == links

@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 import morphgen
 from helpers.robots import arm
 from helpers.tokens import arm_tokens, field_of, shapes_of
-from morphgen.benchmark.tokens import (
-    padded,
-    robot_of_tokens,
-    scaled_positions,
-    tokens,
-)
+from morphgen.benchmark.tokens import normalize_positions, pad_tokens, robot_from_tokens, tokens
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
@@ -41,7 +36,7 @@ UNIT3 = st.tuples(NUMBERS, NUMBERS, NUMBERS).filter(lambda v: math.hypot(*v) > 0
 QUATERNIONS = (
     st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS)
     .filter(lambda q: math.hypot(*q) > 0.1)
-    .map(rotation.normalized)
+    .map(rotation.normalize)
 )
 POSES = st.builds(Pose, st.tuples(NUMBERS, NUMBERS, NUMBERS), QUATERNIONS)
 SHAPES = st.builds(
@@ -93,7 +88,7 @@ def bodies(draw):
 
 
 def assert_read_back(made, **options):
-    back, shapes = robot_of_tokens(made, "back", **options)
+    back, shapes = robot_from_tokens(made, "back", **options)
     again = tokens(back, shapes, **options)
     np.testing.assert_allclose(again, made, rtol=0, atol=1e-9)
     assert shapes == shapes_of(back)
@@ -107,7 +102,7 @@ def test_tokens_of_the_robot_of_tokens_are_the_tokens(body):
     for made in tokens(robot, shapes, q):
         back = assert_read_back(made)
         assert back.parents == robot.parents
-        assert back.movable == robot.movable
+        assert back.movable_joints == robot.movable_joints
         assert {frame.link[4:] for frame in back.frames} == {f.link[1:] for f in robot.frames}
         assert {name[4:] for name in shapes_of(back)} == {name[1:] for name in shapes}
         for name in ("geometry pose", "joint origin"):
@@ -120,7 +115,7 @@ def test_the_robot_of_tokens_has_the_same_links_at_zero(body):
     robot, shapes, _ = body
     joints = tuple(replace(joint, mimic=None) for joint in robot.joints)
     robot = replace(robot, joints=joints, home=(0.0,) * sum(j.is_movable for j in joints))
-    back, _ = robot_of_tokens(tokens(robot, shapes), "back")
+    back, _ = robot_from_tokens(tokens(robot, shapes), "back")
     ours, theirs = (forward_kinematics(body, np.zeros(body.dof)) for body in (robot, back))
     np.testing.assert_allclose(theirs, ours, atol=1e-9)
 
@@ -132,7 +127,7 @@ def test_composed_robots_are_read_back(request_):
     q = random_configurations(robot, 5, np.random.default_rng(0))
     for made in (*tokens(robot, shapes, q, max_links=40), tokens(robot, shapes, max_links=40)):
         back = assert_read_back(made, max_links=40)
-        assert back.dof == len(robot.movable)
+        assert back.dof == len(robot.movable_joints)
         assert len(back.frames) == 1
     assert [tuple(value) for value in field_of(made, "joint axis")[1:]] == [
         pytest.approx(joint.unit_axis if joint.is_movable else (0, 0, 0)) for joint in robot.joints
@@ -140,20 +135,20 @@ def test_composed_robots_are_read_back(request_):
 
 
 def test_the_robot_of_tokens_moves_in_scaled_positions():
-    back, shapes = robot_of_tokens(arm_tokens(), "back")
+    back, shapes = robot_from_tokens(arm_tokens(), "back")
     assert back.name == "back"
     assert [link.name for link in back.links] == [f"link{i}" for i in range(6)]
     assert [joint.name for joint in back.joints] == [f"joint{i}" for i in range(1, 6)]
     assert {joint.limits for joint in back.joints} == {(-1.0, 1.0)}
     assert back.home == pytest.approx((0.2, 0.25, -0.5, 0.0, 0.0))
-    np.testing.assert_allclose(scaled_positions(back, back.home), back.home)
+    np.testing.assert_allclose(normalize_positions(back, back.home), back.home)
     assert back.frames == (Frame("tool", "link3"),)
     assert shapes["link0"] == Shape(Box((0.1, 0.1, 0.04)))
 
 
 def test_tokens_in_single_precision_are_read():
     made = arm_tokens()
-    back, shapes = robot_of_tokens(made.astype(np.float32), "back")
+    back, shapes = robot_from_tokens(made.astype(np.float32), "back")
     np.testing.assert_allclose(tokens(back, shapes), made, atol=2e-5)
 
 
@@ -174,7 +169,7 @@ def spoilt(row, column, value):
         (np.zeros((24, 48)), "has 24 links, more than max_links 23"),
         (spoilt(2, 0, 0.5), "link 2: link index: 0.5, not 2/22: made with another max_links"),
         (arm_tokens()[[0, 2, 1, 3, 4, 5]], "link 1: link index: 0.0909091, not 1/22"),
-        (padded(arm_tokens(), 8)[0], "link 6: link index: 0, not 6/22: "),
+        (pad_tokens(arm_tokens(), 8)[0], "link 6: link index: 0, not 6/22: "),
         (spoilt(0, 1, 0.0), "link 0: parent index: 0 makes no tree; expected -1/22"),
         (spoilt(1, 1, -1 / 22), "link 1: parent index: -0.0454545 makes no tree; expected 0/22"),
         (
@@ -228,7 +223,7 @@ def spoilt(row, column, value):
 )
 def test_what_is_no_token_is_refused_by_link_and_field(made, message):
     with pytest.raises(BenchmarkError, match=re.escape(message)) as refusal:
-        robot_of_tokens(made, "x")
+        robot_from_tokens(made, "x")
     assert str(refusal.value).startswith("tokens of 'x'")
 
 
@@ -236,11 +231,11 @@ def test_a_base_that_moves_is_refused():
     made = arm_tokens()
     made[0, 19:] = made[1, 19:]
     with pytest.raises(BenchmarkError, match="link 0: joint type: revolute, but the base is fixed"):
-        robot_of_tokens(made, "x")
+        robot_from_tokens(made, "x")
 
 
 def test_tokens_made_for_other_sizes_are_refused():
     made = tokens(arm(), {}, max_links=30)
     assert_read_back(made, max_links=30)
     with pytest.raises(BenchmarkError, match="made with another max_links than 23"):
-        robot_of_tokens(made, "x")
+        robot_from_tokens(made, "x")

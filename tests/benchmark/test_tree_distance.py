@@ -17,13 +17,13 @@ from morphgen.benchmark.tree_distance import (
     FIXED,
     change_costs,
     edit_distance,
-    kinematic_tree,
+    labelled_tree,
     normalised_distance,
 )
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import Joint, Link, Robot
-from morphgen.model.scaling import scaled
+from morphgen.model.tree import scale_links
 
 BLOCK = Shape(Box((0.1, 0.2, 0.3)))
 AXES = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, 0.6, 0.8))
@@ -46,7 +46,7 @@ def body(*joints, shapes=(), home=None):
 
 def tree(robot, reach=1.0):
     shapes = {link.name: link.collisions[0] for link in robot.links if link.collisions}
-    return kinematic_tree(robot, shapes, reach)
+    return labelled_tree(robot, shapes, reach)
 
 
 def distance(a, b):
@@ -174,7 +174,7 @@ def test_a_capsule_counts_as_a_cylinder_and_a_shape_as_more_than_none():
 
 def test_a_mesh_is_refused():
     with pytest.raises(ValueError, match="a mesh is no primitive"):
-        kinematic_tree(body(), {"link0": Shape(Mesh(Path("a.stl")))}, 1.0)
+        labelled_tree(body(), {"link0": Shape(Mesh(Path("a.stl")))}, 1.0)
 
 
 def test_a_joint_more_costs_one_and_a_body_on_a_fixed_joint_a_quarter():
@@ -228,7 +228,7 @@ def test_the_order_of_links_in_the_file_does_not_matter(random):
         shuffled.append(joint)
         known.add(joint.child)
     links = (hand.root, *(hand.link(joint.child) for joint in shuffled))
-    home = {hand.joints[k].name: q for k, q in zip(hand.independent, hand.home, strict=True)}
+    home = {hand.joints[k].name: q for k, q in zip(hand.independent_joints, hand.home, strict=True)}
     moved = tuple(home[joint.name] for joint in shuffled if joint.is_independent)
     other = replace(hand, links=links, joints=tuple(shuffled), home=moved)
     assert distance(hand, other) == pytest.approx(0, abs=1e-6)
@@ -255,7 +255,7 @@ def test_the_order_of_siblings_and_the_sign_of_axes_do_not_matter(order):
 @pytest.mark.parametrize("factor", [0.01, 3.0])
 def test_size_does_not_matter(factor):
     robot = morphgen.compose("arm=lwr ee=claw")
-    large = scaled(robot, {link.name: factor for link in robot.links})
+    large = scale_links(robot, {link.name: factor for link in robot.links})
     a, b = tree(robot, reach=1.2), tree(large, reach=1.2 * factor)
     assert normalised_distance(a, b) == pytest.approx(0, abs=1e-9)
     assert normalised_distance(a, tree(large, reach=1.2)) > 0.01
@@ -283,7 +283,7 @@ def test_alike_bodies_are_nearer_than_others():
 
 
 def test_the_benchmarks_largest_robots_take_milliseconds():
-    pair = [kinematic_tree(robot, token_shapes(robot), 1.0) for robot in morphgen.sample("arm5", 2)]
+    pair = [labelled_tree(robot, token_shapes(robot), 1.0) for robot in morphgen.sample("arm5", 2)]
     assert [len(each.kinds) for each in pair] == [23, 23]
     times = []
     for _ in range(5):

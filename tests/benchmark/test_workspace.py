@@ -8,12 +8,12 @@ import pytest
 
 import morphgen
 from helpers.robots import arm
-from morphgen.benchmark.workspace import overlap, shoulder, workspace
+from morphgen.benchmark.workspace import density_overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, frame_positions, random_configurations, reach
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
-from morphgen.model.scaling import scaled
+from morphgen.model.tree import scale_links
 
 LWR = "arm=lwr ee=plane"
 
@@ -61,19 +61,19 @@ def test_the_density_is_of_all_samples_and_the_same_every_time():
     assert found.density.sum() == pytest.approx(1)
     assert (found.density >= 0).all()
     np.testing.assert_array_equal(found.density, again.density)
-    assert overlap(found, again) == pytest.approx(1, abs=1e-12)
+    assert density_overlap(found, again) == pytest.approx(1, abs=1e-12)
 
 
 def test_it_is_the_same_both_ways_and_a_share():
     a, b = (workspace(morphgen.compose(words)) for words in (LWR, "arm3"))
-    assert overlap(a, b) == overlap(b, a)
-    assert 0.3 < overlap(a, b) < 0.9
+    assert density_overlap(a, b) == density_overlap(b, a)
+    assert 0.3 < density_overlap(a, b) < 0.9
 
 
 def test_bodies_whose_tools_never_meet_share_nothing():
     up = workspace(chain(("revolute", (0, 0, 0), (1, 0, 0))))
     flat = workspace(chain(("revolute", (0, 0, 0), (0, 0, 1)), tool=(0.5, 0.0, 0.0)))
-    assert overlap(up, flat) == 0.0
+    assert density_overlap(up, flat) == 0.0
 
 
 def test_a_hinge_reaches_its_radius_and_nowhere_else():
@@ -89,21 +89,21 @@ def test_a_hinge_reaches_its_radius_and_nowhere_else():
 @pytest.mark.parametrize("factor", [0.01, 3.0])
 def test_size_does_not_matter(factor):
     robot = morphgen.compose(LWR)
-    large = scaled(robot, {link.name: factor for link in robot.links})
+    large = scale_links(robot, {link.name: factor for link in robot.links})
     assert workspace(large).reach == pytest.approx(factor * workspace(robot).reach)
-    assert overlap(workspace(robot), workspace(large)) == pytest.approx(1, abs=1e-9)
+    assert density_overlap(workspace(robot), workspace(large)) == pytest.approx(1, abs=1e-9)
 
 
 def test_what_an_arm_stands_on_does_not_matter():
     robot = workspace(morphgen.compose(LWR))
     raised = workspace(morphgen.compose(f"base=pedestal {LWR}"))
     assert raised.shoulder[2] > robot.shoulder[2] + 0.1
-    assert overlap(robot, raised) == pytest.approx(1, abs=1e-9)
+    assert density_overlap(robot, raised) == pytest.approx(1, abs=1e-9)
 
 
 def test_where_an_axis_has_its_origin_does_not_matter():
     robot = morphgen.compose(LWR)
-    first = next(k for k in robot.independent)
+    first = next(k for k in robot.independent_joints)
     child = robot.joints[first].child
     down = Pose(tuple(-0.1 * value for value in robot.joints[first].unit_axis))
     up = down.inverse()
@@ -115,7 +115,7 @@ def test_where_an_axis_has_its_origin_does_not_matter():
     moved = replace(robot, joints=tuple(joints))
     assert reach(moved) == pytest.approx(reach(robot))
     assert shoulder(moved) == pytest.approx(shoulder(robot))
-    assert overlap(workspace(moved), workspace(robot)) == pytest.approx(1, abs=1e-9)
+    assert density_overlap(workspace(moved), workspace(robot)) == pytest.approx(1, abs=1e-9)
 
 
 def test_the_shoulder_is_where_the_second_axis_crosses_the_first():
@@ -157,7 +157,7 @@ def test_the_same_arm_with_another_finger_is_drawn_in_the_same_poses():
         ),
         home=(0.0, *robot.home),
     )
-    assert overlap(workspace(robot), workspace(other)) == pytest.approx(1, abs=1e-5)
+    assert density_overlap(workspace(robot), workspace(other)) == pytest.approx(1, abs=1e-5)
 
 
 def test_densities_depend_less_on_the_number_of_samples_than_occupied_cells():
@@ -171,8 +171,8 @@ def test_densities_depend_less_on_the_number_of_samples_than_occupied_cells():
             [abs(measured(few[i], few[j]) - measured(many[i], many[j])) for i, j in pairs]
         )
 
-    assert mean_change(overlap) < 0.005
-    assert mean_change(overlap) < 0.3 * mean_change(shared_cells)
+    assert mean_change(density_overlap) < 0.005
+    assert mean_change(density_overlap) < 0.3 * mean_change(shared_cells)
 
 
 def shared_cells(a, b):

@@ -19,7 +19,7 @@ from helpers.robots import arm
 from morphgen.checks import check, shapes
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Inertial, Link, Mimic, Robot
-from morphgen.model.tree import renamed
+from morphgen.model.tree import rename
 
 
 def found(robot: Robot, code: str) -> Finding:
@@ -115,7 +115,7 @@ def test_a_follower_is_judged_by_its_whole_chain():
 
 
 def test_a_root_may_be_called_world():
-    assert check(renamed(sound(), {"base": "world"})) == ()
+    assert check(rename(sound(), {"base": "world"})) == ()
 
 
 def test_overlap_of_an_ignored_pair_is_no_finding():

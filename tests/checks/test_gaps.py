@@ -15,7 +15,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import Joint, Link, Robot
-from morphgen.model.scaling import scaled
+from morphgen.model.tree import scale_links
 
 
 def pair(parent, child, T_parent_child=Pose(), between=()):  # noqa: B008
@@ -151,5 +151,5 @@ def test_either_link_may_say_why_the_gap_is_as_it_should_be(name):
 def test_a_panda_scaled_about_its_link_frames_is_torn_apart():
     panda = load_part(default_library().manifest("panda")).body
     factors = {"panda_link0": 1.5, "panda_link1": 0.5, "panda_link4": 1.4}
-    torn = {finding.where for finding in check_links_apart(scaled(panda, factors))}
+    torn = {finding.where for finding in check_links_apart(scale_links(panda, factors))}
     assert torn == {"links panda_link0, panda_link1", "links panda_link4, panda_link5"}

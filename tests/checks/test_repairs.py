@@ -18,9 +18,9 @@ from helpers.robots import arm
 from morphgen.checks import check, fix, shapes
 from morphgen.checks.inertia import DEFAULT_DENSITY
 from morphgen.checks.names import safe_names
-from morphgen.model.inertia import inertial_of
+from morphgen.model.inertia import inertial_from_density
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Robot
-from morphgen.model.tree import renamed
+from morphgen.model.tree import rename
 
 
 def keys(robot: Robot) -> set[tuple[str, str]]:
@@ -57,14 +57,14 @@ def test_a_sound_robot_stays_itself():
 def test_missing_mass_is_that_of_the_solid_geometry():
     robot, _ = fix(with_link(sound(), "lower", inertial=None))
     shapes = sound().link("lower").collisions
-    assert robot.link("lower").inertial == inertial_of(shapes, DEFAULT_DENSITY)
+    assert robot.link("lower").inertial == inertial_from_density(shapes, DEFAULT_DENSITY)
 
 
 def test_an_impossible_inertia_keeps_its_mass_and_its_centre():
     broken = with_body("lower", inertia=FLAT_INERTIA, com=(0.0, 0.0, 0.1))
     before, after = broken.link("lower").inertial, fix(broken)[0].link("lower").inertial
     assert (after.mass, after.com) == (before.mass, before.com)
-    solid = inertial_of(broken.link("lower").collisions, 1.0)
+    solid = inertial_from_density(broken.link("lower").collisions, 1.0)
     assert after.inertia == pytest.approx([before.mass / solid.mass * v for v in solid.inertia])
 
 
@@ -95,7 +95,7 @@ def test_home_that_is_no_number_becomes_the_reachable_position_nearest_zero():
 
 
 def test_names_are_changed_everywhere():
-    broken = renamed(arm(), {"left": "left pad"}, {"left": "left/1"})
+    broken = rename(arm(), {"left": "left pad"}, {"left": "left/1"})
     robot, gone = fix(replace(broken, ignore_pairs=(("left pad", "right"),)))
     assert {finding.code for finding in gone} == {"name-characters"}
     assert "left_pad" in robot.link_index
@@ -124,7 +124,7 @@ def test_new_names_are_unique_and_safe_ones_stay():
 def test_faults_that_meet_in_one_robot_are_repaired_together():
     broken = with_joint(with_body("lower", mass=math.nan), "extend", axis=(0, 0, 9), effort=None)
     broken = with_link(broken, "upper", inertial=None)
-    broken = renamed(broken, {"right": "world", "left": "left pad"}, {"elbow": "an elbow"})
+    broken = rename(broken, {"right": "world", "left": "left pad"}, {"elbow": "an elbow"})
     repaired, gone = fix(broken)
     assert len(gone) == 7
     assert check(repaired) == ()

@@ -11,8 +11,8 @@ import trimesh
 from helpers.robots import arm
 from morphgen.checks.self_collision import (
     PENETRATION,
-    SelfCollision,
-    attached_pairs,
+    SelfCollisionChecker,
+    adjacent_pairs,
     ignore_pairs,
     self_collisions,
 )
@@ -121,12 +121,12 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
 
 def test_neighbours_are_attached():
     robot = chain(ball("a"), ball("b"), ball("c"))
-    assert attached_pairs(robot) == (("a", "b"), ("b", "c"))
+    assert adjacent_pairs(robot) == (("a", "b"), ("b", "c"))
 
 
 def test_links_without_shapes_do_not_part_neighbours():
     robot = chain(ball("a"), Link("x"), Link("y"), ball("b"), ball("c"))
-    assert attached_pairs(robot) == (("a", "b"), ("b", "c"))
+    assert adjacent_pairs(robot) == (("a", "b"), ("b", "c"))
 
 
 def test_links_on_fixed_joints_are_one_body():
@@ -134,11 +134,11 @@ def test_links_on_fixed_joints_are_one_body():
     robot = chain(*links)
     fixed = replace(robot.joints[1], kind="fixed")
     robot = replace(robot, joints=(robot.joints[0], fixed, robot.joints[2]), home=(0.0, 0.0))
-    assert attached_pairs(robot) == (("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d"))
+    assert adjacent_pairs(robot) == (("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d"))
 
 
 def test_siblings_on_an_empty_root_are_not_attached():
-    assert attached_pairs(slides(0.0, 0.3)) == ()
+    assert adjacent_pairs(slides(0.0, 0.3)) == ()
 
 
 def test_touching_at_home_is_ignored():
@@ -199,7 +199,7 @@ def test_a_root_named_world_and_a_locked_joint_are_no_matter():
 
 
 def test_configurations_of_another_shape_are_refused():
-    tester = SelfCollision(slides(0.0, 0.3))
+    tester = SelfCollisionChecker(slides(0.0, 0.3))
     for q in ([0.0, 0.0], [[0.0]]):
         with pytest.raises(ValueError, match="q has shape"):
             tester.penetrations(q)

@@ -11,7 +11,7 @@ import pytest
 import morphgen
 from helpers.commands import tree
 from helpers.robots import arm
-from morphgen.benchmark.similarity import MEASURES, features, matrix
+from morphgen.benchmark.similarity import MEASURES, features, similarity_matrix
 from morphgen.cli import similarity as command
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
@@ -58,7 +58,7 @@ def test_a_folder_of_bundles_gives_a_matrix_a_measure(run, bundles, tmp_path):
             "larger is more alike" if measure.larger_is_more_alike else "smaller is more alike"
         )
         assert header.split() == ["#", "robot", "0", "1", "2"]
-        values = matrix(made, measure.name)
+        values = similarity_matrix(made, measure.name)
         for i, row in enumerate(rows):
             number, name, *numbers = row.split()
             assert (number, name) == (str(i), bundles[i].name)
@@ -76,7 +76,7 @@ def test_json_holds_the_matrices(run, bundles):
     made = [features(robot, token_shapes(robot)) for robot in bundles]
     for name, about in found["measures"].items():
         assert about["larger_is_more_alike"] == MEASURES[name].larger_is_more_alike
-        np.testing.assert_allclose(about["matrix"], matrix(made, name), atol=1e-6)
+        np.testing.assert_allclose(about["matrix"], similarity_matrix(made, name), atol=1e-6)
 
 
 def test_the_tree_is_the_measure_if_none_is_named(run, bundles):
@@ -104,7 +104,7 @@ def test_robots_of_a_light_set_are_composed_anew(run, light_set):
     robots = list(morphgen.sample("cubes", 4))
     made = [features(robot, token_shapes(robot)) for robot in robots]
     np.testing.assert_allclose(
-        found["measures"]["cosine"]["matrix"], matrix(made, "cosine"), atol=1e-9
+        found["measures"]["cosine"]["matrix"], similarity_matrix(made, "cosine"), atol=1e-9
     )
 
 

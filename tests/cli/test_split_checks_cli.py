@@ -9,9 +9,9 @@ import pytest
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member, split
 from morphgen.benchmark.built import load_built
-from morphgen.benchmark.paper import PAPER
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
+from morphgen.benchmark.statistics import PAPER
 from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.split_goals import read_goals
 

@@ -9,7 +9,7 @@ import pytest
 import morphgen
 from helpers.commands import tree
 from helpers.robots import arm
-from morphgen.benchmark.tokens import LAYOUT, robot_of_tokens, tokens
+from morphgen.benchmark.tokens import LAYOUT, robot_from_tokens, tokens
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
 
@@ -100,7 +100,7 @@ def test_it_writes_a_file_the_same_bytes_each_time(run, bundle, tmp_path):
     assert Path("arm.npz").read_bytes() == first
     with np.load("arm.npz", allow_pickle=False) as data:
         assert data["tokens"].shape == (6, 48)
-        back, _ = robot_of_tokens(data["tokens"], "back", max_links=int(data["max_links"]))
+        back, _ = robot_from_tokens(data["tokens"], "back", max_links=int(data["max_links"]))
         assert data["links"].tolist() == [link.name for link in arm().links]
     assert back.parents == arm().parents
 

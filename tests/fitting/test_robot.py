@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 import morphgen
-from morphgen.checks.self_collision import SelfCollision
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.cli import main
 from morphgen.errors import FitError
 from morphgen.fitting import token_shapes as token_shapes_module
@@ -150,7 +150,7 @@ def test_a_robot_in_primitives_keeps_its_masses_and_joints():
     assert [link.visuals for link in made.links] == [link.visuals for link in meshes.links]
     assert not any(isinstance(s.geometry, Mesh) for link in made.links for s in link.collisions)
     assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
-    assert SelfCollision(made).penetrations([made.home]) == [{}]
+    assert SelfCollisionChecker(made).penetrations([made.home]) == [{}]
     assert morphgen.check(made) == morphgen.check(meshes)
 
 

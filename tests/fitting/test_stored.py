@@ -22,7 +22,7 @@ from morphgen.formats.fits import (
     stored_fit,
     stored_text,
 )
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, scaled_shape
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, scale_shape
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.25, 1 / 3), (0.3, -0.5, 2.0))
 CAN = Shape(Cylinder(0.05, 0.3), TILTED)
@@ -265,14 +265,14 @@ def test_whatever_changes_the_solid_changes_the_key(mesh):
 
 def test_shapes_scaled_as_a_whole_have_the_same_key_and_their_fit_grows_with_them(mesh):
     shapes = [Shape(mesh, TILTED), Shape(Box((0.1, 0.2, 0.3)), Pose((0.1, 0.0, 0.2)))]
-    larger = [scaled_shape(shape, 1.3) for shape in shapes]
+    larger = [scale_shape(shape, 1.3) for shape in shapes]
     assert shapes_key(larger) == shapes_key(shapes)
     assert shapes_key([larger[0], shapes[1]]) != shapes_key(shapes)
     stored = {shapes_key(shapes): ARM}
     assert stored_fit(shapes, stored) == ARM
     found = stored_fit(larger, stored)
-    assert found.token == scaled_shape(ARM.token, 1.3)
-    assert found.collision == tuple(scaled_shape(shape, 1.3) for shape in ARM.collision)
+    assert found.token == scale_shape(ARM.token, 1.3)
+    assert found.collision == tuple(scale_shape(shape, 1.3) for shape in ARM.collision)
     assert stored_fit([Shape(Sphere(0.1))], stored) is None
 
 

@@ -76,7 +76,7 @@ def test_meshes_of_the_library_cost_no_search_also_scaled_ones(no_search):
     assert len(other) == 1
     assert "link2" in other[0]
     assert same
-    assert scaled[other[0]] == morphgen.model.scaling.scaled_shape(plain[other[0]], 1.4)
+    assert scaled[other[0]] == morphgen.model.geometry.scale_shape(plain[other[0]], 1.4)
 
 
 def test_what_is_stored_nowhere_is_searched_once(monkeypatch, cache):

@@ -13,7 +13,7 @@ from helpers.robots import arm, rod
 from morphgen.errors import FormatError
 from morphgen.formats.mjcf import mjcf_text, to_spec
 from morphgen.formats.mjcf_elements import FLAT_THICKNESS
-from morphgen.model.dynamics import MOTOR_INERTIA, actuation
+from morphgen.model.dynamics import MIN_ROTATIONAL_INERTIA, actuation
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import (
     frame_pose,
@@ -37,7 +37,7 @@ def compiled(robot):
 
 def place(model, robot, q):
     data = mujoco.MjData(model)
-    for k, value in zip(robot.movable, movable_positions(robot, q), strict=True):
+    for k, value in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
         data.joint(robot.joints[k].name).qpos[0] = value
     mujoco.mj_forward(model, data)
     return data
@@ -161,14 +161,14 @@ def test_home_is_a_keyframe_with_its_mimics_and_holds():
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
     assert data.ctrl == pytest.approx(robot.home)
-    for k, q in zip(robot.movable, movable_positions(robot, robot.home), strict=True):
+    for k, q in zip(robot.movable_joints, movable_positions(robot, robot.home), strict=True):
         assert data.joint(robot.joints[k].name).qpos[0] == pytest.approx(q)
     model.opt.gravity[:] = 0
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     for _ in range(200):
         mujoco.mj_step(model, data)
     assert data.ctrl == pytest.approx([data.joint(robot.joints[k].name).qpos[0] for k in
-                                       robot.independent], abs=1e-3)  # fmt: skip
+                                       robot.independent_joints], abs=1e-3)  # fmt: skip
 
 
 def test_branches_keep_the_keyframe_in_mujocos_order():
@@ -221,7 +221,7 @@ def test_massless_moving_links_are_legal_and_weigh_nothing():
     model = compiled(robot)
     assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-9)
     added = [gain.armature for gain in actuation(robot)]
-    assert added[3] == pytest.approx(MOTOR_INERTIA)
+    assert added[3] == pytest.approx(MIN_ROTATIONAL_INERTIA)
     assert model.dof_armature == pytest.approx(added)
     data = mujoco.MjData(model)
     for _ in range(100):

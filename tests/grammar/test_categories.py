@@ -21,7 +21,7 @@ RANGES = {
 def troubles(drawn: Sample, category):
     """What is wrong with a robot of a category."""
     robot = drawn.robot
-    counts = (len(robot.links), len(robot.movable))
+    counts = (len(robot.links), len(robot.movable_joints))
     found = unphysical(robot)
     if counts != benchmark_counts(category, drawn.derivation):
         found.append(f"{counts} links and movable joints: {drawn.derivation}")

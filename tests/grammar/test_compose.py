@@ -52,13 +52,13 @@ class Situation:
         self.robot = joined(text)
         (self.q,) = random_configurations(self.robot, 1, np.random.default_rng(seed))
         self.T_world_link = forward_kinematics(self.robot, self.q)
-        names = [self.robot.joints[k].name for k in self.robot.independent]
+        names = [self.robot.joints[k].name for k in self.robot.independent_joints]
         self.positions = dict(zip(names, self.q, strict=True))
 
     def alone(self, label):
         """Pose of every link of a part in the part's root, the part by itself in that pose."""
         body = self.placed[label].part.body
-        joints = [body.joints[k].name for k in body.independent]
+        joints = [body.joints[k].name for k in body.independent_joints]
         return forward_kinematics(body, [self.positions[f"{label}_{name}"] for name in joints])
 
     def links(self, label):
@@ -164,7 +164,9 @@ def test_mass_is_the_sum_of_the_parts():
 
 def test_home_is_each_parts_own():
     robot = composed("base=gantry ee=robotiq_2f140")
-    home = dict(zip([robot.joints[k].name for k in robot.independent], robot.home, strict=True))
+    home = dict(
+        zip([robot.joints[k].name for k in robot.independent_joints], robot.home, strict=True)
+    )
     assert home["base_z"] == pytest.approx(0.8)
     assert robot.home[:5] == pytest.approx((0, 0, 0.8, 0, 0))
     assert list(home)[5:] == ["ee_finger_joint"]
@@ -255,8 +257,10 @@ def test_both_hands_of_yumi_hold_a_gripper_and_the_right_one_is_the_tool():
 def test_a_plate_under_the_gantry_is_the_papers_primitive_and_points_down():
     robot = composed("base=gantry ee=plane")
     assert len(robot.links) == 7
-    assert len(robot.movable) == robot.dof == 5
-    assert [robot.joints[k].kind for k in robot.movable] == ["prismatic"] * 3 + ["revolute"] * 2
+    assert len(robot.movable_joints) == robot.dof == 5
+    assert [robot.joints[k].kind for k in robot.movable_joints] == ["prismatic"] * 3 + [
+        "revolute"
+    ] * 2
     tool = frame_pose(robot, robot.home)
     assert tool[:3, 2] == pytest.approx([0, 0, -1], abs=1e-12)
     assert tool[:3, 3] == pytest.approx([0, 0, 0.8 - 0.1], abs=1e-12)

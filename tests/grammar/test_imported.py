@@ -15,7 +15,7 @@ from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.imported import import_robot
 from morphgen.model.geometry import IDENTITY, Box
 from morphgen.model.kinematics import frame_pose
-from morphgen.model.tree import renamed
+from morphgen.model.tree import rename
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_a_sound_robot_is_not_repaired(urdf):
 
 
 def test_a_link_that_is_called_tool_makes_room_for_the_frame(urdf):
-    path = urdf(renamed(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
+    path = urdf(rename(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
     robot = import_robot(path, tool="tool")
     assert robot.frame("tool").link == "tool_link"
     assert {"tool", "tool_joint"}.isdisjoint({*robot.link_index, *robot.joint_index})

@@ -13,7 +13,7 @@ from morphgen.grammar import part as module
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Box, scaled_shape
+from morphgen.model.geometry import Box, scale_shape
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
 
@@ -232,7 +232,7 @@ def test_a_link_grows_by_a_parameter_and_its_face_stays_on_its_parent(real):
         manifest = real(parameters=size, scaling=scaling).manifest
         larger = load_part(manifest, {"size": 2}).body
         shapes = plain.body.link("disc").collisions
-        assert larger.link("disc").collisions == tuple(scaled_shape(s, 2) for s in shapes)
+        assert larger.link("disc").collisions == tuple(scale_shape(s, 2) for s in shapes)
         assert larger.joints == plain.body.joints
     face = {"disc": {"by": "size", "face": [0, 0, -0.01]}}
     held = load_part(real(parameters=size, scaling=face).manifest, {"size": 2}).body

@@ -10,9 +10,9 @@ import trimesh
 
 from helpers.robots import arm
 from morphgen.model.geometry import Box, Capsule, Geometry, Mesh, Pose, Shape, Sphere
-from morphgen.model.inertia import inertial_of, with_inertia
+from morphgen.model.inertia import inertial_from_density, with_inertia
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
-from morphgen.model.tree import renamed
+from morphgen.model.tree import rename
 
 FLAT_INERTIA = (1e-3, 0.0, 0.0, 1e-3, 0.0, 2.5e-3)
 
@@ -24,7 +24,9 @@ def sound() -> Robot:
 
 def with_joint(robot: Robot, name: str, **changes: object) -> Robot:
     """The robot, one joint changed; one that begins to move by itself is at 0 at home."""
-    home = {robot.joints[k].name: q for k, q in zip(robot.independent, robot.home, strict=True)}
+    home = {
+        robot.joints[k].name: q for k, q in zip(robot.independent_joints, robot.home, strict=True)
+    }
     joints = tuple(replace(j, **changes) if j.name == name else j for j in robot.joints)
     moving = (j for j in joints if j.is_independent)
     return replace(robot, joints=joints, home=tuple(home.get(j.name, 0.0) for j in moving))
@@ -131,8 +133,8 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "extent-implausible": lambda: with_shape(Box((20.0, 20.0, 20.0))),
     "visual-collision-scale": lambda: with_shape(Box((2.4e-4, 2.4e-4, 2.4e-4)), visual=False),
     "capsule-in-urdf": lambda: with_shape(Capsule(0.02, 0.1)),
-    "name-characters": lambda: replace(renamed(sound(), {"right": "right/pad 1"}), name="an arm"),
-    "name-reserved": lambda: renamed(sound(), {"right": "world"}),
+    "name-characters": lambda: replace(rename(sound(), {"right": "right/pad 1"}), name="an arm"),
+    "name-reserved": lambda: rename(sound(), {"right": "world"}),
     "frame-name-taken": lambda: replace(sound(), frames=(*sound().frames, Frame("base", "base"))),
     "self-collision": _colliding,
     "tool-missing": lambda: replace(sound(), frames=()),
@@ -157,7 +159,7 @@ def _mesh(path: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Ro
     if path.is_file() and path.stem == "ball" and all(map(math.isfinite, scale)) and all(scale):
         return robot.with_links([with_inertia(robot.link("slider"), 1000.0)])
     shape = Shape(Box((0.1, 0.1, 0.1)))
-    return with_link(robot, "slider", inertial=inertial_of([shape], 1000.0))
+    return with_link(robot, "slider", inertial=inertial_from_density([shape], 1000.0))
 
 
 def _text(path: Path, text: str) -> Path:

@@ -73,7 +73,7 @@ def unphysical(robot):
     for joint in robot.joints:
         if joint.limits is not None and not joint.limits[0] < joint.limits[1]:
             found.append(f"{joint.name}: limits {joint.limits}")
-    for k, q in zip(robot.independent, robot.home, strict=True):
+    for k, q in zip(robot.independent_joints, robot.home, strict=True):
         low, high = robot.joints[k].limits or (-math.inf, math.inf)
         if not low <= q <= high:
             found.append(f"{robot.joints[k].name}: home {q} outside of {low}, {high}")

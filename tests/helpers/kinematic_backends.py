@@ -6,7 +6,7 @@ import torch
 
 from morphgen.model import inverse_kinematics, inverse_kinematics_torch, kinematics
 from morphgen.model import kinematics_torch as batched
-from morphgen.model.kinematics import bounds
+from morphgen.model.kinematics import joint_limits
 
 BACKENDS = ("numpy", "float64", "float32")
 
@@ -51,8 +51,8 @@ class TorchBackend:
 
     def __post_init__(self):
         self.tolerance = 1e-9 if self.dtype == torch.float64 else 2e-5
-        self.tree = batched.kinematic_tree(self.robots, dtype=self.dtype)
-        self.chain = batched.tool_chain(self.robots, dtype=self.dtype)
+        self.tree = batched.compile_tree(self.robots, dtype=self.dtype)
+        self.chain = batched.compile_chain(self.robots, dtype=self.dtype)
         self.joints = max(robot.dof for robot in self.robots)
 
     def rows(self, index, q):
@@ -103,7 +103,7 @@ class TorchBackend:
         """Lower and upper limits of every row, each (n, J)."""
         both = torch.zeros(2, len(self.robots), self.joints, dtype=self.dtype)
         for r, robot in enumerate(self.robots):
-            both[:, r, : robot.dof] = torch.from_numpy(bounds(robot).T)
+            both[:, r, : robot.dof] = torch.from_numpy(joint_limits(robot).T)
         return both[0, robot_index], both[1, robot_index]
 
 

@@ -9,9 +9,9 @@ from morphgen.api import compose
 from morphgen.formats.mjcf import to_spec
 from morphgen.model.dynamics import (
     BANDWIDTH,
-    MIN_INERTIA,
-    MOTOR_INERTIA,
-    REFLECTED,
+    MIN_RELATIVE_INERTIA,
+    MIN_ROTATIONAL_INERTIA,
+    MIN_SLIDING_MASS,
     actuation,
     mass_matrix,
 )
@@ -50,7 +50,7 @@ def mujoco_mass_matrix(robot, q):
     model = to_spec(robot).compile()
     data = mujoco.MjData(model)
     addresses = []
-    for k, value in zip(robot.movable, movable_positions(robot, q), strict=True):
+    for k, value in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
         joint = model.joint(robot.joints[k].name)
         data.qpos[joint.qposadr[0]] = value
         addresses.append(joint.dofadr[0])
@@ -90,21 +90,25 @@ def test_gains_are_critically_damped():
 def test_motors_lift_light_joints_to_a_share_of_the_heaviest_of_their_kind():
     robot = arm()
     turning, sliding = [], []
-    for k, gain in zip(robot.independent, actuation(robot), strict=True):
+    for k, gain in zip(robot.independent_joints, actuation(robot), strict=True):
         kind = sliding if robot.joints[k].kind == "prismatic" else turning
         kind.append(gain.stiffness / BANDWIDTH**2)
-    for totals, least in ((turning, MOTOR_INERTIA), (sliding, MIN_INERTIA)):
-        assert min(totals) >= max(REFLECTED * max(totals), least) * (1 - 1e-9)
+    for totals, least in ((turning, MIN_ROTATIONAL_INERTIA), (sliding, MIN_SLIDING_MASS)):
+        assert min(totals) >= max(MIN_RELATIVE_INERTIA * max(totals), least) * (1 - 1e-9)
     robot = compose("arm=ur5 ee=plane")
     gains = actuation(robot)
     inertia = np.diag(mass_matrix(robot, robot.home))
     assert gains[0].armature == 0
-    assert gains[-1].armature == pytest.approx(REFLECTED * inertia.max() - inertia[-1])
+    assert gains[-1].armature == pytest.approx(MIN_RELATIVE_INERTIA * inertia.max() - inertia[-1])
 
 
 @pytest.mark.parametrize(
     ("kind", "least"),
-    [("revolute", MOTOR_INERTIA), ("continuous", MOTOR_INERTIA), ("prismatic", MIN_INERTIA)],
+    [
+        ("revolute", MIN_ROTATIONAL_INERTIA),
+        ("continuous", MIN_ROTATIONAL_INERTIA),
+        ("prismatic", MIN_SLIDING_MASS),
+    ],
 )
 def test_gains_take_a_smallest_inertia(kind, least):
     limits = None if kind == "continuous" else (-1.0, 1.0)

@@ -11,10 +11,19 @@ from helpers.kinematic_backends import BACKENDS, backend
 from helpers.robots import arm
 from helpers.scenes import robot
 from morphgen.model.inverse_kinematics import solve_pose_ik
-from morphgen.model.inverse_kinematics_torch import solve_position_ik, step_to_pose
-from morphgen.model.kinematics import bounds, frame_pose, moved_by, random_configurations
+from morphgen.model.inverse_kinematics_torch import pose_ik_step, solve_position_ik
+from morphgen.model.kinematics import (
+    driving_joints,
+    frame_pose,
+    joint_limits,
+    random_configurations,
+)
 from morphgen.model.kinematics_torch import frame_pose as frame_poses
-from morphgen.model.rotation_torch import quaternion_matrices, quaternions, rotation_vectors
+from morphgen.model.rotation_torch import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotvec_from_matrix,
+)
 
 UR5, PANDA, GANTRY, CHAIN, CLAW = ROBOTS = [
     robot(words)
@@ -47,7 +56,7 @@ def test_a_step_solves_the_damped_normal_equations(kinematics):
 @pytest.mark.parametrize("index", range(len(ROBOTS)))
 def test_tools_get_to_positions_within_limits(kinematics, index):
     body, rng = ROBOTS[index], np.random.default_rng(index)
-    low, high = bounds(body).T
+    low, high = joint_limits(body).T
     q = 0.5 * (low + high) + 0.25 * rng.uniform(-1, 1, (6, body.dof)) * (high - low)
     goals = frame_pose(body, np.clip(q + rng.uniform(-0.2, 0.2, q.shape), low, high))[:, :3, 3]
     found, error = kinematics.solve_position_ik(index, q, goals)
@@ -56,7 +65,9 @@ def test_tools_get_to_positions_within_limits(kinematics, index):
     left = goals - frame_pose(body, found)[:, :3, 3]
     np.testing.assert_allclose(error, left, atol=kinematics.tolerance)
     assert np.median(np.linalg.norm(left, axis=1)) < 1e-3
-    idle = np.setdiff1d(range(body.dof), moved_by(body, body.joints_to(body.frame("tool").link)))
+    idle = np.setdiff1d(
+        range(body.dof), driving_joints(body, body.joint_chain(body.frame("tool").link))
+    )
     np.testing.assert_allclose(found[:, idle], q[:, idle], atol=kinematics.tolerance)
 
 
@@ -89,7 +100,7 @@ def test_a_pose_out_of_reach_is_approached_within_the_limits():
     goal = np.eye(4)
     goal[:3, 3] = (0.0, 0.0, 5.0)
     found = solve_pose_ik(arm(), goal, arm().home, rotation_weight=0.0)
-    low, high = bounds(arm()).T
+    low, high = joint_limits(arm()).T
     assert ((low <= found) & (found <= high)).all()
     assert frame_pose(arm(), found)[2, 3] > frame_pose(arm(), arm().home)[2, 3]
 
@@ -110,7 +121,7 @@ class Stepper:
         return T[:, :3, 3], T[:, :3, :3]
 
     def __call__(self, q, positions, rotations, **options):
-        return step_to_pose(
+        return pose_ik_step(
             self.chain, self.robot_index, q, positions, rotations, self.limits, **options
         )
 
@@ -167,7 +178,7 @@ def test_rotation_vectors_are_the_logarithms_of_rotations(angle):
     axes[:3] = np.eye(3)
     wanted = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
     R = torch.from_numpy(Rotation.from_rotvec(wanted).as_matrix()).float()
-    found = rotation_vectors(R).double().numpy()
+    found = rotvec_from_matrix(R).double().numpy()
     if angle > 3.1415:  # there are two, and which it is depends on the last bit
         found *= np.sign((found * wanted).sum(axis=1, keepdims=True))
     assert np.abs(found - wanted).max() < 3e-6 * max(angle, 1e-3)
@@ -177,12 +188,12 @@ def test_quaternions_are_those_of_scipy_and_back():
     turns = Rotation.random(200, rng=np.random.default_rng(0))
     R = torch.from_numpy(turns.as_matrix())
     expected = turns.as_quat(canonical=True, scalar_first=True)
-    found = quaternions(R)
+    found = quaternion_from_matrix(R)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
-    torch.testing.assert_close(quaternion_matrices(found), R, atol=1e-12, rtol=0)
+    torch.testing.assert_close(matrix_from_quaternion(found), R, atol=1e-12, rtol=0)
 
 
 def test_quaternions_of_half_turns_too():
     turns = np.array([np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1])])
-    found = quaternions(torch.from_numpy(turns.astype(float))).numpy()
+    found = quaternion_from_matrix(torch.from_numpy(turns.astype(float))).numpy()
     assert np.abs(found) == pytest.approx(np.eye(4), abs=1e-9)

@@ -9,15 +9,15 @@ from helpers.robots import arm
 from morphgen.api import compose
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
-    bounds,
     forward_kinematics,
     frame_jacobian,
     frame_pose,
+    joint_limits,
     movable_positions,
+    periodic_joints,
     random_configurations,
     reach,
-    unwound,
-    whole_turns,
+    unwrap_joints,
 )
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 
@@ -83,7 +83,7 @@ def test_reach_of_a_planar_arm_is_its_length():
 def test_random_configurations_stay_in_bounds():
     robot = arm()
     q = random_configurations(robot, 1000, np.random.default_rng(0))
-    limits = bounds(robot)
+    limits = joint_limits(robot)
     assert (q >= limits[:, 0]).all()
     assert (q <= limits[:, 1]).all()
 
@@ -112,9 +112,9 @@ def test_unwound_configurations_are_those_that_turn_least():
     body = compose("arm=ur5 ee=plane")
     rng = np.random.default_rng(0)
     start, ends = rng.uniform(-6, 6, 6), random_configurations(body, 200, rng)
-    found = unwound(body, start, ends)
+    found = unwrap_joints(body, start, ends)
     assert forward_kinematics(body, found) == pytest.approx(forward_kinematics(body, ends))
-    lower, upper = bounds(body).T
+    lower, upper = joint_limits(body).T
     assert (lower <= found).all()
     assert (found <= upper).all()
     apart = np.abs(found - start)
@@ -128,5 +128,5 @@ def test_unwound_configurations_are_those_that_turn_least():
 
 
 def test_a_joint_that_another_follows_is_not_turned_back():
-    turns = whole_turns(compose("arm=panda ee=panda_hand"))
+    turns = periodic_joints(compose("arm=panda ee=panda_hand"))
     assert turns.tolist() == [True] * 7 + [False]

@@ -15,10 +15,10 @@ from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.kinematics_torch import (
+    compile_chain,
+    compile_tree,
     forward_kinematics,
     frame_jacobian,
-    kinematic_tree,
-    tool_chain,
 )
 from morphgen.model.robot import Frame, Link, Mimic, Robot
 
@@ -104,7 +104,7 @@ def test_tool_jacobians_are_those_of_mujoco(kinematics, index):
     robot, q = ROBOTS[index], drawn(index)
     expected = MujocoKinematics(robot)
     model, data = expected.model, expected.data
-    dofs = [model.joint(robot.joints[k].name).dofadr[0] for k in robot.movable]
+    dofs = [model.joint(robot.joints[k].name).dofadr[0] for k in robot.movable_joints]
     T, J = kinematics.frame_jacobian(index, q)
     np.testing.assert_allclose(T, expected.frame_pose(q), atol=kinematics.tolerance)
     np.testing.assert_allclose(kinematics.frame_pose(index, q), T, atol=1e-12)
@@ -126,7 +126,7 @@ def test_tool_jacobians_are_those_of_pinocchio(kinematics, index):
     bare = [replace(link, visuals=(), collisions=()) for link in robot.links]
     model = pinocchio.buildModelFromXML(urdf_text(robot.with_links(bare), str))
     data, tool = model.createData(), robot.frame("tool")
-    names = [robot.joints[k].name for k in robot.movable]
+    names = [robot.joints[k].name for k in robot.movable_joints]
     columns = [model.idx_vs[model.getJointId(name)] for name in names]
     link = model.getFrameId(tool.link, pinocchio.FrameType.BODY)
     frame = model.addFrame(
@@ -188,18 +188,18 @@ def test_derivatives_of_poses_are_the_jacobians():
 
 
 def test_a_tree_may_have_room_for_more_links():
-    tree = kinematic_tree([arm()], max_links=9)
+    tree = compile_tree([arm()], max_links=9)
     assert tree.is_link.tolist() == [[True] * 6 + [False] * 3]
     T = forward_kinematics(tree, torch.tensor([0]), torch.tensor([arm().home]))
     assert T.shape == (1, 9, 4, 4)
     assert (T[:, 6:] == torch.eye(4)).all()
     with pytest.raises(ValueError, match="max_links is 3; expected at least 6"):
-        kinematic_tree([arm()], max_links=3)
+        compile_tree([arm()], max_links=3)
 
 
 def test_a_tool_that_nothing_moves_has_a_pose_and_no_velocity():
     fixed = replace(arm(), name="fixed", frames=(Frame("tool", "base", Pose((1.0, 2.0, 3.0))),))
-    chain = tool_chain([fixed], dtype=torch.float64)
+    chain = compile_chain([fixed], dtype=torch.float64)
     T, J = frame_jacobian(chain, torch.tensor([0]), torch.tensor([fixed.home]).double())
     np.testing.assert_array_equal(T[0].numpy(), frame_pose(fixed, fixed.home))
     assert not J.any()
@@ -207,6 +207,6 @@ def test_a_tool_that_nothing_moves_has_a_pose_and_no_velocity():
 
 def test_a_robot_of_one_link_has_a_root_alone():
     robot = Robot("stone", (Link("a"),))
-    T = forward_kinematics(kinematic_tree([robot]), torch.tensor([0, 0]), torch.zeros(2, 0))
+    T = forward_kinematics(compile_tree([robot]), torch.tensor([0, 0]), torch.zeros(2, 0))
     assert (torch.eye(4) == T).all()
     assert T.shape == (2, 1, 4, 4)

@@ -9,7 +9,7 @@ import trimesh
 
 from morphgen.errors import MeshError
 from morphgen.model.geometry import Mesh
-from morphgen.model.mesh import MeshPart, hull, load_mesh, mesh_parts
+from morphgen.model.mesh import MeshPart, convex_hull, load_mesh, mesh_parts
 
 DAE = """<?xml version="1.0" encoding="utf-8"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -203,8 +203,8 @@ def test_a_scale_that_destroys_the_mesh_is_refused(
 def test_a_hull_encloses_its_mesh_and_is_computed_once(tmp_path: Path) -> None:
     path = tmp_path / "ring.stl"
     trimesh.creation.annulus(0.1, 0.2, 0.3).export(path)
-    shape = hull(Mesh(path))
-    assert hull(Mesh(path)) is shape
+    shape = convex_hull(Mesh(path))
+    assert convex_hull(Mesh(path)) is shape
     assert shape.is_convex
     assert shape.is_watertight
     np.testing.assert_allclose(shape.bounds, load_mesh(Mesh(path)).bounds)
@@ -215,7 +215,7 @@ def test_a_flat_mesh_has_no_hull(tmp_path: Path) -> None:
     path = tmp_path / "flat.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
     with pytest.raises(MeshError, match="flat"):
-        hull(Mesh(path))
+        convex_hull(Mesh(path))
 
 
 @pytest.mark.parametrize("part", ["arm_mico", "hand_2finger", "wrist_spherical_2"])

@@ -7,7 +7,7 @@ import pytest
 from helpers.robots import arm
 from morphgen.errors import RobotError
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
-from morphgen.model.tree import renamed, subtree
+from morphgen.model.tree import rename, subtree
 
 
 def test_two_links_of_one_name():
@@ -52,7 +52,7 @@ def test_subtree_that_loses_a_mimic_leader_is_refused():
 
 
 def test_renaming_carries_every_reference():
-    robot = renamed(arm(), {"slider": "s"}, {"left": "l"})
+    robot = rename(arm(), {"slider": "s"}, {"left": "l"})
     assert robot.frame("tool").link == "s"
     assert robot.joints[-1].mimic == Mimic("l", -1.0, 0.0)
     assert robot.joints[-1].parent == "s"

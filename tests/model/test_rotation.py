@@ -54,4 +54,4 @@ def test_matrix_gives_back_the_quaternion_with_positive_w(rpy):
 
 def test_zero_is_no_rotation():
     with pytest.raises(ValueError, match="no rotation"):
-        rotation.normalized((0.0, 0.0, 0.0, 0.0))
+        rotation.normalize((0.0, 0.0, 0.0, 0.0))

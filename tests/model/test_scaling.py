@@ -9,10 +9,10 @@ import pytest
 from helpers.robots import arm
 from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.inertia import inertial_of
+from morphgen.model.inertia import inertial_from_density
 from morphgen.model.kinematics import forward_kinematics, frame_pose
 from morphgen.model.robot import Link
-from morphgen.model.scaling import scaled
+from morphgen.model.tree import scale_links
 
 STRAIGHT = np.zeros(4)
 
@@ -21,7 +21,7 @@ STRAIGHT = np.zeros(4)
 def test_mass_goes_with_the_third_power_and_inertia_with_the_fifth(factor):
     before, after = (
         arm().link("upper").inertial,
-        scaled(arm(), {"upper": factor}).link("upper").inertial,
+        scale_links(arm(), {"upper": factor}).link("upper").inertial,
     )
     assert after.mass == pytest.approx(factor**3 * before.mass)
     assert after.inertia == pytest.approx([factor**5 * value for value in before.inertia])
@@ -29,21 +29,21 @@ def test_mass_goes_with_the_third_power_and_inertia_with_the_fifth(factor):
 
 
 def test_a_scaled_body_is_that_of_its_scaled_shapes():
-    link = scaled(arm(), {"upper": 1.7}).link("upper")
-    solid = inertial_of(link.collisions, 1000.0)
+    link = scale_links(arm(), {"upper": 1.7}).link("upper")
+    solid = inertial_from_density(link.collisions, 1000.0)
     assert link.inertial.mass == pytest.approx(solid.mass)
     assert link.inertial.inertia == pytest.approx(solid.inertia, abs=1e-9)
     assert link.inertial.com == pytest.approx(solid.com)
 
 
 def test_joints_and_frames_on_a_link_move_out_and_those_it_hangs_on_do_not():
-    larger = scaled(arm(), {"upper": 2.0})
+    larger = scale_links(arm(), {"upper": 2.0})
     before, after = forward_kinematics(arm(), STRAIGHT), forward_kinematics(larger, STRAIGHT)
     upper, lower, slider = (arm().link_index[name] for name in ("upper", "lower", "slider"))
     assert after[upper] == pytest.approx(before[upper])
     assert after[lower, 2, 3] == pytest.approx(before[lower, 2, 3] + 0.3)
     assert after[slider, 2, 3] == pytest.approx(before[slider, 2, 3] + 0.3)
-    tool = scaled(arm(), {"slider": 0.5})
+    tool = scale_links(arm(), {"slider": 0.5})
     gap = frame_pose(arm(), STRAIGHT) - frame_pose(tool, STRAIGHT)
     assert gap[2, 3] == pytest.approx(0.14)
     assert gap[:3, :3] == pytest.approx(np.zeros((3, 3)))
@@ -51,7 +51,7 @@ def test_joints_and_frames_on_a_link_move_out_and_those_it_hangs_on_do_not():
 
 def test_a_robot_scaled_in_every_link_is_the_same_robot_larger():
     q = np.array([0.4, -0.7, 0.0, 0.0])
-    larger = scaled(arm(), {link.name: 1.5 for link in arm().links})
+    larger = scale_links(arm(), {link.name: 1.5 for link in arm().links})
     before, after = forward_kinematics(arm(), q), forward_kinematics(larger, q)
     assert after[:, :3, :3] == pytest.approx(before[:, :3, :3])
     assert after[:, :3, 3] == pytest.approx(1.5 * before[:, :3, 3])
@@ -63,7 +63,7 @@ def test_all_kinds_of_shapes_grow_in_all_directions():
     kinds = (Box((1, 2, 3)), Sphere(1.0), Cylinder(1.0, 2.0), Capsule(1.0, 2.0), mesh)
     shapes = tuple(Shape(kind, Pose((1.0, 0.0, 2.0))) for kind in kinds)
     robot = replace(arm(), links=(Link("base", visuals=shapes), *arm().links[1:]))
-    grown = scaled(robot, {"base": 2.0}).link("base").visuals
+    grown = scale_links(robot, {"base": 2.0}).link("base").visuals
     assert [shape.geometry for shape in grown] == [
         Box((2, 4, 6)),
         Sphere(2.0),
@@ -75,21 +75,21 @@ def test_all_kinds_of_shapes_grow_in_all_directions():
 
 
 def test_links_that_are_not_named_stay_as_they_are():
-    larger = scaled(arm(), {"upper": 2.0})
+    larger = scale_links(arm(), {"upper": 2.0})
     assert [a == b for a, b in zip(larger.links, arm().links, strict=True)].count(False) == 1
-    for same in (scaled(arm(), {}), scaled(arm(), {"upper": 1.0})):
+    for same in (scale_links(arm(), {}), scale_links(arm(), {"upper": 1.0})):
         assert (same.links, same.joints, same.frames) == (arm().links, arm().joints, arm().frames)
 
 
 def test_limits_axes_and_names_stay():
-    larger = scaled(arm(), {link.name: 3.0 for link in arm().links})
+    larger = scale_links(arm(), {link.name: 3.0 for link in arm().links})
     for a, b in zip(larger.joints, arm().joints, strict=True):
         assert (a.name, a.axis, a.limits, a.mimic) == (b.name, b.axis, b.limits, b.mimic)
 
 
 def test_a_link_that_does_not_exist_is_refused():
     with pytest.raises(RobotError, match="uper"):
-        scaled(arm(), {"uper": 2.0})
+        scale_links(arm(), {"uper": 2.0})
 
 
 FACES = {"upper": (0.02, 0.0, -0.1), "slider": (0.0, 0.01, 0.05)}
@@ -116,24 +116,24 @@ def test_faces_of_links_stay_on_their_parents_whatever_the_factors():
     for _ in range(20):
         names = [link.name for link in arm().links if rng.random() < 0.8]
         factors = {name: rng.uniform(0.5, 1.5) for name in names}
-        robot = scaled(arm(), factors, FACES)
+        robot = scale_links(arm(), factors, FACES)
         for on_link, on_parent in face_positions(robot, factors, STRAIGHT):
             assert on_link == pytest.approx(on_parent, abs=1e-12)
 
 
 def test_without_faces_they_would_not():
     factors = {"upper": 1.5}
-    robot = scaled(arm(), factors)
+    robot = scale_links(arm(), factors)
     apart = [np.linalg.norm(a - b) for a, b in face_positions(robot, factors, STRAIGHT)]
     assert max(apart) > 0.05
 
 
 def test_links_of_one_factor_need_no_faces():
     factors = dict.fromkeys((link.name for link in arm().links), 1.3)
-    assert scaled(arm(), factors, FACES).joints == scaled(arm(), factors).joints
-    assert scaled(arm(), {}, FACES).joints == arm().joints
+    assert scale_links(arm(), factors, FACES).joints == scale_links(arm(), factors).joints
+    assert scale_links(arm(), {}, FACES).joints == arm().joints
 
 
 def test_a_face_of_a_link_that_does_not_exist_is_refused():
     with pytest.raises(RobotError, match="uper"):
-        scaled(arm(), {}, {"uper": (0.0, 0.0, 0.0)})
+        scale_links(arm(), {}, {"uper": (0.0, 0.0, 0.0)})

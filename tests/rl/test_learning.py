@@ -19,9 +19,9 @@ from morphgen.tasks.make import make_batch
 def arm_of_three_joints():
     """An arm3 whose base does not turn, nor its wrist."""
     made = morphgen.compose("arm3")
-    moving = [k for k in made.joints_to(made.frame(TOOL).link) if made.joints[k].is_movable]
+    moving = [k for k in made.joint_chain(made.frame(TOOL).link) if made.joints[k].is_movable]
     fixed = {made.joints[k].name for k in (moving[0], moving[-1])}
-    names = [made.joints[k].name for k in made.independent]
+    names = [made.joints[k].name for k in made.independent_joints]
     joints = tuple(
         replace(joint, kind="fixed", limits=None) if joint.name in fixed else joint
         for joint in made.joints

@@ -8,7 +8,7 @@ import torch
 
 from helpers.scenes import robot
 from morphgen.model.geometry import Pose, Shape, Sphere
-from morphgen.model.kinematics import bounds
+from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.rl.connect import explored
 from morphgen.rl.free_ways import LEGS, FreeWays, Routes, shares_to
@@ -52,7 +52,7 @@ def test_a_robot_gets_past_a_stop(made, kind):
     batch = made("prims", 1, kind=kind)
     routes = Routes(batch)
     start = batch.targets[0].numpy().astype(np.float64)
-    low, high = bounds(batch.specs[0].robot).T
+    low, high = joint_limits(batch.specs[0].robot).T
     stop, end = 0.6 * start + 0.4 * low, 0.6 * start + 0.4 * high
     routes.take(0, [stop, end])
     for _ in range(200):

@@ -57,15 +57,15 @@ def test_masks_and_steps_follow_the_joints(robots, bodies):
     for i, robot in enumerate(robots):
         n = len(robot.links)
         assert bodies.links[i].tolist() == [True] * n + [False] * (bodies.max_links - n)
-        moved = [k + 1 for k in robot.independent]
+        moved = [k + 1 for k in robot.independent_joints]
         assert torch.nonzero(bodies.joint_of_link[i] >= 0)[:, 0].tolist() == moved
-        for j, k in enumerate(robot.independent):
+        for j, k in enumerate(robot.independent_joints):
             joint = robot.joints[k]
             most = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
             expected = min(most, (joint.velocity or np.inf) * CONTROL_PERIOD)
             assert bodies.step[i, j] == pytest.approx(expected)
-            assert bodies.lower[i, j] == pytest.approx(joint.bounds[0])
-            assert bodies.upper[i, j] == pytest.approx(joint.bounds[1])
+            assert bodies.lower[i, j] == pytest.approx(joint.effective_limits[0])
+            assert bodies.upper[i, j] == pytest.approx(joint.effective_limits[1])
         assert (bodies.step[i, robot.dof :] == 0).all()
 
 

@@ -12,7 +12,12 @@ from helpers.robots import arm
 from helpers.scenes import push_scene, reach_scene, real_arm_scene, robot
 from morphgen.model.dynamics import BANDWIDTH, mass_matrix
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, forward_kinematics, frame_pose, movable_positions
+from morphgen.model.kinematics import (
+    forward_kinematics,
+    frame_pose,
+    joint_limits,
+    movable_positions,
+)
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import OVERSPEED
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
@@ -28,11 +33,11 @@ def test_links_are_where_the_kinematics_put_them(simulate, request_):
     loaded = client_of(simulation)
     merged = rigid_bodies(body)
     T_world_link = T.matrix @ forward_kinematics(body, q)
-    for k in merged.movable:
+    for k in merged.movable_joints:
         name = merged.joints[k].child
         found = pybullet.getLinkState(
             loaded.robot,
-            loaded.driven[merged.movable.index(k)],
+            loaded.driven[merged.movable_joints.index(k)],
             computeForwardKinematics=True,
             physicsClientId=loaded.id,
         )
@@ -46,7 +51,7 @@ def test_motors_follow_the_critically_damped_law(simulate, request_):
     free = replace(body, joints=tuple(replace(j, effort=None, velocity=None) for j in body.joints))
     simulation = simulate(Scene(free, ground=None), contacts=Contacts(False, False))
     q = np.array(body.home)
-    target = np.clip(q + 0.05 * (np.arange(body.dof) % 3 - 1), *bounds(body).T)
+    target = np.clip(q + 0.05 * (np.arange(body.dof) % 3 - 1), *joint_limits(body).T)
     reset(simulation, q)
     v = np.zeros_like(q)
     for _ in range(50):
@@ -123,7 +128,7 @@ def test_nothing_throws_a_joint(simulate):
     body = robot("arm=ur5 ee=plane")
     simulation = simulate(*[Scene(body)] * 8)
     corners = torch.randn(8, body.dof, generator=torch.Generator().manual_seed(0)).sign()
-    low, high = (torch.tensor(each, dtype=torch.float32) for each in bounds(body).T)
+    low, high = (torch.tensor(each, dtype=torch.float32) for each in joint_limits(body).T)
     wanted = torch.where(corners > 0, high, low)
     q = reset(simulation)
     fastest = max(joint.velocity for joint in body.joints if joint.is_movable)

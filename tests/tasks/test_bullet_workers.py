@@ -283,7 +283,7 @@ def test_the_work_is_shared_evenly():
     scenes = [scene for scene in mixed_scenes() for _ in range(10)]
     shares = divide(scenes, 3)
     assert sorted(env for share in shares for env in share) == list(range(30))
-    loads = [sum(5 + len(scenes[env].robot.movable) for env in share) for share in shares]
+    loads = [sum(5 + len(scenes[env].robot.movable_joints) for env in share) for share in shares]
     assert max(loads) - min(loads) <= 14
     assert divide(scenes[:2], 5) == [[0], [1]]
 

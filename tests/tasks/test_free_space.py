@@ -175,7 +175,7 @@ def plane_hits(scene, q):
     level = {f"robot/{name}" for name in level_links(robot, scene.T_world_root)}
     turntable = np.array([model.body(i).name in level for i in model.geom_bodyid])
     flat = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-    at = [model.joint(f"robot/{robot.joints[k].name}").qposadr[0] for k in robot.movable]
+    at = [model.joint(f"robot/{robot.joints[k].name}").qposadr[0] for k in robot.movable_joints]
     for positions in movable_positions(robot, q):
         data.qpos[at] = positions
         mujoco.mj_kinematics(model, data)

@@ -16,7 +16,7 @@ from morphgen.benchmark.workspace import shoulder, workspace
 from morphgen.checks.self_collision import ignore_pairs
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Box, Shape
-from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Link
 from morphgen.tasks import free_space, goal_sets, obstacles
 from morphgen.tasks.free_space import FreeSpace
@@ -294,7 +294,7 @@ def test_a_certificate_names_every_fault(body, cache):
         return certify_goals(replace(found, **changes), body, scene)
 
     q, poses = found.q.copy(), found.poses.copy()
-    q[3, 1] = bounds(body)[1, 1] + 0.1
+    q[3, 1] = joint_limits(body)[1, 1] + 0.1
     assert faults(q=q)[0].startswith("goal 3: joint 'elbow' is at 2.1, outside (-2, 2)")
     q[3, 1] = np.nan
     assert len(faults(q=q)) == 1

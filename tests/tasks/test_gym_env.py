@@ -154,7 +154,7 @@ def test_an_action_moves_its_own_joint(make):
         seen, *_ = env.step(action)
         moved = torch.nonzero(env.batch.targets[0] != before[0])[:, 0].tolist()
         robot = env.env_spec.robot
-        assert [robot.joints[robot.independent[j]].name for j in moved] == [name]
+        assert [robot.joints[robot.independent_joints[j]].name for j in moved] == [name]
         assert seen["previous_action"].tolist() == action.tolist()
 
 

@@ -6,7 +6,7 @@ import torch
 
 from helpers.scenes import robot
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, forward_kinematics
+from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.tasks.sim.base import Block, Contacts, Scene
 from morphgen.tasks.sim.level_links import level_links
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
@@ -23,7 +23,7 @@ ARM = "arm=arm3 ee=claw"
 )
 def test_links_are_level_whose_height_and_tilt_no_joint_changes(request_, roll, count):
     body, T_world_root = robot(request_), Pose.from_xyz_rpy(rpy=(roll, 0.0, 0.0))
-    drawn = np.random.default_rng(0).uniform(*bounds(body).T, (9, body.dof))
+    drawn = np.random.default_rng(0).uniform(*joint_limits(body).T, (9, body.dof))
     T_world_link = T_world_root.matrix @ np.array([forward_kinematics(body, q) for q in drawn])
     moved = np.ptp(T_world_link[:, :, 2], axis=0).max(axis=1)
     steady = {link.name for link, by in zip(body.links, moved, strict=True) if by < 1e-9}

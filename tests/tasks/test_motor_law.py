@@ -22,7 +22,7 @@ PLENTY = 1e9
 
 
 def limits(body, error, velocity=0.0, effort=PLENTY):
-    rows = len(body.movable)
+    rows = len(body.movable_joints)
     errors, velocities = (np.broadcast_to(each, rows).astype(float) for each in (error, velocity))
     motors = MotorForces([body], [effort] * rows)
     return motors.limits((errors, errors), (velocities, velocities))
@@ -47,7 +47,7 @@ def test_joints_of_an_arm_pull_each_other():
 def test_a_finger_follows_its_leader():
     body = arm()
     error = np.zeros(5)
-    error[body.movable.index(body.joint_index["left"])] = 0.01
+    error[body.movable_joints.index(body.joint_index["left"])] = 0.01
     left, right = limits(body, error)[-2:]
     assert left == right > 0
 
@@ -70,7 +70,7 @@ def test_what_is_far_behind_pulls_no_harder_than_its_speed_limit_needs():
 
 def test_a_robot_has_the_same_bits_alone_and_among_others():
     bodies = [finger(), robot("arm=ur5 ee=plane"), arm()]
-    rows = [len(body.movable) for body in bodies]
+    rows = [len(body.movable_joints) for body in bodies]
     error = np.random.default_rng(0).normal(size=sum(rows))
     every = MotorForces(bodies, [PLENTY] * sum(rows)).limits((error, error), (error, error))
     ends = np.cumsum(rows)

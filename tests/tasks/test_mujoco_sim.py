@@ -10,11 +10,11 @@ import torch
 
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
-from morphgen.checks.self_collision import attached_pairs
+from morphgen.checks.self_collision import adjacent_pairs
 from morphgen.errors import SimulationError, UnstableError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, movable_positions
+from morphgen.model.kinematics import joint_limits, movable_positions
 from morphgen.model.robot import Frame
 from morphgen.tasks.sim import mujoco_model
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
@@ -119,12 +119,12 @@ def test_a_far_target_is_approached_no_faster_than_the_joint_may():
     for _ in range(25):
         sim.step(target)
         fastest = max(fastest, sim.qd[0, 0].item())
-    assert 0.9 < fastest / body.joints[body.independent[0]].velocity < 1.35
+    assert 0.9 < fastest / body.joints[body.independent_joints[0]].velocity < 1.35
 
 
 def test_mimic_joints_follow_and_root_poses_and_orders_are_kept():
     body = arm()
-    body = replace(body, ignore_pairs=attached_pairs(body))
+    body = replace(body, ignore_pairs=adjacent_pairs(body))
     at = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.1, 0.2, 0.3))
     sim = MujocoSimulation([Scene(body, at)], NOTHING_TOUCHES)
     target = torch.tensor([[0.5, 0.4, 0.02, 0.03]])
@@ -266,7 +266,7 @@ def test_links_touch_the_ground_if_asked(contacts, lowest):
     sim = MujocoSimulation([Scene(robot("prims"), Pose((0, 0, -0.5)))], contacts)
     q = sim.q.clone()
     depth = sim.scenes[0].robot.joint_index["gantry_z"]
-    column = sim.scenes[0].robot.independent.index(depth)
+    column = sim.scenes[0].robot.independent_joints.index(depth)
     for _ in range(60):
         q[0, column] = max(q[0, column] - 0.02, 0.2)
         sim.step(q)
@@ -276,7 +276,7 @@ def test_links_touch_the_ground_if_asked(contacts, lowest):
 
 def test_links_touch_each_other_if_asked_and_not_ignored():
     body = robot("arm=panda ee=panda_hand")
-    q = np.clip(np.array([0, 1.2, 0, -3.0, 0, 0.2, 0.8, 0.0]), *bounds(body).T)
+    q = np.clip(np.array([0, 1.2, 0, -3.0, 0, 0.2, 0.8, 0.0]), *joint_limits(body).T)
     counts = []
     for contacts in (Contacts(), Contacts(self_collision=False)):
         sim = MujocoSimulation([Scene(body, ground=None)], contacts)
@@ -403,11 +403,11 @@ def test_full_speed_back_and_forth_is_stable(request_):
     body = robot(request_)
     sim = MujocoSimulation([Scene(body, block=Block((0.1,) * 3, Pose((0.4, 0.2, 0.05)), 0.1))])
     rng = np.random.default_rng(3)
-    target, limits = np.array(body.home), bounds(body)
+    target, limits = np.array(body.home), joint_limits(body)
     for k in range(200):
         if k % 3 == 0:
             sign = rng.choice([-1, 1], size=body.dof)
-        speed = [min(body.joints[j].velocity or 10.0, 10.0) for j in body.independent]
+        speed = [min(body.joints[j].velocity or 10.0, 10.0) for j in body.independent_joints]
         target = np.clip(target + 0.02 * sign * np.array(speed), *limits.T)
         sim.step(torch.from_numpy(target[None]).float())
         assert sim.qd.abs().max() < 40
@@ -416,9 +416,13 @@ def test_full_speed_back_and_forth_is_stable(request_):
 def test_movable_joints_are_where_the_robot_says():
     scene = reach_scene()
     sim = MujocoSimulation([scene])
-    q = torch.from_numpy(np.random.default_rng(0).uniform(*bounds(scene.robot).T)[None]).float()
+    q = torch.from_numpy(
+        np.random.default_rng(0).uniform(*joint_limits(scene.robot).T)[None]
+    ).float()
     sim.reset(torch.tensor([0]), q, torch.zeros(1, 7))
     assert torch.equal(sim.q, q)
     expected = movable_positions(scene.robot, q[0].double().numpy())
-    found = [sim._data[0].joint(scene.robot.joints[k].name).qpos[0] for k in scene.robot.movable]
+    found = [
+        sim._data[0].joint(scene.robot.joints[k].name).qpos[0] for k in scene.robot.movable_joints
+    ]
     assert found == pytest.approx(expected)

@@ -10,7 +10,7 @@ from helpers.scenes import robot
 from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push import feasibility
 from morphgen.tasks.push import starts as module
@@ -56,7 +56,7 @@ def test_every_block_can_be_pushed_across(words, boxes, cache):
     assert ((-0.2 * found.scale <= y) & (y <= -0.15 * found.scale)).all()
     assert found.line == pytest.approx(0.2 * found.scale)
     for q in (found.q, found.behind, found.across):
-        assert ((q >= bounds(body)[:, 0]) & (q <= bounds(body)[:, 1])).all()
+        assert ((q >= joint_limits(body)[:, 0]) & (q <= joint_limits(body)[:, 1])).all()
     assert space.free(found.q, found.blocks).all()
     assert space.free(found.behind, found.blocks).all()
     assert space.free(found.across).all()

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.robots import arm
 from helpers.scenes import robot
-from morphgen.checks.self_collision import ignored_pairs
+from morphgen.checks.self_collision import untested_pairs
 from morphgen.model.dynamics import mass_matrix
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.robots import robot_of
@@ -44,6 +44,6 @@ def test_links_that_ignore_others_are_not_joined():
 def test_neighbours_are_ignored_whoever_reads_the_robot():
     made = robot_of("arm3-stick")
     bare = replace(made, ignore_pairs=())
-    assert set(ignored_pairs(bare)) <= set(ignored_pairs(made)) == set(made.ignore_pairs)
+    assert set(untested_pairs(bare)) <= set(untested_pairs(made)) == set(made.ignore_pairs)
     _, tried = FreeSpace(Scene(bare, ground=-1.0)).draw(20, np.random.default_rng(0))
     assert tried < 200

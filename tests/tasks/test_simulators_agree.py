@@ -8,7 +8,7 @@ import torch
 
 from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import bounds, frame_pose
+from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
 from morphgen.tasks.sim.base import Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
@@ -45,7 +45,7 @@ SLOW = [pytest.param(words, id=words, marks=pytest.mark.slow) for words in OF_TH
 
 def largest_steps(body):
     """How far the benchmark moves a target at once, shape (dof,)."""
-    joints = [body.joints[k] for k in body.independent]
+    joints = [body.joints[k] for k in body.independent_joints]
     most = [STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN for joint in joints]
     fast = [(joint.velocity or np.inf) * CONTROL_PERIOD for joint in joints]
     return np.minimum(most, fast)
@@ -58,7 +58,7 @@ def smooth_walk(body, seed, steps=SECOND):
     for _ in range(steps):
         action = 0.9 * action + 0.3 * rng.normal(size=body.dof)
         moved = target + largest_steps(body) * np.clip(action, -1, 1)
-        target = np.clip(moved, *bounds(body).T)
+        target = np.clip(moved, *joint_limits(body).T)
         path.append(target)
     return np.array(path)
 

@@ -10,7 +10,7 @@ from helpers.robots import arm
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.model.kinematics import bounds
+from morphgen.model.kinematics import joint_limits
 from morphgen.viewer.compare_page import (
     fit_qualities,
     fit_table,
@@ -44,7 +44,7 @@ def test_a_role_moves_every_robot_by_the_same_share():
         assert with_roles(robot, home, {}) == pytest.approx(home)
         moved = with_roles(robot, home, {"joint 2": -1.0, "finger 1": 1.0, "joint 99": 1.0})
         rows = {role: i for i, role in enumerate(roles(robot))}
-        low, high = bounds(robot).T
+        low, high = joint_limits(robot).T
         assert moved[rows["joint 2"]] == pytest.approx(low[rows["joint 2"]])
         assert moved[rows["finger 1"]] == pytest.approx(high[rows["finger 1"]])
         values = dict(zip(roles(robot), scaled(robot, home), strict=True))

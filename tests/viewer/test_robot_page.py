@@ -13,7 +13,7 @@ from PIL import Image
 
 from helpers.robots import arm
 from morphgen.checks import check
-from morphgen.checks.self_collision import SelfCollision
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.model.kinematics import frame_pose
 from morphgen.viewer.places import read_place
@@ -94,7 +94,7 @@ def test_collisions_are_red_while_they_last(see, viewer):
     page = see(f"?robot=words:arm=ur5 ee=plane&q={joints_text(q)}&show=visual,ignored pairs", on=on)
     page.get_by_text("collision", exact=True).wait_for()
     robot = read_place("words:arm=ur5 ee=plane", on.places)
-    (pairs,) = SelfCollision(robot).penetrations([q])
+    (pairs,) = SelfCollisionChecker(robot).penetrations([q])
     assert len(pairs) > 0
     links = [robot.link_index[name] for pair in pairs for name in pair]
     for link in links:

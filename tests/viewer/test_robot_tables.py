@@ -98,10 +98,10 @@ def test_bounds_hold_the_foot_and_the_tip():
 
 
 def test_a_free_configuration_is_free():
-    from morphgen.checks.self_collision import SelfCollision
+    from morphgen.checks.self_collision import SelfCollisionChecker
 
     robot = arm()
-    tested = SelfCollision(robot)
+    tested = SelfCollisionChecker(robot)
     q = free_configuration(tested, robot, np.random.default_rng(0))
     assert q is not None
     assert tested.penetrations([q]) == [{}]
