@@ -178,7 +178,7 @@ def _moves(browser: Any, folder: Path, moves: int) -> list[Row]:  # noqa: ANN401
 
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write how long every move took, milliseconds."""
-    from morphgen.viewer import robot_page
+    from morphgen.viewer import page_robot
     from morphgen.viewer.app import serve
     from morphgen.viewer.robot_state import RobotPage, show_moved
 
@@ -189,7 +189,7 @@ def _serve(told: Path) -> None:
         show_moved(moved)
         times.append(1e3 * (time.perf_counter() - begun))
 
-    with patch.object(robot_page, "show_moved", timed):
+    with patch.object(page_robot, "show_moved", timed):
         viewer = serve()
         print(f"http://127.0.0.1:{viewer.port}", flush=True)
         with suppress(KeyboardInterrupt):

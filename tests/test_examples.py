@@ -12,10 +12,10 @@ from morphgen.grammar.library import default_library
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import episode_bytes, read_episode
-from morphgen.viewer.places import Places
-from morphgen.viewer.play_choices import wanted_of
-from morphgen.viewer.play_files import recording
-from morphgen.viewer.rollout import Rollout, Wanted
+from morphgen.viewer.episode_export import recording
+from morphgen.viewer.page_play_controls import parse_rollout
+from morphgen.viewer.robot_uri import FileAccess
+from morphgen.viewer.rollout import Rollout, RolloutConfig
 
 CUSTOM_TASK = Path(__file__).parents[1] / "examples" / "custom_task.py"
 RUN = "runs/planar-cube-follow/se/seed0"
@@ -44,9 +44,9 @@ def test_a_task_outside_of_the_package_trains_plays_and_is_shown(follow, tmp_pat
     assert "m from the goal" in capsys.readouterr().out
     assert main(["goals", robot, "--task", "follow", "--certify"]) == 0
 
-    places = Places(default_library().folders, (tmp_path,), tmp_path / "none")
-    assert wanted_of(Address("play", ("follow",)), []).task == "follow"
-    rollout = Rollout(Wanted("follow", ("words:base=planar ee=cube",), RUN), places)
+    places = FileAccess(default_library().folders, (tmp_path,), tmp_path / "none")
+    assert parse_rollout(Address("play", ("follow",)), []).task == "follow"
+    rollout = Rollout(RolloutConfig("follow", ("words:base=planar ee=cube",), RUN), places)
     while rollout.advance():
         pass
     rollout.close()

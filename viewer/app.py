@@ -20,18 +20,18 @@ from morphgen.formats.urdf import UnsoundError
 from morphgen.grammar.library import default_library
 from morphgen.viewer import (
     browser,
-    compare_page,
-    compose_page,
-    folder_page,
-    library_page,
     markup,
-    robot_page,
-    split_page,
+    page_compare,
+    page_compose,
+    page_gallery,
+    page_library,
+    page_robot,
+    page_split,
 )
+from morphgen.viewer.access import access_policy
 from morphgen.viewer.address import Address, Page, parse_address
-from morphgen.viewer.gate import gate_of
 from morphgen.viewer.messages import check_values
-from morphgen.viewer.places import Places
+from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.server import start_server
 from morphgen.viewer.session import BUG, Session, close, post, refuse
 from morphgen.viewer.targets import target_address
@@ -44,18 +44,18 @@ WORKERS = 2
 
 def _show_play(session: Session) -> None:
     # What simulates takes seconds and much memory to load, which other pages need not.
-    from morphgen.viewer import play_page
+    from morphgen.viewer import page_play
 
-    play_page.show(session)
+    page_play.show(session)
 
 
 SHOW: Mapping[Page, Callable[[Session], None]] = {
-    "library": library_page.show,
-    "gallery": folder_page.show,
-    "robot": robot_page.show,
-    "compose": compose_page.show,
-    "compare": compare_page.show,
-    "split": split_page.show,
+    "library": page_library.show,
+    "gallery": page_gallery.show,
+    "robot": page_robot.show,
+    "compose": page_compose.show,
+    "compare": page_compare.show,
+    "split": page_split.show,
     "play": _show_play,
 }
 """How each page is built."""
@@ -68,7 +68,7 @@ class Viewer:
     server: viser.ViserServer
     start: Address
     """The page that is shown to those who name none."""
-    places: Places
+    places: FileAccess
     workers: Workers
     uploads: TemporaryDirectory[str]
     """Where uploads are kept; it goes with the viewer, or with its process."""
@@ -111,13 +111,13 @@ def serve(
     Raises:
         MorphgenError: If there is no such thing, or the address is none of this machine's.
     """
-    places = Places(default_library(library).folders, _roots(words), Path("/nowhere"))
+    places = FileAccess(default_library(library).folders, _roots(words), Path("/nowhere"))
     places.library.names()  # a folder that is missing, or a part that is broken, is told now
     start = target_address(words, places)
-    gate = gate_of(host, origins)
+    gate = access_policy(host, origins)
     _require_address(host)
     uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
-    places = Places(places.folders, places.roots, Path(uploads.name).resolve())
+    places = FileAccess(places.folders, places.roots, Path(uploads.name).resolve())
     server = start_server(host, port, gate)
     # What a browser misses that has just gone is no news.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")

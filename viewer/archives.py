@@ -10,7 +10,7 @@ import zlib
 from pathlib import PurePosixPath
 
 from morphgen.errors import MorphgenError
-from morphgen.viewer.places import shortened
+from morphgen.viewer.robot_uri import shortened
 
 LARGEST = 100 * 2**20
 """Bytes of all files, unpacked."""

@@ -23,7 +23,7 @@ from morphgen.viewer.choice import (
     with_value,
 )
 from morphgen.viewer.composed import Composed, fault, show_robot
-from morphgen.viewer.places import WORDS, words_at
+from morphgen.viewer.robot_uri import WORDS, resolve_words
 from morphgen.viewer.session import show_state, when
 
 
@@ -58,7 +58,7 @@ def show_choice(tab: PartsTab) -> None:
     session, words = tab.composed.session, tab.choice.words
     library = session.places.library
     try:
-        derivation, name = words_at(words, session.places)
+        derivation, name = resolve_words(words, session.places)
         robot = compose(derivation, library, name)
     except MorphgenError as error:
         tab.fault.content = fault(error, session.places)

@@ -17,9 +17,9 @@ from morphgen.model.robot import Robot
 from morphgen.viewer import markup, robot_tables
 from morphgen.viewer.address import Address
 from morphgen.viewer.downloads import robot_files, zipped
-from morphgen.viewer.overlays import has_tool
-from morphgen.viewer.places import Places
-from morphgen.viewer.robot_view import RobotView, add_robot, look_at, robot_bounds
+from morphgen.viewer.robot_uri import FileAccess
+from morphgen.viewer.scene_overlays import has_tool
+from morphgen.viewer.scene_robot import RobotView, add_robot, look_at, robot_bounds
 from morphgen.viewer.session import Session, in_worker, later, notify, say, when
 
 ROBOTS = "robots"
@@ -94,7 +94,7 @@ def show_robot(
     later(composed.session, lambda: _check(composed), "check")
 
 
-def fault(error: MorphgenError, places: Places) -> str:
+def fault(error: MorphgenError, places: FileAccess) -> str:
     """Why there is no robot."""
     return markup.framed(markup.tag("error", "error"), f" {escape(places.told(error))}")
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from morphgen.checks import check
 from morphgen.formats.bundle import CARD, write_bundle
 from morphgen.model.robot import Robot
-from morphgen.viewer.places import Places, read_place
+from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
 
 _STAMP = (1980, 1, 1, 0, 0, 0)
 """Of every file in a zip, so that the same robot gives the same bytes."""
 
 
-def bundle_files(place: str, places: Places) -> dict[str, bytes]:
+def bundle_files(place: str, places: FileAccess) -> dict[str, bytes]:
     """The files of a robot's bundle by their paths in it, made where there is none.
 
     Raises:
@@ -24,7 +24,7 @@ def bundle_files(place: str, places: Places) -> dict[str, bytes]:
     """
     if ":" not in place and (folder := places.path(place)).is_dir() and (folder / CARD).is_file():
         return _files(folder)
-    return robot_files(read_place(place, places))
+    return robot_files(read_robot_uri(place, places))
 
 
 def robot_files(robot: Robot) -> dict[str, bytes]:

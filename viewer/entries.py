@@ -22,7 +22,7 @@ class Entry:
 
     name: str
     place: str
-    """See ``morphgen.viewer.places``."""
+    """See ``morphgen.viewer.robot_uri``."""
     category: str = ""
     role: str = ""
     """The side of a split, or a part's kind."""

@@ -3,7 +3,7 @@
 An episode's file is an ``.npz``. ``about`` is a text of JSON: ``format`` (2), ``morphgen`` (its
 version), ``task``, ``policy``, ``seed``, ``obstacles`` (whether any were asked for), ``simulator``,
 ``period`` (seconds between two moments), and of every body in ``bodies``: ``name``, ``place`` (see
-``morphgen.viewer.places``), ``body`` (its ``robot_hash``), ``ground`` (metres, or null),
+``morphgen.viewer.robot_uri``), ``body`` (its ``robot_hash``), ``ground`` (metres, or null),
 ``obstacles`` (``size`` and ``pose`` of each), ``block`` (its edges, or null) and ``markers``
 (``name``, ``shape`` and ``size`` of each shape that shows a goal, see ``morphgen.tasks.task``).
 
@@ -44,7 +44,7 @@ from morphgen.model.rotation import Vec3
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
-from morphgen.viewer.places import Places, read_place
+from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
 
 Array = NDArray[np.float32]
 
@@ -152,7 +152,7 @@ def episode_bytes(episode: Episode) -> bytes:
     return content.getvalue()
 
 
-def read_episode(path: Path, places: Places) -> Episode:
+def read_episode(path: Path, places: FileAccess) -> Episode:
     """Read an episode's file, with its robots.
 
     Args:
@@ -242,8 +242,8 @@ def _arrays(track: Track) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _track(row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], places: Places) -> Track:
-    robot = split_colours(read_place(str(row["place"]), places))
+def _track(row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], places: FileAccess) -> Track:
+    robot = split_colours(read_robot_uri(str(row["place"]), places))
     if robot_hash(robot) != row["body"]:
         raise EpisodeError(
             f"the robot at {row['place']} is not the one that was recorded: it has changed since"

@@ -93,7 +93,7 @@ def findings_table(findings: Sequence[Finding], told: Callable[[str], str] = str
 
     Args:
         findings: What was found.
-        told: How a text of them may be shown, see ``Places.told``.
+        told: How a text of them may be shown, see ``FileAccess.told``.
     """
     if not findings:
         return '<div class="dim">no findings</div>'

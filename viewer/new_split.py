@@ -11,7 +11,14 @@ from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.viewer.places import MEMBER, Places, derivation_at, member_at, read_place, shortened
+from morphgen.viewer.robot_uri import (
+    MEMBER,
+    FileAccess,
+    read_robot_uri,
+    resolve_derivation,
+    resolve_member,
+    shortened,
+)
 
 SPLITS = "splits"
 """Folder below which they are written."""
@@ -19,7 +26,7 @@ LONGEST_NAME = 200
 """Characters of a split's name."""
 
 
-def member_of(place: str, category: str, task: str, obstacles: bool, places: Places) -> Member:
+def member_of(place: str, category: str, task: str, obstacles: bool, places: FileAccess) -> Member:
     """The robot at a place as a member of a split.
 
     Raises:
@@ -27,9 +34,9 @@ def member_of(place: str, category: str, task: str, obstacles: bool, places: Pla
         MorphgenError: If it cannot be composed.
     """
     if place.startswith(MEMBER):
-        return replace(member_at(place, places), task=task, obstacles=obstacles)
-    robot = read_place(place, places)
-    derivation = str(derivation_at(place, places) or robot.provenance.get("derivation", ""))
+        return replace(resolve_member(place, places), task=task, obstacles=obstacles)
+    robot = read_robot_uri(place, places)
+    derivation = str(resolve_derivation(place, places) or robot.provenance.get("derivation", ""))
     if not derivation:
         raise BenchmarkError(f"{place} was imported: a split names robots by their derivations")
     composed = compose(parse_derivation(derivation), places.library, robot.name)
@@ -39,7 +46,7 @@ def member_of(place: str, category: str, task: str, obstacles: bool, places: Pla
 
 
 def save_split(
-    name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], places: Places
+    name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], places: FileAccess
 ) -> Path:
     """Write the file of a split below the folder where the viewer was started.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from morphgen.benchmark.split_file import split_names
-from morphgen.viewer.listings import folder_entries, split_entries
-from morphgen.viewer.places import MEMBER, WORDS, Places, is_set, split_at
+from morphgen.viewer.robot_rows import folder_entries, split_entries
+from morphgen.viewer.robot_uri import MEMBER, WORDS, FileAccess, is_set, resolve_split
 
 PARTS = "arms with a plate"
 BODIES = 500
@@ -16,7 +16,7 @@ Bodies = list[tuple[str, str]]
 """Names and places."""
 
 
-def sources(place: str, trained: Bodies, places: Places) -> dict[str, Callable[[], Bodies]]:
+def sources(place: str, trained: Bodies, places: FileAccess) -> dict[str, Callable[[], Bodies]]:
     """Where bodies can be chosen from: what they are, and how to list them.
 
     Args:
@@ -39,29 +39,29 @@ def sources(place: str, trained: Bodies, places: Places) -> dict[str, Callable[[
     return found
 
 
-def split_bodies(name: str, places: Places) -> Bodies:
+def split_bodies(name: str, places: FileAccess) -> Bodies:
     """The members of a split, those to train on first."""
-    rows = split_entries(name, split_at(name, places))
+    rows = split_entries(name, resolve_split(name, places))
     return [(f"{row.role}: {row.name}", row.place) for row in rows[:BODIES]]
 
 
-def set_bodies(folder: str, places: Places) -> Bodies:
+def set_bodies(folder: str, places: FileAccess) -> Bodies:
     """The robots of a set."""
     return [(row.name, row.place) for row in folder_entries(folder, places)[:BODIES]]
 
 
-def part_bodies(places: Places) -> Bodies:
+def part_bodies(places: FileAccess) -> Bodies:
     """Every arm with a plate at its end, and the plate that slides."""
     arms = [(arm, f"{WORDS}arm={arm} ee=plane") for arm in places.library.names("arm")]
     return [*arms, ("planar-cube", f"{WORDS}base=planar ee=cube")]
 
 
 def labels(bodies: Bodies, chosen: Sequence[str]) -> dict[str, str]:
-    """Places by labels that are all different, in the order of the bodies.
+    """FileAccess by labels that are all different, in the order of the bodies.
 
     Args:
         bodies: Names and places.
-        chosen: Places that play; what is not among the bodies comes first, by its place.
+        chosen: FileAccess that play; what is not among the bodies comes first, by its place.
     """
     found: dict[str, str] = {}
     known = {place for _, place in bodies}
@@ -73,5 +73,5 @@ def labels(bodies: Bodies, chosen: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _lister(split: str, places: Places) -> Callable[[], Bodies]:
+def _lister(split: str, places: FileAccess) -> Callable[[], Bodies]:
     return lambda: split_bodies(split, places)

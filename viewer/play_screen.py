@@ -13,10 +13,10 @@ from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup
 from morphgen.viewer.episode import Episode, score_until
 from morphgen.viewer.play_bodies import Bodies
-from morphgen.viewer.play_scene import PlayScene, add_episode, show_step
 from morphgen.viewer.player import Player
-from morphgen.viewer.robot_view import look_at
-from morphgen.viewer.rollout import Source, Wanted
+from morphgen.viewer.rollout import RolloutConfig, Source
+from morphgen.viewer.scene_episode import PlayScene, add_episode, show_step
+from morphgen.viewer.scene_robot import look_at
 from morphgen.viewer.session import Session, say, set_value
 
 PLANNERS = ("ik", "scripted")
@@ -28,18 +28,18 @@ class PlayPage:
     """Playback in one browser; the screen of its player."""
 
     session: Session
-    wanted: Wanted | None = None
+    wanted: RolloutConfig | None = None
     """What is simulated; None for a recorded episode."""
     trained: Bodies = field(default_factory=list)
     player: Player | None = None
     source: Source | None = None
     scene: PlayScene | None = None
     bodies: dict[str, str] = field(default_factory=dict)
-    """Places by their labels in the dropdown."""
+    """FileAccess by their labels in the dropdown."""
     controls: dict[str, Any] = field(default_factory=dict)
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     framed: tuple[str, ...] = ()
-    """Places of the bodies that the camera was turned to."""
+    """FileAccess of the bodies that the camera was turned to."""
     planned: bool = True
     """Whether the policy has got beyond its first step."""
 
@@ -118,7 +118,7 @@ def playing(page: PlayPage) -> Player:
     return page.player
 
 
-def asked(page: PlayPage) -> Wanted:
+def asked(page: PlayPage) -> RolloutConfig:
     """What is simulated."""
     assert page.wanted is not None
     return page.wanted

@@ -14,10 +14,10 @@ from morphgen.formats.bundle import MJCF, URDF
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.downloads import bundle_files, zipped
-from morphgen.viewer.places import UPLOAD, WORDS
 from morphgen.viewer.robot_state import (
     RobotPage,
 )
+from morphgen.viewer.robot_uri import UPLOAD, WORDS
 from morphgen.viewer.session import (
     Session,
     in_worker,

@@ -12,9 +12,9 @@ from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
-from morphgen.viewer import markup, overlays, robot_tables
-from morphgen.viewer.overlays import Overlays
-from morphgen.viewer.robot_view import (
+from morphgen.viewer import markup, robot_tables, scene_overlays
+from morphgen.viewer.scene_overlays import Overlays
+from morphgen.viewer.scene_robot import (
     RobotView,
     move,
     paint_red,
@@ -81,11 +81,11 @@ def show_moved(page: RobotPage) -> None:
             paint_red(page.view, {name for pair in found for name in pair})
             page.texts["collisions"].content = markup.framed(robot_tables.collision_text(found))
         if is_on(page, "ignored pairs"):
-            overlays.show_ignored_pairs(page.over)
-        if overlays.has_tool(page.robot):
+            scene_overlays.show_ignored_pairs(page.over)
+        if scene_overlays.has_tool(page.robot):
             T_root_tool = frame_pose(page.robot, page.q)
             if is_on(page, "trail"):
-                overlays.extend_trail(page.over, T_root_tool[:3, 3])
+                scene_overlays.extend_trail(page.over, T_root_tool[:3, 3])
             if page.gizmo is not None and not page.dragged:
                 pose = Pose.from_matrix(T_root_tool)
                 page.gizmo.position, page.gizmo.wxyz = pose.position, pose.quaternion

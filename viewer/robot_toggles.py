@@ -11,15 +11,15 @@ from morphgen.formats.fits import read_stored
 from morphgen.model.geometry import Pose
 from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.kinematics import frame_pose
-from morphgen.viewer import overlays
-from morphgen.viewer.places import as_in_library
+from morphgen.viewer import scene_overlays
 from morphgen.viewer.robot_state import (
     RobotPage,
     is_on,
     set_configuration,
     tell_address,
 )
-from morphgen.viewer.robot_view import (
+from morphgen.viewer.robot_uri import with_library_meshes
+from morphgen.viewer.scene_robot import (
     Layer,
     robot_extent,
     set_opacity,
@@ -44,7 +44,9 @@ def add_toggles(page: RobotPage) -> None:
     """Add a checkbox for everything that can be shown, and the opacity."""
     gui, session = page.session.client.gui, page.session
     for name in (*SHOWN, *MORE):
-        if name in ("workspace", "trail", "drag the tool") and not overlays.has_tool(page.robot):
+        if name in ("workspace", "trail", "drag the tool") and not scene_overlays.has_tool(
+            page.robot
+        ):
             continue
         box = page.toggles[name] = gui.add_checkbox(name, name == "visual")
         when(box, session, _toggler(page, name))
@@ -66,13 +68,13 @@ def toggle(page: RobotPage, name: str) -> None:
     elif name == "drag the tool":
         _toggle_gizmo(page, on)
     elif not on:
-        overlays.remove(page.over, name)
+        scene_overlays.remove(page.over, name)
     elif name == "joint axes":
-        overlays.show_joint_axes(page.over)
+        scene_overlays.show_joint_axes(page.over)
     elif name == "centres of mass":
-        overlays.show_mass_centres(page.over)
+        scene_overlays.show_mass_centres(page.over)
     elif name == "ignored pairs":
-        overlays.show_ignored_pairs(page.over)
+        scene_overlays.show_ignored_pairs(page.over)
     elif name == "workspace":
         later(page.session, lambda: _show_workspace(page))
     tell_address(page)
@@ -102,7 +104,7 @@ def _toggle_layer(page: RobotPage, layer: Layer, on: bool) -> None:
 def _show_primitives(page: RobotPage) -> None:
     """Draw the primitives that stand for the links; what is stored at once, the rest is fitted."""
     folders = page.session.places.folders
-    robot = as_in_library(page.robot, page.session.places.library)
+    robot = with_library_meshes(page.robot, page.session.places.library)
     found, missing = stored_primitives(robot, read_stored(folders))
     if missing:
         say(page.session, f"fitting primitives to {len(missing)} links; this takes a while")
@@ -116,10 +118,10 @@ def _show_primitives(page: RobotPage) -> None:
 
 def _show_workspace(page: RobotPage) -> None:
     say(page.session, "sampling the workspace")
-    points = overlays.workspace_points(page.robot)
+    points = scene_overlays.workspace_points(page.robot)
     say(page.session, "")
     if is_on(page, "workspace"):
-        overlays.show_workspace(page.over, points)
+        scene_overlays.show_workspace(page.over, points)
 
 
 def _toggle_gizmo(page: RobotPage, on: bool) -> None:

@@ -28,16 +28,16 @@ from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.renderer import moment
 from morphgen.tasks.robots import robot_of
 from morphgen.viewer.episode import Array, Episode, Track
-from morphgen.viewer.places import (
+from morphgen.viewer.robot_uri import (
     CHECKPOINT,
     DERIVED,
     WORDS,
-    PlaceError,
-    Places,
-    as_in_library,
+    FileAccess,
+    UriError,
     name_of,
-    read_place,
+    read_robot_uri,
     shortened,
+    with_library_meshes,
 )
 
 MOST = 9
@@ -45,7 +45,7 @@ MOST = 9
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RolloutConfig:
     """What is to be played."""
 
     task: str
@@ -104,8 +104,8 @@ class Rollout:
 
     def __init__(
         self,
-        wanted: Wanted,
-        places: Places,
+        wanted: RolloutConfig,
+        places: FileAccess,
         progress: Callable[[str], object] = lambda text: None,
     ) -> None:
         """Begin an episode.
@@ -130,7 +130,7 @@ class Rollout:
                 first = first or error
                 self.faults[place] = str(error)
         if not self._players:
-            raise first or PlaceError("no robot is named: add one with &robot=")
+            raise first or UriError("no robot is named: add one with &robot=")
         self.longest = max(int(each.env.batch.longest[0]) for each in self._players)
         self.episode = Episode(
             wanted.task,
@@ -164,12 +164,12 @@ def simulators() -> list[str]:
     return sorted(installed, key=lambda name: name != "mujoco")
 
 
-def policy_file(policy: str, task: str, places: Places) -> str:
+def policy_file(policy: str, task: str, places: FileAccess) -> str:
     """A policy as ``morphgen.rl.play`` knows it; the path of a checkpoint becomes absolute.
 
     Raises:
         TaskError: If there is none of that name, or it is for the other task.
-        PlaceError: If it is a file that may not be looked at.
+        UriError: If it is a file that may not be looked at.
     """
     if policy not in BASELINES:
         return str(_checkpoint_file(policy, baselines_for(task), places))
@@ -177,11 +177,11 @@ def policy_file(policy: str, task: str, places: Places) -> str:
     return policy
 
 
-def _checkpoint_file(policy: str, references: Iterable[str], places: Places) -> Path:
+def _checkpoint_file(policy: str, references: Iterable[str], places: FileAccess) -> Path:
     """The file or folder of a checkpoint."""
     try:
         return places.path(policy)
-    except PlaceError as error:
+    except UriError as error:
         if "/" in policy or policy.endswith(".pt"):
             raise
         raise TaskError(
@@ -189,14 +189,14 @@ def _checkpoint_file(policy: str, references: Iterable[str], places: Places) -> 
         ) from error
 
 
-def checkpoints(places: Places, most: int = 50) -> list[str]:
+def checkpoints(places: FileAccess, most: int = 50) -> list[str]:
     """The first checkpoints below the folder ``runs``, as addresses have them."""
     root = places.roots[0]
     found = sorted((root / "runs").rglob(CHECKPOINT))
     return [path.relative_to(root).as_posix() for path in found[:most]]
 
 
-def trained_with(policy: str, places: Places) -> tuple[str, bool, list[tuple[str, str]]]:
+def trained_with(policy: str, places: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
     """What the policy of a checkpoint was trained on.
 
     Returns:
@@ -213,9 +213,9 @@ def trained_with(policy: str, places: Places) -> tuple[str, bool, list[tuple[str
         return rows[0].task, any(row.obstacles for row in rows), named
     words = source.name.split()
     if is_robot_file(source.name):
-        robot = read_place(source.name, places)
+        robot = read_robot_uri(source.name, places)
     elif words and words[0].endswith(SUFFIX):
-        robot = read_place(WORDS + source.name, places)
+        robot = read_robot_uri(WORDS + source.name, places)
     else:
         robot = robot_of(source.name, library=places.folders)
     derivation = robot.provenance.get("derivation")
@@ -224,9 +224,9 @@ def trained_with(policy: str, places: Places) -> tuple[str, bool, list[tuple[str
     return source.task, source.obstacles, [(source.name, place)]
 
 
-def _player(wanted: Wanted, place: str, policy: str, places: Places) -> _Player:
-    read = read_place(place, places)
-    body = as_primitives(as_in_library(read, places.library), places.folders)
+def _player(wanted: RolloutConfig, place: str, policy: str, places: FileAccess) -> _Player:
+    read = read_robot_uri(place, places)
+    body = as_primitives(with_library_meshes(read, places.library), places.folders)
     seen = interface_of(policy)
     env = TaskEnv(
         wanted.task,

@@ -21,7 +21,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from morphgen.viewer.gate import Gate, policy, refusal
+from morphgen.viewer.access import AccessPolicy, policy, refusal_reason
 from morphgen.viewer.messages import message_fault
 
 LONGEST_LINE = 65_536
@@ -61,7 +61,7 @@ class _Connection(ServerConnection):
         return data
 
 
-def start_server(host: str, port: int, gate: Gate) -> viser.ViserServer:
+def start_server(host: str, port: int, gate: AccessPolicy) -> viser.ViserServer:
     """Start viser's server; every request goes by the gate.
 
     Raises:
@@ -79,7 +79,7 @@ def start_server(host: str, port: int, gate: Gate) -> viser.ViserServer:
 
 
 @contextlib.contextmanager
-def _gated(gate: Gate) -> Iterator[None]:
+def _gated(gate: AccessPolicy) -> Iterator[None]:
     """Have the server that viser starts ask the gate; viser has no setting for it."""
     module = websockets.asyncio.server
     plain, started = module.serve, []
@@ -105,10 +105,10 @@ def _gated(gate: Gate) -> Iterator[None]:
 
 
 def _answer(
-    gate: Gate, plain: Answer, connection: ServerConnection, request: Request
+    gate: AccessPolicy, plain: Answer, connection: ServerConnection, request: Request
 ) -> Response | None:
     """Answer a request; None lets a websocket be opened."""
-    if why := refusal(gate, request.path, request.headers):
+    if why := refusal_reason(gate, request.path, request.headers):
         return _sentence(http.HTTPStatus.FORBIDDEN, why)
     try:
         response = plain(connection, request)

@@ -15,7 +15,7 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.viewer import browser, markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.places import Places
+from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.workers import Workers
 
 BUG = "something is wrong with morphgen itself; what it is stands where the viewer was started"
@@ -36,7 +36,7 @@ class Session:
     """One browser. What its user does is worked off in order by a thread of its own."""
 
     client: viser.ClientHandle
-    places: Places
+    places: FileAccess
     workers: Workers
     """Processes for what takes long."""
     address: Address

@@ -10,20 +10,20 @@ from morphgen.benchmark.split_file import split_names
 from morphgen.errors import nearest
 from morphgen.grammar.model import SUFFIX, grammar_names
 from morphgen.viewer.address import Address, Page
-from morphgen.viewer.places import (
+from morphgen.viewer.robot_uri import (
     CHECKPOINT,
     EPISODE_SUFFIX,
     PLAYED,
     SPLIT_SUFFIX,
     WORDS,
-    PlaceError,
-    Places,
+    FileAccess,
+    UriError,
     is_robot,
-    words_at,
+    resolve_words,
 )
 
 
-def target_address(words: Sequence[str], places: Places) -> Address:
+def target_address(words: Sequence[str], places: FileAccess) -> Address:
     """The page that ``morphgen view`` opens for its words.
 
     Args:
@@ -37,11 +37,11 @@ def target_address(words: Sequence[str], places: Places) -> Address:
         return Address("library")
     if len(words) == 1 and "=" not in words[0]:
         return _single_address(words[0], places)
-    words_at(" ".join(words), places)
+    resolve_words(" ".join(words), places)
     return Address("robot", (WORDS + " ".join(words),))
 
 
-def _single_address(word: str, places: Places) -> Address:
+def _single_address(word: str, places: FileAccess) -> Address:
     if Path(word).exists():
         path = places.path(word)
         if path.suffix in PLAYED or (path / CHECKPOINT).is_file():
@@ -57,12 +57,10 @@ def _single_address(word: str, places: Places) -> Address:
     if word in grammar_names():
         return Address("compose", (word,))
     valid = (*split_names(), *grammar_names())
-    raise PlaceError(
-        f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}"
-    )
+    raise UriError(f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}")
 
 
-def _played_address(word: str, places: Places) -> Address:
+def _played_address(word: str, places: FileAccess) -> Address:
     """The page that plays an episode, or the policy of a checkpoint or a run's folder."""
     if word.endswith(EPISODE_SUFFIX):
         from morphgen.viewer.episode import read_episode

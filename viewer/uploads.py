@@ -21,7 +21,7 @@ from morphgen.formats.xml import parse_xml
 from morphgen.model.mesh import SUFFIXES
 from morphgen.viewer.archives import ArchiveError, is_inside, unpacked
 from morphgen.viewer.messages import LARGEST_UPLOAD
-from morphgen.viewer.places import UPLOAD, Places, shortened
+from morphgen.viewer.robot_uri import UPLOAD, FileAccess, shortened
 
 MOST_KEPT = 50
 """Uploads that a viewer keeps."""
@@ -50,7 +50,7 @@ class UploadError(MorphgenError):
     """A file that is no robot, or none that is taken from strangers."""
 
 
-def keep(name: str, content: bytes, places: Places) -> str:
+def keep(name: str, content: bytes, places: FileAccess) -> str:
     """Keep an upload.
 
     Args:

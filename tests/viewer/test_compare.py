@@ -11,7 +11,10 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.kinematics import joint_limits
-from morphgen.viewer.compare_page import (
+from morphgen.viewer.comparison import all_roles, roles, scaled, with_roles
+from morphgen.viewer.drawings import heatmap_svg, map_svg
+from morphgen.viewer.figures import differences, tokens_png
+from morphgen.viewer.page_compare import (
     fit_qualities,
     fit_table,
     heat,
@@ -19,9 +22,6 @@ from morphgen.viewer.compare_page import (
     likeness_table,
     parse_places,
 )
-from morphgen.viewer.drawings import heatmap_svg, map_svg
-from morphgen.viewer.joint_roles import all_roles, roles, scaled, with_roles
-from morphgen.viewer.token_figure import differences, tokens_png
 
 LIBRARY = default_library()
 

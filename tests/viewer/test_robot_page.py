@@ -16,9 +16,9 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.model.kinematics import frame_pose
-from morphgen.viewer.places import read_place
 from morphgen.viewer.robot_state import joints_text
-from morphgen.viewer.robot_view import RED
+from morphgen.viewer.robot_uri import read_robot_uri
+from morphgen.viewer.scene_robot import RED
 
 ARM = "?robot=robots/some-arm"
 
@@ -93,7 +93,7 @@ def test_collisions_are_red_while_they_last(see, viewer):
     q = [0.0, -1.0, 2.6, 2.5, 0.0, 0.0]
     page = see(f"?robot=words:arm=ur5 ee=plane&q={joints_text(q)}&show=visual,ignored pairs", on=on)
     page.get_by_text("collision", exact=True).wait_for()
-    robot = read_place("words:arm=ur5 ee=plane", on.places)
+    robot = read_robot_uri("words:arm=ur5 ee=plane", on.places)
     (pairs,) = SelfCollisionChecker(robot).penetrations([q])
     assert len(pairs) > 0
     links = [robot.link_index[name] for pair in pairs for name in pair]
@@ -122,7 +122,7 @@ def test_workspace_trail_and_gizmo(see, viewer, picture):
     names = session.client.scene._handle_from_node_name
     page.wait_for_timeout(1000)
     assert {"/robot/workspace", "/robot/trail", "/gizmo"} <= names.keys()
-    robot = read_place("robots/some-arm", on.places)
+    robot = read_robot_uri("robots/some-arm", on.places)
     pose = frame_pose(robot, [0.5, *robot.home[1:]])
     assert names["/gizmo"].position == pytest.approx(pose[:3, 3], abs=1e-6)
     picture(page)
@@ -137,7 +137,7 @@ def test_links_and_findings_are_told(see, viewer):
     show_tab(page, "Links")
     page.get_by_role("cell", name="ee_panda_rightfinger").wait_for()
     show_tab(page, "Check")
-    codes = {finding.code for finding in check(read_place(place, on.places))}
+    codes = {finding.code for finding in check(read_robot_uri(place, on.places))}
     assert len(codes) > 0
     for code in codes:
         page.get_by_text(code, exact=True).first.wait_for()

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.model.robot import Inertial
-from morphgen.viewer.robot_page import free_configuration
+from morphgen.viewer.page_robot import free_configuration
 from morphgen.viewer.robot_state import joints_text, parse_joints
 from morphgen.viewer.robot_tables import (
     chains,
@@ -18,7 +18,7 @@ from morphgen.viewer.robot_tables import (
     slider_step,
     summary,
 )
-from morphgen.viewer.robot_view import inertia_semi_axes, robot_bounds
+from morphgen.viewer.scene_robot import inertia_semi_axes, robot_bounds
 
 
 def test_joints_are_grouped_by_their_part():

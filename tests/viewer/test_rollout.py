@@ -20,11 +20,11 @@ from morphgen.rl.training import train
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, still
-from morphgen.viewer.places import CHECKPOINT, Places
-from morphgen.viewer.play_choices import address_of, wanted_of
-from morphgen.viewer.play_files import recording, renderer_of
-from morphgen.viewer.play_scene import GAP, area, places_in_grid
-from morphgen.viewer.rollout import Recorded, Rollout, Wanted, simulators
+from morphgen.viewer.episode_export import recording, renderer_of
+from morphgen.viewer.page_play_controls import address_of, parse_rollout
+from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess
+from morphgen.viewer.rollout import Recorded, Rollout, RolloutConfig, simulators
+from morphgen.viewer.scene_episode import GAP, area, places_in_grid
 from morphgen.viewer.targets import target_address
 
 CUBE = "words:base=planar ee=cube"
@@ -39,7 +39,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def places(root):
-    return Places(default_library().folders, (root,), root / "none")
+    return FileAccess(default_library().folders, (root,), root / "none")
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def episode(places, cache):
     """Two bodies that reached: one composed, one a bundle."""
-    rollout = Rollout(Wanted("reach", (CUBE, "robots/one"), "ik", 3), places)
+    rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "ik", 3), places)
     while rollout.advance():
         pass
     rollout.close()
@@ -134,7 +134,7 @@ def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, place
 
 
 def test_an_episode_at_its_start_can_be_saved(places, root, cache):
-    rollout = Rollout(Wanted("reach", ("robots/one",), "zero"), places)
+    rollout = Rollout(RolloutConfig("reach", ("robots/one",), "zero"), places)
     (root / "start.npz").write_bytes(episode_bytes(rollout.episode))
     rollout.close()
     read = read_episode(root / "start.npz", places)
@@ -179,7 +179,7 @@ def test_files_of_another_kind_are_refused(places, root):
 
 def test_an_episode_of_a_robot_that_has_changed_is_refused(places, root, cache):
     write_bundle(arm(), root / "robots" / "two", picture=False)
-    rollout = Rollout(Wanted("reach", ("robots/two",), "zero"), places)
+    rollout = Rollout(RolloutConfig("reach", ("robots/two",), "zero"), places)
     rollout.close()
     (root / "two.npz").write_bytes(episode_bytes(rollout.episode))
     urdf = root / "robots" / "two" / "robot.urdf"
@@ -189,7 +189,7 @@ def test_an_episode_of_a_robot_that_has_changed_is_refused(places, root, cache):
 
 
 def test_one_that_cannot_play_does_not_keep_the_others_from_it(places, cache):
-    rollout = Rollout(Wanted("reach", ("robots/none", "robots/one"), "zero"), places)
+    rollout = Rollout(RolloutConfig("reach", ("robots/none", "robots/one"), "zero"), places)
     assert list(rollout.faults) == ["robots/none"]
     assert "no such file" in rollout.faults["robots/none"]
     assert [track.place for track in rollout.episode.tracks] == ["robots/one"]
@@ -200,7 +200,7 @@ def test_a_policy_that_sees_its_tool_is_shown_it(root, places, cache):
     config = small_config(total_timesteps=32)
     config = replace(config, policy=replace(config.policy, tool_position=True))
     train(root / "run", config, execution=QUIET)
-    rollout = Rollout(Wanted("reach", (CUBE,), "run"), places)
+    rollout = Rollout(RolloutConfig("reach", (CUBE,), "run"), places)
     assert rollout.faults == {}
     assert rollout.advance()
     rollout.close()
@@ -209,14 +209,14 @@ def test_a_policy_that_sees_its_tool_is_shown_it(root, places, cache):
 @pytest.mark.parametrize(
     ("wanted", "why"),
     [
-        (Wanted("reach", (), "zero"), "no robot is named"),
-        (Wanted("reach", ("robots/none",), "zero"), "no such file"),
-        (Wanted("reach", ("robots/one",), "scripted"), "is for push, not for reach"),
-        (Wanted("push", ("robots/one",), "ik"), "is for reach, not for push"),
-        (Wanted("reach", ("robots/one",), "zeros"), "did you mean 'zero'"),
-        (Wanted("reach", ("robots/one",), "../x.pt"), "outside of the folders"),
-        (Wanted("reach", ("robots/one",), "x.pt"), "no such file"),
-        (Wanted("reach", ("robots/one",), "robots/one/robot.urdf"), "is not a checkpoint"),
+        (RolloutConfig("reach", (), "zero"), "no robot is named"),
+        (RolloutConfig("reach", ("robots/none",), "zero"), "no such file"),
+        (RolloutConfig("reach", ("robots/one",), "scripted"), "is for push, not for reach"),
+        (RolloutConfig("push", ("robots/one",), "ik"), "is for reach, not for push"),
+        (RolloutConfig("reach", ("robots/one",), "zeros"), "did you mean 'zero'"),
+        (RolloutConfig("reach", ("robots/one",), "../x.pt"), "outside of the folders"),
+        (RolloutConfig("reach", ("robots/one",), "x.pt"), "no such file"),
+        (RolloutConfig("reach", ("robots/one",), "robots/one/robot.urdf"), "is not a checkpoint"),
     ],
 )
 def test_what_cannot_be_played_is_refused(places, cache, wanted, why):
@@ -230,9 +230,9 @@ def test_a_run_is_known_by_its_checkpoint():
 
 def test_an_address_tells_what_is_played():
     for simulator in simulators():
-        wanted = Wanted("push", ("robots/one", CUBE), "random", 7, True, simulator)
-        assert wanted_of(address_of(wanted), []) == wanted
-    default = wanted_of(address_of(Wanted("push", (), "zero")), [("it", "robots/one")])
+        wanted = RolloutConfig("push", ("robots/one", CUBE), "random", 7, True, simulator)
+        assert parse_rollout(address_of(wanted), []) == wanted
+    default = parse_rollout(address_of(RolloutConfig("push", (), "zero")), [("it", "robots/one")])
     assert default.places == ("robots/one",)
 
 

@@ -9,9 +9,9 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
 from morphgen.viewer.address import parse_address
 from morphgen.viewer.entries import Entry
-from morphgen.viewer.folder_page import sides_of
 from morphgen.viewer.new_split import member_of, save_split
-from morphgen.viewer.places import Places
+from morphgen.viewer.page_gallery import sides_of
+from morphgen.viewer.robot_uri import FileAccess
 
 SPLIT = "extrapolation/primitives/reach"
 
@@ -63,7 +63,7 @@ def test_a_new_split_is_saved_of_what_is_shown(see, folder):
 
 def test_robots_of_a_set_become_members(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    places = Places(default_library().folders, (folder.resolve(),), folder / "none")
+    places = FileAccess(default_library().folders, (folder.resolve(),), folder / "none")
     members = [
         member_of(f"robots/prims/prims-{i:06d}", "prims", "push", False, places) for i in range(4)
     ]
@@ -83,7 +83,7 @@ def test_sides_are_inside_and_outside_of_the_filter():
 
 
 def test_sides_must_not_be_empty_and_names_must_be_names(folder):
-    places = Places((), (folder.resolve(),), folder / "none")
+    places = FileAccess((), (folder.resolve(),), folder / "none")
     with pytest.raises(BenchmarkError, match="0 train and 0 test"):
         save_split("mine", "interpolation", [], [], places)
     with pytest.raises(BenchmarkError, match="use letters"):

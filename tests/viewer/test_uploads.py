@@ -19,7 +19,7 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.viewer import archives, uploads
 from morphgen.viewer.downloads import bundle_files, zipped
-from morphgen.viewer.places import PlaceError, Places, read_place
+from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
 from morphgen.viewer.uploads import UploadError, keep
 
 URDF = b'<robot name="r"><link name="a"/></robot>'
@@ -33,7 +33,7 @@ MESHED = (
 def places(tmp_path):
     folder = tmp_path / "uploads"
     folder.mkdir()
-    return Places(default_library().folders, (tmp_path.resolve(),), folder.resolve())
+    return FileAccess(default_library().folders, (tmp_path.resolve(),), folder.resolve())
 
 
 def archive(files, how=zipfile.ZIP_STORED):
@@ -47,7 +47,7 @@ def archive(files, how=zipfile.ZIP_STORED):
 def test_a_urdf_is_kept_and_read(places):
     place = keep("some.urdf", URDF, places)
     assert place.startswith("upload:")
-    assert read_place(place, places).name == "r"
+    assert read_robot_uri(place, places).name == "r"
 
 
 def test_a_zipped_bundle_comes_back_as_it_left(places, tmp_path):
@@ -56,7 +56,7 @@ def test_a_zipped_bundle_comes_back_as_it_left(places, tmp_path):
     assert {"robot.urdf", "robot.xml", "card.json"} <= files.keys()
     sent = zipped("arm", files)
     assert sent == zipped("arm", dict(reversed(files.items())))
-    assert read_place(keep("arm.zip", sent, places), places).home == arm().home
+    assert read_robot_uri(keep("arm.zip", sent, places), places).home == arm().home
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_a_mesh_is_not_taken_from_another_upload_or_the_folder_above(places):
     first = keep(
         "a.zip", archive({"p/m.stl": box, "a.urdf": MESHED % b"package://p/m.stl"}), places
     )
-    assert read_place(first, places).links[0].visuals
+    assert read_robot_uri(first, places).links[0].visuals
     (places.uploads.parent / "q").mkdir()
     (places.uploads.parent / "q" / "m.stl").write_bytes(box)
     token = first.removeprefix("upload:").partition("/")[0]
@@ -230,7 +230,7 @@ def test_only_descriptions_meshes_and_cards_are_kept(places):
         "__MACOSX/p/._a.urdf": b"\0",
     }
     place = keep("p.zip", archive(files), places)
-    assert read_place(place, places).name == "r"
+    assert read_robot_uri(place, places).name == "r"
     (folder,) = places.uploads.iterdir()
     kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert kept == {"p/urdf/a.urdf", "p/meshes/m.STL", "p/package.xml", "p/robot.xml"}
@@ -240,8 +240,8 @@ def test_no_xacro_is_read_below_the_uploads(places):
     folder = places.uploads / "1"
     folder.mkdir()
     (folder / "a.xacro").write_bytes(XACRO)
-    with pytest.raises(PlaceError, match="only a URDF or a bundle is read from an upload"):
-        read_place("upload:1/a.xacro", places)
+    with pytest.raises(UriError, match="only a URDF or a bundle is read from an upload"):
+        read_robot_uri("upload:1/a.xacro", places)
 
 
 def test_no_more_are_kept_than_a_number(places, monkeypatch):
@@ -271,7 +271,7 @@ def test_a_robot_of_morphgen_keeps_its_tool_and_home(places, tmp_path, as_zip, p
     name, content = (
         ("arm.zip", zipped("arm", files)) if as_zip else ("robot.urdf", files["robot.urdf"])
     )
-    back = read_place(keep(name, content, places), places)
+    back = read_robot_uri(keep(name, content, places), places)
     assert (back.home, back.ignore_pairs) == (robot.home, pairs)
     assert robot_hash(back) == robot_hash(robot)
     assert bool(back.provenance) == as_zip
@@ -280,7 +280,7 @@ def test_a_robot_of_morphgen_keeps_its_tool_and_home(places, tmp_path, as_zip, p
 def test_a_link_called_tool_is_the_tool(places):
     text = b"""<robot name="r"><link name="a"/><link name="tool"/><joint name="j" type="fixed">
     <parent link="a"/><child link="tool"/></joint></robot>"""
-    assert read_place(keep("a.urdf", text, places), places).frame("tool").link == "tool"
+    assert read_robot_uri(keep("a.urdf", text, places), places).frame("tool").link == "tool"
 
 
 def test_uploads_come_through_a_websocket_and_are_read(viewer, tmp_path):

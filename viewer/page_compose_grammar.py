@@ -27,7 +27,7 @@ from morphgen.viewer.address import Address, AddressError, whole_number
 from morphgen.viewer.choice import first_parts
 from morphgen.viewer.composed import Composed, fault, show_robot
 from morphgen.viewer.packed_text import packed, unpacked
-from morphgen.viewer.places import DERIVED, grammar_at
+from morphgen.viewer.robot_uri import DERIVED, resolve_grammar
 from morphgen.viewer.session import say, set_value, show_state, when
 
 
@@ -133,7 +133,7 @@ def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
 
 def _load(tab: GrammarTab, name: str) -> None:
     tab.grammar = name
-    tab.original = grammar_text(grammar_at(name, tab.composed.session.places))
+    tab.original = grammar_text(resolve_grammar(name, tab.composed.session.places))
     set_value(tab.text, tab.original)
     show_derived(tab, drawn=False)
 

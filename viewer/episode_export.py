@@ -12,9 +12,9 @@ import numpy as np
 
 from morphgen.tasks.renderer import SIZE, Frame, Moment, Renderer, write_film
 from morphgen.tasks.sim.base import Block, Scene
+from morphgen.viewer.access import AccessPolicy
 from morphgen.viewer.episode import Episode, Track
-from morphgen.viewer.gate import Gate
-from morphgen.viewer.play_scene import add_episode, show_step
+from morphgen.viewer.scene_episode import add_episode, show_step
 from morphgen.viewer.server import start_server
 
 STRIDE = 2
@@ -42,7 +42,7 @@ def recording(episode: Episode) -> bytes:
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    server = start_server("127.0.0.1", 0, Gate(names=frozenset()))  # nobody may ask it
+    server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))  # nobody may ask it
     try:
         shown = add_episode(server.scene, episode)
         serializer = server.get_scene_serializer()

@@ -15,16 +15,16 @@ from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
 from morphgen.viewer.entries import Entry
-from morphgen.viewer.places import (
+from morphgen.viewer.robot_uri import (
     DERIVED,
     MEMBER,
     ROBOT_SUFFIXES,
     WORDS,
-    PlaceError,
-    Places,
+    FileAccess,
+    UriError,
     is_robot,
-    member_place,
-    split_at,
+    member_uri,
+    resolve_split,
 )
 
 UNREADABLE = "unreadable"
@@ -32,15 +32,15 @@ UNREADABLE = "unreadable"
 _LOUD = ("error", "warning")
 
 
-def folder_entries(text: str, places: Places) -> list[Entry]:
+def folder_entries(text: str, places: FileAccess) -> list[Entry]:
     """The robots in a folder: of a set by its index, of others by their cards; URDFs, too.
 
     Raises:
-        PlaceError: If it is no folder, or holds no robot.
+        UriError: If it is no folder, or holds no robot.
     """
     folder = places.path(text)
     if not folder.is_dir():
-        raise PlaceError(f"{text}: no folder")
+        raise UriError(f"{text}: no folder")
     index = folder / INDEX
     if index.is_file():
         return list(_set_entries(text.rstrip("/"), folder))
@@ -52,7 +52,7 @@ def folder_entries(text: str, places: Places) -> list[Entry]:
         elif path.is_file() and path.suffix in ROBOT_SUFFIXES[:2]:
             found.append(Entry(path.name, place, "description", order=len(found)))
     if not found:
-        raise PlaceError(f"{text} holds no robot; morphgen sample and morphgen compose make some")
+        raise UriError(f"{text} holds no robot; morphgen sample and morphgen compose make some")
     return found
 
 
@@ -75,7 +75,7 @@ def split_entries(name: str, split: Split) -> list[Entry]:
     return [
         Entry(
             member.name,
-            member_place(name, side, member),
+            member_uri(name, side, member),
             member.category,
             side,
             member.task + (" with obstacles" if member.obstacles else ""),
@@ -100,11 +100,11 @@ def part_entries(library: Library) -> list[Entry]:
     return found
 
 
-def neighbours(place: str, places: Places) -> tuple[str, str]:
+def neighbours(place: str, places: FileAccess) -> tuple[str, str]:
     """The places of the robots before and after one, in its set or split; empty where none is."""
     if place.startswith(MEMBER):
         name = place.removeprefix(MEMBER).rpartition("@")[0]
-        rows = split_entries(name, split_at(name, places))
+        rows = split_entries(name, resolve_split(name, places))
     elif ":" not in place and (folder := place.rstrip("/").rpartition("/")[0]):
         if not (places.path(folder) / INDEX).is_file():
             return "", ""
@@ -146,7 +146,7 @@ def _index(path: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], ...]:
         for record in records:
             record["name"], record["index"], record["dof"], record["findings"]
     except (FormatError, OSError, KeyError, TypeError) as error:
-        raise PlaceError(f"{path}: no index of a set: {error!r}") from error
+        raise UriError(f"{path}: no index of a set: {error!r}") from error
     return records
 
 

@@ -20,7 +20,7 @@ from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
 from morphgen.formats.files import keep, write_atomic
 from morphgen.formats.picture import render
-from morphgen.viewer.places import Places, content_key, is_robot, read_place
+from morphgen.viewer.robot_uri import FileAccess, content_hash, is_robot, read_robot_uri
 from morphgen.viewer.workers import Workers
 
 SIZE = (240, 180)
@@ -40,15 +40,15 @@ class Portrait:
     """Why there is no robot; empty if there is."""
 
 
-def ask(workers: Workers, place: str, places: Places) -> Future[Portrait]:
+def ask(workers: Workers, place: str, places: FileAccess) -> Future[Portrait]:
     """Have a portrait made."""
     return workers.submit(portrait, place, places)
 
 
-def portrait(place: str, places: Places) -> Portrait:
+def portrait(place: str, places: FileAccess) -> Portrait:
     """The portrait of the robot at a place, from the cache or made and kept there."""
     try:
-        name = f"{content_key(place, places)}.json"
+        name = f"{content_hash(place, places)}.json"
         path = user_cache_path("morphgen") / f"viewer-{_FORMAT}" / name
         if path.is_file():
             data = json.loads(path.read_text(encoding="utf-8"))
@@ -71,8 +71,8 @@ def thumbnail_of_picture(path: Path) -> str:
         return ""
 
 
-def _made(place: str, places: Places) -> Portrait:
-    robot = read_place(place, places)
+def _made(place: str, places: FileAccess) -> Portrait:
+    robot = read_robot_uri(place, places)
     loud = sorted({finding.code for finding in check(robot) if finding.severity != "info"})
     known = robot_stats(robot)
     has_tool = any(frame.name == "tool" for frame in robot.frames)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from morphgen.viewer import markup
 from morphgen.viewer.choice import parse_choice
-from morphgen.viewer.compose_grammar import add_grammar_tab, show_derived
 from morphgen.viewer.compose_parts import add_parts_tab, show_choice
 from morphgen.viewer.composed import Composed, add_check_tab, add_get_tab
-from morphgen.viewer.places import grammar_at
-from morphgen.viewer.robot_page import SIDE, add_floor
+from morphgen.viewer.page_compose_grammar import add_grammar_tab, show_derived
+from morphgen.viewer.page_robot import SIDE, add_floor
+from morphgen.viewer.robot_uri import resolve_grammar
 from morphgen.viewer.session import Session
 
 
@@ -23,7 +23,7 @@ def show(session: Session) -> None:
     is_grammar = bool(words) and "=" not in words[0]
     choice = parse_choice(["arm=ur5", "ee=plane"] if is_grammar or not words else words, library)
     name = words[0] if is_grammar else "arm3"
-    grammar = grammar_at(name, session.places)
+    grammar = resolve_grammar(name, session.places)
     gui = session.client.gui
     gui.set_panel_label("morphgen")
     gui.main_panel.dock_right()

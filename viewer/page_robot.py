@@ -15,12 +15,10 @@ from morphgen.model.kinematics import joint_limits, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
-from morphgen.viewer import markup, overlays, robot_tables
+from morphgen.viewer import markup, robot_tables, scene_overlays
 from morphgen.viewer.address import Address
-from morphgen.viewer.listings import neighbours
-from morphgen.viewer.overlays import Overlays
-from morphgen.viewer.places import MEMBER, name_of, read_place
 from morphgen.viewer.robot_downloads import add_downloads
+from morphgen.viewer.robot_rows import neighbours
 from morphgen.viewer.robot_state import (
     RobotPage,
     parse_joints,
@@ -29,7 +27,9 @@ from morphgen.viewer.robot_state import (
     tell_address,
 )
 from morphgen.viewer.robot_toggles import add_toggles, toggle
-from morphgen.viewer.robot_view import (
+from morphgen.viewer.robot_uri import MEMBER, name_of, read_robot_uri
+from morphgen.viewer.scene_overlays import Overlays
+from morphgen.viewer.scene_robot import (
     add_robot,
     look_at,
     paint_red,
@@ -66,13 +66,13 @@ def show(session: Session) -> None:
     gui.main_panel.set_width(SIDE)
     gui.add_html(markup.STYLE + _way(session, place))
     session.status = gui.add_html(markup.status(f"reading {name_of(place)}"))
-    robot = split_colours(read_place(place, session.places))
+    robot = split_colours(read_robot_uri(place, session.places))
     low, high = robot_bounds(robot)
     add_floor(scene, float(np.linalg.norm(high - low)))
     look_at(session.client, low, high)
     view = add_robot(scene, robot, "/robot")
     page = RobotPage(session, place, robot, view, Overlays(view), np.array(robot.home))
-    distance = reach(robot) if overlays.has_tool(robot) and robot.dof else None
+    distance = reach(robot) if scene_overlays.has_tool(robot) and robot.dof else None
     gui.add_html(
         markup.framed(
             f"<h3>{escape(robot.name)}</h3>"
@@ -134,7 +134,7 @@ def _way(session: Session, place: str) -> str:
 
 def _plays(robot: Robot, place: str) -> str:
     """Links to the pages on which a robot does its tasks; a robot without tool has none."""
-    if not (overlays.has_tool(robot) and robot.dof):
+    if not (scene_overlays.has_tool(robot) and robot.dof):
         return ""
     links = (markup.link(Address("play", (task,), robots=(place,)), task) for task in TASKS)
     return f"<br>see it {' · '.join(links)}"
@@ -227,7 +227,7 @@ def _examine(page: RobotPage) -> None:
     """Find what is wrong with the robot, and be ready to see collisions."""
     session = page.session
     say(session, "checking")
-    findings = list(check(page.robot, tool_required=overlays.has_tool(page.robot)))
+    findings = list(check(page.robot, tool_required=scene_overlays.has_tool(page.robot)))
     if ":" not in page.place and (folder := session.places.path(page.place)).is_dir():
         findings += file_findings(folder) if (folder / CARD).is_file() else ()
     page.texts["findings"].content = markup.framed(

@@ -14,7 +14,7 @@ from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 from morphgen.viewer.episode import Episode, Track
-from morphgen.viewer.robot_view import Rgb, RobotView, add_robot, move, robot_bounds
+from morphgen.viewer.scene_robot import Rgb, RobotView, add_robot, move, robot_bounds
 
 Position = tuple[float, float, float]
 

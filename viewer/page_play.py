@@ -9,13 +9,13 @@ from html import escape
 import viser
 
 from morphgen.errors import MorphgenError
-from morphgen.viewer import browser, markup, play_files
+from morphgen.viewer import browser, episode_export, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, still
-from morphgen.viewer.places import EPISODE_SUFFIX, name_of
-from morphgen.viewer.play_choices import add_choices, begin, trained_bodies, wanted_of
+from morphgen.viewer.page_play_controls import add_choices, begin, parse_rollout, trained_bodies
 from morphgen.viewer.play_screen import PlayPage, playing
 from morphgen.viewer.player import SPEEDS, Player
+from morphgen.viewer.robot_uri import EPISODE_SUFFIX, name_of
 from morphgen.viewer.rollout import Recorded
 from morphgen.viewer.session import Session, at_end, in_worker, later, say, when
 
@@ -41,7 +41,7 @@ def show(session: Session) -> None:
         episode = read_episode(session.places.path(subject), session.places)
     else:
         page.trained = trained_bodies(page)
-        page.wanted = wanted_of(session.address, page.trained)
+        page.wanted = parse_rollout(session.address, page.trained)
     page.texts["fault"] = gui.add_html("")
     _add_time(page)
     page.texts["score"] = gui.add_html("")
@@ -92,8 +92,8 @@ def _scrub(page: PlayPage) -> None:
 
 def _add_downloads(page: PlayPage) -> None:
     gui, session = page.session.client.gui, page.session
-    film = functools.partial(in_worker, session, play_files.film)
-    scene = functools.partial(in_worker, session, play_files.recording)
+    film = functools.partial(in_worker, session, episode_export.film)
+    scene = functools.partial(in_worker, session, episode_export.recording)
     files: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
         (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
         ("Film (.mp4)", ".mp4", film),

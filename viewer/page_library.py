@@ -6,11 +6,11 @@ import viser
 
 from morphgen.benchmark.split_file import split_names
 from morphgen.grammar.model import grammar_names
-from morphgen.viewer import browser, gallery, markup
+from morphgen.viewer import browser, gallery_grid, markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.gallery import Gallery
-from morphgen.viewer.listings import part_entries, subfolders
-from morphgen.viewer.places import Places
+from morphgen.viewer.gallery_grid import Gallery
+from morphgen.viewer.robot_rows import part_entries, subfolders
+from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.session import Session, post
 from morphgen.viewer.uploads import keep
 
@@ -18,7 +18,7 @@ from morphgen.viewer.uploads import keep
 def show(session: Session) -> None:
     """The first page: sets and splits, grammars, and the parts as a gallery."""
     rows = Gallery(session, "Parts", part_entries(session.places.library))
-    gallery.open_panels(rows, markup.crumbs(), library_links(session.places))
+    gallery_grid.open_panels(rows, markup.crumbs(), library_links(session.places))
     gui = session.client.gui
     upload = gui.add_upload_button("Look at a URDF or a zipped bundle", icon=viser.Icon.UPLOAD)
 
@@ -27,7 +27,7 @@ def show(session: Session) -> None:
         post(session, lambda: _open_upload(session, sent.name, sent.content))
 
     upload.on_upload(uploaded)
-    gallery.build(rows)
+    gallery_grid.build(rows)
 
 
 def _open_upload(session: Session, name: str, content: bytes) -> None:
@@ -35,7 +35,7 @@ def _open_upload(session: Session, name: str, content: bytes) -> None:
     browser.go_to(session.client, Address("robot", (place,)).query)
 
 
-def library_links(places: Places) -> str:
+def library_links(places: FileAccess) -> str:
     """Links to all that is no part: robots of this folder, splits, grammars."""
     here = places.roots[0]
     robots = ["robots", *(f"robots/{name}" for name in subfolders(here / "robots"))]

@@ -27,7 +27,7 @@ from morphgen.viewer.entries import (
     paged,
     with_facts,
 )
-from morphgen.viewer.portraits import Portrait, ask, thumbnail_of_picture
+from morphgen.viewer.robot_files import Portrait, ask, thumbnail_of_picture
 from morphgen.viewer.session import Session, later, notify, say, show_state, when
 from morphgen.viewer.workers import WorkerDied, Workers
 

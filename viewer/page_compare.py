@@ -24,10 +24,11 @@ from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import browser, markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.joint_roles import all_roles, roles, scaled, with_roles
-from morphgen.viewer.places import PlaceError, as_in_library, name_of, read_place
-from morphgen.viewer.robot_page import add_floor
-from morphgen.viewer.robot_view import (
+from morphgen.viewer.comparison import all_roles, roles, scaled, with_roles
+from morphgen.viewer.figures import tokens_png
+from morphgen.viewer.page_robot import add_floor
+from morphgen.viewer.robot_uri import UriError, name_of, read_robot_uri, with_library_meshes
+from morphgen.viewer.scene_robot import (
     Rgb,
     RobotView,
     add_robot,
@@ -40,7 +41,6 @@ from morphgen.viewer.robot_view import (
     show_layer,
 )
 from morphgen.viewer.session import Session, in_worker, later, say, set_value, show_state, when
-from morphgen.viewer.token_figure import tokens_png
 
 MOST = 4
 """Robots that are compared at once."""
@@ -79,19 +79,19 @@ def show(session: Session) -> None:
     """Build the page.
 
     Raises:
-        PlaceError: If more than ``MOST`` robots are named.
+        UriError: If more than ``MOST`` robots are named.
         MorphgenError: If one of them cannot be read.
     """
     places = session.address.of
     if not 1 <= len(places) <= MOST:
-        raise PlaceError(f"{len(places)} robots to compare: expected 2 to {MOST}")
+        raise UriError(f"{len(places)} robots to compare: expected 2 to {MOST}")
     gui = session.client.gui
     gui.set_panel_label("morphgen")
     gui.main_panel.dock_right()
     gui.main_panel.set_width(SIDE)
     gui.add_html(markup.STYLE + markup.crumbs(("compare", None)))
     session.status = gui.add_html(markup.status(f"reading {len(places)} robots"))
-    robots = [split_colours(read_place(place, session.places)) for place in places]
+    robots = [split_colours(read_robot_uri(place, session.places)) for place in places]
     views = _stand_beside(session, robots)
     page = ComparePage(session, places, robots, views, [np.array(robot.home) for robot in robots])
     tabs = gui.add_tab_group()
@@ -123,7 +123,7 @@ def fit_qualities(
     """
     stored = read_stored(folders)
     found = {}
-    for link in as_in_library(robot, Library(folders)).links:
+    for link in with_library_meshes(robot, Library(folders)).links:
         if link.collisions and are_primitives(link.collisions):
             found[link.name] = (1.0, link.collisions)
         elif link.collisions and (fit := stored_fit(link.collisions, stored)):
@@ -148,7 +148,9 @@ def likeness(robots: Sequence[Robot], folders: Sequence[Path]) -> Likeness:
         BenchmarkError: If a robot has no tool, or no joint that moves it.
         MorphgenError: If a mesh cannot be read.
     """
-    shapes = [token_shapes(as_in_library(robot, Library(folders)), folders) for robot in robots]
+    shapes = [
+        token_shapes(with_library_meshes(robot, Library(folders)), folders) for robot in robots
+    ]
     # What is compared here has no study around it; the largest robot says what fits.
     size = max(MAX_LINKS, *(len(robot.links) for robot in robots))
     tables = tuple(

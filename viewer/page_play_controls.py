@@ -13,17 +13,24 @@ from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import browser, play_bodies
 from morphgen.viewer.address import Address, whole_number
-from morphgen.viewer.places import WORDS, name_of
 from morphgen.viewer.play_bodies import Bodies
 from morphgen.viewer.play_screen import PlayPage, asked, playing
-from morphgen.viewer.rollout import MOST, Rollout, Wanted, checkpoints, simulators, trained_with
+from morphgen.viewer.robot_uri import WORDS, name_of
+from morphgen.viewer.rollout import (
+    MOST,
+    Rollout,
+    RolloutConfig,
+    checkpoints,
+    simulators,
+    trained_with,
+)
 from morphgen.viewer.session import say, set_value, when
 
 BODY = "words:arm=ur5 ee=plane"
 """What plays if an address names nobody."""
 
 
-def wanted_of(address: Address, trained: Bodies) -> Wanted:
+def parse_rollout(address: Address, trained: Bodies) -> RolloutConfig:
     """What an address asks to play.
 
     Args:
@@ -45,7 +52,7 @@ def wanted_of(address: Address, trained: Bodies) -> Wanted:
     if (number := whole_number(seed, -1)) < 0:
         raise MorphgenError(f"seed {seed!r:.80}: expected a whole number, 0 or more")
     default = trained[0][1] if trained else BODY
-    return Wanted(
+    return RolloutConfig(
         task,
         (address.robots or (default,))[:MOST],
         state.get("policy") or baselines_for(task)[0],
@@ -55,7 +62,7 @@ def wanted_of(address: Address, trained: Bodies) -> Wanted:
     )
 
 
-def address_of(wanted: Wanted) -> Address:
+def address_of(wanted: RolloutConfig) -> Address:
     """The address of what is played; what is at its default is left out."""
     state = {
         "policy": wanted.policy,
@@ -79,7 +86,7 @@ def trained_bodies(page: PlayPage) -> Bodies:
     return bodies
 
 
-def add_choices(page: PlayPage, wanted: Wanted) -> None:
+def add_choices(page: PlayPage, wanted: RolloutConfig) -> None:
     """Controls of what is played."""
     gui, session, controls = page.session.client.gui, page.session, page.controls
     again = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
@@ -111,7 +118,7 @@ def add_choices(page: PlayPage, wanted: Wanted) -> None:
     _list_bodies(page)
 
 
-def _policies(page: PlayPage, wanted: Wanted) -> tuple[str, ...]:
+def _policies(page: PlayPage, wanted: RolloutConfig) -> tuple[str, ...]:
     """Those of the task, checkpoints of this folder, and the one that is wanted."""
     found = (*baselines_for(wanted.task), *checkpoints(page.session.places), wanted.policy)
     return tuple(dict.fromkeys(found))

@@ -13,15 +13,15 @@ import viser
 from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.similarity import MEASURES, classical_mds, to_distances
 from morphgen.benchmark.split import REGIMES, SIDES, Member, Split, split_id
-from morphgen.viewer import gallery, markup
+from morphgen.viewer import gallery_grid, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.drawings import heatmap_svg, map_svg
-from morphgen.viewer.gallery import Gallery
-from morphgen.viewer.listings import split_entries
+from morphgen.viewer.gallery_grid import Gallery
 from morphgen.viewer.new_split import save_split
-from morphgen.viewer.places import member_at, member_place, split_at
+from morphgen.viewer.robot_rows import split_entries
+from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.session import Session, later, notify, say, when
-from morphgen.viewer.split_study import Study, study
+from morphgen.viewer.splits import Study, study
 
 SIDE = 520.0
 """Width of the panel, pixels."""
@@ -47,16 +47,16 @@ def show(session: Session) -> None:
         MorphgenError: If there is no such split, or its file cannot be read.
     """
     place = session.address.subject
-    split = split_at(place, session.places)
+    split = resolve_split(place, session.places)
     rows = Gallery(session, split.name, split_entries(place, split), columns=SIDES)
     page = SplitPage(session, place, split, rows)
     gui = session.client.gui
-    gallery.open_panels(
+    gallery_grid.open_panels(
         rows, markup.crumbs((split.name, None)), _about(split) + _plays(place, split), SIDE
     )
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
-        gallery.build(rows)
+        gallery_grid.build(rows)
         _add_new_split(page)
     with tabs.add_tab("Map", viser.Icon.MAP):
         page.measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
@@ -118,9 +118,7 @@ def _plays(place: str, split: Split) -> str:
     """A link to the page on which the first robots to test on do their task."""
     first = split.test[0]
     robots = tuple(
-        member_place(place, "test", member)
-        for member in split.test[:4]
-        if member.task == first.task
+        member_uri(place, "test", member) for member in split.test[:4] if member.task == first.task
     )
     state = {"obstacles": "yes"} if first.obstacles else {}
     link = markup.link(
@@ -178,7 +176,7 @@ def _draw(page: SplitPage) -> None:
 
 def _member_places(page: SplitPage, members: Sequence[Member], sides: Sequence[str]) -> list[str]:
     return [
-        member_place(page.place, "train" if side == "train" else "test", member)
+        member_uri(page.place, "train" if side == "train" else "test", member)
         for member, side in zip(members, sides, strict=True)
     ]
 
@@ -193,8 +191,8 @@ def _add_new_split(page: SplitPage) -> None:
 
     def save() -> None:
         sides: dict[str, list[Member]] = {side: [] for side in SIDES}
-        for entry in gallery.passing(page.gallery):
-            sides[entry.role].append(member_at(entry.place, session.places))
+        for entry in gallery_grid.passing(page.gallery):
+            sides[entry.role].append(resolve_member(entry.place, session.places))
         chosen = regime.value
         path = save_split(name.value, chosen, sides["train"], sides["test"], session.places)
         shown = path.relative_to(session.places.roots[0])

@@ -10,12 +10,12 @@ import viser
 from morphgen.benchmark.split import REGIMES, Member
 from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer import gallery, markup
+from morphgen.viewer import gallery_grid, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.entries import Entry
-from morphgen.viewer.gallery import Gallery
-from morphgen.viewer.listings import folder_entries, subfolders
+from morphgen.viewer.gallery_grid import Gallery
 from morphgen.viewer.new_split import member_of, save_split
+from morphgen.viewer.robot_rows import folder_entries, subfolders
 from morphgen.viewer.session import Session, later, notify, say, when
 
 
@@ -23,15 +23,15 @@ def show(session: Session) -> None:
     """The page of a folder of robots.
 
     Raises:
-        PlaceError: If there is none.
+        UriError: If there is none.
     """
     place = session.address.subject
     entries = folder_entries(place, session.places)
     rows = Gallery(session, place, entries)
     below = [f"{place.rstrip('/')}/{name}" for name in subfolders(session.places.path(place))]
     links = " · ".join(markup.link(Address("gallery", (name,)), name) for name in below)
-    gallery.open_panels(rows, markup.crumbs((place, None)), links)
-    gallery.build(rows)
+    gallery_grid.open_panels(rows, markup.crumbs((place, None)), links)
+    gallery_grid.build(rows)
     _add_new_split(rows)
 
 
@@ -86,7 +86,7 @@ def _add_new_split(rows: Gallery) -> None:
 def _save(rows: Gallery, wanted: _Wanted) -> None:
     """Compose the robots in the workers, and write the split."""
     session = rows.session
-    passing = gallery.passing(rows)
+    passing = gallery_grid.passing(rows)
     sides = sides_of(rows.entries, passing, wanted.train.value, wanted.test.value)
     train, test = (_members(session, side, wanted) for side in sides)
     say(session, "")

@@ -46,12 +46,12 @@ LONGEST_TOLD = 1000
 _TEMPORARY = re.compile(rf"{re.escape(tempfile.gettempdir())}/(tmp|morphgen-)[^/\s]*/?(robot/)?")
 
 
-class PlaceError(MorphgenError):
+class UriError(MorphgenError):
     """There is nothing to see at a place."""
 
 
 @dataclass(frozen=True)
-class Places:
+class FileAccess:
     """What may be looked at; plain data that a worker gets, too."""
 
     folders: tuple[Path, ...]
@@ -70,7 +70,7 @@ class Places:
         """The file or folder of a place that is a path.
 
         Raises:
-            PlaceError: If it does not exist, or is outside of ``roots``.
+            UriError: If it does not exist, or is outside of ``roots``.
         """
         base, name, allowed = self.roots[0], text, self.roots
         if text.startswith(UPLOAD):
@@ -82,11 +82,11 @@ class Places:
         except (OSError, ValueError):  # a name that no file system takes
             inside, exists = True, False
         if not inside:
-            raise PlaceError(
+            raise UriError(
                 f"{shortened(text)}: is outside of the folders that this viewer was started for"
             )
         if not exists:
-            raise PlaceError(f"{shortened(text)}: no such file or folder")
+            raise UriError(f"{shortened(text)}: no such file or folder")
         return path
 
     def told(self, error: object) -> str:
@@ -115,7 +115,7 @@ def is_set(folder: Path) -> bool:
     return (folder / INDEX).is_file() or (folder / SETTINGS).is_file()
 
 
-def read_place(place: str, places: Places) -> Robot:
+def read_robot_uri(place: str, places: FileAccess) -> Robot:
     """The robot at a place.
 
     Raises:
@@ -125,17 +125,17 @@ def read_place(place: str, places: Places) -> Robot:
     try:
         return _read(place, places)
     except RecursionError:
-        raise PlaceError(f"{shortened(place)}: is nested too deeply") from None
+        raise UriError(f"{shortened(place)}: is nested too deeply") from None
 
 
-def _read(place: str, places: Places) -> Robot:
+def _read(place: str, places: FileAccess) -> Robot:
     if place.startswith(MEMBER):
-        return member_robot(member_at(place, places), places.library)
-    if derivation := derivation_at(place, places):
+        return member_robot(resolve_member(place, places), places.library)
+    if derivation := resolve_derivation(place, places):
         return compose(derivation, places.library, _name(place, derivation, places))
     path = places.path(place)
     if place.startswith(UPLOAD) and path.is_file() and path.suffix != ROBOT_SUFFIXES[0]:
-        raise PlaceError(f"{shortened(place)}: only a URDF or a bundle is read from an upload")
+        raise UriError(f"{shortened(place)}: only a URDF or a bundle is read from an upload")
     return _with_tool(read_robot(path))
 
 
@@ -146,11 +146,11 @@ def _with_tool(robot: Robot) -> Robot:
     return robot
 
 
-def grammar_at(name: str, places: Places) -> Grammar:
+def resolve_grammar(name: str, places: FileAccess) -> Grammar:
     """The grammar of a name, or of a file.
 
     Raises:
-        PlaceError: If the file may not be looked at.
+        UriError: If the file may not be looked at.
         GrammarError: If there is none, or it cannot be read.
     """
     folders = places.library.folders
@@ -158,28 +158,28 @@ def grammar_at(name: str, places: Places) -> Grammar:
     return load_grammar(find_grammar(word, folders), folders)
 
 
-def words_at(text: str, places: Places) -> tuple[Derivation, str]:
+def resolve_words(text: str, places: FileAccess) -> tuple[Derivation, str]:
     """What words of ``morphgen compose`` derive, and the robot's name; see ``parse_words``.
 
     Raises:
-        PlaceError: If they name a grammar's file that may not be looked at.
+        UriError: If they name a grammar's file that may not be looked at.
         MorphgenError: If they name what does not exist or does not fit.
     """
     return parse_words(_with_path(text.split(), places), places.library)
 
 
-def _with_path(words: list[str], places: Places) -> list[str]:
+def _with_path(words: list[str], places: FileAccess) -> list[str]:
     """Words with the path of the grammar's file that the first of them names, if it does."""
     first = words[0] if words else ""
     if "=" in first or not (first.endswith(SUFFIX) or "/" in first):
         return words
     path = places.path(first)
     if path.suffix != SUFFIX:
-        raise PlaceError(f"{shortened(first)}: a grammar's file ends in {SUFFIX}")
+        raise UriError(f"{shortened(first)}: a grammar's file ends in {SUFFIX}")
     return [str(path), *words[1:]]
 
 
-def as_in_library(robot: Robot, library: Library) -> Robot:
+def with_library_meshes(robot: Robot, library: Library) -> Robot:
     """The robot with the meshes of the library's parts, to which fits are stored.
 
     A bundle has copies of them. A robot whose derivation does not give the same text of URDF, but
@@ -207,33 +207,33 @@ def name_of(place: str) -> str:
     return place.rstrip("/").rpartition("/")[2]
 
 
-def derivation_at(place: str, places: Places) -> Derivation | None:
+def resolve_derivation(place: str, places: FileAccess) -> Derivation | None:
     """How the robot at a place is derived; None if it is read from a URDF.
 
     Raises:
         MorphgenError: If there is no such place, or its derivation is none.
     """
     if place.startswith(WORDS):
-        return words_at(place.removeprefix(WORDS), places)[0]
+        return resolve_words(place.removeprefix(WORDS), places)[0]
     if place.startswith(DERIVED):
         return parse_derivation(place.removeprefix(DERIVED))
     if place.startswith(MEMBER):
-        return parse_derivation(member_at(place, places).derivation)
+        return parse_derivation(resolve_member(place, places).derivation)
     light = places.path(place) / DERIVATION
     if light.is_file() and not (places.path(place) / CARD).is_file():
         return parse_derivation(light.read_text(encoding="utf-8"), str(light))
     return None
 
 
-def _name(place: str, derivation: Derivation, places: Places) -> str:
+def _name(place: str, derivation: Derivation, places: FileAccess) -> str:
     if place.startswith(WORDS):
-        return words_at(place.removeprefix(WORDS), places)[1]
+        return resolve_words(place.removeprefix(WORDS), places)[1]
     if place.startswith(DERIVED):
         return default_name(derivation, places.library)
     return places.path(place).resolve().name
 
 
-def split_at(text: str, places: Places) -> Split:
+def resolve_split(text: str, places: FileAccess) -> Split:
     """A split by its name, file or built folder.
 
     Raises:
@@ -245,38 +245,38 @@ def split_at(text: str, places: Places) -> Split:
     return read_split_file(path / SPLIT if path.is_dir() else path).split
 
 
-def member_place(split: str, side: Side, member: Member) -> str:
+def member_uri(split: str, side: Side, member: Member) -> str:
     """The place of a member of a split."""
     return f"{MEMBER}{split}@{side}/{member.name}"
 
 
-def member_at(place: str, places: Places) -> Member:
+def resolve_member(place: str, places: FileAccess) -> Member:
     """The member of a split at a place.
 
     Raises:
-        PlaceError: If there is none.
+        UriError: If there is none.
     """
     name, at, member = place.removeprefix(MEMBER).rpartition("@")
     text, _, robot = member.partition("/")
     side = next((each for each in SIDES if each == text), None)
     if not at or side is None:
-        raise PlaceError(f"{place}: expected split:NAME@train/ROBOT or split:NAME@test/ROBOT")
-    members = {each.name: each for each in split_at(name, places).side(side)}
+        raise UriError(f"{place}: expected split:NAME@train/ROBOT or split:NAME@test/ROBOT")
+    members = {each.name: each for each in resolve_split(name, places).side(side)}
     if robot not in members:
-        raise PlaceError(
+        raise UriError(
             f"{place}: split {name} has no {side} robot {robot!r}" + nearest(robot, members)
         )
     return members[robot]
 
 
-def content_key(place: str, places: Places) -> str:
+def content_hash(place: str, places: FileAccess) -> str:
     """A hash that changes when the robot at a place may: its files, its parts, morphgen.
 
     Raises:
         MorphgenError: If there is no such place.
     """
     lines = [version("morphgen")]
-    if derivation := derivation_at(place, places):
+    if derivation := resolve_derivation(place, places):
         lines.append(str(derivation))
         lines += _stamps(_part_files(derivation, places.library))
     else:

@@ -9,7 +9,7 @@ from websockets.exceptions import InvalidStatus
 
 from helpers.viser_client import PlainClient
 from morphgen.errors import MorphgenError
-from morphgen.viewer.gate import Gate, gate_of, refusal
+from morphgen.viewer.access import AccessPolicy, access_policy, refusal_reason
 from morphgen.viewer.server import start_server
 
 HUB = "https://hub.example.com"
@@ -19,7 +19,7 @@ def asked(gate, host, origin=None, path="/"):
     headers = Headers({"Host": host} if host is not None else {})
     if origin is not None:
         headers["Origin"] = origin
-    return refusal(gate, path, headers)
+    return refusal_reason(gate, path, headers)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def asked(gate, host, origin=None, path="/"):
     ],
 )
 def test_its_own_names_and_allowed_sites_may_ask(bound, host, origin):
-    assert asked(gate_of(bound, [HUB]), host, origin) == ""
+    assert asked(access_policy(bound, [HUB]), host, origin) == ""
 
 
 @pytest.mark.parametrize(
@@ -70,14 +70,14 @@ def test_its_own_names_and_allowed_sites_may_ask(bound, host, origin):
     ],
 )
 def test_all_others_may_not(bound, host, origin):
-    assert asked(gate_of(bound), host, origin)
+    assert asked(access_policy(bound), host, origin)
 
 
 def test_two_hosts_or_origins_are_refused():
     for key in ("Host", "Origin"):
         headers = Headers([("Host", "localhost"), ("Origin", "http://localhost")])
         headers[key] = headers[key]
-        assert refusal(Gate(), "/", headers).startswith("expected one Host")
+        assert refusal_reason(AccessPolicy(), "/", headers).startswith("expected one Host")
 
 
 @pytest.mark.parametrize(
@@ -91,8 +91,10 @@ def test_two_hosts_or_origins_are_refused():
     ],
 )
 def test_an_address_cannot_bring_in_another_server(query):
-    assert "another server" in asked(Gate(), "localhost:8080", path=f"/?{query}")
-    assert asked(Gate(), "localhost:8080", path="/?websocket=ws://localhost:8080/proxy") == ""
+    assert "another server" in asked(AccessPolicy(), "localhost:8080", path=f"/?{query}")
+    assert (
+        asked(AccessPolicy(), "localhost:8080", path="/?websocket=ws://localhost:8080/proxy") == ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_an_address_cannot_bring_in_another_server(query):
 )
 def test_a_malformed_origin_is_refused(origin):
     with pytest.raises(MorphgenError, match=re.escape(f"--allow-origin {origin!r}: expected")):
-        gate_of("127.0.0.1", [origin])
+        access_policy("127.0.0.1", [origin])
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:{port}"])
@@ -170,7 +172,7 @@ def test_what_is_no_request_leaves_no_traceback(viewer, capfd):
 
 
 def test_nobody_may_ask_the_server_of_a_recording():
-    server = start_server("127.0.0.1", 0, Gate(names=frozenset()))
+    server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))
     try:
         with pytest.raises(InvalidStatus):
             PlainClient(server.get_port())

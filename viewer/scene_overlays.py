@@ -11,12 +11,12 @@ import numpy as np
 from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
-from morphgen.viewer.robot_view import RobotView, robot_extent
+from morphgen.viewer.scene_robot import RobotView, robot_extent
 
 POINTS = 12_000
 """Of a workspace."""
 TRAIL = 400
-"""Places of the tool that a trail keeps."""
+"""FileAccess of the tool that a trail keeps."""
 _ORANGE, _BLUE, _GREY = (247, 103, 7), (25, 113, 194), (134, 142, 150)
 
 

@@ -10,20 +10,20 @@ from morphgen.benchmark.split import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
-from morphgen.viewer.listings import (
+from morphgen.viewer.robot_rows import (
     folder_entries,
     neighbours,
     part_entries,
     split_entries,
     subfolders,
 )
-from morphgen.viewer.places import (
-    PlaceError,
-    Places,
-    as_in_library,
-    content_key,
-    read_place,
-    split_at,
+from morphgen.viewer.robot_uri import (
+    FileAccess,
+    UriError,
+    content_hash,
+    read_robot_uri,
+    resolve_split,
+    with_library_meshes,
 )
 from morphgen.viewer.targets import target_address
 
@@ -33,7 +33,7 @@ def places(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_bundle(arm(), tmp_path / "robots" / "one", picture=False)
     (tmp_path / "uploads").mkdir()
-    return Places(
+    return FileAccess(
         default_library().folders, (tmp_path.resolve(),), (tmp_path / "uploads").resolve()
     )
 
@@ -82,7 +82,7 @@ def test_an_unknown_target_is_refused(places, words, why):
     ],
 )
 def test_robots_are_read(places, place, name):
-    robot = read_place(place, places)
+    robot = read_robot_uri(place, places)
     assert robot.name.startswith(name)
     assert robot.dof > 0
 
@@ -92,8 +92,8 @@ def test_robots_are_read(places, place, name):
     ["../x", "/etc/passwd", "upload:../../etc/passwd", "robots/../../x", "upload:/etc/hostname"],
 )
 def test_nothing_outside_is_read(places, place):
-    with pytest.raises(PlaceError, match="outside of the folders"):
-        read_place(place, places)
+    with pytest.raises(UriError, match="outside of the folders"):
+        read_robot_uri(place, places)
 
 
 @pytest.mark.parametrize(
@@ -107,17 +107,17 @@ def test_nothing_outside_is_read(places, place):
 )
 def test_bad_places_say_why(places, place, why):
     with pytest.raises(MorphgenError, match=why):
-        read_place(place, places)
+        read_robot_uri(place, places)
 
 
 def test_a_key_changes_with_the_file(places):
-    before = content_key("robots/one", places)
-    assert content_key("robots/one", places) == before
+    before = content_hash("robots/one", places)
+    assert content_hash("robots/one", places) == before
     urdf = places.path("robots/one/robot.urdf")
     urdf.write_text(urdf.read_text() + "\n")
-    assert content_key("robots/one", places) != before
-    words = content_key("words:base=planar ee=cube", places)
-    assert words == content_key("derivation:" + str(_derivation(places)), places)
+    assert content_hash("robots/one", places) != before
+    words = content_hash("words:base=planar ee=cube", places)
+    assert words == content_hash("derivation:" + str(_derivation(places)), places)
 
 
 @pytest.mark.parametrize(
@@ -136,27 +136,27 @@ def test_a_key_changes_with_the_file(places):
 )
 def test_a_page_tells_no_folder_of_the_machine(text, told):
     root, temporary = Path("/home/me/work"), tempfile.gettempdir()
-    places = Places((), (root,), Path(temporary) / "morphgen-uploads-1")
+    places = FileAccess((), (root,), Path(temporary) / "morphgen-uploads-1")
     given = text.format(uploads=places.uploads, root=root, temporary=temporary)
     assert places.told(given) == told
 
 
 def _derivation(places):
-    from morphgen.viewer.places import derivation_at
+    from morphgen.viewer.robot_uri import resolve_derivation
 
-    return derivation_at("words:base=planar ee=cube", places)
+    return resolve_derivation("words:base=planar ee=cube", places)
 
 
 def test_a_bundle_takes_the_librarys_meshes_only_if_it_is_the_same(places, tmp_path):
-    made = read_place("words:arm=ur5 ee=plane", places)
+    made = read_robot_uri("words:arm=ur5 ee=plane", places)
     bundle = write_bundle(made, tmp_path / "robots" / "ur5", picture=False)
-    read = read_place("robots/ur5", places)
-    assert robot_hash(as_in_library(read, places.library)) == robot_hash(made)
+    read = read_robot_uri("robots/ur5", places)
+    assert robot_hash(with_library_meshes(read, places.library)) == robot_hash(made)
     text = (bundle / "robot.urdf").read_text()
     (bundle / "robot.urdf").write_text(text.replace('mass value="3.7"', 'mass value="3.8"'))
-    changed = read_place("robots/ur5", places)
+    changed = read_robot_uri("robots/ur5", places)
     assert changed.mass != made.mass
-    assert as_in_library(changed, places.library) is changed
+    assert with_library_meshes(changed, places.library) is changed
 
 
 def test_folders_are_listed(places, tmp_path):
@@ -170,12 +170,12 @@ def test_folders_are_listed(places, tmp_path):
         ("two", None, ("unreadable",)),
     ]
     assert subfolders(tmp_path) == ["robots"]
-    with pytest.raises(PlaceError, match="holds no robot"):
+    with pytest.raises(UriError, match="holds no robot"):
         folder_entries("uploads", places)
 
 
 def test_splits_and_parts_are_listed(places):
-    rows = split_entries(SPLIT, split_at(SPLIT, places))
+    rows = split_entries(SPLIT, resolve_split(SPLIT, places))
     assert [row.role for row in rows] == ["train"] * 10 + ["test"] * 2
     assert neighbours(rows[1].place, places) == (rows[0].place, rows[2].place)
     assert neighbours(rows[0].place, places)[0] == ""

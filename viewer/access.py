@@ -25,7 +25,7 @@ _FOREIGN_SERVER, _FOREIGN_FILE = "websocket", "playbackPath"
 
 
 @dataclass(frozen=True)
-class Gate:
+class AccessPolicy:
     """Which names a viewer may be asked by, and which sites may ask."""
 
     names: frozenset[str] = frozenset(LOCAL_NAMES)
@@ -36,7 +36,7 @@ class Gate:
     """Other sites that may ask, such as ``https://hub.example.com``."""
 
 
-def gate_of(host: str, origins: Sequence[str] = ()) -> Gate:
+def access_policy(host: str, origins: Sequence[str] = ()) -> AccessPolicy:
     """The gate of a viewer.
 
     Args:
@@ -50,10 +50,10 @@ def gate_of(host: str, origins: Sequence[str] = ()) -> Gate:
     everywhere = _is_unspecified(host)
     if everywhere:
         names |= {name.lower() for name in (socket.gethostname(), socket.getfqdn()) if name}
-    return Gate(frozenset(names), everywhere, frozenset(map(_parsed_origin, origins)))
+    return AccessPolicy(frozenset(names), everywhere, frozenset(map(_parsed_origin, origins)))
 
 
-def refusal(gate: Gate, path: str, headers: Headers) -> str:
+def refusal_reason(gate: AccessPolicy, path: str, headers: Headers) -> str:
     """Why a request is refused, in one sentence; empty if it is not.
 
     A request without ``Origin`` is no script's of another site: browsers send it with every
@@ -85,7 +85,7 @@ def refusal(gate: Gate, path: str, headers: Headers) -> str:
     return ""
 
 
-def policy(gate: Gate, host: str) -> str:
+def policy(gate: AccessPolicy, host: str) -> str:
     """The Content-Security-Policy of the page: what it may connect to, and who may frame it.
 
     viser's page would connect to any server that its address names and run what that sends.
@@ -102,7 +102,7 @@ def policy(gate: Gate, host: str) -> str:
     )
 
 
-def _is_own(gate: Gate, netloc: str) -> bool:
+def _is_own(gate: AccessPolicy, netloc: str) -> bool:
     """Whether a host with its port is this viewer's name.
 
     The port is not compared, because a tunnel (``ssh -L``) may have another.
@@ -118,7 +118,7 @@ def _is_own(gate: Gate, netloc: str) -> bool:
     )
 
 
-def _may_ask(gate: Gate, origin: str, host: str) -> bool:
+def _may_ask(gate: AccessPolicy, origin: str, host: str) -> bool:
     """Whether a site is the viewer's own, by the name that it was asked by, or an allowed one."""
     site = _split(origin)
     if site is None or site.scheme not in _PORTS:
