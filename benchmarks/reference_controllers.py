@@ -35,7 +35,7 @@ from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import mapped
-from morphgen.rl.baselines import baselines_for, make_baseline
+from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
@@ -67,7 +67,7 @@ class Measuring:
         row: Row = {"robot": member.name, "task": member.task}
         for sim in self.sims:
             with closing(batch_of([spec], self.envs, sim=sim)) as batch:
-                acting = make_baseline(baselines_for(member.task)[0], batch, 0)
+                acting = BASELINES[baselines_for(member.task)[0]].make(0)
                 good = run_episodes(batch, acting, self.episodes)
                 chance = run_episodes(batch, Random(0), self.episodes)
                 row[f"{sim} reference"] = mean(episode.success for episode in good)

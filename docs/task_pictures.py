@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from morphgen.rl.baselines import baselines_for
-from morphgen.rl.play import controller, play
+from morphgen.rl.play import make_controller, play
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
 
@@ -44,7 +44,7 @@ def main() -> int:
 
 def _row(task: str, robot: str, seed: int) -> np.ndarray:
     with closing(TaskEnv(task, robot, render_mode="rgb_array", size=SIZE)) as env:
-        acting = controller(baselines_for(task)[0], env, seed)
+        acting = make_controller(baselines_for(task)[0], env, seed)
         frames = list(play(env, acting, 1, seed, lambda episode: print(robot, episode)))
     # An episode that success does not end is over long before its time is.
     last = len(frames) if TASKS[task].target == "line" else len(frames) // 4

@@ -9,7 +9,7 @@ from typing import Any
 
 from morphgen.benchmark.split import Side
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields, require_agent
+from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields
 from morphgen.rl.aliases import current_name
 from morphgen.rl.config import NUMBERS, PolicyConfig, PPOConfig
 from morphgen.tasks.registry import TASKS
@@ -55,7 +55,7 @@ def parse_agent(text: str) -> AgentSpec:
     """
     agent = next((name for name in AGENTS if re.match(rf"{re.escape(name)}([+-]|$)", text)), None)
     if agent is None:
-        require_agent(text.partition("+")[0])
+        AGENTS[text.partition("+")[0]]  # raises
         raise AssertionError(text)  # an agent's name alone is matched above
     switch = rf"([+-])({'|'.join(SWITCHES)})"
     rest = text[len(agent) :]
@@ -87,7 +87,7 @@ def parse_agents(text: str) -> list[tuple[str, AgentSpec, Side]]:
         name, at, side = part.partition("@")
         spec = parse_agent(name)
         if at and (side != "test" or not AGENTS[spec.agent].per_robot):
-            valid = " and ".join(name for name, agent in AGENTS.items() if agent.per_robot)
+            valid = " and ".join(name for name in AGENTS if AGENTS[name].per_robot)
             raise TaskError(f"agent {part!r}: only {valid} may be trained elsewhere, on @test")
         label = f"{spec}{at}{side}"
         if label in agents:
@@ -113,7 +113,7 @@ def configs_of(
     Raises:
         TaskError: If a value is out of its range.
     """
-    network = require_agent(spec.agent).config
+    network = AGENTS[spec.agent].config
     values = dict(changes)
     for name, on in spec.switches.items():
         values[current_name(name.replace("-", "_"))] = on

@@ -10,7 +10,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.rl.agents import require_agent
+from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from
 from morphgen.rl.observation_layout import Layout, layout_from
 from morphgen.rl.policies import make_networks
@@ -65,7 +65,7 @@ def require_policy(data: object, where: str) -> None:
     require_fields(PolicyConfig, data, where)
     assert isinstance(data, Mapping)
     try:
-        network = require_agent(data.get("agent", PolicyConfig.agent)).config
+        network = AGENTS[data.get("agent", PolicyConfig.agent)].config
     except TaskError as error:
         raise TaskError(f"{where}: {error}") from error
     if data.get("network") is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from morphgen.errors import TaskError
-from morphgen.rl.agents import NetworkConfig, require_agent
+from morphgen.rl.agents import AGENTS, NetworkConfig
 from morphgen.tasks.actions import ActionKind
 
 MAX_NUM_STEPS = 16_384
@@ -38,7 +38,7 @@ class PolicyConfig:
         Raises:
             TaskError: If the agent is unknown, or the sizes are those of another agent.
         """
-        config = require_agent(self.agent).config
+        config = AGENTS[self.agent].config
         if self.fixed_std and self.discrete:
             raise TaskError(
                 "fixed-deviation: discrete actions have no deviation; it goes with --no-discrete"
@@ -59,7 +59,7 @@ class PolicyConfig:
     @property
     def hides_morphology(self) -> bool:
         """Whether the networks see joint positions only, by choice or because of the agent."""
-        return self.proprioceptive_only or require_agent(self.agent).proprioceptive_only
+        return self.proprioceptive_only or AGENTS[self.agent].proprioceptive_only
 
 
 def policy_from(stored: Mapping[str, Any]) -> PolicyConfig:
@@ -71,7 +71,7 @@ def policy_from(stored: Mapping[str, Any]) -> PolicyConfig:
     own = dict(stored)
     sizes = own.pop("network", None) or {}
     agent = own.get("agent", PolicyConfig.agent)
-    return PolicyConfig(**own, network=require_agent(agent).config(**sizes))
+    return PolicyConfig(**own, network=AGENTS[agent].config(**sizes))
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from morphgen.benchmark.split import Side
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
-from morphgen.rl.baselines import BASELINES, make_baseline
+from morphgen.rl.baselines import BASELINES
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.inference import Mode, Policy, PolicyController
 from morphgen.rl.intervals import mean_interval
@@ -22,7 +22,7 @@ from morphgen.rl.robot_source import RobotSource, members, other_side, specs_of
 from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
 from morphgen.rl.scores import Score
-from morphgen.rl.training import checkpoints
+from morphgen.rl.training import checkpoint_files
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, default_configs
 from morphgen.tasks.make import batch_of
@@ -34,8 +34,8 @@ MAX_ENVS_PER_ROBOT = 34
 EVAL_SEED_OFFSET = 0x5C0_4E5
 """Mixed into the seed, so that evaluation episodes differ from training ones with the same seed."""
 
-MakeController = Callable[[TaskBatch], Controller]
-"""Builds a controller for a batch."""
+MakeController = Callable[[], Controller]
+"""Builds a controller."""
 Progress = Callable[[float, int], None]
 """Callback with the number of episodes done, fractions included, and their total number."""
 StartProgress = Callable[[str], Progress]
@@ -43,7 +43,7 @@ StartProgress = Callable[[str], Progress]
 
 
 def no_progress(done: float, total: int) -> None:
-    """Report the progress to nobody."""
+    """UpdateMetrics the progress to nobody."""
 
 
 def no_progress_of(name: str) -> Progress:
@@ -118,7 +118,7 @@ def evaluate_run(
     Raises:
         TaskError: If there is no checkpoint, or no such side.
     """
-    files = list(checkpoints(path))
+    files = list(checkpoint_files(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
     return evaluate_checkpoints(files, source, config, mode, device=device, progress=progress)
 
@@ -193,7 +193,7 @@ def _evaluate_together(
 ) -> list[Score]:
     """Evaluate policies on the same robots; their episodes count together."""
 
-    def make(learner: dict[str, Any], batch: TaskBatch) -> Controller:
+    def make(learner: dict[str, Any]) -> Controller:
         return PolicyController(Policy(learner, mode, config.seed, device))
 
     controllers = [partial(make, learner) for _, learner in trained]
@@ -209,13 +209,9 @@ def evaluate_baseline(
     Raises:
         TaskError: If it is unknown, or can do none of the robots' tasks.
     """
-    if name not in BASELINES:
-        raise TaskError(f"unknown baseline {name!r}{nearest(name, BASELINES)}")
-
-    def make(batch: TaskBatch) -> Controller:
-        return make_baseline(name, batch, config.seed)
-
-    return evaluate([make], source, config, Interface(), tasks=BASELINES[name], progress=progress)
+    baseline = BASELINES[name]
+    make = partial(baseline.make, config.seed)
+    return evaluate([make], source, config, Interface(), tasks=baseline.tasks, progress=progress)
 
 
 def evaluate(
@@ -281,7 +277,7 @@ def _random_episodes(
     key = (source, replace(config, workers=1), tasks)
     if key not in _random_cache:
         _random_cache[key] = _run_all(
-            lambda batch: Random(config.seed), specs, config, Interface(), library
+            partial(Random, config.seed), specs, config, Interface(), library
         )
     return _random_cache[key]
 
@@ -309,7 +305,7 @@ def _run_all(
             progress(before + done, total)
 
         try:
-            controller = controller or make(batch)
+            controller = controller or make()
             for episode in run_episodes(batch, controller, rounds, add):
                 episodes[episode.robot_index].append(episode)
         finally:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from morphgen.errors import TaskError, nearest
-from morphgen.rl.baselines import BASELINES, baselines_for, make_baseline
+from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
@@ -32,7 +32,7 @@ def require_policy(name: str, task: str) -> None:
     valid = baselines_for(task)
     if name in BASELINES and name not in valid:
         raise TaskError(
-            f"policy {name!r} is for {' or '.join(BASELINES[name] or ())}, not for {task}; "
+            f"policy {name!r} is for {' or '.join(BASELINES[name].tasks or ())}, not for {task}; "
             f"valid: {', '.join(valid)}"
         )
     if name not in BASELINES:
@@ -51,7 +51,7 @@ def interface_of(name: str) -> Interface:
     return run.interface
 
 
-def controller(name: str, env: TaskEnv, seed: int) -> Controller:
+def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
     """Return a controller by its name.
 
     Args:
@@ -73,7 +73,7 @@ def controller(name: str, env: TaskEnv, seed: int) -> Controller:
         policy = Policy(learner, "deterministic", seed)
         policy.require(env.batch.observe())
         return PolicyController(policy)
-    return make_baseline(name, env.batch, seed)
+    return BASELINES[name].make(seed)
 
 
 def play(

@@ -20,9 +20,9 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from morphgen.errors import TaskError
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
 from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
 from morphgen.rl.policies import make_networks, rows_needed
-from morphgen.rl.report import Metrics, Report, explained_variance
 from morphgen.rl.rollout_buffer import STEP_KEYS, RolloutBuffer
 from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import TaskBatch
@@ -30,7 +30,7 @@ from morphgen.tasks.observation import Observation
 
 LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
 LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")
-"""Metrics of a gradient step; see ``Report``."""
+"""Metrics of a gradient step; see ``UpdateMetrics``."""
 KL_FACTOR = 1.2
 """Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
 MIN_ACTOR_LR_SCALE = 0.01
@@ -103,7 +103,7 @@ class Learner:
         """Whether all updates have been made."""
         return self.update >= self.num_updates
 
-    def iterate(self) -> Report:
+    def iterate(self) -> UpdateMetrics:
         """Collect a rollout and learn from it.
 
         Raises:
@@ -120,7 +120,7 @@ class Learner:
             raise TaskError(f"update {self.update}: {', '.join(lost)} is not finite any more")
         ended = time.perf_counter()
         timesteps = self.config.num_steps * self.batch.num_envs
-        return Report(
+        return UpdateMetrics(
             update=self.update,
             transitions=self.update * timesteps,
             collect_seconds=collected - started,

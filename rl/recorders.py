@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import write_atomic
-from morphgen.rl.report import Report
+from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.runs import RunConfig
 
 METRICS, EVENTS = "metrics.jsonl", "events"
@@ -25,7 +25,7 @@ METRICS, EVENTS = "metrics.jsonl", "events"
 class Recorder(Protocol):
     """Stores reports."""
 
-    def record(self, report: Report) -> None:
+    def record(self, report: UpdateMetrics) -> None:
         """Store a report."""
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class Metrics:
         write_atomic(path, "".join(json.dumps(each) + "\n" for each in kept))
         self._file = path.open("a", encoding="utf-8")
 
-    def record(self, report: Report) -> None:
+    def record(self, report: UpdateMetrics) -> None:
         """Write a line."""
         self._file.write(json.dumps(_finite(asdict(report))) + "\n")
         self._file.flush()
@@ -92,7 +92,7 @@ class TensorBoard:
             ) from error
         self._writer = SummaryWriter(str(folder / EVENTS), purge_step=update + 1)
 
-    def record(self, report: Report) -> None:
+    def record(self, report: UpdateMetrics) -> None:
         """Write scalars, by update."""
         for name, value in scalars(report):
             self._writer.add_scalar(name, value, report.update)
@@ -125,7 +125,7 @@ class WeightsAndBiases:
         except wandb.errors.Error as error:
             raise TaskError(f"--wandb: {error}") from error
 
-    def record(self, report: Report) -> None:
+    def record(self, report: UpdateMetrics) -> None:
         """Send scalars, by update."""
         self._run.log(dict(scalars(report)), step=report.update)
 
@@ -165,7 +165,7 @@ def recording(
         yield kept
 
 
-def scalars(report: Report) -> Iterator[tuple[str, float]]:
+def scalars(report: UpdateMetrics) -> Iterator[tuple[str, float]]:
     """Yield names and values of a report's numbers; those of robots and terms as ``name/key``."""
     for name, value in asdict(report).items():
         if isinstance(value, Mapping):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from morphgen.rl.report import Metrics
+from morphgen.rl.metrics import Metrics
 from morphgen.tasks.observation import Observation
 
 STEP_KEYS = ("reward", "score", "success", "terminated", "truncated", "unstable")

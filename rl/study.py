@@ -21,7 +21,7 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, write_atomic
 from morphgen.processes import ray_cluster, require_ray
 from morphgen.rl.aliases import renamed
-from morphgen.rl.baselines import BASELINES, is_for
+from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
     EvalConfig,
     StartProgress,
@@ -33,7 +33,7 @@ from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.robot_source import RobotSource, members, other_side, tasks_of
 from morphgen.rl.runs import RunConfig, require_open
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
-from morphgen.rl.training import ExecutionConfig, Part, Show, train
+from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
 
 SCORES = "scores.json"
 POLL = 2.0
@@ -92,7 +92,7 @@ def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -
             replace(eval_config, workers=1),
         )
         for name in BASELINES
-        if is_for(name, tasks)
+        if BASELINES[name].suits(tasks)
     ]
 
 
@@ -159,7 +159,7 @@ def require_cells(cells: Sequence[Cell]) -> None:
 def do_cell(
     cell: Cell,
     execution: ExecutionConfig,
-    show: Callable[[Part], Show] | None = None,
+    show: Callable[[Subrun], ShowMetrics] | None = None,
     progress: StartProgress = no_progress_of,
 ) -> None:
     """Train and evaluate a cell, as far as it is not done. No other process may work on it.
@@ -185,10 +185,10 @@ def do_cell(
     write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
 
 
-def work_here(
+def run_cells(
     cells: Sequence[Cell],
     execution: ExecutionConfig,
-    show: Callable[[Part], Show] | None = None,
+    show: Callable[[Subrun], ShowMetrics] | None = None,
     progress: StartProgress = no_progress_of,
 ) -> Iterator[Outcome]:
     """Do cells one after another, and yield their outcomes.
@@ -212,7 +212,7 @@ def work_here(
             skipped = 0
 
 
-def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
+def run_cells_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
     """Return work on the Ray cluster at an address, a task per cell; without one, on a local Ray.
 
     Its machines have morphgen installed and share the study's folder.
@@ -245,14 +245,14 @@ def work_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
 
 
 def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:
-    (outcome,) = work_here([cell], execution)
+    (outcome,) = run_cells([cell], execution)
     return outcome.error
 
 
 def _do_locked(
     cell: Cell,
     execution: ExecutionConfig,
-    show: Callable[[Part], Show] | None,
+    show: Callable[[Subrun], ShowMetrics] | None,
     progress: StartProgress,
 ) -> Outcome | None:
     """Do a cell and return its outcome; None if another process works on it."""
@@ -295,7 +295,7 @@ def _baseline_scores(cell: Cell, eval_config: EvalConfig, progress: StartProgres
     scores = []
     for side in cell.sides:
         source = other_side(cell.source, side)
-        if is_for(cell.agent, tasks_of(source)):
+        if BASELINES[cell.agent].suits(tasks_of(source)):
             show = progress(f"{cell.agent} on {side}")
             scores += evaluate_baseline(cell.agent, source, eval_config, progress=show)
     return scores

@@ -23,7 +23,7 @@ from morphgen.rl.recorders import read_metrics
 from morphgen.rl.robot_source import tasks_of
 from morphgen.rl.scores import Score, scores_to_json
 from morphgen.rl.study import Cell, as_record
-from morphgen.rl.training import parts_of
+from morphgen.rl.training import subruns_of
 
 TABLE, DATA, ROBOTS, CURVES = "table.md", "results.json", "results.csv", "curves.png"
 MISSING, NONE = "missing", "-"
@@ -196,7 +196,7 @@ def curves(results: Results) -> bytes:
 def _curve(cell: Cell) -> Curve | None:
     """Return the mean training curve of a run's parts; None if there are no metrics yet."""
     assert cell.config is not None
-    runs = parts_of(cell.folder, cell.config)
+    runs = subruns_of(cell.folder, cell.config)
     parts = [read_metrics(part.folder) for part in runs]
     length = min(map(len, parts))
     if not length:

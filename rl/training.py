@@ -15,9 +15,9 @@ from morphgen.formats.files import alone
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.learner_state import load_networks, state_of
 from morphgen.rl.learner_state import resume as resume_learner
+from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import recording, require_wandb
-from morphgen.rl.report import Report
 from morphgen.rl.robot_source import members, require_links, single_members, specs_of
 from morphgen.rl.runs import (
     CHECKPOINT,
@@ -41,7 +41,7 @@ CHECKPOINTS, MIN_CHECKPOINTS = 10, 4
 ROBOTS = "robots"
 """Subfolder with the runs of single robots, in a run of ``se`` on a split."""
 
-Show = Callable[[Report, int], None]
+ShowMetrics = Callable[[UpdateMetrics, int], None]
 """Callback for every report, with the number of updates of the run."""
 
 
@@ -70,7 +70,7 @@ class ExecutionConfig:
 
 
 @dataclass(frozen=True)
-class Part:
+class Subrun:
     """A run that trains one set of weights."""
 
     folder: Path
@@ -79,14 +79,14 @@ class Part:
     """Config of this run alone."""
 
 
-def parts_of(folder: Path, config: RunConfig) -> list[Part]:
+def subruns_of(folder: Path, config: RunConfig) -> list[Subrun]:
     """Return the parts of a run: itself, or one per robot for an agent of single robots.
 
     Each part has its own seed, and its share of environments and timesteps, rounded up.
     """
     per_robot = AGENTS[config.policy.agent].per_robot
     if not per_robot or not config.source.split or config.source.member:
-        return [Part(folder, config)]
+        return [Subrun(folder, config)]
     sources = list(single_members(config.source))
     share = 1 if config.full_budget else len(sources)
     num_envs = -(-config.num_envs // share)
@@ -95,7 +95,7 @@ def parts_of(folder: Path, config: RunConfig) -> list[Part]:
     for i, source in enumerate(sources):
         seed = int(np.random.SeedSequence([config.seed, i]).generate_state(1)[0])
         own = replace(config, source=source, ppo=ppo, seed=seed, num_envs=num_envs)
-        parts.append(Part(folder / ROBOTS / str(source.member), own))
+        parts.append(Subrun(folder / ROBOTS / str(source.member), own))
     return parts
 
 
@@ -105,10 +105,10 @@ def train(
     *,
     resume: bool = False,
     execution: ExecutionConfig | None = None,
-    show: Callable[[Part], Show] | None = None,
+    show: Callable[[Subrun], ShowMetrics] | None = None,
     hold: Callable[[Path], AbstractContextManager[None]] = alone,
-) -> list[Part]:
-    """Train a run to its end; see ``parts_of``.
+) -> list[Subrun]:
+    """Train a run to its end; see ``subruns_of``.
 
     It may be interrupted or killed at any time. Resumed, it continues from its last checkpoint and
     ends with the same weights as an uninterrupted run. Nothing is written before learning can
@@ -130,7 +130,7 @@ def train(
         FormatError: If another process writes to the folder.
         MorphgenError: If a robot or simulator cannot be built.
     """
-    execution, parts = execution or ExecutionConfig(), parts_of(folder, config)
+    execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     for part in parts:
         require_runnable(part.config)
     require_device(config.device)
@@ -189,7 +189,7 @@ def require_device(name: str) -> None:
         raise TaskError(f"--device {name}: there are {torch.cuda.device_count()} CUDA devices")
 
 
-def checkpoints(path: Path) -> Iterator[Path]:
+def checkpoint_files(path: Path) -> Iterator[Path]:
     """Yield the checkpoints of a path: a file, or the folder of a run, with one or many parts.
 
     Raises:
@@ -201,7 +201,7 @@ def checkpoints(path: Path) -> Iterator[Path]:
     found = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
     if not found:
         raise TaskError(f"{path}: no checkpoint, and no folder of a run with one")
-    parts = parts_of(path, read_config(path))
+    parts = subruns_of(path, read_config(path))
     missing = [part.folder.name for part in parts if not (part.folder / CHECKPOINT).is_file()]
     if missing:
         raise TaskError(
@@ -211,7 +211,7 @@ def checkpoints(path: Path) -> Iterator[Path]:
     yield from found
 
 
-def is_done(part: Part) -> bool:
+def is_done(part: Subrun) -> bool:
     """Return whether all updates of a part have been made."""
     if not (part.folder / CHECKPOINT).is_file():
         return False
@@ -227,7 +227,7 @@ def updates_between(config: RunConfig) -> int:
 
 
 @contextmanager
-def _learner(part: Part, execution: ExecutionConfig) -> Iterator[Learner]:
+def _learner(part: Subrun, execution: ExecutionConfig) -> Iterator[Learner]:
     """Build the learner of a part, and resume its checkpoint if there is one."""
     config, interface = part.config, part.config.interface
     specs = specs_of(config.source, GoalConfig(tasks=config.tasks))
@@ -253,7 +253,7 @@ def _learner(part: Part, execution: ExecutionConfig) -> Iterator[Learner]:
         batch.close()
 
 
-def _learn(learner: Learner, part: Part, execution: ExecutionConfig, show: Show) -> None:
+def _learn(learner: Learner, part: Subrun, execution: ExecutionConfig, show: ShowMetrics) -> None:
     interval = updates_between(part.config)
     recorders = recording(
         part.folder,
@@ -275,5 +275,5 @@ def _learn(learner: Learner, part: Part, execution: ExecutionConfig, show: Show)
             show(report, learner.num_updates)
 
 
-def _ignore(report: Report, num_updates: int) -> None:
-    """Show a report to nobody."""
+def _ignore(report: UpdateMetrics, num_updates: int) -> None:
+    """ShowMetrics a report to nobody."""

@@ -17,7 +17,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.grammar.model import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES, baselines_for
-from morphgen.rl.play import controller, interface_of, require_policy
+from morphgen.rl.play import interface_of, make_controller, require_policy
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
@@ -239,7 +239,7 @@ def _player(wanted: RolloutConfig, place: str, policy: str, places: FileAccess) 
         library=places.folders,
     )
     try:
-        acting = controller(policy, env, wanted.seed)
+        acting = make_controller(policy, env, wanted.seed)
         env.batch.reset(wanted.seed)
     except MorphgenError:
         env.close()

@@ -111,11 +111,11 @@ def _baselines(args: argparse.Namespace) -> dict[str, list[Score]]:
 def _policies(args: argparse.Namespace) -> dict[str, list[Score]]:
     from morphgen.rl.inference import MODES
     from morphgen.rl.runs import read_checkpoint
-    from morphgen.rl.training import checkpoints, require_device
+    from morphgen.rl.training import checkpoint_files, require_device
 
     require_words(args)
     require_device(args.device)
-    files = list(checkpoints(Path(args.checkpoint)))
+    files = list(checkpoint_files(Path(args.checkpoint)))
     for file in files:
         config, learner = read_checkpoint(file)
         if learner["update"] < config.num_updates:

@@ -69,10 +69,10 @@ def run(args: argparse.Namespace) -> int:
     """Train and print the path of the checkpoint."""
     from morphgen.errors import TaskError
     from morphgen.rl.runs import CHECKPOINT
-    from morphgen.rl.training import checkpoints
+    from morphgen.rl.training import checkpoint_files
 
     require_words(args)
-    files = list(checkpoints(args.checkpoint))
+    files = list(checkpoint_files(args.checkpoint))
     if len(files) > 1:
         raise TaskError(
             f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"

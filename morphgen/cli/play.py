@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from collections import deque
 
     from morphgen.errors import TaskError
-    from morphgen.rl.play import FPS, controller, interface_of, play, require_policy
+    from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
     from morphgen.tasks.gym_env import TaskEnv
     from morphgen.tasks.registry import TASKS
     from morphgen.tasks.renderer import require_film, write_film
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         render_mode=None if args.out is None else "rgb_array",
     )
     try:
-        acting = controller(args.policy, env, args.seed)
+        acting = make_controller(args.policy, env, args.seed)
         frames = play(env, acting, args.episodes, args.seed, _Report(TASKS[args.task].target))
         if args.out is None:
             deque(frames, maxlen=0)

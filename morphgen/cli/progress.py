@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from morphgen.rl.evaluation import Progress
-    from morphgen.rl.report import Report
-    from morphgen.rl.training import Part, Show
+    from morphgen.rl.metrics import UpdateMetrics
+    from morphgen.rl.training import ShowMetrics, Subrun
 
 MINUTE = 60.0
 """Seconds between lines of an evaluation."""
@@ -42,7 +42,7 @@ class Shower:
     def __init__(self) -> None:
         self._bar: tqdm[NoReturn] | None = None
 
-    def __call__(self, part: Part) -> Show:
+    def __call__(self, part: Subrun) -> ShowMetrics:
         """Begin with a part."""
         self.close()
         name = part.config.source.member or part.config.source.name
@@ -89,7 +89,7 @@ class Shower:
             self._bar.close()
             self._bar = None
 
-    def _show(self, report: Report, updates: int) -> None:
+    def _show(self, report: UpdateMetrics, updates: int) -> None:
         assert self._bar is not None
         if self._bar.n == 0:
             self._bar.initial = report.transitions - report.transitions // report.update
@@ -113,7 +113,7 @@ class _Minutes:
             print(f"{self._name}: {done:.0f} of {total} episodes", file=sys.stderr, flush=True)
 
 
-def _print(name: str, report: Report, updates: int) -> None:
+def _print(name: str, report: UpdateMetrics, updates: int) -> None:
     if report.unstable:
         print(_unstable(name, report), file=sys.stderr, flush=True)
     if report.update % max(updates // 20, 1) and report.update < updates:
@@ -128,12 +128,12 @@ def _print(name: str, report: Report, updates: int) -> None:
     )
 
 
-def _unstable(name: str, report: Report) -> str:
+def _unstable(name: str, report: UpdateMetrics) -> str:
     return (
         f"{name}: update {report.update}: {report.unstable} of {report.episodes} episodes ended "
         "because their simulation became unstable"
     )
 
 
-def _success(report: Report) -> str:
+def _success(report: UpdateMetrics) -> str:
     return f"{report.success:.0%}" if report.episodes else "unknown"

@@ -93,7 +93,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.robot_source import other_side
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
-    from morphgen.rl.training import parts_of, require_device, require_runnable
+    from morphgen.rl.training import require_device, require_runnable, subruns_of
     from morphgen.tasks.env_specs import default_configs
 
     if args.gpus is not None and args.ray is None:
@@ -112,7 +112,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
             for seed in seeds:
                 config = config_of(other_side(source, side), spec, _with(args, seed))
                 config = matched_budget(replace(config, seed=seed))
-                for part in () if args.report else parts_of(args.out, config):
+                for part in () if args.report else subruns_of(args.out, config):
                     require_runnable(part.config)
                 made.append(agent_cell(args.out, label, config, eval_config))
     return made
@@ -143,15 +143,15 @@ def _with(args: argparse.Namespace, seed: int) -> argparse.Namespace:
 
 def _work(args: argparse.Namespace, cells: list[Cell]) -> int:
     """Do the cells and return how many failed."""
-    from morphgen.rl.study import work_here, work_on_ray
+    from morphgen.rl.study import run_cells, run_cells_on_ray
 
     failed = 0
     with shown("if the same command is given again") as show:
         if args.ray is None:
-            outcomes = work_here(cells, execution_of(args), show, show.counting)
+            outcomes = run_cells(cells, execution_of(args), show, show.counting)
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
-            outcomes = work_on_ray(args.ray or None, gpus=gpus)(cells, execution_of(args))
+            outcomes = run_cells_on_ray(args.ray or None, gpus=gpus)(cells, execution_of(args))
         for done, outcome in enumerate(outcomes, 1):
             show.close()
             cell = outcome.cell

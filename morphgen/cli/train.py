@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from morphgen.rl.agent_spec import AgentSpec
     from morphgen.rl.robot_source import RobotSource
     from morphgen.rl.runs import RunConfig
-    from morphgen.rl.training import ExecutionConfig, Part
+    from morphgen.rl.training import ExecutionConfig, Subrun
     from morphgen.tasks.task import TaskConfig
 
 SWITCHES = {
@@ -155,7 +155,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def trained(folder: Path, config: RunConfig, args: argparse.Namespace) -> list[Part]:
+def trained(folder: Path, config: RunConfig, args: argparse.Namespace) -> list[Subrun]:
     """Train a run to its end, with a progress bar."""
     from morphgen.rl.training import train
 
@@ -304,7 +304,7 @@ def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:
 
     agent = config.policy.agent
     if args.whole and not AGENTS[agent].per_robot:
-        valid = " or ".join(name for name, each in AGENTS.items() if each.per_robot)
+        valid = " or ".join(name for name in AGENTS if AGENTS[name].per_robot)
         raise TaskError(f"--whole is for --agent {valid}, not for {agent}")
     changed = parse_constants(args.set)
     for name in changed:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import Any
 
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError
+from morphgen.tasks.registry import Registry
 
 MAX_WIDTH = 8192
 """Largest width of a layer; the weights between two such layers take 256 MiB."""
@@ -46,6 +47,8 @@ class NetworkConfig:
 class Agent:
     """A row of the registry: how an agent is trained, and the module that has its networks."""
 
+    name: str
+    """Name in ``AGENTS``."""
     module: str
     """Import path of the module; it is imported when the agent is used."""
     per_robot: bool = False
@@ -56,8 +59,8 @@ class Agent:
     @property
     def config(self) -> type[NetworkConfig]:
         """Class with the sizes of the networks."""
-        found: type[NetworkConfig] = import_module(self.module).Config
-        return found
+        config: type[NetworkConfig] = import_module(self.module).Config
+        return config
 
     @property
     def network(self) -> Any:  # noqa: ANN401
@@ -65,31 +68,24 @@ class Agent:
         return import_module(self.module).Network
 
 
-AGENTS: dict[str, Agent] = {
-    "se": Agent("morphgen.rl.agents.mlp", per_robot=True, proprioceptive_only=True),
-    "me-mlp": Agent("morphgen.rl.agents.mlp"),
-    "me-tf": Agent("morphgen.rl.agents.transformer"),
-}
+SE = Agent("se", "morphgen.rl.agents.mlp", per_robot=True, proprioceptive_only=True)
+ME_MLP = Agent("me-mlp", "morphgen.rl.agents.mlp")
+ME_TF = Agent("me-tf", "morphgen.rl.agents.transformer")
+
+AGENTS: Registry[Agent] = Registry(
+    "agent",
+    "morphgen.agents",
+    {"se": f"{__name__}:SE", "me-mlp": f"{__name__}:ME_MLP", "me-tf": f"{__name__}:ME_TF"},
+)
 """Agents by name: ``se`` (single embodiment) learns one robot, ``me-...`` (multi) learn many."""
-
-
-def require_agent(name: str) -> Agent:
-    """Return the agent of a name.
-
-    Raises:
-        TaskError: If there is none.
-    """
-    if name not in AGENTS:
-        raise TaskError(f"unknown agent {name!r}{nearest(name, AGENTS)}")
-    return AGENTS[name]
 
 
 def network_fields() -> Iterator[tuple[str, float, tuple[str, ...]]]:
     """Yield every size of every agent's networks: its name, its default, and its agents."""
     defaults: dict[str, float] = {}
     owners: dict[str, list[str]] = {}
-    for name, agent in AGENTS.items():
-        for field in fields(agent.config):
+    for name in AGENTS:
+        for field in fields(AGENTS[name].config):
             defaults.setdefault(field.name, field.default)  # type: ignore[arg-type]
             owners.setdefault(field.name, []).append(name)
     for field_name, agents in owners.items():

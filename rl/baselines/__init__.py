@@ -1,52 +1,61 @@
-"""Baselines: controllers that learn nothing; they show that a task can be done.
+"""Registry of baselines: controllers that learn nothing, and show that a task can be done.
 
-Importing the registry loads nothing heavy, so that the command line lists baselines at once.
+Importing the registry loads no simulator and no torch, so that the command line starts quickly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING
+
+from morphgen.tasks.registry import Registry
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Controller
-    from morphgen.tasks.batch import TaskBatch
 
-BASELINES: dict[str, tuple[str, ...] | None] = {
-    "random": None,
-    "zero": None,
-    "ik": ("reach",),
-    "scripted": ("push",),
-}
-"""Tasks of each baseline by its name, None for all; those that solve a task come last."""
+
+@dataclass(frozen=True)
+class Baseline:
+    """A row of the registry: the tasks of a baseline, and its controller."""
+
+    name: str
+    """Name in ``BASELINES``."""
+    controller: str
+    """Import path of the controller's class, as ``module:class``; imported when it is used."""
+    tasks: tuple[str, ...] | None = None
+    """Tasks that the baseline is for; None for all tasks."""
+
+    def suits(self, tasks: Iterable[str]) -> bool:
+        """Return whether the baseline is for any of the tasks."""
+        return self.tasks is None or not set(self.tasks).isdisjoint(tasks)
+
+    def make(self, seed: int) -> Controller:
+        """Return a new controller; its random numbers depend on the seed alone."""
+        module, _, name = self.controller.partition(":")
+        controller: Controller = getattr(import_module(module), name)(seed)
+        return controller
+
+
+RANDOM = Baseline("random", "morphgen.rl.baselines.simple:Random")
+ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero")
+IK = Baseline("ik", "morphgen.rl.baselines.ik:InverseKinematics", ("reach",))
+SCRIPTED = Baseline("scripted", "morphgen.rl.baselines.scripted_push:ScriptedPush", ("push",))
+
+BASELINES: Registry[Baseline] = Registry(
+    "baseline",
+    "morphgen.baselines",
+    {
+        "random": f"{__name__}:RANDOM",
+        "zero": f"{__name__}:ZERO",
+        "ik": f"{__name__}:IK",
+        "scripted": f"{__name__}:SCRIPTED",
+    },
+)
+"""Baselines by name; those that solve a task come last."""
 
 
 def baselines_for(task: str) -> tuple[str, ...]:
-    """Return the baselines for a task; if one solves it, that is the first."""
-    return tuple(name for name in reversed(BASELINES) if is_for(name, (task,)))
-
-
-def is_for(name: str, tasks: Iterable[str]) -> bool:
-    """Return whether a baseline is for any of the tasks."""
-    own = BASELINES[name]
-    return own is None or bool(set(own) & set(tasks))
-
-
-def make_baseline(name: str, batch: TaskBatch, seed: int) -> Controller:
-    """Return the baseline of a name in ``BASELINES``, for a batch.
-
-    Raises:
-        BenchmarkError: If a robot has hardly any collision-free configuration.
-    """
-    from morphgen.rl.baselines.simple import Random, Zero
-
-    if name == "ik":
-        from morphgen.rl.references import InverseKinematics
-        from morphgen.tasks.free_space import FreeSpace
-
-        return InverseKinematics(seed, [FreeSpace(spec.scene) for spec in batch.specs])
-    if name == "scripted":
-        from morphgen.rl.scripted_push import ScriptedPush
-
-        return ScriptedPush(seed)
-    return Random(seed) if name == "random" else Zero()
+    """Return the names of the baselines for a task; if one solves it, that is the first."""
+    return tuple(name for name in reversed(tuple(BASELINES)) if BASELINES[name].suits((task,)))

@@ -1,4 +1,4 @@
-"""The baselines that do not look at anything: no action, and random actions."""
+"""The baselines that ignore the observation: no action, and random actions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from morphgen.tasks.config import BINS
 
 
 class Zero:
-    """Does nothing."""
+    """Keeps all joint targets where they are."""
+
+    def __init__(self, seed: int = 0) -> None:
+        """Ignore the seed: nothing is random."""
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return actions that change no target, shape (n, L)."""
@@ -26,7 +29,7 @@ class Random:
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return actions (n, L), uniform over [-1, 1] or over the bins."""
         if task.kind == "discrete":
-            drawn = torch.randint(len(BINS), task.mask.shape, generator=self._generator)
+            actions = torch.randint(len(BINS), task.mask.shape, generator=self._generator)
         else:
-            drawn = 2 * torch.rand(task.mask.shape, generator=self._generator) - 1
-        return drawn.to(task.mask.device)
+            actions = 2 * torch.rand(task.mask.shape, generator=self._generator) - 1
+        return actions.to(task.mask.device)

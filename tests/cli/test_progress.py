@@ -10,10 +10,10 @@ import pytest
 from helpers.runs import small_config
 from morphgen.cli import progress
 from morphgen.cli.progress import Shower
-from morphgen.rl.report import Report
+from morphgen.rl.metrics import UpdateMetrics
 
-FLOATS = [each.name for each in fields(Report) if each.type == "float"]
-REPORT = Report(
+FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
+REPORT = UpdateMetrics(
     update=1,
     transitions=32,
     scores=(1.0,),

@@ -46,7 +46,8 @@ def linear(monkeypatch):
     module = ModuleType("linear_agent")
     module.Config, module.Network = Config, Network
     monkeypatch.setitem(sys.modules, "linear_agent", module)
-    monkeypatch.setitem(AGENTS, "linear", Agent("linear_agent"))
+    monkeypatch.setattr(AGENTS, "_loaded", dict(AGENTS._loaded))
+    AGENTS.register(Agent("linear", "linear_agent"))
 
 
 def test_an_agent_of_another_module_trains_and_acts(linear, tmp_path):

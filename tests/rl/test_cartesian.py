@@ -3,7 +3,7 @@
 import numpy as np
 
 from helpers.scenes import robot
-from morphgen.rl.cartesian import OneTool
+from morphgen.rl.baselines.cartesian import OneTool
 from morphgen.tasks.bodies import bodies_of
 
 

@@ -23,7 +23,7 @@ from morphgen.rl.evaluation import (
 from morphgen.rl.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs import read_checkpoint, write_checkpoint
 from morphgen.rl.scores import scores_to_json
-from morphgen.rl.training import checkpoints, parts_of, train
+from morphgen.rl.training import checkpoint_files, subruns_of, train
 from morphgen.tasks.make import batch_of
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
@@ -142,12 +142,12 @@ def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=64)
     train(tmp_path, config, execution=QUIET)
     own = evaluate_run(tmp_path, "train", EVAL, "deterministic")
-    names = [part.config.source.member for part in parts_of(tmp_path, config)]
+    names = [part.config.source.member for part in subruns_of(tmp_path, config)]
     assert sorted(each.robot for each in own) == sorted(names)
     assert [each.episodes for each in own] == [2, 2]
     (test,) = evaluate_run(tmp_path, "test", EVAL, "deterministic")
     assert (test.side, test.episodes) == ("test", 4)
-    files = list(checkpoints(tmp_path))
+    files = list(checkpoint_files(tmp_path))
     assert evaluate_checkpoints(files, small_source(), EVAL, "deterministic") == own
     others = replace(small_source(), goal_seed=1)
     again = evaluate_checkpoints(files, others, EVAL, "deterministic")
@@ -232,7 +232,7 @@ def test_obstacles_may_be_on_one_side_or_around_one_robot_alone(agent, tmp_path)
         source = split_source(split(own, (made("base=gantry ee=plane", test),)))
         config, folder = small_config(source, agent=agent, total_timesteps=64), tmp_path / place
         train(folder, config, execution=QUIET)
-        for part in parts_of(folder, config):
+        for part in subruns_of(folder, config):
             assert read_checkpoint(part.folder)[1]["layout"]["obstacles"] == 3
         for side, count in (("train", 2), ("test", 1)):
             assert len(evaluate_run(folder, side, EVAL, "deterministic")) == count

@@ -12,6 +12,7 @@ from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.metrics import explained_variance
 from morphgen.rl.ppo import (
     KL_FACTOR,
     MIN_ACTOR_LR_SCALE,
@@ -21,7 +22,6 @@ from morphgen.rl.ppo import (
     next_actor_lr_scale,
     policy_loss,
 )
-from morphgen.rl.report import explained_variance
 from morphgen.rl.rollout_buffer import RolloutBuffer
 from morphgen.rl.symlog import symlog
 

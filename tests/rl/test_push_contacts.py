@@ -6,7 +6,7 @@ import pytest
 from helpers.scenes import ball
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import Link
-from morphgen.rl.push_contacts import leaning, poised
+from morphgen.rl.baselines.push_contacts import leaning, poised
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 

@@ -15,6 +15,7 @@ from helpers.learners import learner
 from helpers.runs import small_config, small_source
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.rl.learner_state import state_of
+from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.recorders import (
     METRICS,
     Metrics,
@@ -23,7 +24,6 @@ from morphgen.rl.recorders import (
     recording,
     require_wandb,
 )
-from morphgen.rl.report import Report
 from morphgen.rl.robot_source import robot_source, specs_of
 from morphgen.rl.runs import (
     CHECKPOINT,
@@ -39,9 +39,9 @@ from morphgen.tasks.env_specs import GoalConfig
 
 
 def report(update, success=0.5):
-    numbers = [each.name for each in fields(Report) if each.type == "float"]
+    numbers = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
     numbers.remove("success")
-    return Report(
+    return UpdateMetrics(
         update=update,
         transitions=32 * update,
         scores=(1.0, math.nan),

@@ -6,8 +6,8 @@ import torch
 
 from helpers.scenes import robot
 from morphgen.model.kinematics_torch import frame_positions
-from morphgen.rl.push_plans import PushPlanner
-from morphgen.rl.scripted_push import PLANS, RISE, ScriptedPush
+from morphgen.rl.baselines.push_planner import PushPlanner
+from morphgen.rl.baselines.scripted_push import PLANS, RISE, ScriptedPush
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig

@@ -28,11 +28,11 @@ from morphgen.rl.study import (
     baseline_cells,
     matched_budget,
     read_scores,
-    work_here,
-    work_on_ray,
+    run_cells,
+    run_cells_on_ray,
 )
 from morphgen.rl.study_report import CURVES, DATA, ROBOTS, TABLE, rows, table_text, write_tables
-from morphgen.rl.training import parts_of
+from morphgen.rl.training import subruns_of
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +48,7 @@ def cells_in(folder, agents=("se", "me-mlp"), seeds=(0, 1)):
 
 
 def finished(cells):
-    outcomes = list(work_here(cells, QUIET))
+    outcomes = list(run_cells(cells, QUIET))
     assert [each.error for each in outcomes] == [""] * len(cells)
 
 
@@ -103,12 +103,12 @@ def test_a_killed_study_goes_on_where_it_was(whole, tmp_path):
         return told
 
     with pytest.raises(Killed):
-        list(work_here(cells, QUIET, show))
+        list(run_cells(cells, QUIET, show))
     done = [cell for cell in cells if read_scores(cell) is not None]
     assert [cell.agent for cell in done] == ["random", "zero", "ik"]
     first_robot = cells[3].folder / "robots" / begun[0][0].name
     kept = {cell.folder: tree(cell.folder) for cell in done} | {first_robot: tree(first_robot)}
-    list(work_here(cells, QUIET, show))
+    list(run_cells(cells, QUIET, show))
     assert [path for path, _ in begun].count(begun[0][0]) == 1
     for folder, before in kept.items():
         assert tree(folder) == before
@@ -130,7 +130,7 @@ def test_a_cell_that_another_process_works_on_is_left_for_last(tmp_path, monkeyp
         threading.Thread(target=other.release).start()
 
     monkeypatch.setattr(study.time, "sleep", wait)
-    order = [outcome.cell.agent for outcome in work_here(cells, QUIET)]
+    order = [outcome.cell.agent for outcome in run_cells(cells, QUIET)]
     assert order == ["zero", "ik", "random"]
     assert waits
 
@@ -140,7 +140,7 @@ def test_a_cell_that_fails_is_told_and_does_not_stop_the_others(tmp_path):
     other = replace(bad, config=replace(bad.config, ppo=replace(bad.config.ppo, gamma=0.5)))
     finished([other])
     (bad.folder / SCORES).unlink()
-    outcomes = list(work_here([bad, good], QUIET))
+    outcomes = list(run_cells([bad, good], QUIET))
     assert "another run: ppo.gamma 0.5, not 0.99" in outcomes[0].error
     assert outcomes[1].error == ""
     assert read_scores(bad) is None
@@ -164,7 +164,7 @@ def test_what_nobody_foresaw_does_not_stop_the_others_either(tmp_path, monkeypat
         return train(folder, config, **options)
 
     monkeypatch.setattr(study, "train", without_memory)
-    outcomes = list(work_here([bad, good], QUIET))
+    outcomes = list(run_cells([bad, good], QUIET))
     assert [each.error for each in outcomes] == ["RuntimeError: CUDA out of memory", ""]
     assert "Traceback" in capsys.readouterr().err
 
@@ -320,8 +320,8 @@ def test_an_agent_on_the_test_robots_has_as_much_data_of_each_as_on_the_train_ro
     own = matched_budget(config)
     assert own.ppo.total_timesteps == -(-6400 * test // train)
     assert own.num_envs == -(-config.num_envs * test // train)
-    (part, *_) = parts_of(Path("se"), replace(config, source=other_side(source, "train")))
-    (alone, *_) = parts_of(Path("se@test"), own)
+    (part, *_) = subruns_of(Path("se"), replace(config, source=other_side(source, "train")))
+    (alone, *_) = subruns_of(Path("se@test"), own)
     assert (alone.config.ppo, alone.config.num_envs) == (part.config.ppo, part.config.num_envs)
     assert matched_budget(replace(config, full_budget=True)) == replace(config, full_budget=True)
 
@@ -331,7 +331,7 @@ def test_ray_does_the_same(whole, tmp_path):
     pytest.importorskip("ray")
     cells = cells_in(tmp_path, seeds=(0,))
     for _ in range(2):
-        outcomes = list(work_on_ray(None)(cells, QUIET))
+        outcomes = list(run_cells_on_ray(None)(cells, QUIET))
         assert sorted(each.cell.agent for each in outcomes) == sorted(c.agent for c in cells)
         assert all(each.error == "" for each in outcomes)
     same = [cell for cell in whole if cell.seed != 1]

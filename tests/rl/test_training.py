@@ -24,9 +24,9 @@ from morphgen.rl.robot_source import robot_source, split_source
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config, write_checkpoint
 from morphgen.rl.training import (
     ExecutionConfig,
-    checkpoints,
-    parts_of,
+    checkpoint_files,
     require_runnable,
+    subruns_of,
     train,
     updates_between,
 )
@@ -153,9 +153,9 @@ def test_se_trains_a_policy_for_each_robot_which_share_environments_and_transiti
         (2, 64)
     ] * 2
     assert len({part.config.seed for part in parts} | {config.seed}) == 3
-    assert [file.parent.name for file in checkpoints(tmp_path / "run")] == sorted(names)
+    assert [file.parent.name for file in checkpoint_files(tmp_path / "run")] == sorted(names)
     assert not equal(*(weights(part.folder) for part in parts))
-    whole = parts_of(tmp_path, replace(config, full_budget=True))
+    whole = subruns_of(tmp_path, replace(config, full_budget=True))
     assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in whole] == [
         (4, 128)
     ] * 2
@@ -164,7 +164,7 @@ def test_se_trains_a_policy_for_each_robot_which_share_environments_and_transiti
 def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=128)
     train(tmp_path / "whole", config, execution=QUIET)
-    parts = parts_of(tmp_path / "cut", config)
+    parts = subruns_of(tmp_path / "cut", config)
     begun = []
 
     def show(part):
@@ -178,7 +178,7 @@ def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
             continue
     first, second = (part.config.source.member for part in parts)
     assert begun == [first, second, second]
-    for part, same in zip(parts, parts_of(tmp_path / "whole", config), strict=True):
+    for part, same in zip(parts, subruns_of(tmp_path / "whole", config), strict=True):
         assert equal(weights(part.folder), weights(same.folder))
 
 
@@ -188,7 +188,7 @@ def test_a_run_of_se_with_robots_that_have_no_policy_yet_is_not_taken_for_whole(
     (parts[0].folder / CHECKPOINT).unlink()
     says = f"1 of its 2 robots have no policy yet, such as {parts[0].folder.name}"
     with pytest.raises(TaskError, match=says):
-        list(checkpoints(tmp_path / "run"))
+        list(checkpoint_files(tmp_path / "run"))
 
 
 def test_a_robot_that_was_changed_since_is_another_run(tmp_path, monkeypatch):
@@ -208,8 +208,8 @@ def test_a_robot_that_was_changed_since_is_another_run(tmp_path, monkeypatch):
 
 
 def test_an_agent_of_many_robots_and_one_robot_are_one_run(tmp_path):
-    assert len(parts_of(tmp_path, small_config(small_source()))) == 1
-    assert len(parts_of(tmp_path, small_config(agent="se"))) == 1
+    assert len(subruns_of(tmp_path, small_config(small_source()))) == 1
+    assert len(subruns_of(tmp_path, small_config(agent="se"))) == 1
 
 
 def test_fine_tuning_begins_with_the_networks_of_a_checkpoint(tmp_path):

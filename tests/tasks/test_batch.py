@@ -12,11 +12,10 @@ from morphgen.errors import TaskError
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import TOOL
+from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.simple import Random, Zero
-from morphgen.rl.references import InverseKinematics
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.config import BINS
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import batch_of, make_batch
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.points import NOISE
@@ -147,8 +146,7 @@ def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
 
 def test_inverse_kinematics_goes_around_what_is_in_the_way(made):
     batch = made(12, robots=(1, 1, 2))
-    spaces = [FreeSpace(setting.scene) for setting in batch.specs]
-    steps = run(batch, InverseKinematics(0, spaces), CONFIG.steps)
+    steps = run(batch, InverseKinematics(0), CONFIG.steps)
     assert steps[-1].success.float().mean() >= 0.9
 
 

@@ -15,7 +15,7 @@ from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
 from morphgen.rl import runs
-from morphgen.rl.play import controller, play
+from morphgen.rl.play import make_controller, play
 from morphgen.rl.training import train
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.viewer.address import Address
@@ -62,7 +62,7 @@ def episode(places, cache):
 def test_an_episode_is_the_one_that_morphgen_play_has(episode):
     env = TaskEnv("reach", "planar-cube", sim="mujoco")
     results = []
-    list(play(env, controller("ik", env, 3), 1, 3, results.append))
+    list(play(env, make_controller("ik", env, 3), 1, 3, results.append))
     env.close()
     track = episode.tracks[0]
     (result,) = results

@@ -12,7 +12,7 @@ Metrics = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Report:
+class UpdateMetrics:
     """Metrics of one update; means over its transitions unless said otherwise."""
 
     update: int

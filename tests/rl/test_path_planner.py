@@ -7,7 +7,7 @@ import pytest
 
 from helpers.scenes import ball
 from morphgen.model.geometry import Pose
-from morphgen.rl.free_ways import STRIDE, FreeWays, Price
+from morphgen.rl.baselines.path_planner import STRIDE, FreeWays, Price
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 

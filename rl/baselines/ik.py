@@ -8,11 +8,12 @@ import numpy as np
 import torch
 
 from morphgen.model.inverse_kinematics_torch import solve_position_ik
-from morphgen.rl.free_ways import FreeWays, Routes, Way, shares_to
+from morphgen.rl.baselines.path_planner import FreeWays, Routes, Way, shares_to
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
 STARTS = 16
@@ -32,26 +33,25 @@ class InverseKinematics:
     """Finds a configuration whose tool is at the goal when an episode begins, and goes there.
 
     Damped least squares (Wampler 1986) from several starts within the joints' limits; the nearest
-    that arrives is taken. With ``spaces`` it is one to which a way is free, as ``FreeWays`` finds
-    them; only if there is none, the nearest.
+    that arrives is taken to which a way is free, as ``FreeWays`` finds them; only if there is none,
+    the nearest.
     """
 
-    def __init__(self, seed: int, spaces: Sequence[FreeSpace] = ()) -> None:
-        """Prepare.
-
-        Args:
-            seed: Of the starts that are tried.
-            spaces: What is free, by robot; nothing is looked at without.
-        """
+    def __init__(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
-        self._spaces, self._seed = spaces, seed
+        self._seed = seed
+        self._specs: Sequence[EnvSpec] = ()
+        self._spaces: list[FreeSpace] = []
         self._ways: dict[int, FreeWays] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """A step along the way, all joints in proportion."""
+        if self._specs is not task.specs:
+            self._specs, self._ways = task.specs, {}
+            self._spaces = [FreeSpace(spec.scene) for spec in task.specs]
         if self._task is not task:
-            self._task, self._routes, self._ways = task, Routes(task), {}
+            self._task, self._routes = task, Routes(task)
         new = torch.nonzero(task.elapsed == 0)[:, 0]
         if len(new):
             self._plan(task, new)
@@ -59,11 +59,11 @@ class InverseKinematics:
         return actions_of(shares_to(task, self._routes.wanted), task.kind)
 
     def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
-        for attempt in range(ROUNDS if self._spaces else 1):
+        for attempt in range(ROUNDS):
             found = self._solved(task, envs, attempt)
             missed = []
             for i, (env, ends) in enumerate(zip(envs.tolist(), found, strict=True)):
-                way = self._way(task, env, ends, attempt) if self._spaces else None
+                way = self._way(task, env, ends, attempt)
                 if way is None:
                     missed.append(i)
                 if way or attempt == 0:

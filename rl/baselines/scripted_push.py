@@ -10,8 +10,8 @@ import torch
 
 from morphgen.model.inverse_kinematics_torch import pose_ik_step
 from morphgen.model.kinematics_torch import frame_positions
-from morphgen.rl.free_ways import Routes, shares_to
-from morphgen.rl.push_plans import SPEED, Plan, PushPlanner
+from morphgen.rl.baselines.path_planner import Routes, shares_to
+from morphgen.rl.baselines.push_planner import SPEED, Plan, PushPlanner
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import CONTROL_PERIOD

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.kinematics import joint_limits, unwrap_joints
-from morphgen.rl.connect import FreePart, Tree, connected, explored, shortened
+from morphgen.rl.baselines.rrt_connect import FreePart, Tree, connected, explored, shortened
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from morphgen.model.dynamics import actuation
 from morphgen.model.inverse_kinematics import solve_position_ik
 from morphgen.model.kinematics import frame_jacobian, unwrap_joints
-from morphgen.rl.cartesian import OneTool
-from morphgen.rl.free_ways import FreeWays, Price, Way
-from morphgen.rl.push_contacts import Poised, leaning, poised, touches
+from morphgen.rl.baselines.cartesian import OneTool
+from morphgen.rl.baselines.path_planner import FreeWays, Price, Way
+from morphgen.rl.baselines.push_contacts import Poised, leaning, poised, touches
 from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.feasibility import free_within

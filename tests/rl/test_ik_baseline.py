@@ -10,11 +10,11 @@ from helpers.scenes import robot
 from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import Frame, Joint, Link, Robot
-from morphgen.rl.connect import explored
-from morphgen.rl.free_ways import LEGS, FreeWays, Routes, shares_to
-from morphgen.rl.references import STARTS, InverseKinematics, random_starts
+from morphgen.rl.baselines.ik import STARTS, InverseKinematics, random_starts
+from morphgen.rl.baselines.path_planner import LEGS, FreeWays, Routes, shares_to
+from morphgen.rl.baselines.rrt_connect import explored
+from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.rl.rollouts import run_episodes
-from morphgen.rl.scripted_push import ScriptedPush
 from morphgen.tasks.actions import actions_of
 from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.free_space import FreeSpace
@@ -40,10 +40,6 @@ def made(tmp_path):
     yield make
     for batch in opened:
         batch.close()
-
-
-def spaces(batch):
-    return [FreeSpace(setting.scene) for setting in batch.specs]
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
@@ -137,7 +133,7 @@ def test_starts_are_the_given_one_and_others_that_leave_fingers_alone(made):
 @pytest.mark.parametrize("words", [CLAW, CHAIN])
 def test_goals_are_reached_though_links_are_in_each_others_way(made, words):
     batch = made(words, 8)
-    episodes = run_episodes(batch, InverseKinematics(0, spaces(batch)), 1)
+    episodes = run_episodes(batch, InverseKinematics(0), 1)
     assert sum(episode.success for episode in episodes) >= 7
 
 

@@ -10,10 +10,10 @@ from helpers.goal_sets import draw_spec
 from helpers.scenes import robot
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
-from morphgen.rl import push_plans
-from morphgen.rl.cartesian import OneTool
-from morphgen.rl.push_contacts import poised
-from morphgen.rl.push_plans import SPEED, PushPlanner
+from morphgen.rl.baselines import push_planner
+from morphgen.rl.baselines.cartesian import OneTool
+from morphgen.rl.baselines.push_contacts import poised
+from morphgen.rl.baselines.push_planner import SPEED, PushPlanner
 from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
@@ -58,7 +58,7 @@ def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
         assert (blocks[:, 1] > block[1]).all()
         return near(configurations).astype(float)
 
-    monkeypatch.setattr(push_plans, "leaning", said)
+    monkeypatch.setattr(push_planner, "leaning", said)
     assert near(first)
     assert not near(planner.plan(q, block).way[-1])
 
