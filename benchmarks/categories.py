@@ -1,11 +1,12 @@
-"""Robots of every category of the benchmark: drawn, counted, checked, loaded everywhere.
+"""Sample robots of every morphology category, count their links, check and load them.
 
     python benchmarks/categories.py [--n 100] [--seed 0] [--only chain,arm3] [--samples 20]
 
-Prints a row a category: links and movable joints beside those of the benchmark, draws that were
-rejected, whether `morphgen check --strict` finds nothing in the bundles, the largest disagreement
-of any loader in tool position, and robots drawn in a second by one process (bundle and loaders
-not counted). Exit code 1 if anything is not as it should be.
+Prints one row per category: links and movable joints next to the paper's numbers, rejected draws,
+whether `morphgen check --strict` passes for all bundles, the largest difference of the tool
+position between any two loaders, and robots sampled per second by one process (without writing and
+loading). The exit code is 1 if a category differs from the paper, a check fails or loaders
+disagree.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ from morphgen.grammar.model import find_grammar, grammar_names, load_grammar
 from morphgen.grammar.sampling import draw
 
 Counts = tuple[Iterable[int], Iterable[int]]
-"""Numbers of links, and of movable joints, that a robot may have."""
+"""Allowed numbers of links and of movable joints."""
 
 
 @dataclass(frozen=True)
 class Spec:
-    """What the benchmark's table says of a category."""
+    """The paper's numbers of links and movable joints of one category."""
 
     text: str
-    """Links / movable joints."""
+    """Text of the table: links / movable joints."""
     counts: Callable[[Derivation], Counts]
 
 
@@ -54,7 +55,7 @@ def _within(links: tuple[int, int], movable: tuple[int, int]) -> Spec:
 
 
 def _by_number(text: str, part: str, links: tuple[int, int], movable: tuple[int, int]) -> Spec:
-    """Counts that go with the number n of a part: (a, b) stands for a n + b."""
+    """Return a spec whose counts are linear in the number n of a part: (a, b) means a n + b."""
 
     def counts(derivation: Derivation) -> Counts:
         n = sum(node.part == part for node in derivation.walk())
@@ -81,7 +82,7 @@ SPEC = {
 
 
 def main() -> int:
-    """Run all categories."""
+    """Sample and check all categories, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--n", type=int, default=100, help="robots of each category")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,28 +1,28 @@
-"""Environment steps a second: raw PyBullet, morphgen, panda-gym and MuJoCo in one run.
+"""Environment steps per second of raw PyBullet, morphgen, panda-gym and MuJoCo in one run.
 
     python benchmarks/env_speed.py [--envs 128] [--seconds 4] [--rounds 3] [--json rows.json]
 
-Reach and push of a Panda with its hand and reach of a UR5 with a plate, collision shapes of fitted
-primitives; random actions, whole episodes, the same in all rows that are ours; steps of 5 ms, four
-to an action. Rows of a task:
+Reach and push of a Panda with its hand, and reach of a UR5 with a plate, with collision shapes of
+fitted primitives. All rows of morphgen use the same random actions and whole episodes. A control
+step has four physics steps of 5 ms. Rows of a task:
 
-- raw PyBullet: the same scenes under the same actions, and of that only what is spent within
-  `stepSimulation`: as if targets, states, observations and rewards cost nothing. In two processes,
-  each with half of the environments, it is what the machine's cores have to give.
-- morphgen with PyBullet in one process and in two, with MuJoCo in one thread and in two:
-  observations, rewards and new episodes on.
-- two processes of morphgen with PyBullet that know nothing of each other: what two in one batch
-  could be if they never had to wait; and MuJoCo where nothing touches anything, as if finding
-  contacts cost nothing.
-- morphgen with PyBullet and without self-collision, which panda-gym does not have; and with the 50
-  iterations of the solver that panda-gym has, where we have 200 if there is a block.
-- panda-gym, its own scene and observation, joint control, its physics set to the same steps; one
-  environment in one process, and one in each of two (Gymnasium's vector environments).
+- raw PyBullet: the same scenes and actions, counting only the time inside `stepSimulation`.
+  Targets, states, observations and rewards cost nothing here. With two processes, each steps half
+  of the environments; this is the physical limit of the machine.
+- morphgen with PyBullet in one and two processes, and with MuJoCo in one and two threads, with
+  observations, rewards and resets.
+- two independent processes of morphgen with PyBullet: the limit of one batch with two workers that
+  never wait for each other. MuJoCo in a scene without contacts: the limit without collision
+  detection.
+- morphgen with PyBullet without self-collision, which panda-gym lacks, and with panda-gym's 50
+  solver iterations (morphgen uses 200 if the scene has a block).
+- panda-gym with its own scene and observation, joint control and the same physics steps: one
+  environment in one process, and one in each of two processes (Gymnasium's vector environments).
 
-Every row is measured in turn, in every round, so that what else the machine does hits all; the
-figures are medians of the rounds. "of raw" is the ratio to raw PyBullet of the same task.
+Every round measures all rows in turn, so that other load on the machine affects all rows. The
+figures are medians over the rounds. "of raw" is the ratio to raw PyBullet of the same task.
 
-panda-gym comes with `pip install morphgen[bench]`; without it its rows are left out.
+panda-gym comes with `pip install morphgen[bench]`; without it its rows are missing.
 """
 
 from __future__ import annotations
@@ -55,21 +55,21 @@ from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
 from morphgen.tasks.speed import measure, random_actions
 
 Rate = Callable[[float], float]
-"""Environment steps a second, measured for so many seconds at least."""
+"""Measure environment steps per second over at least the given number of seconds."""
 CASES: tuple[tuple[str, str, str], ...] = (
     ("reach", "arm=panda ee=panda_hand", "PandaReachJoints-v3"),
     ("push", "arm=panda ee=panda_hand", "PandaPushJoints-v3"),
     ("reach", "arm=ur5 ee=plane", ""),
 )
-"""Task, robot, and the environment of panda-gym that does the same."""
+"""Task, robot, and the panda-gym environment of the same task."""
 RAW = "raw PyBullet"
 EPISODE = ReachConfig.steps
-"""Control steps; every one has actions of its own, and every row is of whole episodes."""
+"""Episode length [control steps]; every row runs whole episodes."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A way to step the environments of a task."""
+    """One way to step the environments of a task."""
 
     case: str
     name: str
@@ -77,7 +77,7 @@ class Row:
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all rows and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--envs", type=int, default=128)
     parser.add_argument("--seconds", type=float, default=4.0, help="of every row in every round")
@@ -159,7 +159,7 @@ def _ours(
 
 
 def _hasty(rate: Rate, seconds: float) -> float:
-    """With as many iterations of the solver as PyBullet has by default, and panda-gym."""
+    """Use PyBullet's default number of solver iterations, which panda-gym uses too."""
     iterations = bullet_scene.ITERATIONS
     bullet_scene.ITERATIONS = 50
     try:

@@ -1,18 +1,18 @@
-"""The best that one primitive can do for a link: our fit beside brute force from random starts.
+"""Upper bound of one-primitive fits: compare our fit with brute force from random starts.
 
     python benchmarks/fit_ceiling.py [--only ur5,panda] [--starts 300] [--jobs 2] [--json rows.json]
-    python benchmarks/fit_ceiling.py --points links.npz --draw          # where the library is
+    python benchmarks/fit_ceiling.py --points links.npz --draw          # writes the point clouds
     python benchmarks/fit_ceiling.py --points links.npz --device cuda   # needs only NumPy and torch
 
-For each distinct link of the arms that the target speaks of: that many boxes, cylinders and
-spheres each, at random places, random ways up, of random sizes, climb the intersection over union
-with the link's solid in three rounds, each with more points for the better ones. Nothing of our
-guesses, and none of the code that moves them, is used. Best and ours are then counted on the same
-fresh points, so their difference is surer than they are.
+For each distinct link of the arms, the script draws boxes, cylinders and spheres of random
+position, rotation and size. Gradient ascent raises their intersection over union (IoU) with the
+link's solid in three rounds; later rounds keep the best candidates and use more points. The script
+shares no initial guesses and no optimisation code with the fitter. The best candidate and our fit
+are then measured on the same new points, so their difference is more precise than the two values.
 
-A row a link: ours, and its kind; the best found, and its kind; the difference; how many of the
-last round of that kind end within 0.002 of the best (many: it is the top of the hill, and other
-starts would bring no more); the best of each kind.
+Columns: IoU and kind of our fit; IoU and kind of the best candidate; the difference; the number of
+candidates of the last round within 0.002 of the best (a large number means that more starts would
+not help); the best IoU of each kind.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ if TYPE_CHECKING:
 
 KINDS = ("box", "cylinder", "sphere")
 FRESH_SEEDS = (101, 102, 103, 104)
-"""Of the points that tell what a fit is worth; each draws as many as a search sees."""
+"""Seeds of the points that measure a fit; each draws as many points as a search uses."""
 NEAR_BEST = 0.002
 HEADERS = ("link", "ours", "kind", "best", "kind", "more", "ends there", *KINDS)
 
 
 @dataclass(frozen=True)
 class Round:
-    """Steps of gradient ascent for some of the candidates."""
+    """Settings of one round of gradient ascent."""
 
     candidates: int | None
-    """How many are moved, the best of those before; None for all."""
+    """Number of candidates to optimise, the best ones of the previous round; None for all."""
     points: int
     steps: int
     softness: tuple[float, float]
-    """Width of a primitive's surface at the first and at the last step, in sizes of the solid."""
+    """Width of a primitive's soft surface at the first and last step [sizes of the solid]."""
     rate: tuple[float, float]
-    """Step sizes at the first and at the last step, likewise."""
+    """Learning rate at the first and last step [sizes of the solid]."""
 
 
 ROUNDS = (
@@ -69,40 +69,40 @@ ROUNDS = (
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A link's solid as points, in a frame of its own and in units of its size, and our fit."""
+    """A link's solid as points, in its own frame and in units of its size, and our fit."""
 
     names: NDArray[np.str_]
     """``arm/link`` of all links with these meshes."""
     points: NDArray[np.float32]
-    """Shape (n, 3): what the climb sees, in no order."""
+    """Points for the optimisation, in random order, shape (n, 3)."""
     inside: NDArray[np.bool_]
     weights: NDArray[np.float32]
     fresh_points: NDArray[np.float32]
-    """Shape (m, 3): what the end is counted on."""
+    """Points for the final measurement, shape (m, 3)."""
     fresh_inside: NDArray[np.bool_]
     fresh_weights: NDArray[np.float32]
     kind: NDArray[np.int64]
-    """Of our fit, index into ``KINDS``, shape ()."""
+    """Kind of our fit as an index into ``KINDS``, shape ()."""
     placed: NDArray[np.float32]
-    """Our fit: centre, quaternion and half extents, shape (1, 10)."""
+    """Our fit as centre, quaternion and half extents, shape (1, 10)."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points of a target on a device."""
+    """A target's points on a device."""
 
     points: Tensor
     inside: Tensor
     weights: Tensor
 
     def first(self, n: int) -> Cloud:
-        """Some of the points."""
+        """Return the first points."""
         return Cloud(self.points[:n], self.inside[:n], self.weights[:n])
 
 
 @dataclass(frozen=True)
 class Ceiling:
-    """What came out for a link."""
+    """Result of brute force for one link."""
 
     names: tuple[str, ...]
     kind: str
@@ -113,7 +113,7 @@ class Ceiling:
     of_kind: tuple[float, ...]
 
     def row(self) -> list[object]:
-        """For the table."""
+        """Return the row of the table."""
         more = self.best - self.ours
         ends = f"{self.near_best} of {ROUNDS[-1].candidates}"
         found = [self.ours, self.kind, self.best, self.best_kind, more, ends, *self.of_kind]
@@ -121,7 +121,7 @@ class Ceiling:
 
 
 def main() -> int:
-    """Search and print."""
+    """Search all links and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="parts of arm/link, separated by commas")
     parser.add_argument("--starts", type=int, default=300, help="of each kind")
@@ -163,13 +163,13 @@ def main() -> int:
 
 
 def ceiling(target: Target, *, starts: int, seed: int, device: str) -> Ceiling:
-    """Brute force for one link.
+    """Search one link by brute force.
 
     Args:
-        target: Its points, and our fit.
-        starts: How many of each kind.
-        seed: Of the starts.
-        device: Where to compute, a name of torch's.
+        target: Points of the link's solid, and our fit.
+        starts: Number of random candidates of each kind.
+        seed: Seed of the candidates.
+        device: Name of the torch device.
     """
     cloud = _cloud(target.points, target.inside, target.weights, device)
     fresh = _cloud(target.fresh_points, target.fresh_inside, target.fresh_weights, device)
@@ -194,7 +194,7 @@ def ceiling(target: Target, *, starts: int, seed: int, device: str) -> Ceiling:
 
 
 def _random(cloud: Cloud, n: int, rng: np.random.Generator) -> Tensor:
-    """Centres in the solid's bounding box, any way up, half extents over a decade: (n, 10)."""
+    """Draw centres in the bounding box, uniform rotations and log-uniform half extents: (n, 10)."""
     body = cloud.points[cloud.inside]
     low, high = body.amin(dim=0), body.amax(dim=0)
     centres = low + (high - low) * torch.from_numpy(rng.random((n, 3))).to(low)
@@ -213,7 +213,7 @@ def _climbed(kind: int, placed: Tensor, cloud: Cloud) -> Tensor:
 
 
 def _ascended(kind: int, placed: Tensor, cloud: Cloud, how: Round) -> Tensor:
-    """Candidates (n, 10) after the steps of a round."""
+    """Return the candidates, shape (n, 10), after the gradient steps of a round."""
     centres, quaternions, halves = (part.clone() for part in _parts(placed))
     quaternions /= quaternions.norm(dim=1, keepdim=True)
     logs = halves.log()
@@ -239,7 +239,7 @@ def _ascended(kind: int, placed: Tensor, cloud: Cloud, how: Round) -> Tensor:
 
 @torch.no_grad()
 def _counted(kind: int, placed: Tensor, cloud: Cloud) -> Tensor:
-    """Intersection over union of candidates (n, 10), shape (n,)."""
+    """Return the intersection over union of candidates (n, 10), shape (n,)."""
     found = []
     for start in range(0, len(placed), 16):
         member = _distance(kind, *_parts(placed[start : start + 16]), cloud.points) <= 0
@@ -252,14 +252,14 @@ def _counted(kind: int, placed: Tensor, cloud: Cloud) -> Tensor:
 
 
 def _parts(placed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres, quaternions and half extents."""
+    """Split candidates into centres, quaternions and half extents."""
     return placed[:, :3], placed[:, 3:7], placed[:, 7:]
 
 
 def _distance(
     kind: int, centres: Tensor, quaternions: Tensor, halves: Tensor, points: Tensor
 ) -> Tensor:
-    """Signed distance of points (m, 3) to primitives of a kind, (n, ...); shape (n, m)."""
+    """Return the signed distances of points (m, 3) to n primitives of a kind, shape (n, m)."""
     x, y, z = ((points - centres[:, None]) @ _rotations(quaternions)).unbind(dim=2)
     a, b, c = halves[:, :, None].unbind(dim=1)
     match KINDS[kind]:
@@ -274,7 +274,7 @@ def _distance(
 
 
 def _rotations(quaternions: Tensor) -> Tensor:
-    """Rotation matrices (n, 3, 3) of quaternions (w, x, y, z), of any length."""
+    """Return rotation matrices (n, 3, 3) of quaternions (w, x, y, z) of any norm."""
     unit = quaternions / quaternions.norm(dim=1, keepdim=True)
     w, v = unit[:, :1, None], unit[:, None, 1:]
     eye = torch.eye(3).to(v)

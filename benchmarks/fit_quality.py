@@ -1,27 +1,27 @@
-"""How well primitives stand for links, beside trimesh's tightest bound and scikit-robot.
+"""Quality of primitive fits, compared with trimesh's tightest bound and scikit-robot.
 
     python benchmarks/fit_quality.py [--only ur5,panda] [--solid link,as-read] [--jobs 2]
                                      [--json rows.json]
 
-Every link of every real arm, the same solid and the same measure for all, that of
-`morphgen.fitting.quality`. A table for each solid:
+Measures every link of every real arm. All methods use the same solid and the measure of
+`morphgen.fitting.quality`. Prints one table per definition of the solid:
 
-- ``link``: what `morphgen.fitting.solid` takes for the inside of the link.
-- ``as-read``: a mesh's own triangles if trimesh finds them closed just as it reads the file, and
-  the convex hull of any other mesh. COLLADA files, whose vertices are split at sharp edges, are
-  never closed so, and their links (all of the Jaco's) become fuller than they are.
-- ``hull``: the convex hull of each mesh, which is what simulators collide with.
+- ``link``: the interior of the link as `morphgen.fitting.solid` defines it.
+- ``as-read``: a mesh's own triangles if trimesh reads the file as a closed surface, else the convex
+  hull. COLLADA files split vertices at sharp edges and are therefore never closed, so that links
+  from COLLADA files (all of the Jaco's) are fuller than they should be.
+- ``hull``: the convex hull of each mesh, which simulators use for collisions.
 
-A row an arm, means over its links (links with the same meshes
-are fitted once):
+A row is an arm; values are means over its links (links with the same meshes are fitted once):
 
-- IoU of one primitive: trimesh's tightest of oriented box, cylinder and sphere (what AnyBody uses),
-  scikit-robot's, ours; ours with up to four primitives, and how many these are.
-- Enclosing: volume over the solid's volume, and least coverage, of scikit-robot's and ours.
-- Processor seconds a link, measuring included for ours: scikit-robot's; ours with one primitive
+- IoU of one primitive: trimesh's tightest of oriented box, cylinder and sphere (AnyBody's method),
+  scikit-robot's, ours; ours with up to four primitives, and their number.
+- Enclosing fits: volume divided by the solid's volume, and the smallest coverage, of scikit-robot's
+  and ours.
+- CPU seconds per link, for ours including the measurement: scikit-robot's, ours with one primitive
   and with up to four.
 
-scikit-robot comes with `pip install morphgen[bench]`; without it its columns are left out.
+scikit-robot comes with `pip install morphgen[bench]`; without it its columns are missing.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from morphgen.typing import Array
 
 T = TypeVar("T")
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
-"""The arms that the targets speak of."""
+"""The arms for which issues of this project set targets."""
 ONE = FitOptions()
 UP_TO_FOUR = FitOptions(max_primitives=4, iou=1.0)
 ENCLOSE = FitOptions(enclose=True)
@@ -76,12 +76,12 @@ COLUMNS: dict[str, Callable[[Sequence[dict[str, float]], str], float]] = {
     "s one": lambda rows, key: _mean(rows, key),
     "s four": lambda rows, key: _mean(rows, key),
 }
-"""Columns of the table, and how links are summed up."""
+"""Columns of the table, and how the values of the links are combined."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A link of an arm."""
+    """One link of one arm."""
 
     arm: str
     link: str
@@ -89,7 +89,7 @@ class Task:
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all links and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="arms, separated by commas")
     parser.add_argument("--solid", default="link", help=f"of {', '.join(SOLIDS)}; by commas")
@@ -130,7 +130,7 @@ def _print(found: Mapping[str, Sequence[dict[str, float]]], peer: bool) -> None:
 
 
 def link_tasks(only: set[str]) -> list[Task]:
-    """The links with shapes of the real arms, of all of them if none is named."""
+    """Return the links with shapes of the named real arms, or of all real arms."""
     return [
         Task(manifest.name, link.name, shapes_to_fit(link))
         for manifest in default_library().manifests("arm")
@@ -154,7 +154,7 @@ def _as_read(shapes: Sequence[Shape]) -> Solid:
 
 
 def _meshes(shapes: Sequence[Shape]) -> Iterator[tuple[trimesh.Trimesh, bool]]:
-    """In the link frame, and whether each is closed as its file is read; none that are flat."""
+    """Return meshes in the link frame and whether each file is closed as read; skip flat meshes."""
     for shape in shapes:
         geometry, is_closed = shape.geometry, True
         if isinstance(geometry, Mesh):
@@ -203,7 +203,7 @@ def _measure(task: Task, *, solid_name: str, peer: bool) -> dict[str, float]:
 
 
 def _tightest(solid: Solid) -> Shape:
-    """The least of trimesh's bounding primitives."""
+    """Return the smallest of trimesh's bounding primitives."""
     T_box, extents = trimesh.bounds.oriented_bounds(solid.mesh)
     cylinder = trimesh.bounds.minimum_cylinder(solid.mesh)
     centre, radius = trimesh.nsphere.minimum_nsphere(solid.mesh)

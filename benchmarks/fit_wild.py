@@ -1,12 +1,12 @@
-"""How well primitives stand for meshes that the fitter was not tuned on.
+"""Quality of primitive fits for meshes on which the fitter was not tuned.
 
     python benchmarks/fit_wild.py [--only talos,icub] [--jobs 2]
 
-Every link with meshes of every URDF of example-robot-data (arms, hands, legged robots, humanoids),
-links with the same meshes once; one primitive, and up to four where they are needed for an
-intersection over union of 0.9. Prints the distribution, how solids were made, what was refused,
-and the ten worst with the two figures that explain most: what share of its bounding box a solid
-fills, and what share of its convex hull.
+Fits every link with meshes of every URDF of example-robot-data (arms, hands, legged robots,
+humanoids); links with the same meshes are fitted once. Each link gets one primitive, and up to four
+where an intersection over union of 0.9 needs them. Prints the distribution, the methods that made
+the solids, the refused links, and the ten worst links with two explanations: the share of its
+bounding box and the share of its convex hull that the solid fills.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ WORST = 10
 PROBES = 2**14
 
 Row = tuple[str, str, float, float, int, float, float, float]
-"""Link, solid, IoU of one and of several, how many, share of box, share of hull, seconds."""
+"""Link, solid, IoU of one and of several primitives, their number, box and hull shares, seconds."""
 
 
 def main() -> int:
-    """Measure and print."""
+    """Fit all links and print the summary."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="parts of file names, separated by commas")
     parser.add_argument("--jobs", type=int, default=1)
@@ -69,7 +69,7 @@ def main() -> int:
 
 
 def _links(words: list[str]) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
-    """Shapes by robot and link, the same meshes once; and what cannot be read."""
+    """Return the shapes by robot and link, without repeated meshes, and the unreadable files."""
     urdfs = sorted(
         Path(str(entry.locate()))
         for entry in files("example-robot-data") or []

@@ -1,19 +1,19 @@
-"""Every URDF and xacro of packages through ``morphgen import``, beside ROS's ``check_urdf``.
+"""Import every URDF and xacro of some packages, and compare with ROS's ``check_urdf``.
 
     python benchmarks/import_scoreboard.py [PACKAGE|DIR ...] [--conform] [--all]
 
-A package is named as pip does and must be installed; by default those of ``PACKAGES``. Each file is
-imported in a process of its own, with the package's folder as root, and comes out as one of
+A package is a pip name and must be installed; the default is those of ``PACKAGES``. A process of
+its own imports each file with the package's folder as root. The outcomes are:
 
-    imported   the bundle was written (with --conform: and every loader agrees on it)
-    wrong      it was imported, but a loader disagrees (--conform)
-    refused    morphgen says in one line why
-    fragment   a xacro of macros: no robot in it
-    CRASHED    a traceback, or a time-out
+    imported   the bundle was written (with --conform: and all loaders agree)
+    wrong      the file was imported, but a loader disagrees (--conform)
+    refused    morphgen gives a one-line reason
+    fragment   a xacro with macros only, without a robot
+    CRASHED    a traceback or a time-out
 
-``check_urdf`` (Debian: liburdfdom-tools) is asked about what is refused; for a xacro it cannot be.
-Files that it accepts and morphgen refuses are listed, each with its reason; --all lists every file
-that is not imported. Exit code 1 if anything crashed or is wrong.
+``check_urdf`` (Debian package liburdfdom-tools) reads the refused URDF files; it cannot read xacro.
+The script lists the files that it accepts and morphgen refuses, each with the reason; --all lists
+every file that is not imported. The exit code is 1 if any outcome is CRASHED or wrong.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class Outcome:
     result: str
     reason: str = ""
     accepted: bool | None = None
-    """Whether ``check_urdf`` accepts it; None if it was not asked."""
+    """Whether ``check_urdf`` accepts the file; None if it did not read it."""
 
 
 def main() -> int:
-    """Import everything."""
+    """Import all files and print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -111,7 +111,7 @@ def _files(root: Path) -> Iterator[Path]:
 
 
 def _outcome(package: str, root: Path, path: Path, out: Path, conform: bool) -> Outcome:
-    """Import a file in a process of its own."""
+    """Import one file in a process of its own."""
     receiving, sending = _FORK.Pipe(duplex=False)
     child = _FORK.Process(target=_import, args=(sending, root, path, out, conform))
     child.start()
@@ -165,7 +165,7 @@ def _is_accepted(path: Path) -> bool | None:
 
 
 def _is_fragment(path: Path) -> bool:
-    """Whether a xacro only defines macros and properties, for other files to use."""
+    """Return whether a xacro only defines macros and properties for other files."""
     text = path.read_text(encoding="utf-8", errors="replace")
     outside = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     outside = re.sub(r"<(xacro:)?macro\b.*?</(xacro:)?macro>", "", outside, flags=re.DOTALL)

@@ -1,16 +1,16 @@
-"""Forward kinematics of many configurations: NumPy and torch beside MuJoCo and Pinocchio.
+"""Forward kinematics of many configurations in NumPy, torch, MuJoCo and Pinocchio.
 
     python benchmarks/kinematics.py [--robot "arm=ur5 ee=plane"] [--n 1024] [--rounds 15]
                                     [--device cpu]
 
-Poses of all links, of the tool with its Jacobian, and positions of the tool alone, at random
-configurations. MuJoCo (`mj_kinematics`, for the Jacobian `mj_comPos` and `mj_jacSite`) and
-Pinocchio take one configuration at a time in a Python loop, as every user of theirs does. Each row
-is measured in turn in every round, so that what else the machine does hits all; times are medians,
-"MuJoCo = 1" is the ratio to MuJoCo's time for the same result in the same round, as a median. Torch
-runs with one thread. Robots are compiled before the clock starts.
+Measures the poses of all links, the tool pose with its Jacobian, and the tool position, at random
+configurations. MuJoCo (`mj_kinematics`; for the Jacobian also `mj_comPos` and `mj_jacSite`) and
+Pinocchio take one configuration at a time in a Python loop. Every round measures all rows in turn,
+so that other load on the machine affects all rows. Times are medians; "MuJoCo = 1" is the median
+ratio to MuJoCo's time for the same result in the same round. Torch uses one thread. Compiling the
+robots is not counted.
 
-Without Pinocchio (`pip install morphgen[test]`) its rows are left out.
+Without Pinocchio (`pip install morphgen[test]`) its rows are missing.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from morphgen.typing import Array
 LINKS, JACOBIAN, POSITION = "links", "tool, Jacobian", "tool position"
 Call = Callable[[], object]
 Rows = dict[tuple[str, str], Call]
-"""Calls to measure, by computation and library."""
+"""Functions to measure, by computation and library."""
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all rows and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="arm=ur5 ee=plane")
     parser.add_argument("--n", type=int, default=1024)

@@ -1,38 +1,36 @@
-"""PPO beside that of stable-baselines3: transitions a second, collected and learned from.
+"""Transitions per second of PPO in morphgen and in stable-baselines3.
 
     python benchmarks/ppo_speed.py [--robot ur5-plane] [--envs 64] [--rounds 3] [--threads 1,2]
         [--sims pybullet,mujoco] [--json rows.json]
     python benchmarks/ppo_speed.py --device cuda [--envs 128] [--rounds 3] [--json rows.json]
 
-A row is an update: every environment acts for 128 control steps, and four epochs of 16 minibatches
-learn from it. Equal in all rows of a simulator and number of threads:
+A row is one update: a rollout of 128 control steps in every environment, and four epochs of 16
+minibatches. Within a simulator and number of threads all rows share:
 
-- the environments: reach of one robot, the same batch made anew, with its padding and with the
-  share of their episodes that has passed when they begin; stable-baselines3 gets it as
-  ``morphgen.tasks.sb3.sb3_vector`` makes it. Continuous actions.
-- steps, environments, epochs, minibatches and their size, and so the number of gradient steps;
-  clip range, discount, lambda, entropy weight, Adam; one value and one policy network, apart.
-- threads of torch, and as many workers of the simulator (processes of PyBullet, threads of MuJoCo).
+- the environments: reach of one robot, a new batch with the same padding and the same staggered
+  episodes; stable-baselines3 gets it through ``morphgen.tasks.sb3.sb3_vector``. Continuous actions.
+- rollout length, environments, epochs, minibatches and minibatch size, and thus gradient steps;
+  clip range, discount, GAE lambda, entropy weight, Adam; separate value and policy networks.
+- torch threads, and as many workers of the simulator (PyBullet processes, MuJoCo threads).
 
-"same network" is our MLP of ``se`` as features extractor of stable-baselines3, one for the policy
-and one for values, with its linear layers behind: the same layers with the same number of
-parameters, which is checked. "own MLP" is what stable-baselines3 makes by itself: the flattened
-observation, and as many layers of the same width, tanh between. "Gymnasium" has that network too,
-and as many environments ``morphgen/Reach-v0`` in its ``DummyVecEnv``: what one writes without our
-batch. These have no padding, so that the network is smaller, and no workers.
+"same network" uses our MLP of ``se`` as features extractor of stable-baselines3, one for the policy
+and one for values, each with a linear layer; the script checks that the number of parameters is
+equal. "own MLP" is the default of stable-baselines3: the flattened observation and as many tanh
+layers of the same width. "Gymnasium" also has that network, and as many ``morphgen/Reach-v0``
+environments in a ``DummyVecEnv``: the usual way without our batch. Those have no padding, so that
+the network is smaller, and no workers.
 
-What is not equal: we compute values once more over the whole rollout before learning, keep a
-moving average of the critic, and clip the gradients of policy and values apart. The symlog and the
-slow critic of the paper are off.
+Differences that remain: morphgen computes values again over the whole rollout before learning,
+keeps an exponential moving average of the critic, and clips the gradients of policy and values
+separately. The paper's symlog and slow critic are off.
 
-Rows are measured in turn, in every round, after one update that is not counted; the figures are
-medians of the rounds.
+Every round measures all rows in turn, after one update that is not counted. Figures are medians.
 
-With ``--device`` it measures the learner alone: ``me-tf`` learns from random rollouts of the right
-shapes, with bfloat16 and ``torch.compile`` on and off; samples a second are transitions times
-epochs over the time of learning. No simulator is needed for that.
+With ``--device`` the script measures only the learner: ``me-tf`` learns from random rollouts, with
+bfloat16 and ``torch.compile`` on and off. Samples per second are transitions times epochs divided
+by the learning time. No simulator is needed.
 
-stable-baselines3 comes with `pip install morphgen[bench]`; without it its rows are left out.
+stable-baselines3 comes with `pip install morphgen[bench]`; without it its rows are missing.
 """
 
 from __future__ import annotations
@@ -67,7 +65,7 @@ from morphgen.tasks.config import BINS
 from morphgen.tasks.observation import Observation
 
 Update = Callable[[], tuple[float, float]]
-"""Makes an update; returns the seconds of collection and of learning."""
+"""Run one update; return the seconds of collection and of learning."""
 Row = dict[str, str | int | float]
 
 SE = PolicyConfig("se", discrete=False)
@@ -78,7 +76,7 @@ ROBOTS, OBSTACLES = 10, 3
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all rows and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     cores = os.cpu_count() or 1
     parser.add_argument("--robot", default="ur5-plane")
@@ -107,7 +105,7 @@ def main() -> int:
 
 
 def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Iterator[Row]:  # noqa: ANN401
-    """Rows of a simulator and a number of threads."""
+    """Return the rows of a simulator and a number of threads."""
     from morphgen.tasks.make import make_batch
     from morphgen.tasks.robots import robot_of
 
@@ -146,7 +144,7 @@ def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Itera
 def _measured(
     updates: Mapping[str, Update], rounds: int, what: str
 ) -> dict[str, tuple[float, float]]:
-    """Median seconds of collection and of learning, by name."""
+    """Return the median seconds of collection and of learning, by name."""
     for update in updates.values():
         update()
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in updates}
@@ -166,7 +164,7 @@ def _own_update(learner: Learner) -> tuple[float, float]:
 
 
 def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
-    """Updates of stable-baselines3, with the network of a learner or with one of its own."""
+    """Return the update of stable-baselines3, with a learner's network or with its own."""
     from stable_baselines3 import PPO
 
     network: dict[str, Any]
@@ -220,7 +218,7 @@ def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
 
 
 def _spread(batch: TaskBatch) -> Any:  # noqa: ANN401 - a class of what may not be installed
-    """The batch for stable-baselines3; like a learner's, its first episodes are under way."""
+    """Return the batch for stable-baselines3, with staggered episodes like a learner's."""
     from morphgen.tasks.sb3 import SB3Vector
     from morphgen.tasks.spaces import arrays
     from morphgen.tasks.vector import TaskVector
@@ -233,7 +231,7 @@ def _spread(batch: TaskBatch) -> Any:  # noqa: ANN401 - a class of what may not 
 
 
 def _single(robot: Robot, sim: Any, envs: int) -> Any:  # noqa: ANN401
-    """Gymnasium's environments, one beside the other in one process."""
+    """Return Gymnasium environments, one after the other in one process."""
     import gymnasium
     from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -242,7 +240,7 @@ def _single(robot: Robot, sim: Any, envs: int) -> Any:  # noqa: ANN401
 
 
 def _extractor() -> type[Any]:
-    """Our MLP up to its last layer, as a features extractor of stable-baselines3."""
+    """Return our MLP without its last layer, as a features extractor of stable-baselines3."""
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
     class Extractor(BaseFeaturesExtractor):
@@ -264,12 +262,12 @@ def _extractor() -> type[Any]:
 
 
 def _parameters(*networks: torch.nn.Module) -> int:
-    """How many numbers are learned."""
+    """Return the number of learned parameters."""
     return sum(each.numel() for network in networks for each in network.parameters())
 
 
 def _learners(device: str, envs: int, rounds: int) -> list[Row]:
-    """Rows of the learner alone."""
+    """Return the rows of the learner alone."""
     updates: dict[str, Update] = {}
     settings = list(product((False, True), repeat=2))
     for bf16, compiled in settings:
@@ -294,7 +292,7 @@ def _learners(device: str, envs: int, rounds: int) -> list[Row]:
 
 
 class _RandomBatch:
-    """A stand-in for ``TaskBatch`` whose observations and rewards are random."""
+    """A replacement of ``TaskBatch`` with random observations and rewards."""
 
     kind = "discrete"
 
@@ -326,15 +324,15 @@ class _RandomBatch:
         """There is no line."""
 
     def observe(self) -> Observation:
-        """The same each time."""
+        """Return the same observation each time."""
         return self._seen
 
     def reset(self, *, spread: bool) -> Observation:
-        """Nothing begins."""
+        """Return the first observation."""
         return self._seen
 
     def step(self, actions: torch.Tensor) -> Step:
-        """A score for the action, and nothing else."""
+        """Return a reward that depends on the action, and the same observation."""
         reward = self._score * torch.tensor(BINS, device=self.device)[actions].mean(dim=1)
         return Step(
             observation=self._seen,

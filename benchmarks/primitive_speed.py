@@ -1,22 +1,22 @@
-"""How much faster simulators step a robot whose collision meshes became primitives.
+"""Speed-up of simulators when a robot's collision meshes are replaced by primitives.
 
     python benchmarks/primitive_speed.py [--only panda,ur5] [--single] [--steps 4000] [--blocks 7]
 
-Every real arm that collides with meshes, without a tool, its base fixed: with the meshes, which
-both simulators take for their convex hulls, and with the stored fits of up to four primitives a
-link, or with ``--single`` of one (fitted now where none is stored). Pairs of links that either
-robot ignores are tested on neither. Position targets lead from home through random configurations
-without self-collision, one a second, the same for both robots; steps of 5 ms; no weight; no
-visuals. Two scenes: the arm alone, tested against itself, and above a table, a box right below all
-that the arm is at home, on which every second configuration presses.
+Simulates every real arm with collision meshes, with a fixed base and without a tool: once with the
+meshes, which both simulators replace by convex hulls, and once with the stored fits of up to four
+primitives per link (``--single``: one primitive, fitted now if no fit is stored). Both forms ignore
+the same pairs of links: those that either form ignores. Position targets lead from home through
+random configurations without self-collision, one per second, the same for both forms. Physics steps
+have 5 ms; gravity and visuals are off. There are two scenes: the arm alone, and the arm above a
+table just below its home configuration, on which every second configuration presses.
 
-A row an arm for every scene: links with collision shapes, vertices of their hulls, primitives; and
-for each simulator the share of steps with a contact (meshes, primitives), 1000 steps/s with meshes
-and with primitives, and how many times faster primitives are. The last row is the geometric mean
-of these ratios, without those of simulations that became unstable. Steps/s are the median of the
-blocks, each from home, after one to warm up; meshes and primitives take turns, so that what else
-the machine does hits both. PyBullet makes hulls of cylinders, too, unless told not to, and here it
-is (URDF_USE_IMPLICIT_CYLINDER); it is left out, and told, where it is not installed.
+A row is an arm in a scene: links with collision shapes, vertices of their hulls, primitives; and
+for each simulator the share of steps with a contact (meshes, primitives), thousands of steps per
+second with meshes and with primitives, and the speed-up. The last row is the geometric mean of the
+speed-ups without simulations that diverged. Steps per second are the median over the blocks, each
+starting at home, after one warm-up block; meshes and primitives alternate. PyBullet also replaces
+cylinders by hulls unless URDF_USE_IMPLICIT_CYLINDER is set, as it is here. Without PyBullet its
+columns are missing, and the script prints that.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ from worlds import Make, MujocoWorld, PybulletWorld, World
 LEG = 200
 """Steps from one random configuration to the next."""
 HOLD = 10
-"""Steps that a target on the way is held."""
+"""Steps for which each target on the path is held."""
 TRIES = 32
-"""Configurations that are drawn for each that is needed."""
+"""Configurations drawn for each one that is needed."""
 PRESS = 0.05
-"""Depth of the lowest joint below the table where the arm presses on it, metres."""
+"""Depth of the lowest joint below the table where the arm presses on it [m]."""
 CLEARANCE = 0.005
-"""Height of the arm at home above the table, metres."""
+"""Height of the arm at home above the table [m]."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm in two forms that ignore the same pairs."""
+    """Two forms of an arm, with meshes and with primitives, that ignore the same pairs."""
 
     name: str
     meshes: Robot
@@ -74,13 +74,13 @@ class Arm:
 
     @property
     def table_top(self) -> float:
-        """Height of the table, metres."""
+        """Height of the table top [m]."""
         return min(_lowest(self.meshes), _lowest(self.primitives)) - CLEARANCE
 
 
 @dataclass(frozen=True)
 class Speeds:
-    """An arm in a simulator; pairs are with meshes and with primitives."""
+    """Speeds of one arm in one simulator; pairs hold the values of meshes and primitives."""
 
     contacts: tuple[float, float]
     """Share of the steps with a contact."""
@@ -90,16 +90,16 @@ class Speeds:
 
     @property
     def ratio(self) -> float:
-        """How many times faster primitives are."""
+        """Speed of primitives divided by the speed of meshes."""
         return self.steps[1] / self.steps[0]
 
 
 Table = dict[str, dict[str, Speeds]]
-"""Speeds of one scene, by arm and simulator."""
+"""Speeds in one scene, by arm and simulator."""
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all arms and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", help="names of arms, separated by commas")
     parser.add_argument("--single", action="store_true", help="one primitive a link, not four")
@@ -143,7 +143,7 @@ def _names(library: Library, only: str | None) -> list[str]:
 
 
 def _arm(name: str, library: Library, *, single: bool) -> Arm | None:
-    """The two forms of an arm; None if it has no collision meshes."""
+    """Return the two forms of an arm, or None if it has no collision meshes."""
     robot = morphgen.compose(f"arm={name}")
     if all(are_primitives(link.collisions) for link in robot.links):
         return None
@@ -162,7 +162,7 @@ def _bare(robot: Robot, ignored: tuple[tuple[str, str], ...]) -> Robot:
 
 
 def _lowest(robot: Robot) -> float:
-    """Height of the lowest point of the links' bounding boxes at home, metres."""
+    """Return the height of the lowest point of the links' bounding boxes at home [m]."""
     heights = []
     for T, link in zip(forward_kinematics(robot, robot.home), robot.links, strict=True):
         if link.collisions:
@@ -173,10 +173,12 @@ def _lowest(robot: Robot) -> float:
 
 
 def _targets(arm: Arm, table_top: float | None, steps: int, seed: int) -> Array:
-    """A path from home through random configurations, shape (n, dof), a row to hold at a time.
+    """Return a path from home through random configurations, shape (n, dof).
+
+    Each row is a target that is held for ``HOLD`` steps.
 
     Raises:
-        RuntimeError: If hardly a configuration is free of self-collision.
+        RuntimeError: If too few configurations are free of self-collision.
     """
     legs = -(-steps // LEG)
     free = random_configurations(arm.meshes, TRIES * legs, np.random.default_rng(seed))
@@ -211,7 +213,7 @@ def _measure(
 
 
 def _block(world: World, targets: Array, steps: int) -> float:
-    """Time that the steps of a block take, s."""
+    """Return the duration of the steps of one block [s]."""
     world.reset()
     start = time.perf_counter()
     for i, target in enumerate(targets):
@@ -220,7 +222,7 @@ def _block(world: World, targets: Array, steps: int) -> float:
 
 
 def _contacts(world: World, targets: Array, steps: int) -> float:
-    """Share of the steps of a block with a contact."""
+    """Return the share of the steps of one block with a contact."""
     world.reset()
     touching = 0
     for step in range(steps):
@@ -230,7 +232,7 @@ def _contacts(world: World, targets: Array, steps: int) -> float:
 
 
 def _sizes(arm: Arm) -> tuple[int, int, int]:
-    """Links with collision shapes, vertices of their hulls, primitives."""
+    """Return the numbers of links with collision shapes, hull vertices and primitives."""
     model = to_spec(arm.meshes).compile()
     hulls = model.geom_dataid[model.geom_type == mujoco.mjtGeom.mjGEOM_MESH]
     links = sum(1 for link in arm.meshes.links if link.collisions)

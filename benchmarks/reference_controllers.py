@@ -1,15 +1,15 @@
-"""How often reference controllers succeed, on every robot of every scenario, in both simulators.
+"""Success of the baselines on every robot of every scenario, in both simulators.
 
     python benchmarks/reference_controllers.py [--task reach] [--only ur5] [--envs 8] [--episodes 2]
         [--sims pybullet,mujoco] [--obstacles] [--jobs 2] [--json rows.json]
 
-Distinct bodies of all splits that come with morphgen, each at the tasks that splits give it (a
-body at one task once), collision shapes of fitted primitives, goals and starts of seed 0. A row a
-body and task: the share of episodes that end in success, with inverse kinematics for reach or the
-scripted push, and with random actions; and how far the tool moves in an episode without any action.
-Without ``--obstacles`` there are none, whatever the splits say.
+Runs each distinct pair of robot and task of the shipped splits, with collision shapes of fitted
+primitives and the goals and starts of seed 0. A row gives the success rate of inverse kinematics
+(reach) or the scripted push, the success rate of random actions, and the largest motion of the tool
+in an episode without actions. Obstacles exist only with ``--obstacles``.
 
-The last rows are means. A simulator that is not installed is left out, and told.
+The last rows are means. If a simulator is not installed, its columns are missing and the script
+prints that.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Measuring:
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all robots and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--only", default="", help="robots whose name matches this expression")
@@ -114,13 +114,13 @@ def main() -> int:
 
 
 def _write(path: Path | None, rows: list[Row]) -> None:
-    """Keep what is measured so far, should the hour be cut short."""
+    """Write the results so far, in case the run is interrupted."""
     if path:
         path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 def _members() -> Iterator[Member]:
-    """A member for every body at every task."""
+    """Return one split member for each pair of robot and task."""
     seen: set[tuple[str, str]] = set()
     for name in split_names():
         split = read_split(name)
@@ -132,7 +132,7 @@ def _members() -> Iterator[Member]:
 
 
 def _drift(batch: TaskBatch) -> float:
-    """How far tools move within an episode without action, at most, millimetres."""
+    """Return the largest tool motion in an episode without actions [mm]."""
     batch.reset()
     start = frame_positions(batch.bodies.chain, batch.body, batch.q)
     acting, farthest = Zero(), 0.0

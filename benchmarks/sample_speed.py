@@ -1,11 +1,11 @@
-"""How fast robots are sampled, with one process and with two, and where the time goes.
+"""Robots sampled per second with one and with two processes, and the time of each step.
 
     python benchmarks/sample_speed.py [--grammar arm3] [--n 2000]
 
-Light sets (URDF and derivation) in fresh temporary folders, which are compared byte for byte. Each
-run is a process of its own, so that its memory is its own. With one job the time begins when a
-first small set is made; with two it holds the start of the workers. The shares are of one process,
-in a run of its own with clocks around the steps.
+Samples light sets (URDF and derivation) into new temporary folders and compares them byte for byte.
+Each run is a process of its own, so that its memory can be measured. With one job, time starts
+after a first small set; with two jobs it includes the start of the workers. A separate run with one
+process measures the share of each step.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ STEPS = (
     (conditions, "reach", "reach"),
     (robot_set, "_write_light", "write"),
 )
-"""Function by module and name, and the step that it is. A step within a step counts for itself."""
+"""Module and name of each measured function, and its step. Nested steps are counted once."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What one run took."""
+    """Measurements of one run."""
 
     seconds: float
     memory_early: float
-    """Peak of the process that hands out the work after a tenth of the robots, MiB."""
+    """Peak memory of the parent process after a tenth of the robots [MiB]."""
     memory_end: float
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure the runs and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--grammar", default="arm3")
     parser.add_argument("--n", type=int, default=2000)
@@ -112,7 +112,7 @@ def _measure(plan: SetPlan, n: int, jobs: int) -> Run:
 
 
 def _shares(plan: SetPlan, n: int) -> list[tuple[str, float, str]]:
-    """Time by step: name, ms a robot and share."""
+    """Return for each step its name, time per robot [ms] and share."""
     clock = _Clock()
     for module, name, step in STEPS:
         setattr(module, name, clock.around(getattr(module, name), step))
@@ -129,14 +129,14 @@ def _shares(plan: SetPlan, n: int) -> list[tuple[str, float, str]]:
 
 
 class _Clock:
-    """Time spent in steps, without that of the steps inside them."""
+    """Time spent in each step, without the steps nested in it."""
 
     def __init__(self) -> None:
         self.spent: defaultdict[str, float] = defaultdict(float)
         self._inside = [0.0]
 
     def around(self, function: Callable[P, T], step: str) -> Callable[P, T]:
-        """The function, its time counted."""
+        """Return the function, wrapped so that its time is counted."""
 
         @wraps(function)
         def timed(*args: P.args, **options: P.kwargs) -> T:
@@ -162,7 +162,7 @@ def _content(folder: Path) -> dict[str, bytes]:
 
 
 def _peak() -> float:
-    """Largest memory of this process so far, MiB."""
+    """Return the peak memory of this process so far [MiB]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 

@@ -1,21 +1,22 @@
-"""How long a viewer's pages take, and how much memory its server needs.
+"""Load times of the viewer's pages, and the memory of its server.
 
     python benchmarks/viewer_speed.py [--robots 100] [--many 500] [--moves 200]
 
-Sets of arm3 are drawn into a temporary folder, bundles without pictures, and nothing is in the
-cache of thumbnails. `morphgen view` serves them in a process of its own, and a browser without a
-screen or GPU, which shares the machine, looks at them. Seconds:
+Samples sets of arm3 into a temporary folder, as bundles without pictures and with an empty cache of
+thumbnails. `morphgen view` serves them in a process of its own, and a headless browser on the same
+machine opens them. Times in seconds:
 
 - from the start of `morphgen view robots/arm3` until it prints its address;
-- from asking for the page until the first thumbnail is there, and until those of the whole page
-  are (24 robots), drawn by the two workers;
-- from asking for the page of a Panda with its hand until it can be moved and collisions are known.
+- from requesting the gallery page until its first thumbnail, and until all 24 thumbnails, which two
+  workers draw;
+- from requesting the page of a Panda with its hand until it can be moved and its collisions are
+  known.
 
-Milliseconds of the server for a move of a slider of that page, collisions tested, median and 95th
-percentile, of a slider that the browser moves every 30 ms. Memory: of the server, without its
-workers, at its first page and with a gallery of many robots, 96 a page (Linux).
+Prints the server's time for one slider move of that page with collision tests [ms], median and 95th
+percentile, for a slider that the browser moves every 30 ms. Prints the memory of the server without
+its workers at its first page and with a gallery of many robots, 96 per page (Linux).
 
-Needs `pip install morphgen[test]` and a chromium.
+Needs `pip install morphgen[test]` and chromium.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ from tabulate import tabulate
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WAIT = 120_000
-"""How long a page may take, milliseconds."""
+"""Longest time to wait for a page [ms]."""
 PAUSE = 30
-"""Between two moves, milliseconds."""
+"""Time between two moves [ms]."""
 FIRST = 5
-"""Moves that do not count: loading the page shows some, and what is used the first time is slow."""
+"""Moves that are not counted: loading the page causes some, and first calls are slow."""
 PANDA = "?robot=words:arm=panda ee=panda_hand"
 CARD = ".card img"
 MORPHGEN = (sys.executable, "-m", "morphgen")
@@ -53,7 +54,7 @@ Row = tuple[str, str]
 
 
 def main() -> int:
-    """Measure and print."""
+    """Measure all pages and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--many", type=int, default=500)
@@ -104,7 +105,7 @@ def _page(browser: Any) -> Iterator[Any]:  # noqa: ANN401
 
 @contextmanager
 def _started(command: Sequence[str], folder: Path) -> Iterator[tuple[str, float, int]]:
-    """A viewer's address, how long it took to be there, and its process."""
+    """Start a viewer; return its address, the time until it answered [s], and its process."""
     begun = time.perf_counter()
     viewing = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     try:
@@ -154,12 +155,12 @@ def _memory(browser: Any, folder: Path, many: int) -> list[Row]:  # noqa: ANN401
 
 
 def _resident(process: int) -> int:
-    """Resident memory of a process, bytes."""
+    """Return the resident memory of a process [bytes]."""
     return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _moves(browser: Any, folder: Path, moves: int) -> list[Row]:  # noqa: ANN401
-    """What the server does for a move, measured where it does it."""
+    """Return the server's time of each move [ms], measured in the server."""
     told = folder / "moves.json"
     command = [sys.executable, str(Path(__file__).resolve()), "--serve", str(told)]
     with _started(command, folder) as (address, _, _), _page(browser) as page:
@@ -177,7 +178,7 @@ def _moves(browser: Any, folder: Path, moves: int) -> list[Row]:  # noqa: ANN401
 
 
 def _serve(told: Path) -> None:
-    """Serve until interrupted, then write how long every move took, milliseconds."""
+    """Serve until interrupted, then write the time of every move [ms]."""
     from morphgen.viewer import page_robot
     from morphgen.viewer.app import serve
     from morphgen.viewer.robot_state import RobotPage, show_moved
