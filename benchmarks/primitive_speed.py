@@ -183,7 +183,7 @@ def _targets(arm: Arm, table_top: float | None, steps: int, seed: int) -> Array:
     legs = -(-steps // LEG)
     free = random_configurations(arm.meshes, TRIES * legs, np.random.default_rng(seed))
     for robot in (arm.meshes, arm.primitives):
-        free = free[[not pairs for pairs in SelfCollisionChecker(robot).each(free)]]
+        free = free[[not pairs for pairs in SelfCollisionChecker(robot).penetrations(free)]]
     if len(free) < legs:
         raise RuntimeError(f"{arm.name} collides with itself nearly everywhere")
     corners = free[:legs].copy()

@@ -69,7 +69,7 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
     """
     tested = SelfCollisionChecker(robot, untested_pairs(robot))
     q = random_configurations(robot, SAMPLES, np.random.default_rng(0))
-    times = Counter(pair for found in tested.each(q) for pair in found)
+    times = Counter(pair for found in tested.penetrations(q) for pair in found)
     between: dict[tuple[int, ...], list[Pair]] = defaultdict(list)
     for pair in sorted(pair for pair, count in times.items() if count >= OFTEN * SAMPLES):
         between[_between(robot, *pair)].append(pair)
@@ -121,7 +121,9 @@ def _plane(
     ]
     q = np.tile(robot.home, (int(count.prod()), 1))
     q[:, columns] = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(len(q), -1)
-    free = np.array([not found.keys() & {*pairs} for found in tested.each(q)]).reshape(count)
+    free = np.array([not found.keys() & {*pairs} for found in tested.penetrations(q)]).reshape(
+        count
+    )
     continuous = [robot.joints[robot.independent_joints[j]].kind == "continuous" for j in joints]
     components = _components(free, continuous)
     if components.max() < 2:

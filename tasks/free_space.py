@@ -182,7 +182,9 @@ class FreeSpace:
         if not np.isfinite(q).all():  # nothing collides there, which is not to be free
             raise ValueError(f"q of {robot.name} is not finite")
         held = np.zeros((len(q), len(self._obstacles)))
-        return self._tested.each(np.concatenate([q, held, self._placed(blocks, len(q))], axis=1))
+        return self._tested.penetrations(
+            np.concatenate([q, held, self._placed(blocks, len(q))], axis=1)
+        )
 
     def _placed(self, blocks: ArrayLike | None, n: int) -> Array:
         """Positions of the block's joints, shape (n, 6), or (n, 0) if there is no block."""

@@ -107,7 +107,7 @@ def free_configuration(
     """A random configuration without self-collision; None if none is found."""
     for _ in range(TRIES // 10):
         q = random_configurations(robot, 10, rng)
-        for row, found in zip(q, tested.each(q), strict=True):
+        for row, found in zip(q, tested.penetrations(q), strict=True):
             if not found:
                 return np.asarray(row)
     return None

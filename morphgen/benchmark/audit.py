@@ -147,8 +147,8 @@ def _robot_findings(found: SplitSurvey) -> Iterator[Finding]:
     for side, member, robot in _robots(found):
         if isinstance(robot, Fault):
             yield _finding(robot.code, side, member, robot.why)
-        elif robot.body != member.body:
-            why = f"the split names body {member.body}, its derivation gives {robot.body}"
+        elif robot.robot_hash != member.body:
+            why = f"the split names body {member.body}, its derivation gives {robot.robot_hash}"
             yield _finding("body-changed", side, member, why)
 
 
@@ -156,7 +156,7 @@ def _leaks(found: SplitSurvey, near: Near) -> Iterator[Finding]:
     """Test robots that are in train, or nearly."""
     split = found.split
     names = {member.name: member for member in split.train}
-    tree, cosine = found.of("tree"), found.of("cosine")
+    tree, cosine = found.by_measure("tree"), found.by_measure("cosine")
     for j, member in enumerate(split.test):
         rivals = [i for i, other in enumerate(split.train) if other.task == member.task]
         shared = [i for i in rivals if split.train[i].body == member.body]
@@ -214,7 +214,7 @@ def _bound_findings(found: SplitSurvey) -> Iterator[Finding]:
         bound = parse_bound(str(text))
     except BenchmarkError as error:
         raise BenchmarkError(f"split {found.split.name!r}: made: {error}") from error
-    for member, cosines in zip(found.split.test, found.of("cosine").T, strict=True):
+    for member, cosines in zip(found.split.test, found.by_measure("cosine").T, strict=True):
         largest = max(cosines[~np.isnan(cosines)].tolist(), default=None)
         if largest is not None and not bound.holds(largest):
             why = (
@@ -228,7 +228,7 @@ def _neighbours(found: SplitSurvey) -> Iterator[Neighbour]:
     train, test = found.split.train, found.split.test
     for j, member in enumerate(test):
         for name, measure in MEASURES.items():
-            values = found.of(name)[:, j]
+            values = found.by_measure(name)[:, j]
             if np.isnan(values).all():
                 continue
             best = np.nanargmax(values) if measure.larger_is_more_alike else np.nanargmin(values)

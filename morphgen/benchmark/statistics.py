@@ -62,7 +62,7 @@ def summarize_survey(found: SplitSurvey) -> dict[str, object]:
     return {
         "train": _side(split, split.train, found.train),
         "test": _side(split, split.test, found.test),
-        COSINE: mean_and_range(found.of(COSINE).ravel().tolist()),
+        COSINE: mean_and_range(found.by_measure(COSINE).ravel().tolist()),
     }
 
 
@@ -82,10 +82,10 @@ def _side(
         if isinstance(robot, Fault):
             raise BenchmarkError(f"split {split.name!r}: robot {member.name!r}: {robot.why}")
         robots.append(robot)
-    facts = [robot.facts for robot in robots]
+    facts = [robot.stats for robot in robots]
     return {
         "robots": len(robots),
-        "bodies": len({robot.body for robot in robots}),
+        "bodies": len({robot.robot_hash for robot in robots}),
         **{key: round(float(np.mean(_column(facts, key))), DIGITS) for key in COUNTED},
         **{key: mean_and_range(_column(facts, key)) for key in MEASURED},
     }

@@ -60,9 +60,9 @@ class Fault:
 class SurveyedRobot:
     """A robot of a split as it is composed today."""
 
-    body: str
+    robot_hash: str
     """Its hash."""
-    facts: RobotStats
+    stats: RobotStats
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +80,13 @@ class SplitSurvey:
     split: Split
     train: tuple[SurveyedRobot | Fault, ...]
     test: tuple[SurveyedRobot | Fault, ...]
-    likeness: Array
+    similarity: Array
     """Of every train robot to every test robot by every measure, in the order of ``MEASURES``,
     shape (n_train, n_test, n_measures); NaN where one of the two has a fault."""
 
-    def of(self, measure: str) -> Array:
+    def by_measure(self, measure: str) -> Array:
         """Likeness by one measure, shape (n_train, n_test)."""
-        return self.likeness[:, :, tuple(MEASURES).index(measure)]
+        return self.similarity[:, :, tuple(MEASURES).index(measure)]
 
 
 def robot_stats(robot: Robot) -> RobotStats:

@@ -1,7 +1,6 @@
-"""Self-collision: which links penetrate each other, and which pairs do so by design.
+"""Self-collision: which links penetrate each other, and which pairs of links are not tested.
 
-Collision shapes are tested by MuJoCo; a mesh counts as its convex hull, as in every simulator
-that these robots run in.
+MuJoCo tests the collision shapes; as in MuJoCo and PyBullet, a mesh counts as its convex hull.
 """
 
 from __future__ import annotations
@@ -10,285 +9,265 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations, product
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from lxml import etree
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from morphgen.errors import RobotError
-from morphgen.formats.mjcf_elements import (
-    Meshes,
-    geom_attributes,
-    joint_attributes,
-    pose_attributes,
-)
 from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
 from morphgen.model.tree import RigidGroup, rigid_groups
+from morphgen.typing import Array
+
+if TYPE_CHECKING:
+    import mujoco
 
 PENETRATION = 1e-4
-"""Depth from which an overlap counts as penetration, metres; faces that only meet do not."""
-MOSTLY = 0.95
-"""Share of random configurations from which a penetrating pair counts as never separating."""
+"""Smallest overlap that counts as penetration [m]; faces that only touch stay below it."""
+ALWAYS_SHARE = 0.95
+"""Share of random configurations in which a pair must penetrate to count as always penetrating."""
 SAMPLES = 128
-"""Random configurations that ``ignore_pairs`` draws."""
-_MEMORY = "16M"
-_GAVE_UP = "EPA"
-"""What a warning of MuJoCo's has if the depth of two shapes that overlap was not found."""
-_NUDGES = (0.0, *(sign * 10.0**k for k in range(-9, -4) for sign in (1, -1)))
-"""By how much the first joint is moved then, rad or m, and the last by half of it, lest shapes on
-parallel slides stay as they are: the least that helps, and nothing as far as depths that count."""
+"""Number of random configurations that ``survey_collisions`` tests."""
+_MUJOCO_MEMORY = "16M"
+_EPA_WARNING = "EPA"
+"""Part of MuJoCo's warning that its penetration-depth algorithm (EPA) did not converge."""
+_PERTURBATIONS = (0.0, *(sign * 10.0**k for k in range(-9, -4) for sign in (1, -1)))
+"""Offsets of the first joint [rad or m] that are tried in turn when EPA fails.
+
+The other joints get less, down to half of it for the last one, because equal offsets would leave
+shapes on parallel slides as they are. Even the largest offset is below ``PENETRATION``.
+"""
 
 
 class SelfCollisionChecker:
     """A robot's collision shapes, compiled once and tested at many configurations."""
 
     def __init__(self, robot: Robot, ignore: Iterable[Pair] | None = None) -> None:
-        """Compile.
+        """Compile the collision model.
 
         Args:
-            robot: The body.
+            robot: The robot.
             ignore: Pairs of links that are not tested; by default ``robot.ignore_pairs``. Links
-                joined by fixed joints are one body and never tested against each other.
+                joined by fixed joints are one MuJoCo body and never tested against each other.
 
         Raises:
             MeshError: If a collision mesh cannot be read.
-            RobotError: If ``ignore`` names a link that the robot does not have.
+            RobotError: If ``ignore`` names an unknown link.
         """
+        import mujoco  # here, because commands that test no collisions should start quickly
+
         self._robot = robot
-        self._model = _model(robot, robot.ignore_pairs if ignore is None else ignore)
+        self._model = _compile(robot, robot.ignore_pairs if ignore is None else ignore)
         self._data = mujoco.MjData(self._model)
-        self._links = [int(self._model.body(i).name) for i in self._model.geom_bodyid.tolist()]
-        self._addresses = np.array(
+        self._geom_links = [
+            robot.links[int(self._model.body(i).name)].name
+            for i in self._model.geom_bodyid.tolist()
+        ]
+        self._qpos = np.array(
             [self._model.joint(robot.joints[k].name).qposadr[0] for k in robot.movable_joints],
             np.intp,
         )
-        self._shares = np.linspace(1.0, 0.5, len(self._addresses))
+        self._perturbation = np.linspace(1.0, 0.5, len(self._qpos))
 
-    def penetrations(self, q: ArrayLike) -> list[dict[Pair, float]]:
-        """Test configurations.
+    def penetrations(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
+        """Test configurations, one at a time as the result is iterated.
 
         Args:
-            q: Independent joint positions, shape (n, dof), rad or m.
+            q: Independent joint positions, shape (n, dof) [rad or m].
 
         Returns:
-            For every configuration, the depth (metres, more than ``PENETRATION``) of every
-            penetrating pair of links.
+            For each configuration, every penetrating pair of links and its depth [m], which is
+            more than ``PENETRATION``.
 
         Raises:
             ValueError: If ``q`` has another shape.
             RobotError: If the contacts of one configuration do not fit into memory, or MuJoCo
-                finds no depth of two shapes that overlap.
+                finds no depth for two overlapping shapes. Raised while iterating.
         """
-        return list(self.each(q))
-
-    def each(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
-        """What ``penetrations`` returns, one configuration at a time."""
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2:
             raise ValueError(f"q has shape {q.shape}; {self._robot.name} needs (n, dof)")
         return (self._test(positions) for positions in movable_positions(self._robot, q))
 
-    def _test(self, positions: NDArray[np.float64]) -> dict[Pair, float]:
-        data = self._data
+    def _test(self, positions: Array) -> dict[Pair, float]:
+        import mujoco
+
         self._collide(positions)
         depths: dict[Pair, float] = {}
-        if data.ncon == 0:
+        if self._data.ncon == 0:
             return depths
-        if data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
+        if self._data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
             raise RobotError(
-                f"robot {self._robot.name!r}: its contacts at one configuration exceed {_MEMORY}; "
-                "ignore the pairs that always overlap"
+                f"robot {self._robot.name!r}: its contacts at one configuration exceed "
+                f"{_MUJOCO_MEMORY}; ignore the pairs that always overlap"
             )
-        contact = data.contact
+        contact = self._data.contact
         for (a, b), distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
             if distance < -PENETRATION:
-                links = self._robot.links
-                pair = sorted_pair(links[self._links[a]].name, links[self._links[b]].name)
+                pair = sorted_pair(self._geom_links[a], self._geom_links[b])
                 depths[pair] = max(depths.get(pair, 0.0), -distance)
         return depths
 
-    def _collide(self, positions: NDArray[np.float64]) -> None:
-        """Find contacts, a hair beside the configuration if MuJoCo gives up on a pair there."""
-        for nudge in _NUDGES:
-            self._data.qpos[self._addresses] = positions + nudge * self._shares
+    def _collide(self, positions: Array) -> None:
+        """Find the contacts at movable joint positions, perturbed slightly where EPA fails."""
+        import mujoco
+
+        for offset in _PERTURBATIONS:
+            self._data.qpos[self._qpos] = positions + offset * self._perturbation
             mujoco.mj_kinematics(self._model, self._data)
-            with capture_mujoco_warnings() as told:
+            with capture_mujoco_warnings() as warnings:
                 mujoco.mj_collision(self._model, self._data)
-            if not any(_GAVE_UP in each for each in told):
+            if not any(_EPA_WARNING in warning for warning in warnings):
                 return
         raise RobotError(
-            f"robot {self._robot.name!r}: MuJoCo cannot say how deep two of its shapes overlap at "
-            f"movable joint positions {positions.tolist()}: {told[0]}"
+            f"robot {self._robot.name!r}: MuJoCo finds no penetration depth of two overlapping "
+            f"shapes at movable joint positions {positions.tolist()}: {warnings[0]}"
         )
 
 
 @dataclass(frozen=True)
 class CollisionSurvey:
-    """The pairs whose contact is no self-collision, and why home is without any."""
+    """Pairs of links to ignore, and the penetrations at the home configuration."""
 
-    ignored: tuple[Pair, ...]
-    """Sorted pairs, in alphabetical order."""
-    at_home: Mapping[Pair, float]
-    """Depth of pairs that penetrate at home, but for neighbours and known pairs, metres."""
-
-
-def self_collisions(robot: Robot, q: ArrayLike) -> list[dict[Pair, float]]:
-    """Penetrating pairs of links, less ``robot.ignore_pairs``, at configurations.
-
-    Args:
-        robot: The body.
-        q: Independent joint positions, shape (n, dof), rad or m.
-
-    Returns:
-        For every configuration, the depth of every penetrating pair, metres.
-
-    Raises:
-        MeshError: If a collision mesh cannot be read.
-        ValueError: If ``q`` has another shape.
-    """
-    return SelfCollisionChecker(robot).penetrations(q)
-
-
-def ignore_pairs(
-    robot: Robot,
-    *,
-    known: Iterable[Pair] = (),
-    check: Callable[[str, str], bool] | None = None,
-    samples: int = SAMPLES,
-    seed: int = 0,
-) -> tuple[Pair, ...]:
-    """Pairs of links whose contact is no self-collision.
-
-    They are the links of one rigid body (joined by fixed joints), the neighbours across one
-    movable joint (links without collision shapes between them do not part them), the pairs that
-    penetrate at home, and those that do in at least ``MOSTLY`` of random configurations. So
-    nothing is in self-collision at home.
-
-    A robot composed of parts whose own pairs are known costs less: pass these as ``known`` and,
-    as ``check``, whether two links belong to different parts.
-
-    Args:
-        robot: The body.
-        known: Pairs to ignore without a test; they are in the result.
-        check: Whether a pair is tested at random configurations; by default every pair is. All
-            pairs are tested at home.
-        samples: Random configurations; none are drawn if no pair is left to test.
-        seed: Seed of the random configurations.
-
-    Returns:
-        Sorted pairs, in alphabetical order.
-
-    Raises:
-        MeshError: If a collision mesh cannot be read.
-    """
-    return survey_collisions(robot, known=known, check=check, samples=samples, seed=seed).ignored
+    ignore_pairs: tuple[Pair, ...]
+    """Pairs whose contact is not a self-collision, sorted."""
+    home_penetrations: Mapping[Pair, float]
+    """Depth [m] of the pairs that penetrate at home; adjacent and known pairs are not tested."""
 
 
 def survey_collisions(
     robot: Robot,
     *,
-    known: Iterable[Pair] = (),
-    check: Callable[[str, str], bool] | None = None,
+    known_pairs: Iterable[Pair] = (),
+    should_test: Callable[[str, str], bool] | None = None,
     samples: int = SAMPLES,
     seed: int = 0,
 ) -> CollisionSurvey:
-    """What ``ignore_pairs`` returns, with what it saw at home; see there."""
-    ignored = {sorted_pair(*pair) for pair in known} | set(adjacent_pairs(robot))
-    left = set(_pairs(_touchable(robot))) - ignored
-    if not left:
-        return CollisionSurvey(tuple(sorted(ignored)), {})
-    tested = SelfCollisionChecker(robot, ignored)
-    (at_home,) = tested.penetrations([robot.home])
-    ignored.update(at_home)
-    left = {pair for pair in left - ignored if check is None or check(*pair)}
-    if left and robot.dof:
-        q = random_configurations(robot, samples, np.random.default_rng(seed))
-        ignored.update(_mostly_penetrating(tested, q, left))
-    return CollisionSurvey(tuple(sorted(ignored)), at_home)
+    """Find the pairs of links whose contact is not a self-collision.
 
+    These are ``adjacent_pairs``, the pairs that penetrate at home, and those that penetrate in at
+    least ``ALWAYS_SHARE`` of random configurations. A robot with these pairs ignored is therefore
+    free of self-collision at home.
 
-def _mostly_penetrating(
-    tested: SelfCollisionChecker, q: NDArray[np.float64], pairs: set[Pair]
-) -> set[Pair]:
-    """Those of the pairs that penetrate in at least ``MOSTLY`` of the configurations.
+    A robot composed of parts whose own pairs are known costs less: pass these as ``known_pairs``
+    and, as ``should_test``, whether two links belong to different parts.
 
-    Most pairs part at once, so the rest of the configurations is seldom needed.
+    Args:
+        robot: The robot.
+        known_pairs: Pairs to ignore without a test.
+        should_test: Whether two links are tested at random configurations; by default all are.
+            At home, every pair is tested.
+        samples: Number of random configurations; none are drawn if no pair is left to test.
+        seed: Seed of the random configurations.
+
+    Raises:
+        MeshError: If a collision mesh cannot be read.
     """
-    apart = dict.fromkeys(pairs, 0)
-    for found in tested.each(q):
-        for pair in apart.keys() - found.keys():
-            apart[pair] += 1
-            if len(q) - apart[pair] < MOSTLY * len(q):
-                del apart[pair]
-        if not apart:
+    ignore = {sorted_pair(*pair) for pair in known_pairs} | set(adjacent_pairs(robot))
+    collidable = [link.name for link in robot.links if link.collisions]
+    remaining = set(_pairs(collidable)) - ignore
+    if not remaining:
+        return CollisionSurvey(tuple(sorted(ignore)), {})
+    checker = SelfCollisionChecker(robot, ignore)
+    (home_penetrations,) = checker.penetrations([robot.home])
+    ignore.update(home_penetrations)
+    remaining = {pair for pair in remaining - ignore if should_test is None or should_test(*pair)}
+    if remaining and robot.dof:
+        q = random_configurations(robot, samples, np.random.default_rng(seed))
+        ignore.update(_always_penetrating(checker, q, remaining))
+    return CollisionSurvey(tuple(sorted(ignore)), home_penetrations)
+
+
+def _always_penetrating(checker: SelfCollisionChecker, q: Array, pairs: set[Pair]) -> set[Pair]:
+    """Return the pairs that penetrate in at least ``ALWAYS_SHARE`` of the configurations."""
+    separations = dict.fromkeys(pairs, 0)
+    for depths in checker.penetrations(q):
+        for pair in separations.keys() - depths.keys():
+            separations[pair] += 1
+            if len(q) - separations[pair] < ALWAYS_SHARE * len(q):
+                del separations[pair]
+        if not separations:  # most pairs separate at once, which spares the other configurations
             break
-    return set(apart)
+    return set(separations)
 
 
 def untested_pairs(robot: Robot) -> tuple[Pair, ...]:
-    """Pairs of links that nothing tests: those the robot ignores, and neighbours across joints.
+    """Return the pairs that no collision test considers: ``ignore_pairs`` and adjacent links.
 
-    Robots that morphgen made ignore neighbours already; one that was read as it stands may not.
+    Robots that morphgen composed ignore adjacent links already; those read from a file may not.
     """
     return tuple(sorted({*robot.ignore_pairs, *adjacent_pairs(robot)}))
 
 
 def adjacent_pairs(robot: Robot) -> tuple[Pair, ...]:
-    """Pairs of links in one rigid body or across one movable joint, sorted.
+    """Return the pairs of links in one rigid group or across one movable joint, sorted.
 
-    Only links with collision shapes are named. A rigid body without any is passed through, so
-    that the bodies on both sides of it are neighbours.
+    Only links with collision shapes are named. A group without any is skipped: the groups on both
+    sides of it are adjacent.
     """
     groups = rigid_groups(robot)
-    owner = {link.name: i for i, group in enumerate(groups) for link in group.links}
-    members = [[link.name for link in group.links if link.collisions] for group in groups]
+    group_of = {link.name: i for i, group in enumerate(groups) for link in group.links}
+    collidable = [[link.name for link in group.links if link.collisions] for group in groups]
+
+    def parent_of(group: RigidGroup) -> int | None:
+        parent = robot.parents[robot.link_index[group.links[0].name]]
+        return group_of[robot.links[parent].name] if parent >= 0 else None
+
     pairs: set[Pair] = set()
-    for i, group in enumerate(groups):
-        pairs.update(_pairs(members[i]))
-        above = _group_above(robot, group, owner)
-        while above is not None and not members[above]:
-            above = _group_above(robot, groups[above], owner)
-        if above is not None:
-            pairs.update(sorted_pair(*names) for names in product(members[i], members[above]))
+    for names, group in zip(collidable, groups, strict=True):
+        pairs.update(_pairs(names))
+        parent = parent_of(group)
+        while parent is not None and not collidable[parent]:
+            parent = parent_of(groups[parent])
+        if parent is not None:
+            pairs.update(sorted_pair(a, b) for a, b in product(names, collidable[parent]))
     return tuple(sorted(pairs))
 
 
-def _group_above(robot: Robot, group: RigidGroup, owner: Mapping[str, int]) -> int | None:
-    parent = robot.parents[robot.link_index[group.links[0].name]]
-    return owner[robot.links[parent].name] if parent >= 0 else None
+@contextmanager
+def capture_mujoco_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, of all threads, instead of writing them to ``MUJOCO_LOG.TXT``."""
+    import mujoco
 
-
-def _touchable(robot: Robot) -> list[str]:
-    return [link.name for link in robot.links if link.collisions]
+    warnings: list[str] = []
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield warnings
+    finally:
+        mujoco.set_mju_user_warning(previous)
 
 
 def _pairs(names: Iterable[str]) -> Iterator[Pair]:
     return (sorted_pair(a, b) for a, b in combinations(names, 2))
 
 
-def _index(robot: Robot, name: str) -> int:
-    robot.link(name)
-    return robot.link_index[name]
+def _compile(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
+    """Compile a model of collision shapes and joints only; bodies are named by link index."""
+    import mujoco
 
+    from morphgen.formats.mjcf_elements import (
+        Meshes,
+        geom_attributes,
+        joint_attributes,
+        pose_attributes,
+    )
 
-def _model(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
-    """Collision shapes and joints only: what it takes to place and intersect shapes."""
     meshes = Meshes(None)
     root = etree.Element("mujoco")
     etree.SubElement(root, "compiler", MJCF_COMPILER_ATTRIBUTES)
-    etree.SubElement(root, "size", memory=_MEMORY)
+    etree.SubElement(root, "size", memory=_MUJOCO_MEMORY)
     etree.SubElement(etree.SubElement(root, "option"), "flag", filterparent="disable")
     asset = etree.SubElement(root, "asset")
-    world = etree.SubElement(root, "worldbody")
-    bodies: list[etree._Element] = []
+    bodies = [etree.SubElement(root, "worldbody")]
     for i, link in enumerate(robot.links):
-        parent = bodies[robot.parents[i]] if i else world
         joint = robot.joints[i - 1] if i else None
-        placed = pose_attributes(joint.T_parent_joint) if joint else {}
-        body = etree.SubElement(parent, "body", {"name": str(i)} | placed)
+        pose = pose_attributes(joint.T_parent_joint) if joint else {}
+        parent = bodies[robot.parents[i] + 1]
+        body = etree.SubElement(parent, "body", {"name": str(i)} | pose)
         if joint is not None and joint.is_movable:
             etree.SubElement(body, "joint", joint_attributes(joint))
         for shape in link.collisions:
@@ -296,9 +275,9 @@ def _model(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
         bodies.append(body)
     meshes.write(asset)
     contact = etree.SubElement(root, "contact")
-    for pair in ignore:
-        a, b = (_index(robot, name) for name in pair)
-        etree.SubElement(contact, "exclude", body1=str(a), body2=str(b))
+    for a, b in ignore:
+        indices = [str(robot.link_index[robot.link(name).name]) for name in (a, b)]
+        etree.SubElement(contact, "exclude", body1=indices[0], body2=indices[1])
     try:
         spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
         meshes.add_to(spec)
@@ -307,15 +286,3 @@ def _model(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
         raise RobotError(
             f"robot {robot.name!r} has a shape or depth that MuJoCo refuses: {error}"
         ) from error
-
-
-@contextmanager
-def capture_mujoco_warnings() -> Iterator[list[str]]:
-    """Collect warnings while this lasts; they are MuJoCo's own, of all threads."""
-    told: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(told.append)
-    try:
-        yield told
-    finally:
-        mujoco.set_mju_user_warning(before)

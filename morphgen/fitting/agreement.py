@@ -76,7 +76,10 @@ def agreement(
     truth = np.array(list(_mesh_collisions(meshes, ignored, q)))
     first, second = (
         _counts(
-            truth, np.array([bool(pairs) for pairs in SelfCollisionChecker(robot, ignored).each(q)])
+            truth,
+            np.array(
+                [bool(pairs) for pairs in SelfCollisionChecker(robot, ignored).penetrations(q)]
+            ),
         )
         for robot in (primitives, meshes)
     )

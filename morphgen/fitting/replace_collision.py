@@ -84,7 +84,7 @@ def with_primitives(
     """
     links = tuple(_with_collision(link, primitives.get(link.name), visual) for link in robot.links)
     made = as_written(replace(robot, links=links, ignore_pairs=()))
-    return replace(made, ignore_pairs=survey_collisions(made).ignored)
+    return replace(made, ignore_pairs=survey_collisions(made).ignore_pairs)
 
 
 def stored_primitives(

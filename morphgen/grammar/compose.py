@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from morphgen.checks.self_collision import CollisionSurvey, ignore_pairs, survey_collisions
+from morphgen.checks.self_collision import CollisionSurvey, survey_collisions
 from morphgen.errors import CompositionError, nearest
 from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
@@ -48,7 +48,7 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
         FormatError: If a part's source or stored fits cannot be read.
     """
     robot = with_stored_fits(join(derivation, library, name), library.folders)
-    return replace(robot, ignore_pairs=survey_of(robot, derivation, library).ignored)
+    return replace(robot, ignore_pairs=survey_of(robot, derivation, library).ignore_pairs)
 
 
 def join(derivation: Derivation, library: Library, name: str) -> Robot:
@@ -223,17 +223,19 @@ def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Collisi
             pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(load_part(manifest))]
             known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
     found = survey_collisions(
-        robot, known=known, check=lambda a, b: owner[a] != owner[b] or a in tested
+        robot, known_pairs=known, should_test=lambda a, b: owner[a] != owner[b] or a in tested
     )
     faulty = {
-        (a, b) for (a, b), depth in found.at_home.items() if owner[a] != owner[b] and depth > TOUCH
+        (a, b)
+        for (a, b), depth in found.home_penetrations.items()
+        if owner[a] != owner[b] and depth > TOUCH
     }
     return CollisionSurvey(
-        tuple(pair for pair in found.ignored if pair not in faulty), found.at_home
+        tuple(pair for pair in found.ignore_pairs if pair not in faulty), found.home_penetrations
     )
 
 
 @lru_cache(maxsize=256)
 def part_pairs(part: Part) -> tuple[Pair, ...]:
     """Pairs of a part's own links whose contact is no self-collision."""
-    return ignore_pairs(part.body)
+    return survey_collisions(part.body).ignore_pairs

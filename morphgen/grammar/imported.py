@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from morphgen.checks import fix, record_repairs
-from morphgen.checks.self_collision import ignore_pairs
+from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import FormatError, nearest
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read_urdf
@@ -62,7 +62,7 @@ def import_robot(
     robot = record_repairs(robot, robot.source_findings)
     if repair:
         robot, _ = fix(robot)
-    return replace(robot, ignore_pairs=ignore_pairs(robot))
+    return replace(robot, ignore_pairs=survey_collisions(robot).ignore_pairs)
 
 
 def _without_name_clash(robot: Robot) -> Robot:

@@ -130,9 +130,9 @@ def build(
         if not holds(condition, properties):
             return f"where {condition}"
     contacts = survey_of(robot, derivation, library)
-    if any(depth > TOUCH for depth in contacts.at_home.values()):
+    if any(depth > TOUCH for depth in contacts.home_penetrations.values()):
         return "links overlap at home"
-    robot = with_stored_fits(replace(robot, ignore_pairs=contacts.ignored), library.folders)
+    robot = with_stored_fits(replace(robot, ignore_pairs=contacts.ignore_pairs), library.folders)
     findings = check(robot, home_tested=True)
     for finding in findings:
         if finding.severity != "info":

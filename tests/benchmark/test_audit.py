@@ -71,7 +71,7 @@ def test_a_body_that_is_nearly_in_train_is_a_leak():
 def test_nearness_needs_both_measures():
     made = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
     likeness = survey_split(made, LIBRARY)
-    tree, alike = likeness.of("tree")[0, 0], likeness.of("cosine")[0, 0]
+    tree, alike = likeness.by_measure("tree")[0, 0], likeness.by_measure("cosine")[0, 0]
     for near, expected in (
         (Near(tree * 1.01, alike - 1e-12), True),
         (Near(tree, alike - 1e-12), False),
@@ -213,7 +213,7 @@ def test_a_category_that_is_trained_is_no_extrapolation():
 
 
 def test_a_bound_on_likeness_that_was_promised_is_tested():
-    likeness = survey_split(combined(), LIBRARY).of("cosine").max()
+    likeness = survey_split(combined(), LIBRARY).by_measure("cosine").max()
     for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
         made = combined(made={"similarity": bound})
         codes = {code for code, _ in found(made)}
@@ -264,7 +264,7 @@ def test_a_derivation_that_two_members_share_is_composed_once():
     assert seen == [4] * 4
     both = survey_split(made, LIBRARY)
     assert both.train[0] == both.train[3]
-    np.testing.assert_array_equal(both.likeness[0], both.likeness[3])
+    np.testing.assert_array_equal(both.similarity[0], both.similarity[3])
 
 
 def test_an_audit_is_plain_data():

@@ -13,8 +13,7 @@ from morphgen.checks.self_collision import (
     PENETRATION,
     SelfCollisionChecker,
     adjacent_pairs,
-    ignore_pairs,
-    self_collisions,
+    survey_collisions,
 )
 from morphgen.errors import RobotError
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
@@ -26,6 +25,10 @@ BALL = (Shape(Sphere(0.05)),)
 
 def ball(name):
     return Link(name, collisions=BALL)
+
+
+def penetrations(robot, q):
+    return list(SelfCollisionChecker(robot).penetrations(q))
 
 
 def slides(*offsets):
@@ -50,7 +53,7 @@ def chain(*links, kind="revolute"):
 
 def test_depths_are_those_of_spheres():
     robot = slides(0.0, 0.3)
-    found = self_collisions(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
+    found = penetrations(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
     assert found[0] == {}
     assert found[1] == {("ball0", "ball1"): pytest.approx(0.02, abs=1e-6)}
     assert found[2] == {("ball0", "ball1"): pytest.approx(0.05, abs=1e-6)}
@@ -62,14 +65,14 @@ def test_faces_that_meet_do_not_collide():
     robot = replace(
         robot, links=(robot.root, *(replace(x, collisions=block) for x in robot.links[1:]))
     )
-    clear, deep = self_collisions(robot, [[0.0, -PENETRATION / 2], [0.0, -2 * PENETRATION]])
+    clear, deep = penetrations(robot, [[0.0, -PENETRATION / 2], [0.0, -2 * PENETRATION]])
     assert clear == {}
     assert set(deep) == {("ball0", "ball1")}
 
 
 def test_ignored_pairs_are_not_reported():
     robot = replace(slides(0.0, 0.01, 0.02), ignore_pairs=(("ball0", "ball1"),))
-    (found,) = self_collisions(robot, [robot.home])
+    (found,) = penetrations(robot, [robot.home])
     assert set(found) == {("ball0", "ball2"), ("ball1", "ball2")}
 
 
@@ -84,7 +87,7 @@ def test_spheres_agree_with_the_distance_of_their_centres():
     )
     q = random_configurations(robot, 100, np.random.default_rng(3))
     T = forward_kinematics(robot, q)
-    for found, centres in zip(self_collisions(robot, q), T[..., :3, 3], strict=True):
+    for found, centres in zip(penetrations(robot, q), T[..., :3, 3], strict=True):
         distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
         expected = {
             (f"b{i}", f"b{j}")
@@ -98,15 +101,15 @@ def test_spheres_agree_with_the_distance_of_their_centres():
 def test_the_roots_links_are_tested_like_any_other():
     """MuJoCo by itself never tests what is welded to the world against its children."""
     robot = chain(ball("a"), replace(ball("b"), collisions=(Shape(Sphere(0.3)),)))
-    (found,) = self_collisions(robot, [robot.home])
+    (found,) = penetrations(robot, [robot.home])
     assert set(found) == {("a", "b")}
 
 
 def test_mimic_joints_follow():
-    robot = replace(arm(), ignore_pairs=ignore_pairs(arm()))
+    robot = replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs)
     q = np.array(robot.home)
     q[3] = 0.04
-    assert self_collisions(robot, [q]) == [{}]
+    assert penetrations(robot, [q]) == [{}]
 
 
 def test_a_mesh_counts_as_its_convex_hull(tmp_path):
@@ -115,7 +118,7 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
     mesh = Link("ring", collisions=(Shape(Mesh(tmp_path / "ring.stl")),))
     robot = chain(mesh, ball("inside"))
     robot = replace(robot, joints=(replace(robot.joints[0], T_parent_joint=Pose((0.0, 0.1, 0.0))),))
-    (found,) = self_collisions(robot, [robot.home])
+    (found,) = penetrations(robot, [robot.home])
     assert set(found) == {("inside", "ring")}
 
 
@@ -143,9 +146,9 @@ def test_siblings_on_an_empty_root_are_not_attached():
 
 def test_touching_at_home_is_ignored():
     robot = slides(0.0, 0.05, 0.5)
-    pairs = ignore_pairs(robot)
+    pairs = survey_collisions(robot).ignore_pairs
     assert pairs == (("ball0", "ball1"),)
-    assert self_collisions(replace(robot, ignore_pairs=pairs), [robot.home]) == [{}]
+    assert penetrations(replace(robot, ignore_pairs=pairs), [robot.home]) == [{}]
 
 
 def test_never_separating_pairs_are_ignored():
@@ -158,18 +161,18 @@ def test_never_separating_pairs_are_ignored():
         )
         turn = Joint("turn", "continuous", "hand", "fin", axis=(0, 0, 1))
         robot = Robot("r", (wall, ball("hand"), fin), (push, turn), home=(0.0, 0.0))
-        assert (("fin", "wall") in ignore_pairs(robot)) == expected
-        assert ("fin", "wall") not in self_collisions(robot, [robot.home])[0]
+        assert (("fin", "wall") in survey_collisions(robot).ignore_pairs) == expected
+        assert ("fin", "wall") not in penetrations(robot, [robot.home])[0]
 
 
 def test_the_result_depends_on_nothing_but_the_robot():
-    assert ignore_pairs(arm()) == ignore_pairs(arm())
+    assert survey_collisions(arm()).ignore_pairs == survey_collisions(arm()).ignore_pairs
 
 
 def test_only_pairs_across_parts_are_tested():
     robot = arm()
     part = {"base": 0, "upper": 0, "lower": 0}
-    whole = ignore_pairs(robot)
+    whole = survey_collisions(robot).ignore_pairs
     inside = [pair for pair in whole if part.get(pair[0]) == part.get(pair[1])]
     asked = []
 
@@ -177,37 +180,39 @@ def test_only_pairs_across_parts_are_tested():
         asked.append((a, b))
         return part.get(a) != part.get(b)
 
-    assert ignore_pairs(robot, known=inside, check=across) == whole
+    assert survey_collisions(robot, known_pairs=inside, should_test=across).ignore_pairs == whole
     assert not set(asked) & set(whole)
 
 
 def test_known_pairs_are_kept_whatever_their_order():
     robot = slides(0.0, 0.5)
-    assert ignore_pairs(robot, known=[("ball1", "ball0")]) == (("ball0", "ball1"),)
+    assert survey_collisions(robot, known_pairs=[("ball1", "ball0")]).ignore_pairs == (
+        ("ball0", "ball1"),
+    )
 
 
 def test_a_known_pair_of_no_link_is_an_error():
     with pytest.raises(RobotError, match="no link 'ball9'"):
-        ignore_pairs(slides(0.0, 0.5), known=[("ball0", "ball9")])
+        survey_collisions(slides(0.0, 0.5), known_pairs=[("ball0", "ball9")])
 
 
 def test_a_root_named_world_and_a_locked_joint_are_no_matter():
     robot = slides(0.0, 0.05)
     joints = tuple(replace(j, parent="world", limits=(0.0, 0.0)) for j in robot.joints)
     robot = replace(robot, links=(Link("world"), *robot.links[1:]), joints=joints)
-    assert ignore_pairs(robot) == (("ball0", "ball1"),)
+    assert survey_collisions(robot).ignore_pairs == (("ball0", "ball1"),)
 
 
 def test_configurations_of_another_shape_are_refused():
-    tester = SelfCollisionChecker(slides(0.0, 0.3))
+    checker = SelfCollisionChecker(slides(0.0, 0.3))
     for q in ([0.0, 0.0], [[0.0]]):
         with pytest.raises(ValueError, match="q has shape"):
-            tester.penetrations(q)
+            checker.penetrations(q)
 
 
 def test_a_heap_of_overlapping_links_fits_into_memory():
     robot = slides(*[0.0] * 40)
-    (found,) = self_collisions(robot, [robot.home])
+    (found,) = penetrations(robot, [robot.home])
     assert len(found) == 40 * 39 // 2
 
 
@@ -223,8 +228,8 @@ def test_where_mujoco_gives_up_a_hair_beside_it_counts(monkeypatch, tmp_path, ca
         else:
             collide(model, data)
 
-    monkeypatch.setattr("morphgen.checks.self_collision.mujoco.mj_collision", give_up)
-    (found,) = self_collisions(slides(0.0, 0.08), [[0.0, 0.0]])
+    monkeypatch.setattr("mujoco.mj_collision", give_up)
+    (found,) = penetrations(slides(0.0, 0.08), [[0.0, 0.0]])
     assert found == {("ball0", "ball1"): pytest.approx(0.02)}
     assert given_up == [0.0, 1e-9]
     assert not list(tmp_path.iterdir())
@@ -251,7 +256,7 @@ def test_two_cylinders_that_mujoco_gives_up_on_for_a_ten_millionth():
     )
     robot = slides(0.0, 0.0)
     links = [replace(a, collisions=(b,)) for a, b in zip(robot.links[1:], shapes, strict=True)]
-    (found,) = self_collisions(replace(robot, links=(robot.root, *links)), [[0.0, 0.0]])
+    (found,) = penetrations(replace(robot, links=(robot.root, *links)), [[0.0, 0.0]])
     assert found == {}
 
 
@@ -260,6 +265,6 @@ def test_what_mujoco_cannot_tell_at_all_is_an_error(monkeypatch):
         del model, data
         mujoco.get_mju_user_warning()("EPA: out of memory for faces on expanding polytope")
 
-    monkeypatch.setattr("morphgen.checks.self_collision.mujoco.mj_collision", give_up)
+    monkeypatch.setattr("mujoco.mj_collision", give_up)
     with pytest.raises(RobotError, match=r"'slides': MuJoCo cannot say .* \[0\.0, 0\.0\]: EPA"):
-        self_collisions(slides(0.0, 0.08), [[0.0, 0.0]])
+        penetrations(slides(0.0, 0.08), [[0.0, 0.0]])

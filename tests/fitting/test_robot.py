@@ -150,7 +150,7 @@ def test_a_robot_in_primitives_keeps_its_masses_and_joints():
     assert [link.visuals for link in made.links] == [link.visuals for link in meshes.links]
     assert not any(isinstance(s.geometry, Mesh) for link in made.links for s in link.collisions)
     assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
-    assert SelfCollisionChecker(made).penetrations([made.home]) == [{}]
+    assert list(SelfCollisionChecker(made).penetrations([made.home])) == [{}]
     assert morphgen.check(made) == morphgen.check(meshes)
 
 

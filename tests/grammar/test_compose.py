@@ -10,7 +10,7 @@ import pytest
 from helpers.parts import write_part
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
-from morphgen.checks.self_collision import self_collisions
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import CompositionError, PartError
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.grammar.compose import compose, join, place
@@ -207,7 +207,7 @@ def test_the_panda_and_its_hand_make_the_real_robot():
 )
 def test_no_robot_collides_with_itself_at_home(text):
     robot = composed(text)
-    assert self_collisions(robot, [robot.home]) == [{}]
+    assert list(SelfCollisionChecker(robot).penetrations([robot.home])) == [{}]
     assert robot.ignore_pairs == tuple(sorted({tuple(sorted(pair)) for pair in robot.ignore_pairs}))
     assert {name for pair in robot.ignore_pairs for name in pair} <= set(robot.link_index)
 
@@ -219,7 +219,7 @@ def test_what_can_collide_is_not_ignored():
     assert ("left_arm_base_link", "left_arm_forearm_link") not in robot.ignore_pairs
     home = list(robot.home[6:])
     stretched = [[pan, 0, 0, 0, 0, 0, *home] for pan in (math.pi / 2, -math.pi / 2)]
-    outwards, inwards = self_collisions(robot, stretched)
+    outwards, inwards = SelfCollisionChecker(robot).penetrations(stretched)
     assert outwards == {}
     assert ("left_arm_forearm_link", "right_arm_upper_arm_link") in inwards
 

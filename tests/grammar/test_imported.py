@@ -9,7 +9,7 @@ from helpers.faulty_robots import with_joint
 from helpers.parts import PINCER
 from helpers.robots import arm
 from morphgen.checks import check
-from morphgen.checks.self_collision import self_collisions
+from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import FormatError
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.imported import import_robot
@@ -56,7 +56,7 @@ def test_it_has_the_files_name_or_the_one_that_is_given(urdf):
 
 def test_nothing_is_in_self_collision_at_home(urdf):
     robot = import_robot(urdf(arm()))
-    assert self_collisions(robot, [robot.home]) == [{}]
+    assert list(SelfCollisionChecker(robot).penetrations([robot.home])) == [{}]
     assert ("left", "slider") in robot.ignore_pairs
 
 

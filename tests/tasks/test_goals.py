@@ -13,7 +13,7 @@ from helpers.goal_sets import draw_goals
 from helpers.robots import arm
 from helpers.scenes import robot
 from morphgen.benchmark.workspace import shoulder, workspace
-from morphgen.checks.self_collision import ignore_pairs
+from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
@@ -44,7 +44,7 @@ def cache(tmp_path):
 
 @pytest.fixture(scope="module")
 def body():
-    return replace(arm(), ignore_pairs=ignore_pairs(arm()))
+    return replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs)
 
 
 def made(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
@@ -194,9 +194,9 @@ def test_every_run_gives_the_same_bytes(body, tmp_path):
     code = (
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
         "from dataclasses import replace; from robots import arm; "
-        "from morphgen.checks.self_collision import ignore_pairs; "
+        "from morphgen.checks.self_collision import survey_collisions; "
         "from morphgen.tasks.reach.config import ReachConfig; from goal_draws import draw_goals; "
-        "body = replace(arm(), ignore_pairs=ignore_pairs(arm())); "
+        "body = replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs); "
         "draw_goals(body, ReachConfig(goals=12), obstacles=True, seed=0, ground=-0.4, "
         "cache=Path(sys.argv[1]))"
     )

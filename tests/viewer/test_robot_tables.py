@@ -104,4 +104,4 @@ def test_a_free_configuration_is_free():
     tested = SelfCollisionChecker(robot)
     q = free_configuration(tested, robot, np.random.default_rng(0))
     assert q is not None
-    assert tested.penetrations([q]) == [{}]
+    assert list(tested.penetrations([q])) == [{}]
