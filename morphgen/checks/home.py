@@ -26,7 +26,7 @@ def check_self_collision(robot: Robot) -> Iterator[Finding]:
         return
     touchable = robot.with_links(map(_sound, robot.links))
     tested = SelfCollisionChecker(touchable, untested_pairs(touchable))
-    for (a, b), depth in sorted(tested.penetrations([robot.home])[0].items()):
+    for (a, b), depth in sorted(next(tested.penetrations([robot.home])).items()):
         yield Finding(
             "self-collision",
             "warning",
