@@ -27,9 +27,9 @@ from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.grammar_file import find_grammar, grammar_names, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.grammar.model import find_grammar, grammar_names, load_grammar
-from morphgen.grammar.sampling import draw
+from morphgen.grammar.sampling import sample_robot
 
 Counts = tuple[Iterable[int], Iterable[int]]
 """Allowed numbers of links and of movable joints."""
@@ -114,10 +114,10 @@ def _row(
     rejected: Counter[str] = Counter()
     as_specified = clean = conforms = True
     error = seconds = 0.0
-    draw(grammar, library, 0, seed=args.seed)
+    sample_robot(grammar, library, 0, seed=args.seed)
     for index in range(args.n):
         start = time.perf_counter()
-        drawn = draw(grammar, library, index, seed=args.seed)
+        drawn = sample_robot(grammar, library, index, seed=args.seed)
         seconds += time.perf_counter() - start
         robot = drawn.robot
         links[len(robot.links)] += 1

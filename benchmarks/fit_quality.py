@@ -136,7 +136,7 @@ def link_tasks(only: set[str]) -> list[Task]:
         for manifest in default_library().manifests("arm")
         if not manifest.is_template and not manifest.scaling
         if not only or manifest.name in only
-        for link in load_part(manifest).body.links
+        for link in load_part(manifest).fragment.links
         if shapes_to_fit(link)
     ]
 

@@ -27,8 +27,8 @@ from typing import ParamSpec, TypeVar
 from tabulate import tabulate
 
 from morphgen.grammar import compose, conditions, robot_set, sampling
-from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
-from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
+from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
+from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
 from morphgen.grammar.workers import make_in_processes
 
 P = ParamSpec("P")
@@ -38,7 +38,7 @@ STEPS = (
     (sampling, "derive", "derive"),
     (compose, "load_part", "xacro fill + parse"),
     (sampling, "join", "join"),
-    (sampling, "survey_of", "collision survey"),
+    (sampling, "survey_contacts", "collision survey"),
     (sampling, "check", "check"),
     (conditions, "reach", "reach"),
     (robot_set, "_write_light", "write"),
@@ -66,7 +66,7 @@ def main() -> int:
     text = grammar_text(grammar)
     runs = {}
     with tempfile.TemporaryDirectory() as scratch:
-        plan = SetPlan(Path(scratch), grammar.name, text, 0, (), True, False, ())
+        plan = SetConfig(Path(scratch), grammar.name, text, 0, (), True, False, ())
         for jobs in (1, 2):
             own = replace(plan, folder=Path(scratch) / f"{jobs}")
             runs[jobs] = _apart(_measure, own, args.n, jobs)
@@ -96,7 +96,7 @@ def _apart(measure: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> 
         return pool.submit(measure, *arguments, **options).result()
 
 
-def _measure(plan: SetPlan, n: int, jobs: int) -> Run:
+def _measure(plan: SetConfig, n: int, jobs: int) -> Run:
     early = 0.0
 
     def progress(done: int) -> None:
@@ -111,7 +111,7 @@ def _measure(plan: SetPlan, n: int, jobs: int) -> Run:
     return Run(time.perf_counter() - start, early, _peak())
 
 
-def _shares(plan: SetPlan, n: int) -> list[tuple[str, float, str]]:
+def _shares(plan: SetConfig, n: int) -> list[tuple[str, float, str]]:
     """Return for each step its name, time per robot [ms] and share."""
     clock = _Clock()
     for module, name, step in STEPS:
@@ -152,7 +152,7 @@ class _Clock:
         return timed
 
 
-def _warm(plan: SetPlan) -> None:
+def _warm(plan: SetConfig) -> None:
     make_set(replace(plan, folder=plan.folder.with_name(f"{plan.folder.name}w")), 3, make_serially)
 
 

@@ -28,8 +28,8 @@ from morphgen.benchmark.generate import Order
 from morphgen.benchmark.split import Split
 from morphgen.benchmark.split_file import split_text, write_split
 from morphgen.benchmark.verify import verify
+from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.grammar.model import find_grammar, load_grammar
 
 T = TypeVar("T")
 

@@ -12,10 +12,10 @@ from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import read_robot, write_bundle
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.conditions import require_condition
+from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.grammar.model import find_grammar, load_grammar
 from morphgen.grammar.request import parse_words
-from morphgen.grammar.sampling import sample as draw_samples
+from morphgen.grammar.sampling import sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
@@ -79,7 +79,7 @@ def sample(
     conditions = [parse_condition(where)] if where else []
     for condition in conditions:
         require_condition(condition)
-    return (drawn.robot for drawn in draw_samples(found, parts, n, seed=seed, where=conditions))
+    return (drawn.robot for drawn in sample_robots(found, parts, n, seed=seed, where=conditions))
 
 
 def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) -> Robot:

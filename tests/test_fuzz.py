@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import morphgen
 from helpers.fuzzing import MEMORY_MIB, Runner
-from morphgen.grammar.model import grammar_names
+from morphgen.grammar.grammar_file import grammar_names
 
 TEMPLATES = Path(morphgen.__file__).parents[1] / "templates"
 

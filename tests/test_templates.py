@@ -51,14 +51,14 @@ RANGES = [pytest.param(manifest, id=manifest.name) for manifest in TEMPLATES]
 @pytest.mark.parametrize("manifest", RANGES)
 def test_a_template_is_sound_at_the_ends_of_its_ranges(manifest):
     for values in extremes(manifest):
-        assert troubles(load_part(manifest, values).body, tool_required=False) == [], values
+        assert troubles(load_part(manifest, values).fragment, tool_required=False) == [], values
 
 
 @pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
 def test_masses_of_a_template_follow_from_its_shapes(manifest):
     if manifest.name == "cartpole":
         pytest.skip("its pole has a mass of its own, see below")
-    for link in load_part(manifest).body.links:
+    for link in load_part(manifest).fragment.links:
         shapes = link.collisions or link.visuals
         mass = union_integrals(shapes).volume * manifest.density if shapes else 0.0
         assert (link.inertial.mass if link.inertial else 0.0) == pytest.approx(mass)
@@ -66,7 +66,7 @@ def test_masses_of_a_template_follow_from_its_shapes(manifest):
 
 @pytest.mark.parametrize("values", [{}, {"length": 0.5, "mass": 1.5}, {"length": 1.5}])
 def test_the_pole_of_a_cartpole_has_the_inertia_of_its_shapes(values):
-    pole = load_part(LIBRARY.manifest("cartpole"), values).body.link("pole")
+    pole = load_part(LIBRARY.manifest("cartpole"), values).fragment.link("pole")
     assert pole.inertial.mass == values.get("mass", 1)
     solid = inertial_from_density(
         pole.collisions, pole.inertial.mass / union_integrals(pole.collisions).volume
@@ -79,17 +79,17 @@ def test_the_pole_of_a_cartpole_has_the_inertia_of_its_shapes(values):
 @pytest.mark.parametrize("gather", [0.0, 1.0])
 def test_fingers_of_a_hand_leave_room_for_each_other(fingers, gather):
     part = load_part(LIBRARY.manifest("hand"), {"fingers": fingers, "gather": gather})
-    names = [link.name for link in part.body.links if link.name.endswith("proximal")]
+    names = [link.name for link in part.fragment.links if link.name.endswith("proximal")]
     assert len(names) == fingers
-    T_root_link = forward_kinematics(part.body, part.body.home)
-    outwards = np.array([T_root_link[part.body.link_index[name], :3, 0] for name in names])
+    T_root_link = forward_kinematics(part.fragment, part.fragment.home)
+    outwards = np.array([T_root_link[part.fragment.link_index[name], :3, 0] for name in names])
     cosines = (outwards @ outwards.T)[np.triu_indices(fingers, 1)]
     widest = np.pi / 4 if gather and fingers > 2 else 2 * np.pi / fingers
     assert cosines.max() == pytest.approx(np.cos(widest))
 
 
 def test_fingers_of_a_hand_curl_towards_the_tool():
-    body = load_part(LIBRARY.manifest("hand")).body
+    body = load_part(LIBRARY.manifest("hand")).fragment
     open_hand, fist = forward_kinematics(body, [np.zeros(body.dof), np.full(body.dof, 0.5)])
     tips = [i for i, link in enumerate(body.links) if link.name.endswith("distal")]
     assert (fist[tips, 2, 3] > open_hand[tips, 2, 3] + 0.01).all()

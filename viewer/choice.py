@@ -9,7 +9,7 @@ from morphgen.errors import CompositionError, nearest
 from morphgen.formats.urdf_text import number
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import Kind, Manifest
+from morphgen.grammar.manifest import Manifest, PartKind
 from morphgen.grammar.parameters import MOUNT_YAW, Parameter, parse_value
 from morphgen.grammar.request import MAIN_PORTS, SLOTS
 from morphgen.viewer.robot_tables import slider_step
@@ -78,7 +78,7 @@ def parse_choice(words: Sequence[str], library: Library) -> Choice:
     return Choice(parts, values)
 
 
-def kind_of(slot: str) -> Kind:
+def kind_of(slot: str) -> PartKind:
     """The kind of part that a slot takes."""
     last = slot.rpartition(".")[2]
     return next(kind for kind in SLOTS if kind == last)

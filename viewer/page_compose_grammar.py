@@ -10,18 +10,18 @@ from pathlib import Path
 import viser
 
 from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import First
+from morphgen.grammar.choosers import FirstChooser
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, outline
 from morphgen.grammar.derive import derive
-from morphgen.grammar.model import (
+from morphgen.grammar.grammar_file import (
     SUFFIX,
     Grammar,
     grammar_from_text,
     grammar_names,
     grammar_text,
 )
-from morphgen.grammar.sampling import draw
+from morphgen.grammar.sampling import sample_robot
 from morphgen.viewer import markup
 from morphgen.viewer.address import Address, AddressError, whole_number
 from morphgen.viewer.choice import first_parts
@@ -115,12 +115,12 @@ def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
     if drawn:
         seed, number = tab.seed.value, tab.number.value
         say(session, f"drawing robot {number} of seed {seed}")
-        sample = draw(grammar, library, number, seed=seed)
+        sample = sample_robot(grammar, library, number, seed=seed)
         say(session, "")
         robot, tab.derivation = sample.robot, sample.derivation
         command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
     else:
-        tab.derivation = derive(grammar, library, First())
+        tab.derivation = derive(grammar, library, FirstChooser())
         robot = compose(tab.derivation, library, tab.name)
     n = sum(1 for _ in tab.derivation.walk())
     tab.step.max = max(n, 2)
@@ -170,7 +170,7 @@ def _read_grammar(tab: GrammarTab) -> bool:
     """Say whether the text is a grammar that can be derived; if not, where it fails."""
     try:
         grammar = grammar_from_text(tab.text.value, tab.name)
-        derive(grammar, tab.composed.session.places.library, First())
+        derive(grammar, tab.composed.session.places.library, FirstChooser())
     except GrammarError as error:
         tab.fault.content = fault(error, tab.composed.session.places)
         return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import viser
 
 from morphgen.benchmark.split_file import split_names
-from morphgen.grammar.model import grammar_names
+from morphgen.grammar.grammar_file import grammar_names
 from morphgen.viewer import browser, gallery_grid, markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.gallery_grid import Gallery

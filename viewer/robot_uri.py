@@ -29,8 +29,8 @@ from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.grammar_file import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.request import default_name, parse_words
 from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
 from morphgen.model.robot import TOOL, Frame, Robot

@@ -14,7 +14,7 @@ import torch
 from morphgen.errors import MissingDependencyError, MorphgenError, TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
-from morphgen.grammar.model import SUFFIX
+from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.play import interface_of, make_controller, require_policy

@@ -8,7 +8,7 @@ from pathlib import Path
 from morphgen.benchmark.built import SPLIT
 from morphgen.benchmark.split_file import split_names
 from morphgen.errors import nearest
-from morphgen.grammar.model import SUFFIX, grammar_names
+from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.viewer.address import Address, Page
 from morphgen.viewer.robot_uri import (
     CHECKPOINT,

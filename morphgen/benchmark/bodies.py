@@ -17,10 +17,10 @@ from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.grammar_file import Grammar, grammar_names
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import Grammar, grammar_names
 from morphgen.grammar.request import parse_words
-from morphgen.grammar.sampling import draw
+from morphgen.grammar.sampling import sample_robot
 from morphgen.model.robot import Robot
 from morphgen.processes import mapped
 
@@ -88,7 +88,7 @@ class Maker:
             MorphgenError: If the recipe names what does not exist or does not fit.
         """
         if isinstance(recipe, Drawn):
-            sample = draw(
+            sample = sample_robot(
                 recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
             )
             return self._body(sample.robot, sample.derivation, recipe.grammar.name)

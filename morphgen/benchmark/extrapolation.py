@@ -15,8 +15,8 @@ from morphgen.benchmark.similarity import cosine
 from morphgen.benchmark.split import Split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import Grammar
 
 _BOUND = re.compile(r"\s*([<>])\s*(\d+\.?\d*|\.\d+)\s*")
 

@@ -21,11 +21,11 @@ from morphgen.benchmark.bodies import (
 from morphgen.benchmark.split import MADE_MAX_LINKS, Member, Regime, Split
 from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError
-from morphgen.grammar.choosers import Random, Recorded
+from morphgen.grammar.choosers import RandomChooser, RecordedChooser
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import EndlessError, derive
+from morphgen.grammar.derive import TooManyPartsError, derive
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import Grammar
 
 MAX_DRAWS = 2000
 """Draws that are no test robot before what is asked for is taken to be too hard. They are cheap:
@@ -97,8 +97,8 @@ class Stream:
         """The first derivation drawn for a robot, most often its own; None if it does not end."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         try:
-            return derive(self.grammar, library, Recorded(Random(rng)))
-        except EndlessError:
+            return derive(self.grammar, library, RecordedChooser(RandomChooser(rng)))
+        except TooManyPartsError:
             return None
 
 

@@ -12,8 +12,8 @@ from morphgen.benchmark.regimes import HULLS, ON_HULL, hull_distance, parameters
 from morphgen.benchmark.split import Split
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.model import Grammar
 
 
 def interpolation(

@@ -18,7 +18,7 @@ from morphgen.errors import MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.card import rounded
 from morphgen.grammar.compose import compose
-from morphgen.grammar.conditions import Properties
+from morphgen.grammar.conditions import RobotProperties
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
@@ -91,7 +91,7 @@ class SplitSurvey:
 
 def robot_stats(robot: Robot) -> RobotStats:
     """Count and measure a robot."""
-    known = Properties(robot)
+    known = RobotProperties(robot)
     return RobotStats(
         len(robot.links),
         len(robot.movable_joints),

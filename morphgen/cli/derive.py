@@ -69,10 +69,10 @@ def run_mutate(args: argparse.Namespace) -> int:
     from morphgen.formats.bundle import write_bundle
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import difference
+    from morphgen.grammar.grammar_file import grammar_from_text
     from morphgen.grammar.limits import MAX_TEXT
-    from morphgen.grammar.model import grammar_from_text
-    from morphgen.grammar.mutation import mutate
     from morphgen.grammar.robot_set import GRAMMAR, read_index, read_settings
+    from morphgen.grammar.sampling import mutate
 
     folder = args.robot.resolve().parent
     if not (folder / GRAMMAR).is_file():

@@ -241,7 +241,7 @@ def _targets(args: argparse.Namespace) -> list[Target]:
     if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
         if args.root is not None:
             raise FormatError(f"--root {args.root}: only with a bundle, a URDF or a xacro")
-        return [Target(word, load_part(library.manifest(word)).body, None, is_part=True)]
+        return [Target(word, load_part(library.manifest(word)).fragment, None, is_part=True)]
     return [
         Target(source.label, read_source(source, library, args.root), source.path, is_part=False)
         for source in sources_named(args)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli.options import Subparsers, add_json, add_library, library_of, whole_number
 
 if TYPE_CHECKING:
-    from morphgen.grammar.model import Grammar
+    from morphgen.grammar.grammar_file import Grammar
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -42,7 +42,7 @@ def run_list(args: argparse.Namespace) -> int:
     """Print the names and what their robots are."""
     from tabulate import tabulate
 
-    from morphgen.grammar.model import grammar_names, grammar_summary
+    from morphgen.grammar.grammar_file import grammar_names, grammar_summary
 
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
     print(json.dumps(rows) if args.json else tabulate(rows, headers="keys"))
@@ -51,10 +51,10 @@ def run_list(args: argparse.Namespace) -> int:
 
 def run_check(args: argparse.Namespace) -> int:
     """Print every fault."""
-    from morphgen.grammar.analysis import faults
+    from morphgen.grammar.analysis import check_grammar
 
     grammar = _load(args)
-    found = faults(grammar, library_of(args))
+    found = check_grammar(grammar, library_of(args))
     if args.json:
         print(json.dumps(found))
     else:
@@ -66,16 +66,16 @@ def run_count(args: argparse.Namespace) -> int:
     """Print the number of structures and what is drawn."""
     from morphgen.grammar.analysis import variables
     from morphgen.grammar.limits import COUNT_DIGITS, MAX_COUNT
-    from morphgen.grammar.structures import count
+    from morphgen.grammar.structures import count_structures
 
     grammar = _load(args)
-    structures = count(grammar)
+    structures = count_structures(grammar)
     finite = structures != math.inf
     drawn = variables(grammar)
     if args.json:
         number = int(structures) if structures <= MAX_COUNT else None
         names = [
-            {"where": v.where, "draw": v.text, "continuous": v.distribution.is_continuous}
+            {"where": v.location, "draw": v.text, "continuous": v.distribution.is_continuous}
             for v in drawn
         ]
         print(json.dumps({"structures": number, "finite": finite, "variables": names}))
@@ -85,7 +85,7 @@ def run_count(args: argparse.Namespace) -> int:
     print(f"{grammar.name}: {text} structures, {len(drawn)} values drawn")
     for variable in drawn:
         kind = "continuous" if variable.distribution.is_continuous else "discrete"
-        print(f"  {kind:10}  {variable.where} = {variable.text}")
+        print(f"  {kind:10}  {variable.location} = {variable.text}")
     return 0
 
 
@@ -105,7 +105,7 @@ def run_enumerate(args: argparse.Namespace) -> int:
 
 def run_print(args: argparse.Namespace) -> int:
     """Print the grammar."""
-    from morphgen.grammar.model import grammar_text
+    from morphgen.grammar.grammar_file import grammar_text
 
     text = grammar_text(_load(args))
     print(json.dumps(text) if args.json else text, end="" if not args.json else "\n")
@@ -113,7 +113,7 @@ def run_print(args: argparse.Namespace) -> int:
 
 
 def _load(args: argparse.Namespace) -> Grammar:
-    from morphgen.grammar.model import find_grammar, load_grammar
+    from morphgen.grammar.grammar_file import find_grammar, load_grammar
 
     folders = library_of(args).folders
     return load_grammar(find_grammar(args.grammar, folders), folders)

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.cli.written import write_and_report
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import bundle_folder
-    from morphgen.grammar.imported import import_robot
+    from morphgen.grammar.robot_source import import_robot
 
     if args.name is not None:
         bundle_folder(args.out, args.name)

@@ -60,23 +60,22 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from morphgen.errors import GrammarError
-    from morphgen.grammar.analysis import faults
+    from morphgen.grammar.analysis import check_grammar
     from morphgen.grammar.conditions import require_condition
-    from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
-    from morphgen.grammar.ray_workers import make_on_ray
-    from morphgen.grammar.robot_set import SetPlan, Work, make_serially, make_set
+    from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
+    from morphgen.grammar.robot_set import SetConfig, SetWorker, make_serially, make_set
     from morphgen.grammar.syntax import parse_condition
-    from morphgen.grammar.workers import make_in_processes
+    from morphgen.grammar.workers import make_in_processes, make_on_ray
 
     library = library_of(args)
     grammar = load_grammar(find_grammar(args.grammar, library.folders), library.folders)
-    wrong = faults(grammar, library)
+    wrong = check_grammar(grammar, library)
     if wrong:
         raise GrammarError(wrong[0] + (f" (and {len(wrong) - 1} more)" if wrong[1:] else ""))
     for text in args.where:
         require_condition(parse_condition(text))
     folder = args.out or Path("robots") / grammar.name
-    plan = SetPlan(
+    plan = SetConfig(
         folder,
         grammar.name,
         grammar_text(grammar),
@@ -86,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         not args.no_picture,
         tuple(args.library),
     )
-    work: Work = make_serially
+    work: SetWorker = make_serially
     if args.ray is not None:
         work = make_on_ray(args.ray or None)
     elif args.jobs > 1:

@@ -22,8 +22,8 @@ from morphgen.cli.options import (
 if TYPE_CHECKING:
     from morphgen.benchmark.generate import Order
     from morphgen.benchmark.split import Split
+    from morphgen.grammar.grammar_file import Grammar
     from morphgen.grammar.library import Library
-    from morphgen.grammar.model import Grammar
 
 Splits = tuple["Split", ...]
 Progress = Callable[[int], None]
@@ -246,13 +246,13 @@ def _order(args: argparse.Namespace) -> Order:
 def _grammars(names: Sequence[str], library: Library) -> list[Grammar]:
     """Sound grammars, by name or file."""
     from morphgen.errors import GrammarError
-    from morphgen.grammar.analysis import faults
-    from morphgen.grammar.model import find_grammar, load_grammar
+    from morphgen.grammar.analysis import check_grammar
+    from morphgen.grammar.grammar_file import find_grammar, load_grammar
 
     found = []
     for name in names:
         grammar = load_grammar(find_grammar(name.strip(), library.folders), library.folders)
-        wrong = faults(grammar, library)
+        wrong = check_grammar(grammar, library)
         if wrong:
             raise GrammarError(wrong[0] + (f" (and {len(wrong) - 1} more)" if wrong[1:] else ""))
         found.append(grammar)

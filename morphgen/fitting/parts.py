@@ -69,7 +69,7 @@ def store_part(manifest: Manifest) -> Path:
         FormatError: If the file cannot be written.
         MeshError: If a mesh cannot be read.
     """
-    body = load_part(manifest).body
+    body = load_part(manifest).fragment
     fits = {}
     for row in fit_links(body, COLLISION).links:
         shapes = shapes_to_fit(body.link(row.link))
@@ -120,5 +120,5 @@ def stored_of(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
 
 def _keys(manifest: Manifest) -> set[str]:
     """Keys of links with meshes."""
-    links = (shapes_to_fit(link) for link in load_part(manifest).body.links)
+    links = (shapes_to_fit(link) for link in load_part(manifest).fragment.links)
     return {shapes_key(shapes) for shapes in links if has_meshes(shapes)}

@@ -12,17 +12,22 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from morphgen.errors import CompositionError, GrammarError
-from morphgen.grammar.compose import own_values, require_root
+from morphgen.grammar.compose import part_values, require_root
 from morphgen.grammar.derive import (
     argument,
     attached_parameters,
     require_part,
 )
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_FAULTS, MAX_PARTS
-from morphgen.grammar.model import Grammar
 from morphgen.grammar.part import load_part
-from morphgen.grammar.structures import SearchError, count, enumerate_structures, typical_names
+from morphgen.grammar.structures import (
+    SearchError,
+    count_structures,
+    enumerate_structures,
+    typical_names,
+)
 from morphgen.grammar.syntax import Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, distribution_of, evaluate, no_draw
 
@@ -36,13 +41,13 @@ CHECKED_ENDLESS = 40
 class Variable:
     """A value that a grammar draws."""
 
-    where: str
+    location: str
     """``let`` or symbol, part and parameter."""
     distribution: Distribution
     text: str
 
 
-def faults(grammar: Grammar, library: Library) -> list[str]:
+def check_grammar(grammar: Grammar, library: Library) -> list[str]:
     """Everything that is wrong with a grammar, a line each; none if it is sound.
 
     Unknown names, parameters, units and values out of range; symbols that cannot be reached or
@@ -106,7 +111,7 @@ def _faults_of(item: Item, grammar: Grammar, library: Library, scope: Scope) -> 
 
 def _require_bare(item: Item) -> None:
     if item.arguments:
-        raise GrammarError(f"{item.place}: {item.name!r} is a symbol and takes no parameters")
+        raise GrammarError(f"{item.location}: {item.name!r} is a symbol and takes no parameters")
 
 
 def _endless(grammar: Grammar) -> Iterator[str]:
@@ -135,7 +140,7 @@ def _endless(grammar: Grammar) -> Iterator[str]:
             fresh += [] if below else [symbol]
     for production in grammar.productions:
         if production.symbol not in ending:
-            yield f"{production.place}: {production.symbol!r} never ends: it always holds itself"
+            yield f"{production.location}: {production.symbol!r} never ends: it always holds itself"
 
 
 def _circular(grammar: Grammar) -> Iterator[str]:
@@ -156,7 +161,7 @@ def _circular(grammar: Grammar) -> Iterator[str]:
     itself = {one for one, other in alone if one == other}
     for i, production in enumerate(grammar.productions):
         if sizes[component[i]] > 1 or i in itself:
-            yield f"{production.place}: {production.symbol!r} can be rewritten to itself alone"
+            yield f"{production.location}: {production.symbol!r} can be rewritten to itself alone"
 
 
 def _unreached(grammar: Grammar) -> Iterator[str]:
@@ -170,7 +175,7 @@ def _unreached(grammar: Grammar) -> Iterator[str]:
     for production in grammar.productions:
         if production.symbol not in reached:
             start = grammar.start
-            yield f"{production.place}: {production.symbol!r} cannot be reached from {start!r}"
+            yield f"{production.location}: {production.symbol!r} cannot be reached from {start!r}"
 
 
 def _unused(grammar: Grammar) -> Iterator[str]:
@@ -182,13 +187,13 @@ def _unused(grammar: Grammar) -> Iterator[str]:
     used = {name for expression in expressions for name in _name_set(expression)}
     for let in grammar.lets:
         if let.name not in used:
-            yield f"{let.place}: {let.name!r} is never used"
+            yield f"{let.location}: {let.name!r} is never used"
 
 
 def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     start = grammar.production(grammar.start)
-    place = start.place if start else grammar.name
-    most = CHECKED_ENDLESS if count(grammar) == math.inf else CHECKED_STRUCTURES
+    location = start.location if start else grammar.name
+    most = CHECKED_ENDLESS if count_structures(grammar) == math.inf else CHECKED_STRUCTURES
     roots: set[str] = set()
     derived = False
     try:
@@ -196,19 +201,19 @@ def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
             derived = True
             if structure.part not in roots:
                 roots.add(structure.part)
-                require_root(load_part(library.manifest(structure.part), own_values(structure)))
+                require_root(load_part(library.manifest(structure.part), part_values(structure)))
     except CompositionError as error:
-        yield f"{place}: {error}"
+        yield f"{location}: {error}"
         return
     except SearchError as error:
         if not derived:
-            yield f"{place}: {error}"
+            yield f"{location}: {error}"
         return  # the structures that were derived are sound
     except GrammarError as error:
         yield str(error)
         return
     if not derived:
-        yield f"{place}: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
+        yield f"{location}: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
 
 
 def _items(production: Production) -> Iterator[Item]:

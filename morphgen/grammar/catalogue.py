@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import cast
 
 from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import Kind, PackageSource
+from morphgen.grammar.manifest import PackageSource, PartKind
 from morphgen.grammar.part import Part, load_part
 from morphgen.model.kinematics import reach
 from morphgen.model.robot import Frame, Joint, Link
@@ -19,7 +19,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
         Rows with name, kind, dof, reach (m, to the farthest port or the tool), mass (kg),
         source, licence and summary.
     """
-    return [_row(load_part(manifest)) for manifest in library.manifests(cast(Kind, kind))]
+    return [_row(load_part(manifest)) for manifest in library.manifests(cast(PartKind, kind))]
 
 
 def _row(part: Part) -> dict[str, object]:
@@ -28,9 +28,9 @@ def _row(part: Part) -> dict[str, object]:
     return {
         "name": manifest.name,
         "kind": manifest.kind,
-        "dof": part.body.dof,
+        "dof": part.fragment.dof,
         "reach": round(_reach(part), 3),
-        "mass": round(part.body.mass, 3),
+        "mass": round(part.fragment.mass, 3),
         "source": source.package if isinstance(source, PackageSource) else "template",
         "licence": manifest.licence,
         "summary": manifest.summary,
@@ -40,7 +40,7 @@ def _row(part: Part) -> dict[str, object]:
 def _reach(part: Part) -> float:
     """Distance from the mount to the farthest port or tool, the largest over configurations."""
     ends = [*part.ports.values(), *([part.tool] if part.tool else [])]
-    body = part.body
+    body = part.fragment
     T_mount_root = part.T_root_mount.inverse()
     stand = Joint("mount_joint", "fixed", "mount_frame", body.root.name, T_mount_root)
     stood = replace(

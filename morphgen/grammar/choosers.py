@@ -29,7 +29,7 @@ class Chooser(Protocol):
         """Value of a distribution."""
 
 
-class First:
+class FirstChooser:
     """Takes the first alternative, the smallest count and the typical value."""
 
     def alternative(self, key: str, weights: list[float]) -> int:
@@ -45,7 +45,7 @@ class First:
         return no_draw(key, distribution)
 
 
-class Random:
+class RandomChooser:
     """Draws from a generator."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -67,12 +67,12 @@ class Random:
 
 
 @dataclass
-class Recorded:
+class RecordedChooser:
     """Takes given choices where they fit, others from another chooser, and notes all."""
 
     other: Chooser
     given: Choices = field(default_factory=dict)
-    made: dict[str, float] = field(default_factory=dict)
+    choices: dict[str, float] = field(default_factory=dict)
 
     def alternative(self, key: str, weights: list[float]) -> int:
         """The given index if there is such an alternative."""
@@ -96,7 +96,7 @@ class Recorded:
         return self._note(key, float(number(given)))
 
     def _note(self, key: str, value: float) -> float:
-        if key in self.made:
+        if key in self.choices:
             raise GrammarError(f"two choices share the key {key!r}")
-        self.made[key] = value
+        self.choices[key] = value
         return value

@@ -17,12 +17,12 @@ from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_pair
 from morphgen.model.rotation import from_rpy
 
-TOUCH = 2e-3
+MAX_HOME_OVERLAP = 2e-3
 """Depth to which links that are not neighbours may touch at home, metres."""
 
 
 @dataclass(frozen=True)
-class Placed:
+class ScopedPart:
     """A part under its scope in the tree."""
 
     label: str
@@ -48,7 +48,7 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
         FormatError: If a part's source or stored fits cannot be read.
     """
     robot = with_stored_fits(join(derivation, library, name), library.folders)
-    return replace(robot, ignore_pairs=survey_of(robot, derivation, library).ignore_pairs)
+    return replace(robot, ignore_pairs=survey_contacts(robot, derivation, library).ignore_pairs)
 
 
 def join(derivation: Derivation, library: Library, name: str) -> Robot:
@@ -57,7 +57,7 @@ def join(derivation: Derivation, library: Library, name: str) -> Robot:
     A part whose root is a bare frame dissolves it: what hangs on the root hangs on the parent.
     The tool is that of the outermost part which has one, else the first port of the last part.
     """
-    placed = place(derivation, library)
+    placed = load_parts(derivation, library)
     assembly = _Assembly(placed)
     assembly.add(derivation, None, IDENTITY, owns_tool=True)
     return Robot(
@@ -81,7 +81,7 @@ def join(derivation: Derivation, library: Library, name: str) -> Robot:
 class _Assembly:
     """A robot being put together, parts appended parents first."""
 
-    def __init__(self, placed: Mapping[str, Placed]) -> None:
+    def __init__(self, placed: Mapping[str, ScopedPart]) -> None:
         self._placed = placed
         self._dissolved: dict[str, Frame] = {}
         self.links: list[Link] = []
@@ -97,10 +97,10 @@ class _Assembly:
         part = here.part
         self._add_root(here, parent, T_parent_port)
         self.links.extend(
-            replace(link, name=here.scoped(link.name)) for link in part.body.links[1:]
+            replace(link, name=here.scoped(link.name)) for link in part.fragment.links[1:]
         )
-        self.joints.extend(self._scoped(joint, here) for joint in part.body.joints)
-        self.home.extend(part.body.home)
+        self.joints.extend(self._scoped(joint, here) for joint in part.fragment.joints)
+        self.home.extend(part.fragment.home)
         for port, child in node.children:
             if port not in part.ports:
                 raise CompositionError(
@@ -114,22 +114,22 @@ class _Assembly:
         if owns_tool and tool is not None:
             self.tools.append((node.label, self._frame(tool, here)))
 
-    def _add_root(self, here: Placed, parent: str | None, T_parent_port: Pose) -> None:
+    def _add_root(self, here: ScopedPart, parent: str | None, T_parent_port: Pose) -> None:
         part = here.part
-        root = here.scoped(part.body.root.name)
+        root = here.scoped(part.fragment.root.name)
         if parent is None:
             require_root(part)
-            self.links.append(replace(part.body.root, name=root))
+            self.links.append(replace(part.fragment.root, name=root))
             return
         T_port_mount = Pose(quaternion=from_rpy((0.0, 0.0, here.mount_yaw)))
         T_parent_root = T_parent_port @ T_port_mount @ part.T_root_mount.inverse()
-        if part.body.root.is_empty:
+        if part.fragment.root.is_empty:
             self._dissolved[root] = Frame(root, parent, T_parent_root)
             return
-        self.links.append(replace(part.body.root, name=root))
+        self.links.append(replace(part.fragment.root, name=root))
         self.joints.append(Joint(here.scoped("mount"), "fixed", parent, root, T_parent_root))
 
-    def _frame(self, frame: Frame, here: Placed) -> Frame:
+    def _frame(self, frame: Frame, here: ScopedPart) -> Frame:
         """A part's frame on a link of the robot."""
         link = here.scoped(frame.link)
         if link not in self._dissolved:
@@ -137,7 +137,7 @@ class _Assembly:
         parent = self._dissolved[link]
         return Frame(frame.name, parent.link, parent.T_link_frame @ frame.T_link_frame)
 
-    def _scoped(self, joint: Joint, here: Placed) -> Joint:
+    def _scoped(self, joint: Joint, here: ScopedPart) -> Joint:
         mimic = joint.mimic
         if mimic is not None:
             mimic = Mimic(here.scoped(mimic.joint), mimic.multiplier, mimic.offset)
@@ -162,19 +162,19 @@ def require_root(part: Part) -> None:
         raise CompositionError(f"{part.manifest.name!r} needs a base: its mount is not its root")
 
 
-def place(derivation: Derivation, library: Library) -> dict[str, Placed]:
+def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart]:
     """Load every part of a derivation; by label, parents first."""
-    placed: dict[str, Placed] = {}
+    placed: dict[str, ScopedPart] = {}
     for node in derivation.walk():
         if node.label in placed:
             raise CompositionError(f"two parts are labelled {node.label!r}")
-        part = load_part(library.manifest(node.part), own_values(node))
+        part = load_part(library.manifest(node.part), part_values(node))
         yaw = dict(node.parameters).get(MOUNT_YAW.name, 0.0)
-        placed[node.label] = Placed(node.label, part, yaw)
+        placed[node.label] = ScopedPart(node.label, part, yaw)
     return placed
 
 
-def own_values(node: Derivation) -> dict[str, float]:
+def part_values(node: Derivation) -> dict[str, float]:
     """The parameters of a part itself, without those of how it is mounted."""
     return {name: value for name, value in node.parameters if name != MOUNT_YAW.name}
 
@@ -189,7 +189,7 @@ def _tool_frames(tools: list[tuple[str, Frame]]) -> tuple[Frame, ...]:
     return (replace(named[-1], name="tool"), *named)
 
 
-def _provenance(placed: Iterable[Placed]) -> list[dict[str, object]]:
+def _provenance(placed: Iterable[ScopedPart]) -> list[dict[str, object]]:
     return [
         {
             "label": here.label,
@@ -203,19 +203,19 @@ def _provenance(placed: Iterable[Placed]) -> list[dict[str, object]]:
     ]
 
 
-def survey_of(robot: Robot, derivation: Derivation, library: Library) -> CollisionSurvey:
+def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> CollisionSurvey:
     """Which contacts of a joined robot are no self-collision.
 
     Those of each real part, as it is made, are known from before; all others are tested. Parts
-    that overlap at home by more than ``TOUCH`` are not ignored: that is a faulty composition,
-    which ``check`` reports.
+    that overlap at home by more than ``MAX_HOME_OVERLAP`` are not ignored: ``check`` reports such
+    a faulty composition.
     """
     owner: dict[str, str] = {}
     tested: set[str] = set()
     known: list[Pair] = []
-    for here in place(derivation, library).values():
+    for here in load_parts(derivation, library).values():
         manifest = here.part.manifest
-        names = [here.scoped(link.name) for link in here.part.body.links]
+        names = [here.scoped(link.name) for link in here.part.fragment.links]
         owner |= dict.fromkeys(names, here.label)
         if manifest.is_template or manifest.scaling:
             tested.update(names)
@@ -228,7 +228,7 @@ def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Collisi
     faulty = {
         (a, b)
         for (a, b), depth in found.home_penetrations.items()
-        if owner[a] != owner[b] and depth > TOUCH
+        if owner[a] != owner[b] and depth > MAX_HOME_OVERLAP
     }
     return CollisionSurvey(
         tuple(pair for pair in found.ignore_pairs if pair not in faulty), found.home_penetrations
@@ -238,4 +238,4 @@ def survey_of(robot: Robot, derivation: Derivation, library: Library) -> Collisi
 @lru_cache(maxsize=256)
 def part_pairs(part: Part) -> tuple[Pair, ...]:
     """Pairs of a part's own links whose contact is no self-collision."""
-    return survey_collisions(part.body).ignore_pairs
+    return survey_collisions(part.fragment).ignore_pairs

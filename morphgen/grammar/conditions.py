@@ -25,7 +25,7 @@ _COMPARATORS: Mapping[str, Callable[[float, float], bool]] = {
 }
 
 
-class Properties:
+class RobotProperties:
     """Properties of a robot, each computed when first asked for."""
 
     def __init__(self, robot: Robot) -> None:
@@ -101,7 +101,7 @@ def clauses(condition: Expression) -> Iterator[Expression]:
         yield condition
 
 
-def holds(condition: Expression, properties: Properties) -> bool:
+def holds(condition: Expression, properties: RobotProperties) -> bool:
     """Whether a robot meets a condition."""
     match condition.operator:
         case "and":
@@ -127,22 +127,23 @@ def require_condition(expression: Expression) -> None:
         return
     if expression.operator not in _COMPARATORS:
         raise GrammarError(
-            f"{expression.place}: {expression} is a value; a condition compares, such as mass < 40"
+            f"{expression.location}: {expression} is a value; a condition compares, such as "
+            "mass < 40"
         )
     units = set()
     for operand in expression.operands:
         for name in _names(operand):
             if name.text not in PROPERTIES:
-                raise unknown("property", name.text, name.place, list(PROPERTIES))
+                raise unknown("property", name.text, name.location, list(PROPERTIES))
         sample = {name: (1.0, unit) for name, unit in PROPERTIES.items()}
         units.add(evaluate(operand, Scope(sample, no_draw, ""))[1])
     if len(units - {""}) > 1:
         raise GrammarError(
-            f"{expression.place}: {expression} compares {' with '.join(sorted(units))}"
+            f"{expression.location}: {expression} compares {' with '.join(sorted(units))}"
         )
 
 
-def _value(expression: Expression, properties: Properties) -> float:
+def _value(expression: Expression, properties: RobotProperties) -> float:
     names = {
         name.text: (float(getattr(properties, name.text)), PROPERTIES[name.text])
         for name in _names(expression)
@@ -154,6 +155,6 @@ def _names(expression: Expression) -> Iterator[Expression]:
     if expression.operator == "name":
         yield expression
     elif expression.operator == "call":
-        raise GrammarError(f"{expression.place}: a condition draws nothing: {expression}")
+        raise GrammarError(f"{expression.location}: a condition draws nothing: {expression}")
     for operand in expression.operands:
         yield from _names(operand)

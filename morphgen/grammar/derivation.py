@@ -78,9 +78,9 @@ def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
     try:
         derivation: Derivation = _Builder(origin).transform(_parser().parse(text))
     except UnexpectedInput as error:
-        place = f"{origin}:{max(error.line, 1)}:{max(error.column, 1)}"
+        location = f"{origin}:{max(error.line, 1)}:{max(error.column, 1)}"
         raise GrammarError(
-            f"{place}: no derivation, such as base=fixed[top: arm=ur5[flange: ee=stick]]"
+            f"{location}: no derivation, such as base=fixed[top: arm=ur5[flange: ee=stick]]"
         ) from error
     except VisitError as error:
         raise error.orig_exc from error

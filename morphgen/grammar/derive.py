@@ -10,10 +10,10 @@ from morphgen.errors import GrammarError, PartError, nearest
 from morphgen.formats.urdf_text import number
 from morphgen.grammar.choosers import Chooser
 from morphgen.grammar.derivation import Derivation
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_PARTS
 from morphgen.grammar.manifest import Manifest
-from morphgen.grammar.model import Grammar
 from morphgen.grammar.parameters import MOUNT_YAW, Parameter, require_range
 from morphgen.grammar.syntax import Alternative, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
@@ -51,7 +51,7 @@ class Known:
     """Fewest parts of each symbol; with them a derivation is given up as early as it can be."""
 
 
-class EndlessError(GrammarError):
+class TooManyPartsError(GrammarError):
     """A derivation has more parts than allowed."""
 
 
@@ -112,7 +112,7 @@ class _Run:
         first, _ = self._sequence(self._alternative(start, start.symbol), "", start.symbol, 0)
         if MOUNT_YAW.name in first.values:
             raise GrammarError(
-                f"{start.place}: {first.part!r} stands on no port: it has no {MOUNT_YAW.name}"
+                f"{start.location}: {first.part!r} stands on no port: it has no {MOUNT_YAW.name}"
             )
         return first
 
@@ -128,9 +128,13 @@ class _Run:
             node = self._part(item, label, key)
             return node, node
         if item.arguments:
-            raise GrammarError(f"{item.place}: {item.name!r} is a symbol and takes no parameters")
+            raise GrammarError(
+                f"{item.location}: {item.name!r} is a symbol and takes no parameters"
+            )
         if depth > MAX_PARTS:
-            raise EndlessError(f"{item.place}: {item.name!r} does not end: {depth} levels deep")
+            raise TooManyPartsError(
+                f"{item.location}: {item.name!r} does not end: {depth} levels deep"
+            )
         alternative = self._alternative(production, key)
         if len(alternative.items) == 1:
             (only,) = alternative.items
@@ -180,7 +184,9 @@ class _Run:
         """Count parts to come; give up if there will be too many."""
         self._pending += more
         if len(self._labels) + self._pending > self._max_parts:
-            raise EndlessError(f"{where.place}: more than {self._max_parts} parts: does it end?")
+            raise TooManyPartsError(
+                f"{where.location}: more than {self._max_parts} parts: does it end?"
+            )
 
     def _weighed(self, production: Production, key: str) -> list[float]:
         weights = []
@@ -191,15 +197,18 @@ class _Run:
                 weight = evaluate(alternative.weight, scope)[0]
                 if weight < 0:
                     raise GrammarError(
-                        f"{alternative.weight.place}: a weight is negative: {weight:g}"
+                        f"{alternative.weight.location}: a weight is negative: {weight:g}"
                     )
             weights.append(weight)
         if not math.isfinite(sum(weights)):
             raise GrammarError(
-                f"{production.place}: the weights of {production.symbol!r} sum to no finite number"
+                f"{production.location}: the weights of {production.symbol!r} sum to no finite "
+                "number"
             )
         if sum(weights) <= 0:
-            raise GrammarError(f"{production.place}: all weights of {production.symbol!r} are zero")
+            raise GrammarError(
+                f"{production.location}: all weights of {production.symbol!r} are zero"
+            )
         return weights
 
     def _part(self, item: Item, label: str, key: str) -> _Node:
@@ -214,7 +223,9 @@ class _Run:
         node = _Node(self._free(label), item.name, values, tuple(manifest.ports))
         self._pending -= 1
         if len(self._labels) > self._max_parts:
-            raise EndlessError(f"{item.place}: more than {self._max_parts} parts: does it end?")
+            raise TooManyPartsError(
+                f"{item.location}: more than {self._max_parts} parts: does it end?"
+            )
         return node
 
     def _free(self, label: str) -> str:
@@ -242,7 +253,8 @@ def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
     if item.name not in library.paths:
         valid = [*(production.symbol for production in grammar.productions), *library.paths]
         raise GrammarError(
-            f"{item.place}: {item.name!r} is neither a symbol nor a part{nearest(item.name, valid)}"
+            f"{item.location}: {item.name!r} is neither a symbol nor a part"
+            + nearest(item.name, valid)
         )
     return library.manifest(item.name)
 
@@ -267,20 +279,20 @@ def argument(
     """
     if name not in parameters:
         raise GrammarError(
-            f"{expression.place}: {item.name!r} has no parameter {name!r}"
+            f"{expression.location}: {item.name!r} has no parameter {name!r}"
             + nearest(name, parameters)
         )
     parameter = parameters[name]
     value, unit = evaluate(expression, scope)
     if unit and unit != parameter.unit:
         raise GrammarError(
-            f"{expression.place}: {name} is in {parameter.unit or 'pure numbers'}, "
+            f"{expression.location}: {name} is in {parameter.unit or 'pure numbers'}, "
             f"{expression} in {unit}"
         )
     try:
         return require_range(float(number(value)), parameter, f"{item.name}.{name}")
     except PartError as error:
-        raise GrammarError(f"{expression.place}: {error}") from error
+        raise GrammarError(f"{expression.location}: {error}") from error
 
 
 def _counted(scope: Scope) -> Scope:
@@ -299,10 +311,10 @@ def _attach(trunk: _Node, node: _Node, item: Item) -> None:
     port = item.port or _main_port(trunk, item)
     if port not in trunk.ports:
         raise GrammarError(
-            f"{item.place}: {trunk.part!r} has no port {port!r}{nearest(port, trunk.ports)}"
+            f"{item.location}: {trunk.part!r} has no port {port!r}{nearest(port, trunk.ports)}"
         )
     if any(port == taken for taken, _ in trunk.children):
-        raise GrammarError(f"{item.place}: port {port!r} of {trunk.part!r} is taken already")
+        raise GrammarError(f"{item.location}: port {port!r} of {trunk.part!r} is taken already")
     trunk.children.append((port, node))
 
 
@@ -313,8 +325,8 @@ def _main_port(trunk: _Node, item: Item) -> str:
     if len(trunk.ports) == 1:
         return trunk.ports[0]
     if not trunk.ports:
-        raise GrammarError(f"{item.place}: nothing can go on {trunk.part!r}: it has no port")
+        raise GrammarError(f"{item.location}: nothing can go on {trunk.part!r}: it has no port")
     raise GrammarError(
-        f"{item.place}: say on which port of {trunk.part!r}, such as "
+        f"{item.location}: say on which port of {trunk.part!r}, such as "
         f"{trunk.ports[0]}:{item.name}; ports: {', '.join(trunk.ports)}"
     )

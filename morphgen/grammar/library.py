@@ -10,9 +10,9 @@ from pathlib import Path
 
 from morphgen.errors import PartError, nearest
 from morphgen.formats.resolve import file_stamp
-from morphgen.grammar.manifest import KINDS, Kind, Manifest, read_manifest
+from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
 
-ENVIRONMENT = "MORPHGEN_LIBRARY"
+LIBRARY_VARIABLE = "MORPHGEN_LIBRARY"
 """Environment variable: folders of a user's own parts, separated like ``PATH``."""
 
 
@@ -39,7 +39,7 @@ class Library:
                 found[path.stem] = path
         return dict(sorted(found.items()))
 
-    def manifest(self, name: str, kind: Kind | None = None) -> Manifest:
+    def manifest(self, name: str, kind: PartKind | None = None) -> Manifest:
         """The manifest of a part.
 
         Args:
@@ -59,20 +59,20 @@ class Library:
             )
         return manifest
 
-    def names(self, kind: Kind | None = None) -> list[str]:
+    def names(self, kind: PartKind | None = None) -> list[str]:
         """Names of all parts, or of one kind, sorted."""
         return [name for name, path in self.paths.items() if kind in (None, _manifest(path).kind)]
 
-    def manifests(self, kind: Kind | None = None) -> list[Manifest]:
+    def manifests(self, kind: PartKind | None = None) -> list[Manifest]:
         """Manifests of all parts, or of one kind: by kind, then name."""
         found = [_manifest(path) for path in self.paths.values()]
         chosen = [manifest for manifest in found if kind in (None, manifest.kind)]
-        return sorted(chosen, key=lambda manifest: (KINDS.index(manifest.kind), manifest.name))
+        return sorted(chosen, key=lambda manifest: (PART_KINDS.index(manifest.kind), manifest.name))
 
 
 def default_library(extra: Iterable[Path] = ()) -> Library:
     """The package's parts, those of ``MORPHGEN_LIBRARY``, and those of ``extra`` folders."""
-    environment = os.environ.get(ENVIRONMENT, "")
+    environment = os.environ.get(LIBRARY_VARIABLE, "")
     users = [Path(entry) for entry in environment.split(os.pathsep) if entry]
     given = (folder.absolute() for folder in (*users, *extra))
     own = [Path(str(files(package))) for package in ("morphgen.templates", "morphgen.robots_real")]

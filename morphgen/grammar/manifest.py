@@ -14,8 +14,8 @@ from morphgen.errors import FormatError, PartError, nearest
 from morphgen.formats.data_files import read_bytes, require_plain_yaml
 from morphgen.grammar.parameters import Parameter
 
-Kind = Literal["base", "arm", "ee", "segment", "body"]
-KINDS: tuple[Kind, ...] = ("base", "arm", "ee", "segment", "body")
+PartKind = Literal["base", "arm", "ee", "segment", "body"]
+PART_KINDS: tuple[PartKind, ...] = ("base", "arm", "ee", "segment", "body")
 """A segment is a piece that grammars chain; a body is a whole robot by itself."""
 Number = float | str
 """A number, or an expression over the part's parameters such as ``${size / 2}``."""
@@ -45,7 +45,7 @@ _TEMPLATE = _COMMON | {"file", "density", "parameters", "reference"}
 
 
 @dataclass(frozen=True)
-class Placement:
+class FrameSpec:
     """A frame on one of the part's links."""
 
     link: str
@@ -77,7 +77,7 @@ class Manifest:
     """What a part is and where it is described."""
 
     name: str
-    kind: Kind
+    kind: PartKind
     summary: str
     path: Path
     """The YAML file."""
@@ -86,9 +86,9 @@ class Manifest:
     root: str
     licence: str
     without: tuple[str, ...] = ()
-    mount: Placement | None = None
-    ports: Mapping[str, Placement] = field(default_factory=dict)
-    tool: Placement | None = None
+    mount: FrameSpec | None = None
+    ports: Mapping[str, FrameSpec] = field(default_factory=dict)
+    tool: FrameSpec | None = None
     home: Mapping[str, Number] = field(default_factory=dict)
     effort: Mapping[str, float] = field(default_factory=dict)
     velocity: Mapping[str, float] = field(default_factory=dict)
@@ -128,8 +128,8 @@ def read_manifest(path: Path) -> Manifest:
             raise PartError(f"{path}: unknown key {key!r}{nearest(str(key), allowed)}")
     for key in sorted(_REQUIRED - set(data)):
         raise PartError(f"{path}: key {key!r} is missing")
-    if data["kind"] not in KINDS:
-        raise PartError(f"{path}: kind {data['kind']!r}{nearest(str(data['kind']), KINDS)}")
+    if data["kind"] not in PART_KINDS:
+        raise PartError(f"{path}: kind {data['kind']!r}{nearest(str(data['kind']), PART_KINDS)}")
     if data["name"] != path.stem:
         raise PartError(f"{path}: name {data['name']!r} differs from the file's, {path.stem!r}")
     ports = _mapping(data.get("ports", {}), f"{path}: ports")
@@ -186,8 +186,8 @@ def load_yaml(path: Path) -> object:
         return yaml.load(data, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        place = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
-        raise PartError(f"{path}{place}: no valid YAML: {error.problem}") from error
+        location = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
+        raise PartError(f"{path}{location}: no valid YAML: {error.problem}") from error
     except (yaml.YAMLError, ValueError) as error:
         raise PartError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from error
     except FormatError as error:
@@ -230,14 +230,14 @@ def _arg(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _placement(data: object, where: str) -> Placement:
+def _placement(data: object, where: str) -> FrameSpec:
     entries = _mapping(data, where)
     for key in entries:
         if key not in ("link", "xyz", "rpy"):
             raise PartError(f"{where}: unknown key {key!r}{nearest(key, ('link', 'xyz', 'rpy'))}")
     if "link" not in entries:
         raise PartError(f"{where}: key 'link' is missing")
-    return Placement(
+    return FrameSpec(
         str(entries["link"]),
         _triple(entries.get("xyz", (0, 0, 0)), f"{where}.xyz"),
         _triple(entries.get("rpy", (0, 0, 0)), f"{where}.rpy"),
@@ -299,8 +299,8 @@ def _scaling(data: object, where: str) -> Scaling:
     if not isinstance(parameter, str | None):
         raise PartError(f"{where}.by: {parameter!r} is not the name of a parameter")
     x, y, z = _triple(entries.get("face", (0, 0, 0)), f"{where}.face")
-    place = f"{where}.face"
-    return Scaling(parameter, (_float(x, place), _float(y, place), _float(z, place)))
+    location = f"{where}.face"
+    return Scaling(parameter, (_float(x, location), _float(y, location), _float(z, location)))
 
 
 def _float(value: object, where: str) -> float:

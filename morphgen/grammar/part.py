@@ -16,7 +16,7 @@ from morphgen.formats.urdf import read_urdf, robot_from_xml
 from morphgen.formats.urdf_text import number
 from morphgen.formats.xacro import evaluate, expand
 from morphgen.formats.xacro_compile import CompiledXacro, compile_xacro
-from morphgen.grammar.manifest import Manifest, Number, PackageSource, Placement
+from morphgen.grammar.manifest import FrameSpec, Manifest, Number, PackageSource
 from morphgen.grammar.parameters import resolve_values
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
 from morphgen.model.inertia import inertial_from_mass, with_inertia
@@ -33,7 +33,7 @@ class Part:
 
     manifest: Manifest
     values: Mapping[str, float]
-    body: Robot
+    fragment: Robot
     """Its links and joints, rooted at the manifest's root; names as in the source, but for
     characters that loaders dislike."""
     T_root_mount: Pose
@@ -244,7 +244,7 @@ def _mount(body: Robot, manifest: Manifest, values: Mapping[str, float]) -> Pose
 
 
 def _pose(
-    placement: Placement, body: Robot, manifest: Manifest, values: Mapping[str, float]
+    placement: FrameSpec, body: Robot, manifest: Manifest, values: Mapping[str, float]
 ) -> Pose:
     if placement.link not in body.link_index:
         raise PartError(

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from morphgen.errors import GrammarError, nearest
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_WORD
-from morphgen.grammar.model import Grammar
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value
 from morphgen.grammar.syntax import (
     Alternative,
     Expression,
     Item,
     Let,
-    Place,
     Production,
+    SourceLocation,
     parse_condition,
 )
 from morphgen.grammar.values import Scope, evaluate, no_draw
@@ -99,7 +99,7 @@ def _with_let(grammar: Grammar, name: str, value: str) -> Grammar:
         raise GrammarError(f"{name}={value}: not a number, such as 0.02 or 20mm")
     evaluate(number, Scope({}, no_draw, name))
     lets = tuple(
-        Let(let.name, number, let.place) if let.name == name else let for let in grammar.lets
+        Let(let.name, number, let.location) if let.name == name else let for let in grammar.lets
     )
     return replace(grammar, lets=lets)
 
@@ -148,4 +148,4 @@ def _with_productions(grammar: Grammar, productions: Sequence[Production]) -> Gr
 
 
 def _number(value: float) -> Expression:
-    return Expression("number", (), Place("command line", 1, 1), "", value)
+    return Expression("number", (), SourceLocation("command line", 1, 1), "", value)

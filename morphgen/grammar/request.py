@@ -6,18 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from morphgen.errors import CompositionError, nearest
-from morphgen.grammar.choosers import First
+from morphgen.grammar.choosers import FirstChooser
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import derive
+from morphgen.grammar.grammar_file import SUFFIX, find_grammar, grammar_names, load_grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import Kind, Manifest
-from morphgen.grammar.model import SUFFIX, find_grammar, grammar_names, load_grammar
+from morphgen.grammar.manifest import Manifest, PartKind
 from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
 from morphgen.grammar.pinning import pin
 
-SLOTS: tuple[Kind, ...] = ("base", "arm", "ee")
+SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")
 """Kinds of parts that a request may choose."""
-MAIN_PORTS: Mapping[Kind, str] = {"base": "top", "arm": "flange"}
+MAIN_PORTS: Mapping[PartKind, str] = {"base": "top", "arm": "flange"}
 """Where the next part goes when no port is named."""
 
 
@@ -25,7 +25,7 @@ MAIN_PORTS: Mapping[Kind, str] = {"base": "top", "arm": "flange"}
 class _Slot:
     """A part asked for at one place: ``base``, ``arm``, ``left.ee`` ..."""
 
-    kind: Kind
+    kind: PartKind
     port: str
     """The limb, such as ``left``; empty for the main one."""
     part: str = ""
@@ -55,7 +55,7 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
     grammars = known_grammars(library)
     if first in grammars or first.endswith(SUFFIX):
         grammar = load_grammar(find_grammar(first, library.folders), library.folders)
-        derivation = derive(pin(grammar, words[1:], library), library, First())
+        derivation = derive(pin(grammar, words[1:], library), library, FirstChooser())
         return derivation, "-".join([grammar.name, *([derivation.digest[:8]] if words[1:] else [])])
     if "=" not in first and len(words) > 1 and first not in library.paths:
         raise CompositionError(

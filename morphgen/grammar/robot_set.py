@@ -27,10 +27,10 @@ from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import alone, partial_of, replacing_folder, write_atomic
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.urdf_text import urdf_text
+from morphgen.grammar.grammar_file import Grammar, grammar_from_text
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.limits import MAX_TEXT
-from morphgen.grammar.model import Grammar, grammar_from_text
-from morphgen.grammar.sampling import Sample, draw
+from morphgen.grammar.sampling import Sample, sample_robot
 from morphgen.grammar.syntax import parse_condition
 from morphgen.model.robot import Robot
 
@@ -42,12 +42,12 @@ JOURNAL = ".journal.jsonl"
 
 Record = dict[str, Any]
 """A line of the index."""
-Work = Callable[["SetPlan", Sequence[int]], Iterator[Record]]
+SetWorker = Callable[["SetConfig", Sequence[int]], Iterator[Record]]
 """Makes the robots of the given numbers, in any order."""
 
 
 @dataclass(frozen=True)
-class SetPlan:
+class SetConfig:
     """Everything that a worker needs to make the robots of a set; plain data."""
 
     folder: Path
@@ -85,7 +85,7 @@ class SetReport:
 
 
 def make_set(
-    plan: SetPlan, n: int, work: Work, progress: Callable[[int], None] = lambda done: None
+    plan: SetConfig, n: int, work: SetWorker, progress: Callable[[int], None] = lambda done: None
 ) -> SetReport:
     """Make robots 0 to n - 1 of a set, but for those that are there.
 
@@ -116,17 +116,17 @@ def make_set(
     return report
 
 
-def make_serially(plan: SetPlan, indices: Sequence[int]) -> Iterator[Record]:
+def make_serially(plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
     """Make robots one after the other in this process."""
-    maker = Maker(plan)
+    maker = RobotMaker(plan)
     for index in indices:
         yield maker.make(index)
 
 
-class Maker:
+class RobotMaker:
     """Draws and writes robots of a set."""
 
-    def __init__(self, plan: SetPlan) -> None:
+    def __init__(self, plan: SetConfig) -> None:
         self._plan = plan
         self._library: Library = default_library(plan.library)
         self._grammar: Grammar = grammar_from_text(plan.grammar_text, plan.grammar_name)
@@ -135,7 +135,7 @@ class Maker:
     def make(self, index: int) -> Record:
         """Draw and write one robot; return its line of the index."""
         plan = self._plan
-        drawn = draw(self._grammar, self._library, index, seed=plan.seed, where=self._where)
+        drawn = sample_robot(self._grammar, self._library, index, seed=plan.seed, where=self._where)
         folder = plan.folder / drawn.robot.name
         if plan.light:
             _write_light(drawn, folder)
@@ -230,7 +230,7 @@ def light_urdf(robot: Robot) -> str:
     return urdf_text(robot, lambda mesh: portable_uri(mesh.path))
 
 
-def _prepare(plan: SetPlan) -> None:
+def _prepare(plan: SetConfig) -> None:
     """Make the folder, or see that it holds the same set."""
     path = plan.folder / SETTINGS
     wanted = plan.settings()
@@ -255,7 +255,7 @@ def _prepare(plan: SetPlan) -> None:
         raise FormatError(f"{plan.folder} holds a set of another grammar; name another folder")
 
 
-def _is_barely_begun(plan: SetPlan) -> bool:
+def _is_barely_begun(plan: SetConfig) -> bool:
     """Whether a folder is empty, or what a run left that was interrupted before it made a set."""
     grammar = plan.folder / GRAMMAR
     own = {partial_of(grammar), partial_of(plan.folder / SETTINGS)}
@@ -264,7 +264,7 @@ def _is_barely_begun(plan: SetPlan) -> bool:
     return plan.folder.is_dir() and own >= set(plan.folder.iterdir())
 
 
-def _finished(plan: SetPlan) -> dict[int, tuple[Path, int]]:
+def _finished(plan: SetConfig) -> dict[int, tuple[Path, int]]:
     """Where the records of the robots that are there stand: file and offset, by number.
 
     A line cut short by an interruption counts for nothing. Records themselves stay on disk, so that
@@ -287,7 +287,7 @@ def _finished(plan: SetPlan) -> dict[int, tuple[Path, int]]:
     return places
 
 
-def _write_index(plan: SetPlan, made: int, kept: int) -> SetReport:
+def _write_index(plan: SetConfig, made: int, kept: int) -> SetReport:
     """Write all records in order of their numbers, and sum them up."""
     rejected: Counter[str] = Counter()
     first: dict[str, str] = {}

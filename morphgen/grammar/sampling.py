@@ -1,37 +1,40 @@
-"""Drawing robots from a grammar: the same seed gives the same robots."""
+"""Draw robots from a grammar, and neighbours of a robot; the same seed gives the same robots."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
 from morphgen.checks import check
-from morphgen.errors import MorphgenError
+from morphgen.errors import GrammarError, MorphgenError
 from morphgen.formats.card import rounded
 from morphgen.formats.fits import with_stored_fits
-from morphgen.grammar.choosers import Random, Recorded
-from morphgen.grammar.compose import TOUCH, join, survey_of
-from morphgen.grammar.conditions import Properties, clauses, holds
+from morphgen.grammar.choosers import Choices, RandomChooser, RecordedChooser
+from morphgen.grammar.compose import MAX_HOME_OVERLAP, join, survey_contacts
+from morphgen.grammar.conditions import RobotProperties, clauses, holds
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import EndlessError, derive
+from morphgen.grammar.derive import TooManyPartsError, derive
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_PARTS
-from morphgen.grammar.model import Grammar
 from morphgen.grammar.syntax import Expression
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 
 MAX_ATTEMPTS = 500
-"""Draws for one robot before its conditions are taken to be too hard."""
+"""Draws for one robot before its conditions are considered unsatisfiable."""
 TOO_LARGE = f"more than {MAX_PARTS} parts"
-"""Why a draw is rejected whose recursion went on for too long."""
+"""Reason for rejecting a draw whose recursion exceeds the part limit."""
+UNCHANGED = "nothing changed"
+"""Reason for rejecting a neighbour that equals the original robot."""
 
 
 class SamplingError(MorphgenError):
-    """No robot was found that meets the conditions."""
+    """No valid robot was found within ``MAX_ATTEMPTS`` draws."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +43,17 @@ class Sample:
 
     index: int
     robot: Robot
-    properties: Properties
+    properties: RobotProperties
     findings: tuple[Finding, ...]
+    """Findings of ``morphgen.checks.check``; only of severity ``info``."""
     derivation: Derivation
-    choices: Mapping[str, float]
-    """What was drawn, by the place in the grammar."""
+    choices: Choices
+    """Every random choice by its key, such as ``robot/1.plane.size``."""
     rejected: Mapping[str, int]
-    """Draws that were thrown away for this robot, by the reason."""
+    """Number of rejected draws before this robot, by reason."""
 
 
-def sample(
+def sample_robots(
     grammar: Grammar,
     library: Library,
     n: int,
@@ -63,20 +67,20 @@ def sample(
 
     Args:
         grammar: The grammar.
-        library: Where its parts are.
-        n: How many.
-        seed: Seed of all of them.
-        where: Conditions besides the grammar's own.
+        library: Library of the grammar's parts.
+        n: Number of robots.
+        seed: Seed of all robots.
+        where: Conditions in addition to the grammar's own.
 
     Raises:
         GrammarError: If the grammar cannot be derived.
         SamplingError: If a robot's conditions are not met in ``MAX_ATTEMPTS`` draws.
     """
     for index in range(n):
-        yield draw(grammar, library, index, seed=seed, where=where)
+        yield sample_robot(grammar, library, index, seed=seed, where=where)
 
 
-def draw(
+def sample_robot(
     grammar: Grammar,
     library: Library,
     index: int,
@@ -85,52 +89,135 @@ def draw(
     where: Sequence[Expression] = (),
     name: str | None = None,
 ) -> Sample:
-    """Draw robot number ``index`` of a seed; see ``sample``."""
+    """Draw robot number ``index`` of a seed; see ``sample_robots``.
+
+    Args:
+        grammar: The grammar.
+        library: Library of the grammar's parts.
+        index: Number of the robot.
+        seed: Seed of all robots.
+        where: Conditions in addition to the grammar's own.
+        name: Name of the robot; by default ``<grammar>-<index>``.
+    """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-    conditions = [clause for whole in (*grammar.wheres, *where) for clause in clauses(whole)]
-    rejected: Counter[str] = Counter()
-    for _ in range(MAX_ATTEMPTS):
-        recorded = Recorded(Random(rng))
-        try:
-            derivation = derive(grammar, library, recorded)
-        except EndlessError:
-            rejected[TOO_LARGE] += 1
-            continue
-        own = name or robot_name(grammar, index)
-        found = build(derivation, library, conditions, own, recorded.made)
-        if isinstance(found, str):
-            rejected[found] += 1
-            continue
-        return Sample(index, *found, derivation, recorded.made, dict(rejected))
-    reason, times = rejected.most_common(1)[0]
+    choosers = (RecordedChooser(RandomChooser(rng)) for _ in range(MAX_ATTEMPTS))
+    result = _first_valid(
+        choosers,
+        grammar,
+        library,
+        (*grammar.wheres, *where),
+        name or robot_name(grammar, index),
+        index,
+    )
+    if isinstance(result, Sample):
+        return result
+    reason, times = result.most_common(1)[0]
     raise SamplingError(
         f"robot {index} of {grammar.name!r}: 0 of {MAX_ATTEMPTS} draws were accepted; "
         f"{times} failed at: {reason}"
     )
 
 
+def mutate(
+    grammar: Grammar, library: Library, choices: Choices, n: int, *, seed: int = 0, name: str
+) -> Iterator[Sample]:
+    """Draw neighbours of a robot: each has one of its random choices drawn again.
+
+    Choices that only exist because of the new one, such as the parameters of another part, are
+    drawn too; all other choices are kept.
+
+    Args:
+        grammar: The grammar.
+        library: Library of the grammar's parts.
+        choices: The robot's choices, as in ``Sample.choices``.
+        n: Number of neighbours.
+        seed: Seed; neighbour i does not depend on n.
+        name: Name of the robot; its neighbours are called ``<name>-m0000`` and so on.
+
+    Raises:
+        GrammarError: If the robot has no random choices.
+        SamplingError: If ``MAX_ATTEMPTS`` draws give no other valid neighbour.
+    """
+    random = RandomChooser(np.random.default_rng(seed))
+    origin = derive(grammar, library, RecordedChooser(random, choices))
+    if not choices:
+        raise GrammarError(f"grammar {grammar.name!r} leaves nothing to choose: no neighbours")
+    keys = sorted(choices)
+    for index in range(n):
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        choosers = islice(_with_one_redrawn(rng, choices, keys), MAX_ATTEMPTS)
+        result = _first_valid(
+            choosers, grammar, library, grammar.wheres, f"{name}-m{index:04d}", index, origin
+        )
+        if not isinstance(result, Sample):
+            raise SamplingError(
+                f"no neighbour of {name!r} in {MAX_ATTEMPTS} draws: "
+                + ", ".join(f"{times} x {reason}" for reason, times in sorted(result.items()))
+            )
+        yield result
+
+
 def robot_name(grammar: Grammar, index: int) -> str:
-    """Name of the robot with that number."""
+    """Return the default name of robot number ``index`` of a grammar."""
     return f"{grammar.name}-{index:06d}"
 
 
-def build(
+def _with_one_redrawn(
+    rng: np.random.Generator, choices: Choices, keys: Sequence[str]
+) -> Iterator[RecordedChooser]:
+    """Yield choosers that each forget one random choice and draw it again."""
+    while True:
+        forgotten = keys[int(rng.integers(len(keys)))]
+        kept = {key: value for key, value in choices.items() if key != forgotten}
+        yield RecordedChooser(RandomChooser(rng), kept)
+
+
+def _first_valid(
+    choosers: Iterable[RecordedChooser],
+    grammar: Grammar,
+    library: Library,
+    where: Sequence[Expression],
+    name: str,
+    index: int,
+    origin: Derivation | None = None,
+) -> Sample | Counter[str]:
+    """Return the first valid robot other than ``origin``, or the reasons for all rejections."""
+    conditions = [clause for condition in where for clause in clauses(condition)]
+    rejected: Counter[str] = Counter()
+    for chooser in choosers:
+        try:
+            derivation = derive(grammar, library, chooser)
+        except TooManyPartsError:
+            rejected[TOO_LARGE] += 1
+            continue
+        if derivation == origin:
+            rejected[UNCHANGED] += 1
+            continue
+        built = _build_if_valid(derivation, library, conditions, name, chooser.choices)
+        if not isinstance(built, str):
+            return Sample(index, *built, derivation, chooser.choices, dict(rejected))
+        rejected[built] += 1
+    return rejected
+
+
+def _build_if_valid(
     derivation: Derivation,
     library: Library,
     conditions: Sequence[Expression],
     name: str,
-    choices: Mapping[str, float],
-) -> tuple[Robot, Properties, tuple[Finding, ...]] | str:
-    """Compose a derivation if it is sound and meets conditions; else say why not."""
+    choices: Choices,
+) -> tuple[Robot, RobotProperties, tuple[Finding, ...]] | str:
+    """Compose a robot; return the reason as text if it breaks a condition or fails a check."""
     robot = join(derivation, library, name)
     provenance = {**robot.provenance, "choices": {k: rounded(v) for k, v in choices.items()}}
     robot = replace(robot, provenance=provenance)
-    properties = Properties(robot)
+    properties = RobotProperties(robot)
+    # Cheap tests first: conditions, then overlaps at home, then all checks.
     for condition in conditions:
         if not holds(condition, properties):
             return f"where {condition}"
-    contacts = survey_of(robot, derivation, library)
-    if any(depth > TOUCH for depth in contacts.home_penetrations.values()):
+    contacts = survey_contacts(robot, derivation, library)
+    if any(depth > MAX_HOME_OVERLAP for depth in contacts.home_penetrations.values()):
         return "links overlap at home"
     robot = with_stored_fits(replace(robot, ignore_pairs=contacts.ignore_pairs), library.folders)
     findings = check(robot, home_tested=True)

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 
 from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import First
+from morphgen.grammar.choosers import FirstChooser
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import EndlessError, Known, derive, fewest_parts
+from morphgen.grammar.derive import Known, TooManyPartsError, derive, fewest_parts
+from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_COUNT, MAX_PARTS, MAX_SEARCH
-from morphgen.grammar.model import Grammar
 from morphgen.grammar.syntax import Alternative
 from morphgen.grammar.values import Scope, evaluate, no_draw
 
@@ -22,7 +22,7 @@ class SearchError(GrammarError):
     """No further structure was found with reasonable work."""
 
 
-def count(grammar: Grammar) -> float:
+def count_structures(grammar: Grammar) -> float:
     """Number of structures, values aside; infinite for a grammar that recurs.
 
     One that can be derived in two ways counts twice. A finite number is exact up to ``MAX_COUNT``;
@@ -47,7 +47,7 @@ def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivat
             ``MAX_SEARCH`` parts are placed (``SearchError``).
     """
     seen: set[str] = set()
-    endless = count(grammar) == math.inf
+    endless = count_structures(grammar) == math.inf
     in_vain = 0
     for parts in range(1, MAX_PARTS + 1) if endless else (MAX_PARTS,):
         for derivation in _structures(grammar, library, parts):
@@ -76,7 +76,7 @@ def typical_names(grammar: Grammar) -> dict[str, tuple[float, str]]:
 
 
 @dataclass
-class _Script(First):
+class _Script(FirstChooser):
     """Follows a list of decisions, then takes the first; notes how many options there were."""
 
     decisions: list[int]
@@ -103,7 +103,7 @@ def _structures(grammar: Grammar, library: Library, max_parts: int) -> Iterator[
         script = _Script(decisions)
         try:
             derivation = derive(grammar, library, script, max_parts, known)
-        except EndlessError:
+        except TooManyPartsError:
             derivation = None
         yield derivation
         decisions = (decisions + [0] * len(script.options))[: len(script.options)]

@@ -22,7 +22,7 @@ from morphgen.grammar.notation import parse_tree
 
 
 @dataclass(frozen=True)
-class Place:
+class SourceLocation:
     """Where something stands in a text."""
 
     origin: str
@@ -41,7 +41,7 @@ class Expression:
     """``number``, ``name``, ``call``, ``negative``, an arithmetic sign, a comparator, ``and``,
     ``or`` or ``not``."""
     operands: tuple[Expression, ...]
-    place: Place
+    location: SourceLocation
     text: str = ""
     """The name, the function's name, or the unit of a number."""
     value: float = 0.0
@@ -58,8 +58,8 @@ class Expression:
         levels = 1 + max((operand.levels for operand in self.operands), default=0)
         if levels > MAX_NESTING:
             raise GrammarError(
-                f"{self.place}: an expression of more than {MAX_NESTING} levels; expected at most "
-                f"{MAX_NESTING}"
+                f"{self.location}: an expression of more than {MAX_NESTING} levels; expected at "
+                f"most {MAX_NESTING}"
             )
         object.__setattr__(self, "levels", levels)
 
@@ -84,7 +84,7 @@ class Item:
     """A symbol or part in a sequence."""
 
     name: str
-    place: Place
+    location: SourceLocation
     port: str = ""
     """Port of the part before that it goes to; empty for the main one."""
     arguments: tuple[tuple[str, Expression], ...] = ()
@@ -105,7 +105,7 @@ class Production:
 
     symbol: str
     alternatives: tuple[Alternative, ...]
-    place: Place
+    location: SourceLocation
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Include:
     """Another grammar whose statements are taken over."""
 
     target: str
-    place: Place
+    location: SourceLocation
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Let:
 
     name: str
     expression: Expression
-    place: Place
+    location: SourceLocation
 
 
 @dataclass(frozen=True)
@@ -174,13 +174,13 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         super().__init__()
         self._origin = origin
 
-    def _place(self, token: Token) -> Place:
-        return Place(self._origin, token.line or 1, token.column or 1)
+    def _location(self, token: Token) -> SourceLocation:
+        return SourceLocation(self._origin, token.line or 1, token.column or 1)
 
     def _word(self, token: Token) -> Token:
         if len(token) > MAX_WORD:
             raise GrammarError(
-                f"{self._place(token)}: a word of {len(token):,} characters; expected at most "
+                f"{self._location(token)}: a word of {len(token):,} characters; expected at most "
                 f"{MAX_WORD}"
             )
         return token
@@ -197,22 +197,22 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         return statements
 
     def include(self, target: Token) -> Include:
-        return Include(str(target).strip('"'), self._place(target))
+        return Include(str(target).strip('"'), self._location(target))
 
     def let(self, name: Token, expression: Expression) -> Let:
-        return Let(str(name), expression, self._place(name))
+        return Let(str(name), expression, self._location(name))
 
     def where(self, condition: Expression) -> Where:
         return Where(condition)
 
     def production(self, symbol: Token, *alternatives: Alternative) -> Production:
-        place = self._place(symbol)
+        location = self._location(symbol)
         if len(alternatives) > MAX_ALTERNATIVES:
             raise GrammarError(
-                f"{place}: {len(alternatives):,} alternatives of {str(symbol)!r}; expected at most "
-                f"{MAX_ALTERNATIVES:,}"
+                f"{location}: {len(alternatives):,} alternatives of {str(symbol)!r}; expected at "
+                f"most {MAX_ALTERNATIVES:,}"
             )
-        return Production(str(symbol), alternatives, place)
+        return Production(str(symbol), alternatives, location)
 
     def weight(self, expression: Expression) -> Expression:
         return expression
@@ -229,11 +229,11 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         counts = (int(low), int(high if high is not None else low))
         if not 0 < counts[0] <= counts[1]:
             raise GrammarError(
-                f"{self._place(low)}: repetition {{{counts[0]},{counts[1]}}} needs 1 <= m <= n"
+                f"{self._location(low)}: repetition {{{counts[0]},{counts[1]}}} needs 1 <= m <= n"
             )
         if counts[1] > MAX_PARTS:
             raise GrammarError(
-                f"{self._place(low)}: repetition {{{counts[0]},{counts[1]}}}: expected at most "
+                f"{self._location(low)}: repetition {{{counts[0]},{counts[1]}}}: expected at most "
                 f"{MAX_PARTS}, the most parts of a robot"
             )
         return counts
@@ -244,10 +244,10 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
             if entry is None:
                 continue
             if str(entry[0]) in arguments:
-                raise GrammarError(f"{self._place(entry[0])}: {entry[0]} is given twice")
+                raise GrammarError(f"{self._location(entry[0])}: {entry[0]} is given twice")
             arguments[str(entry[0])] = entry[1]
         return Item(
-            str(name), self._place(name), str(port or ""), tuple(arguments.items()), rest[-1]
+            str(name), self._location(name), str(port or ""), tuple(arguments.items()), rest[-1]
         )
 
     def quantity(self, token: Token) -> Expression:
@@ -256,18 +256,18 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         try:
             value = float(digits)
         except ValueError as error:
-            raise GrammarError(f"{self._place(token)}: {text!r} is no number") from error
-        return Expression("number", (), self._place(token), text[len(digits) :], value)
+            raise GrammarError(f"{self._location(token)}: {text!r} is no number") from error
+        return Expression("number", (), self._location(token), text[len(digits) :], value)
 
     def name(self, token: Token) -> Expression:
-        return Expression("name", (), self._place(token), str(token))
+        return Expression("name", (), self._location(token), str(token))
 
     def call(self, name: Token, *operands: Expression | None) -> Expression:
         given = tuple(operand for operand in operands if operand is not None)
-        return Expression("call", given, self._place(name), str(name))
+        return Expression("call", given, self._location(name), str(name))
 
     def unary(self, sign: Token, operand: Expression) -> Expression:
-        return operand if sign == "+" else Expression("negative", (operand,), self._place(sign))
+        return operand if sign == "+" else Expression("negative", (operand,), self._location(sign))
 
     def sum(self, *parts: Any) -> Expression:
         return self._folded(parts)
@@ -277,27 +277,27 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
 
     def comparison(self, *parts: Any) -> Expression:
         pairs = [
-            Expression(str(parts[i + 1]), (parts[i], parts[i + 2]), self._place(parts[i + 1]))
+            Expression(str(parts[i + 1]), (parts[i], parts[i + 2]), self._location(parts[i + 1]))
             for i in range(0, len(parts) - 2, 2)
         ]
-        return pairs[0] if len(pairs) == 1 else Expression("and", tuple(pairs), pairs[0].place)
+        return pairs[0] if len(pairs) == 1 else Expression("and", tuple(pairs), pairs[0].location)
 
     def or_(self, *parts: Expression) -> Expression:
-        return Expression("or", parts, parts[0].place)
+        return Expression("or", parts, parts[0].location)
 
     def and_(self, *parts: Expression) -> Expression:
-        return Expression("and", parts, parts[0].place)
+        return Expression("and", parts, parts[0].location)
 
     def negation(self, operand: Expression) -> Expression:
-        return Expression("not", (operand,), operand.place)
+        return Expression("not", (operand,), operand.location)
 
     def _folded(self, parts: Sequence[Any]) -> Expression:
         folded: Expression = parts[0]
         for i in range(1, len(parts), 2):
-            folded = Expression(str(parts[i]), (folded, parts[i + 1]), self._place(parts[i]))
+            folded = Expression(str(parts[i]), (folded, parts[i + 1]), self._location(parts[i]))
         return folded
 
 
-def unknown(what: str, name: str, place: Place, valid: Sequence[str]) -> GrammarError:
+def unknown(what: str, name: str, location: SourceLocation, valid: Sequence[str]) -> GrammarError:
     """The error for a name that means nothing, with the nearest that does."""
-    return GrammarError(f"{place}: unknown {what} {name!r}{nearest(name, valid)}")
+    return GrammarError(f"{location}: unknown {what} {name!r}{nearest(name, valid)}")

@@ -94,7 +94,7 @@ DISTRIBUTIONS: Mapping[str, str] = {
 
 
 class Draw(Protocol):
-    """Decides the value of a distribution at a place of the derivation."""
+    """Decides the value of a distribution at a point of the derivation."""
 
     def __call__(self, key: str, distribution: Distribution) -> float:
         """Return a value that the distribution can give."""
@@ -127,7 +127,7 @@ def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
     """
     value, unit = _evaluate(expression, scope)
     if not math.isfinite(value):
-        raise GrammarError(f"{expression.place}: {expression} is not finite")
+        raise GrammarError(f"{expression.location}: {expression} is not finite")
     return value, unit
 
 
@@ -137,26 +137,26 @@ def distribution_of(expression: Expression, scope: Scope) -> tuple[Distribution,
     Raises:
         GrammarError: If there is no such distribution or its arguments do not fit.
     """
-    kind, place = expression.text, expression.place
+    kind, location = expression.text, expression.location
     if kind not in DISTRIBUTIONS:
-        raise unknown("distribution", kind, place, list(DISTRIBUTIONS))
+        raise unknown("distribution", kind, location, list(DISTRIBUTIONS))
     operands = [evaluate(operand, scope) for operand in expression.operands]
     units = {unit for _, unit in operands if unit}
     if len(units) > 1:
-        raise GrammarError(f"{place}: {expression} mixes units {' and '.join(sorted(units))}")
+        raise GrammarError(f"{location}: {expression} mixes units {' and '.join(sorted(units))}")
     distribution = Distribution(kind, tuple(value for value, _ in operands))
     _require_arguments(distribution, expression)
     return distribution, units.pop() if units else ""
 
 
 def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
-    place = expression.place
+    location = expression.location
     match expression.operator:
         case "number":
             return _quantity(expression)
         case "name":
             if expression.text not in scope.names:
-                raise unknown("value", expression.text, place, list(scope.names))
+                raise unknown("value", expression.text, location, list(scope.names))
             return scope.names[expression.text]
         case "call":
             distribution, unit = distribution_of(expression, scope)
@@ -168,14 +168,14 @@ def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
             left, right = (evaluate(operand, scope) for operand in expression.operands)
             return _arithmetic(expression, left, right)
         case _:
-            raise GrammarError(f"{place}: {expression} is a condition, not a value")
+            raise GrammarError(f"{location}: {expression} is a condition, not a value")
 
 
 def _quantity(expression: Expression) -> tuple[float, str]:
     if not expression.text:
         return expression.value, ""
     if expression.text not in UNITS:
-        raise unknown("unit", expression.text, expression.place, list(UNITS))
+        raise unknown("unit", expression.text, expression.location, list(UNITS))
     unit, scale = UNITS[expression.text]
     return expression.value * scale, unit
 
@@ -188,45 +188,45 @@ def _arithmetic(
         case "+" | "-":
             if a_unit and b_unit and a_unit != b_unit:
                 raise GrammarError(
-                    f"{expression.place}: {expression} mixes units {a_unit} and {b_unit}"
+                    f"{expression.location}: {expression} mixes units {a_unit} and {b_unit}"
                 )
             return (a + b if expression.operator == "+" else a - b), a_unit or b_unit
         case "*":
             if a_unit and b_unit:
                 raise GrammarError(
-                    f"{expression.place}: {expression} multiplies {a_unit} by {b_unit}; "
+                    f"{expression.location}: {expression} multiplies {a_unit} by {b_unit}; "
                     "values are lengths, angles, masses or pure numbers"
                 )
             return a * b, a_unit or b_unit
         case _:
             if b == 0:
-                raise GrammarError(f"{expression.place}: {expression} divides by zero")
+                raise GrammarError(f"{expression.location}: {expression} divides by zero")
             if b_unit and a_unit != b_unit:
                 raise GrammarError(
-                    f"{expression.place}: {expression} divides {a_unit or 'a pure number'} by "
+                    f"{expression.location}: {expression} divides {a_unit or 'a pure number'} by "
                     f"{b_unit}; values are lengths, angles, masses or pure numbers"
                 )
             return a / b, "" if b_unit else a_unit
 
 
 def _require_arguments(distribution: Distribution, expression: Expression) -> None:
-    given, place = distribution.arguments, expression.place
+    given, location = distribution.arguments, expression.location
     signature = f"{distribution.kind}({DISTRIBUTIONS[distribution.kind]})"
     wanted = {"choice": None, "normal": 4}.get(distribution.kind, 2)
     if (wanted is not None and len(given) != wanted) or not given:
-        raise GrammarError(f"{place}: {expression} does not fit {signature}")
+        raise GrammarError(f"{location}: {expression} does not fit {signature}")
     low, high = distribution.bounds
     ordered = given[-2] <= given[-1] if wanted is not None else True
     if not ordered:
-        raise GrammarError(f"{place}: {expression}: low is above high in {signature}")
+        raise GrammarError(f"{location}: {expression}: low is above high in {signature}")
     if not math.isfinite(high - low) or (low > 0 and not math.isfinite(high / low)):
-        raise GrammarError(f"{place}: {expression}: {low:g} and {high:g} are too far apart")
+        raise GrammarError(f"{location}: {expression}: {low:g} and {high:g} are too far apart")
     if distribution.kind == "loguniform" and low <= 0:
-        raise GrammarError(f"{place}: {expression}: low must be above zero")
+        raise GrammarError(f"{location}: {expression}: low must be above zero")
     if distribution.kind == "normal" and given[1] < 0:
-        raise GrammarError(f"{place}: {expression}: the deviation is negative")
+        raise GrammarError(f"{location}: {expression}: the deviation is negative")
     if distribution.kind == "randint" and (low != int(low) or high != int(high)):
-        raise GrammarError(f"{place}: {expression}: randint needs whole numbers")
+        raise GrammarError(f"{location}: {expression}: randint needs whole numbers")
 
 
 def no_draw(key: str, distribution: Distribution) -> float:

@@ -14,8 +14,8 @@ from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, parse_derivation
-from morphgen.grammar.model import find_grammar, load_grammar
-from morphgen.grammar.sampling import draw
+from morphgen.grammar.grammar_file import find_grammar, load_grammar
+from morphgen.grammar.sampling import sample_robot
 
 
 def found(made, **options):
@@ -96,7 +96,7 @@ def jittered(node, amount, rng):
 
 @pytest.mark.parametrize("category", ["arm5", "chain", "planar_arm", "cubes", "stick"])
 def test_nearness_is_about_one_per_cent_of_size(category):
-    sample = draw(load_grammar(find_grammar(category)), LIBRARY, 0, seed=1)
+    sample = sample_robot(load_grammar(find_grammar(category)), LIBRARY, 0, seed=1)
     rng = np.random.default_rng(0)
     one = features(sample.robot, token_shapes(sample.robot))
 
@@ -181,7 +181,7 @@ def test_the_rules_of_the_regimes_are_kept():
 def drawn(category, n, seed, **changes):
     grammar = load_grammar(find_grammar(category))
     for i in range(n):
-        robot = draw(grammar, LIBRARY, i, seed=seed)
+        robot = sample_robot(grammar, LIBRARY, i, seed=seed)
         made = member("cubes", f"{category}-{seed}-{i}", category=category)
         body = str(parse_derivation(str(robot.derivation)))
         yield replace(made, derivation=body, body=_hash(body), **changes)

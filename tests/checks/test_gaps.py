@@ -149,7 +149,7 @@ def test_either_link_may_say_why_the_gap_is_as_it_should_be(name):
 
 
 def test_a_panda_scaled_about_its_link_frames_is_torn_apart():
-    panda = load_part(default_library().manifest("panda")).body
+    panda = load_part(default_library().manifest("panda")).fragment
     factors = {"panda_link0": 1.5, "panda_link1": 0.5, "panda_link4": 1.4}
     torn = {finding.where for finding in check_links_apart(scale_links(panda, factors))}
     assert torn == {"links panda_link0, panda_link1", "links panda_link4, panda_link5"}

@@ -7,13 +7,13 @@ import pytest
 from helpers.commands import tree
 from morphgen.cli import main
 from morphgen.formats.urdf_text import urdf_text
-from morphgen.grammar.library import ENVIRONMENT
+from morphgen.grammar.library import LIBRARY_VARIABLE
 
 
 @pytest.fixture(autouse=True)
 def _own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    monkeypatch.delenv(LIBRARY_VARIABLE, raising=False)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from morphgen import cli
 from morphgen.cli import main
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.urdf_text import urdf_text
-from morphgen.grammar.library import ENVIRONMENT
+from morphgen.grammar.library import LIBRARY_VARIABLE
 
 COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
 
@@ -219,7 +219,7 @@ def test_ones_own_library_is_used(run, tmp_path, monkeypatch):
     write_part(tmp_path / "own")
     words = ("compose", "base=gantry", "ee=pincer", "ee.length=30cm", "--no-picture", "--out", "o")
     assert run(*words, "--library", "own", "--name", "a")[0] == 0
-    monkeypatch.setenv(ENVIRONMENT, "own")
+    monkeypatch.setenv(LIBRARY_VARIABLE, "own")
     assert run(*words, "--name", "b")[0] == 0
     assert run(*words, "--library", tmp_path / "own", "--name", "c")[0] == 0
     a, b, c = ((tmp_path / "o" / name / "robot.urdf").read_text() for name in "abc")

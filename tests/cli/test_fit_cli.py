@@ -171,7 +171,7 @@ def test_a_part_of_primitives_keeps_them(run):
     assert plate.split()[:4] == ["plate", "box", "primitives", "1.000"]
     assert mean.split()[:2] == ["mean", "1.000"]
     data = json.loads(run("fit", "plane", "--json")[1])
-    (collision,) = load_part(default_library().manifest("plane")).body.link("plate").collisions
+    (collision,) = load_part(default_library().manifest("plane")).fragment.link("plate").collisions
     (link,) = data["links"]
     assert data["robot"] == "plane"
     assert link["primitives"][0]["box"] == list(collision.geometry.size)
@@ -208,7 +208,10 @@ def test_a_real_part_is_written_without_collision_meshes(run, tmp_path):
     assert [path.name for path in folder.parent.iterdir()] == ["gripper"]
     assert meshes_of(folder, "collision") == []
     assert meshes_of(folder, "visual") != []
-    made, source = read_bundle(folder), load_part(default_library().manifest("fetch_gripper")).body
+    made, source = (
+        read_bundle(folder),
+        load_part(default_library().manifest("fetch_gripper")).fragment,
+    )
     assert made.name == "gripper"
     assert_same_inertials(made, source)
     assert [joint.name for joint in made.joints] == [joint.name for joint in source.joints]

@@ -9,7 +9,7 @@ from helpers.commands import start, tree
 from helpers.grammars import CATEGORIES
 from helpers.parts import PINCER, write_part
 from morphgen.formats.bundle import read_bundle
-from morphgen.grammar.library import ENVIRONMENT
+from morphgen.grammar.library import LIBRARY_VARIABLE
 
 GRAMMAR = """\
 # a plate or a cube on a gantry
@@ -323,7 +323,7 @@ def test_parts_and_grammars_of_a_users_folder(run, monkeypatch, by_environment):
     (folder / "held.grammar").write_text("robot -> fixed ur5 pincer(length=uniform(0.15, 0.3))\n")
     words = ("--library", folder)
     if by_environment:
-        monkeypatch.setenv(ENVIRONMENT, str(folder))
+        monkeypatch.setenv(LIBRARY_VARIABLE, str(folder))
         words = ()
     assert run("grammar", "check", "held", *words) == (0, "held: sound\n", "")
     assert run("sample", "held", "-n", 2, "--light", *words)[0] == 0

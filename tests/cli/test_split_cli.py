@@ -9,7 +9,7 @@ import yaml
 from helpers.commands import tree
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import read_split, split_names
-from morphgen.grammar.library import ENVIRONMENT
+from morphgen.grammar.library import LIBRARY_VARIABLE
 
 INTERPOLATION = ("split", "new", "interpolation", "--grammar", "cubes", "--train", "3")
 COMPOSITION = ("split", "new", "composition", "--from", "base=gantry ee={plane,cube}")
@@ -158,7 +158,7 @@ def test_parts_and_grammars_of_the_users_library_are_found(run, monkeypatch):
     Path("lib/mine.grammar").write_text("robot -> gantry plane(size=uniform(0.1, 0.3))\n")
     words = ("split", "new", "interpolation", "--grammar", "mine", "--train", 2)
     assert run(*words, "--library", "lib", "--out", "a.yaml")[0] == 0
-    monkeypatch.setenv(ENVIRONMENT, str(Path("lib").absolute()))
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(Path("lib").absolute()))
     assert run(*words, "--out", "b.yaml")[0] == 0
     assert Path("a.yaml").read_bytes() == Path("b.yaml").read_bytes()
     data = yaml.safe_load(Path("a.yaml").read_text())

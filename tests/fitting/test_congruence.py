@@ -28,7 +28,7 @@ KINDS = [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.
 
 
 def links(robot: str) -> dict[str, trimesh.Trimesh]:
-    body = load_part(default_library(()).manifest(robot)).body
+    body = load_part(default_library(()).manifest(robot)).fragment
     return {
         link.name: load_mesh(link.collisions[0].geometry)
         for link in body.links

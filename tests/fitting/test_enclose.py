@@ -125,7 +125,7 @@ def test_rounding_up_is_all_that_a_small_thing_gains() -> None:
 
 @pytest.mark.parametrize("robot", ["ur5", "panda"])
 def test_no_link_gets_more_than_the_tightest_bound_of_trimesh(robot: str) -> None:
-    links = load_part(default_library(()).manifest(robot)).body.links
+    links = load_part(default_library(()).manifest(robot)).fragment.links
     meshes = [solid_of(link.collisions).mesh for link in links if link.collisions]
     assert len(meshes) >= 7
     for mesh in meshes:

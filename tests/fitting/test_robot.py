@@ -182,7 +182,7 @@ def test_a_link_that_nothing_can_stand_for_stops_composing(tmp_path):
 
 
 def test_primitives_agree_better_with_meshes_than_hulls_do():
-    meshes = load_part(LIBRARY.manifest("ur5")).body
+    meshes = load_part(LIBRARY.manifest("ur5")).fragment
     found, _ = stored_primitives(meshes, read_stored(LIBRARY.folders))
     primitives, hulls = agreement(meshes, with_primitives(meshes, found), 300)
     for counts in (primitives, hulls):
@@ -278,7 +278,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
 )
 def test_what_is_stored_reproduces(name, options):
     """To a hundredth: other processors round sums otherwise, and a search amplifies that."""
-    body = load_part(LIBRARY.manifest(name)).body
+    body = load_part(LIBRARY.manifest(name)).fragment
     stored = read_stored(LIBRARY.folders)
     for row in fit_links(body, options).links:
         shapes = shapes_to_fit(body.link(row.link))

@@ -8,10 +8,10 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.analysis import faults, variables
-from morphgen.grammar.choosers import Random
+from morphgen.grammar.analysis import check_grammar, variables
+from morphgen.grammar.choosers import RandomChooser
 from morphgen.grammar.derive import derive
-from morphgen.grammar.structures import count, enumerate_structures
+from morphgen.grammar.structures import count_structures, enumerate_structures
 
 
 def structures(found, limit=None):
@@ -20,7 +20,7 @@ def structures(found, limit=None):
 
 @pytest.mark.parametrize("name", CATEGORIES)
 def test_shipped_grammars_are_sound(name):
-    assert faults(shipped(name), LIBRARY) == []
+    assert check_grammar(shipped(name), LIBRARY) == []
 
 
 @pytest.mark.parametrize(
@@ -51,14 +51,14 @@ def test_shipped_grammars_are_sound(name):
     ],
 )
 def test_a_fault_is_told_with_its_place(lines, message):
-    found = faults(grammar(*lines), LIBRARY)
+    found = check_grammar(grammar(*lines), LIBRARY)
     assert found
     assert any(message in fault for fault in found)
     assert all(fault.startswith("g:") and "\n" not in fault for fault in found)
 
 
 def test_all_faults_are_told_at_once():
-    found = faults(
+    found = check_grammar(
         grammar("let r = 1", "robot -> gantri plane(sise=1)", "a -> ur55"),
         LIBRARY,
     )
@@ -73,11 +73,11 @@ def test_all_faults_are_told_at_once():
 
 def test_what_is_used_by_a_weight_or_another_value_is_used():
     lines = "let a = 1", "let b = a", "robot -> @weight(b) cubes | cartpole"
-    assert faults(grammar(*lines), LIBRARY) == []
+    assert check_grammar(grammar(*lines), LIBRARY) == []
 
 
 def test_a_recursion_that_can_end_is_sound():
-    assert faults(grammar("robot -> slides tail", "tail -> bead tail | bead"), LIBRARY) == []
+    assert check_grammar(grammar("robot -> slides tail", "tail -> bead tail | bead"), LIBRARY) == []
 
 
 @pytest.mark.parametrize(
@@ -105,25 +105,25 @@ def test_a_recursion_that_can_end_is_sound():
 def test_the_count_is_that_of_the_list_and_nothing_is_listed_twice(lines, number):
     found = grammar(*lines)
     listed = structures(found)
-    assert count(found) == number == len(listed) == len(set(listed))
+    assert count_structures(found) == number == len(listed) == len(set(listed))
 
 
 def test_the_list_is_all_that_can_be_drawn():
     found = grammar("robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw")
     rng = np.random.default_rng(0)
-    drawn = {str(derive(found, LIBRARY, Random(rng))) for _ in range(600)}
+    drawn = {str(derive(found, LIBRARY, RandomChooser(rng))) for _ in range(600)}
     assert drawn == set(structures(found))
 
 
 def test_an_alternative_written_twice_is_listed_once():
     found = grammar("robot -> gantry ee", "ee -> plane | plane | cube")
-    assert count(found) == 3
+    assert count_structures(found) == 3
     assert len(structures(found)) == 2
 
 
 def test_a_recursion_has_infinitely_many_listed_by_size():
     found = grammar("robot -> slides tail", "tail -> bead | beam tail")
-    assert math.isinf(count(found))
+    assert math.isinf(count_structures(found))
     listed = structures(found, 6)
     assert [text.count("=bead") + text.count("=beam") for text in listed] == [1, 2, 3, 4, 5, 6]
     assert len(set(listed)) == 6
@@ -139,7 +139,7 @@ def test_a_structure_that_cannot_be_is_told_when_its_turn_comes():
 
 
 def test_shipped_grammars_have_as_many_structures_as_they_say():
-    counts = {name: count(shipped(name)) for name in CATEGORIES}
+    counts = {name: count_structures(shipped(name)) for name in CATEGORIES}
     assert counts["chain"] == 6
     assert counts["nlink"] == 4
     assert counts["planar_arm"] == 8
@@ -156,7 +156,7 @@ def test_all_that_is_drawn_is_named_with_its_distribution():
             "link -> bead(radius=r, rod=choice(2cm, r) + uniform(0, 5*r))",
         )
     )
-    assert [(v.where, v.text, v.distribution.is_continuous) for v in found] == [
+    assert [(v.location, v.text, v.distribution.is_continuous) for v in found] == [
         ("let r", "uniform(1cm, 2cm)", True),
         ("link: bead.rod", "choice(2cm, r)", False),
         ("link: bead.rod", "uniform(0, (5 * r))", True),

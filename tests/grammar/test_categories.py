@@ -6,7 +6,7 @@ from helpers.grammars import CATEGORIES, LIBRARY, benchmark_counts, shipped, unp
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.grammar.sampling import Sample, draw
+from morphgen.grammar.sampling import Sample, sample_robot
 
 RANGES = {
     "nlink": ({4, 5, 6, 7}, {2, 3, 4, 5}),
@@ -40,7 +40,7 @@ def troubles(drawn: Sample, category):
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_robots_have_the_counts_of_the_benchmark_and_all_loaders_agree(category, tmp_path):
     found = shipped(category)
-    drawn = [draw(found, LIBRARY, index, seed=11) for index in range(3)]
+    drawn = [sample_robot(found, LIBRARY, index, seed=11) for index in range(3)]
     assert [trouble for one in drawn for trouble in troubles(one, category)] == []
     folder = write_bundle(drawn[0].robot, tmp_path / "robot", picture=False)
     report = conformance(folder, 20)
@@ -53,7 +53,7 @@ def test_robots_have_the_counts_of_the_benchmark_and_all_loaders_agree(category,
 def test_a_hundred_robots_are_sound_and_all_loaders_agree(category, tmp_path):
     found = shipped(category)
     for index in range(100):
-        drawn = draw(found, LIBRARY, index, seed=12)
+        drawn = sample_robot(found, LIBRARY, index, seed=12)
         assert troubles(drawn, category) == []
         folder = write_bundle(drawn.robot, tmp_path / "robot", picture=False)
         report = conformance(folder, 20)

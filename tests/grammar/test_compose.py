@@ -13,7 +13,7 @@ from morphgen.checks.conformance import conformance
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import CompositionError, PartError
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.grammar.compose import compose, join, place
+from morphgen.grammar.compose import compose, join, load_parts
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import default_name, parse_request
@@ -48,7 +48,7 @@ class Situation:
     """A robot in one configuration, and where its parts are in it."""
 
     def __init__(self, text, seed=0):
-        self.placed = place(derive(text), LIBRARY)
+        self.placed = load_parts(derive(text), LIBRARY)
         self.robot = joined(text)
         (self.q,) = random_configurations(self.robot, 1, np.random.default_rng(seed))
         self.T_world_link = forward_kinematics(self.robot, self.q)
@@ -57,13 +57,13 @@ class Situation:
 
     def alone(self, label):
         """Pose of every link of a part in the part's root, the part by itself in that pose."""
-        body = self.placed[label].part.body
+        body = self.placed[label].part.fragment
         joints = [body.joints[k].name for k in body.independent_joints]
         return forward_kinematics(body, [self.positions[f"{label}_{name}"] for name in joints])
 
     def links(self, label):
         """(pose in the robot, pose in the part alone) of every link of a part."""
-        body = self.placed[label].part.body
+        body = self.placed[label].part.fragment
         pairs = zip(body.links, self.alone(label), strict=True)
         index = self.robot.link_index
         there = [(f"{label}_{link.name}", T_part_link) for link, T_part_link in pairs]
@@ -78,7 +78,7 @@ class Situation:
         """Pose of a frame of a part's manifest, of plain numbers, in the robot."""
         part = self.placed[label].part
         link = placement.link.replace("/", "_")
-        T_part_link = self.alone(label)[part.body.link_index[link]]
+        T_part_link = self.alone(label)[part.fragment.link_index[link]]
         offset = Pose.from_xyz_rpy(placement.xyz, placement.rpy).matrix
         return self.root(label) @ T_part_link @ offset
 
@@ -125,8 +125,8 @@ def test_parts_move_in_the_robot_as_they_move_alone(text):
 def test_joints_keep_axis_limits_effort_velocity_damping_and_mimic():
     text = "arm=panda ee=robotiq_2f85"
     robot = joined(text)
-    for label, here in place(derive(text), LIBRARY).items():
-        for joint in here.part.body.joints:
+    for label, here in load_parts(derive(text), LIBRARY).items():
+        for joint in here.part.fragment.joints:
             found = robot.joints[robot.joint_index[f"{label}_{joint.name}"]]
             kept = ("kind", "axis", "limits", "effort", "velocity", "damping", "friction")
             assert [getattr(found, key) for key in kept] == [getattr(joint, key) for key in kept]
@@ -158,8 +158,8 @@ def test_names_say_which_part_they_belong_to_and_do_not_clash():
 
 def test_mass_is_the_sum_of_the_parts():
     text = "base=pedestal left.arm=ur5 left.ee=stick right.arm=panda right.ee=panda_hand"
-    parts = place(derive(text), LIBRARY).values()
-    assert joined(text).mass == pytest.approx(math.fsum(here.part.body.mass for here in parts))
+    parts = load_parts(derive(text), LIBRARY).values()
+    assert joined(text).mass == pytest.approx(math.fsum(here.part.fragment.mass for here in parts))
 
 
 def test_home_is_each_parts_own():

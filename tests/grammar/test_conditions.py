@@ -11,7 +11,7 @@ from morphgen.errors import GrammarError
 from morphgen.grammar.compose import join
 from morphgen.grammar.conditions import (
     PROPERTIES,
-    Properties,
+    RobotProperties,
     clauses,
     holds,
     require_condition,
@@ -23,7 +23,7 @@ from morphgen.grammar.syntax import parse_condition
 def true_of(text, robot):
     condition = parse_condition(text)
     require_condition(condition)
-    return holds(condition, Properties(robot))
+    return holds(condition, RobotProperties(robot))
 
 
 @pytest.fixture(scope="module")
@@ -32,29 +32,29 @@ def gantry():
 
 
 def test_properties_of_a_robot(gantry):
-    properties = Properties(gantry)
+    properties = RobotProperties(gantry)
     assert (properties.links, properties.dof, properties.movable) == (7, 5, 5)
     assert properties.movable_to_tool == 5
     assert properties.mass == pytest.approx(gantry.mass)
 
 
 def test_mimic_joints_move_and_are_not_independent():
-    properties = Properties(arm())
+    properties = RobotProperties(arm())
     assert (properties.links, properties.dof, properties.movable) == (6, 4, 5)
     assert properties.movable_to_tool == 3
 
 
 def test_height_is_that_of_the_highest_point_at_home():
     straight = replace(arm(), home=(0.0, 0.0, 0.0, 0.0))
-    assert Properties(straight).height == pytest.approx(0.05 + 0.3 + 0.3 + 0.2 + 0.1 - 0.03)
+    assert RobotProperties(straight).height == pytest.approx(0.05 + 0.3 + 0.3 + 0.2 + 0.1 - 0.03)
     lying = replace(arm(), home=(np.pi / 2, 0.0, 0.0, 0.0))
-    assert Properties(lying).height == pytest.approx(0.05 + 0.02, abs=1e-3)
+    assert RobotProperties(lying).height == pytest.approx(0.05 + 0.02, abs=1e-3)
 
 
 def test_reach_counts_from_the_root_and_is_nothing_without_a_tool():
-    assert Properties(arm()).reach == pytest.approx(0.05 + 0.3 + 0.3 + 0.04 + 0.28, abs=0.02)
+    assert RobotProperties(arm()).reach == pytest.approx(0.05 + 0.3 + 0.3 + 0.04 + 0.28, abs=0.02)
     toolless = replace(arm(), frames=())
-    assert (Properties(toolless).reach, Properties(toolless).movable_to_tool) == (0, 0)
+    assert (RobotProperties(toolless).reach, RobotProperties(toolless).movable_to_tool) == (0, 0)
 
 
 @pytest.mark.parametrize(

@@ -7,17 +7,17 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import First, Random, Recorded
-from morphgen.grammar.derive import EndlessError, derive
+from morphgen.grammar.choosers import FirstChooser, RandomChooser, RecordedChooser
+from morphgen.grammar.derive import TooManyPartsError, derive
 from morphgen.grammar.limits import MAX_PARTS
 
 
 def first(*lines):
-    return derive(grammar(*lines), LIBRARY, First())
+    return derive(grammar(*lines), LIBRARY, FirstChooser())
 
 
 def draw(found, seed=0):
-    return derive(found, LIBRARY, Random(np.random.default_rng(seed)))
+    return derive(found, LIBRARY, RandomChooser(np.random.default_rng(seed)))
 
 
 def labels(derivation):
@@ -110,10 +110,10 @@ def test_a_let_is_drawn_once_and_an_argument_for_every_copy():
 
 
 def test_two_distributions_in_one_expression_are_drawn_apart():
-    recorded = Recorded(Random(np.random.default_rng(0)))
+    recorded = RecordedChooser(RandomChooser(np.random.default_rng(0)))
     found = grammar("robot -> gantry plane(size=uniform(0.1, 0.2) + uniform(0.1, 0.2))")
     derive(found, LIBRARY, recorded)
-    assert list(recorded.made) == ["robot/1.plane.size", "robot/1.plane.size~2"]
+    assert list(recorded.choices) == ["robot/1.plane.size", "robot/1.plane.size~2"]
 
 
 def test_first_takes_the_first_possible_alternative_and_the_smallest_count():
@@ -132,7 +132,7 @@ def test_weights_are_shares():
         "robot -> @weight(3) cubes | @weight(2*0.5) cartpole | @weight(0) gantry | post"
     )
     rng = np.random.default_rng(0)
-    parts = [derive(found, LIBRARY, Random(rng)).part for _ in range(2000)]
+    parts = [derive(found, LIBRARY, RandomChooser(rng)).part for _ in range(2000)]
     shares = [parts.count(part) / 2000 for part in ("cubes", "cartpole", "gantry", "post")]
     assert shares == pytest.approx([0.6, 0.2, 0, 0.2], abs=0.04)
     assert shares[2] == 0
@@ -144,15 +144,15 @@ def test_a_weight_may_be_drawn():
         "robot -> @weight(w) cubes | @weight(1 - w) cartpole | @weight(0) post",
     )
     for seed in range(20):
-        recorded = Recorded(Random(np.random.default_rng(seed)))
+        recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
         part = derive(found, LIBRARY, recorded).part
-        assert part == ("cubes" if recorded.made["let w"] else "cartpole")
+        assert part == ("cubes" if recorded.choices["let w"] else "cartpole")
 
 
 def test_counts_of_a_repetition_are_equally_likely():
     found = grammar("robot -> post beam{2,4}")
     rng = np.random.default_rng(0)
-    counts = [len(labels(derive(found, LIBRARY, Random(rng)))) - 1 for _ in range(900)]
+    counts = [len(labels(derive(found, LIBRARY, RandomChooser(rng)))) - 1 for _ in range(900)]
     assert [counts.count(n) / 900 for n in (2, 3, 4)] == pytest.approx([1 / 3] * 3, abs=0.05)
 
 
@@ -160,18 +160,20 @@ def test_counts_of_a_repetition_are_equally_likely():
 def test_recorded_choices_make_the_same_derivation_again(name):
     found = shipped(name)
     for seed in range(5):
-        recorded = Recorded(Random(np.random.default_rng(seed)))
+        recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
         tree = derive(found, LIBRARY, recorded)
-        written = {key: float(f"{value:.12g}") for key, value in recorded.made.items()}
-        again = Recorded(First(), written)
+        written = {key: float(f"{value:.12g}") for key, value in recorded.choices.items()}
+        again = RecordedChooser(FirstChooser(), written)
         assert derive(found, LIBRARY, again) == tree
-        assert again.made == recorded.made
+        assert again.choices == recorded.choices
 
 
 def test_choices_that_do_not_fit_are_made_by_the_other():
     found = grammar("robot -> post links", "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw")
     given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
-    assert derive(found, LIBRARY, Recorded(First(), given)) == derive(found, LIBRARY, First())
+    assert derive(found, LIBRARY, RecordedChooser(FirstChooser(), given)) == derive(
+        found, LIBRARY, FirstChooser()
+    )
 
 
 def test_a_recursion_may_end():
@@ -189,17 +191,17 @@ def test_a_recursion_may_end():
     ],
 )
 def test_a_recursion_without_end_is_given_up(lines):
-    with pytest.raises(EndlessError, match=r"^g:\d:\d: "):
+    with pytest.raises(TooManyPartsError, match=r"^g:\d:\d: "):
         first(*lines)
 
 
 def test_no_robot_has_more_parts_than_allowed():
     found = grammar("robot -> slides bead{99}")
-    assert sum(1 for _ in derive(found, LIBRARY, First()).walk()) == MAX_PARTS == 100
-    with pytest.raises(EndlessError, match="more than 100 parts: does it end"):
+    assert sum(1 for _ in derive(found, LIBRARY, FirstChooser()).walk()) == MAX_PARTS == 100
+    with pytest.raises(TooManyPartsError, match="more than 100 parts: does it end"):
         first("robot -> slides bead{100}")
-    with pytest.raises(EndlessError, match="more than 3 parts"):
-        derive(found, LIBRARY, First(), max_parts=3)
+    with pytest.raises(TooManyPartsError, match="more than 3 parts"):
+        derive(found, LIBRARY, FirstChooser(), max_parts=3)
 
 
 @pytest.mark.parametrize(

@@ -7,15 +7,15 @@ import pytest
 
 from helpers.grammars import LIBRARY, shipped, unphysical
 from morphgen.errors import GrammarError
-from morphgen.grammar.analysis import faults
-from morphgen.grammar.choosers import Random
+from morphgen.grammar.analysis import check_grammar
+from morphgen.grammar.choosers import RandomChooser
 from morphgen.grammar.conditions import PROPERTIES
 from morphgen.grammar.derive import derive
-from morphgen.grammar.model import find_grammar, load_grammar
+from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.parameters import UNITS
 from morphgen.grammar.pinning import pin
-from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
-from morphgen.grammar.sampling import SamplingError, sample
+from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
+from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.grammar.values import DISTRIBUTIONS
 
@@ -43,15 +43,15 @@ def test_there_are_five_examples():
 @pytest.mark.parametrize("text", EXAMPLES)
 def test_an_example_is_sound_and_can_be_drawn(load, text):
     found = load(text)
-    assert faults(found, LIBRARY) == []
-    for drawn in sample(found, LIBRARY, 3):
+    assert check_grammar(found, LIBRARY) == []
+    for drawn in sample_robots(found, LIBRARY, 3):
         assert unphysical(drawn.robot) == []
         assert any(frame.name == "tool" for frame in drawn.robot.frames)
 
 
 def test_two_limbs_have_the_names_that_the_page_gives(load):
     (text,) = (text for text in EXAMPLES if "left:limb" in text)
-    (drawn,) = sample(load(text), LIBRARY, 1)
+    (drawn,) = sample_robots(load(text), LIBRARY, 1)
     labels = [node.label for node in drawn.derivation.walk()]
     assert labels == ["pedestal", "left_arm", "left_ee", "right_arm", "right_ee"]
     frames = {frame.name for frame in drawn.robot.frames}
@@ -62,7 +62,7 @@ def test_the_first_example_weighs_its_arms_two_to_one(load):
     import numpy as np
 
     found, rng = load(EXAMPLES[0]), np.random.default_rng(0)
-    arms = [derive(found, LIBRARY, Random(rng)).children[0][1].part for _ in range(300)]
+    arms = [derive(found, LIBRARY, RandomChooser(rng)).children[0][1].part for _ in range(300)]
     assert arms.count("ur5") / 300 == pytest.approx(2 / 3, abs=0.08)
 
 
@@ -74,7 +74,7 @@ def test_there_are_mistakes_of_many_kinds():
 def test_a_mistake_is_answered_as_the_page_says(load, lines, message):
     text = "\n".join(re.findall("`(.*?)`", lines)) + "\n"
     try:
-        found = faults(load(text), LIBRARY)
+        found = check_grammar(load(text), LIBRARY)
     except GrammarError as error:
         found = [str(error)]
     if message.endswith("..."):
@@ -85,7 +85,7 @@ def test_a_mistake_is_answered_as_the_page_says(load, lines, message):
 def test_the_message_of_a_condition_that_cannot_be_met_is_the_pages(monkeypatch):
     (told,) = re.findall(r"`(robot 0 of .*?)`", PAGE)
     with pytest.raises(SamplingError) as caught:
-        next(sample(shipped("cubes"), LIBRARY, 1, where=[parse_condition("mass > 900")]))
+        next(sample_robots(shipped("cubes"), LIBRARY, 1, where=[parse_condition("mass > 900")]))
     assert str(caught.value) == told
 
 
@@ -103,7 +103,7 @@ def test_what_the_page_pins_can_be_pinned():
 def test_the_index_has_the_facts_that_the_page_names(tmp_path):
     (row,) = re.findall(r"\| `index\.jsonl` \| a line a robot: (.*?) \|", PAGE)
     named = set(row.replace("rejected draws", "rejected").split(", "))
-    plan = SetPlan(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())
+    plan = SetConfig(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())
     make_set(plan, 1, make_serially)
     import json
 

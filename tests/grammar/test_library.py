@@ -11,8 +11,8 @@ from morphgen.checks import check
 from morphgen.errors import PartError
 from morphgen.grammar.catalogue import catalogue
 from morphgen.grammar.compose import compose
-from morphgen.grammar.library import ENVIRONMENT, Library, default_library
-from morphgen.grammar.manifest import KINDS
+from morphgen.grammar.library import LIBRARY_VARIABLE, Library, default_library
+from morphgen.grammar.manifest import PART_KINDS
 from morphgen.grammar.part import load_part
 from morphgen.grammar.request import default_name, parse_request
 from morphgen.model.kinematics import forward_kinematics
@@ -60,7 +60,7 @@ ANTHROPOMORPHIC = {"allegro", "dex3"}
 
 @pytest.fixture(autouse=True)
 def _no_library_of_the_users_own(monkeypatch):
-    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    monkeypatch.delenv(LIBRARY_VARIABLE, raising=False)
 
 
 @pytest.mark.parametrize(
@@ -76,14 +76,16 @@ def test_every_part_composes_into_a_robot_that_the_checks_find_sound(name):
 
 @pytest.mark.parametrize("name", sorted(DEGREES_OF_FREEDOM))
 def test_parts_have_the_joints_that_they_are_known_for(name):
-    assert load_part(LIBRARY.manifest(name)).body.dof == DEGREES_OF_FREEDOM[name]
+    assert load_part(LIBRARY.manifest(name)).fragment.dof == DEGREES_OF_FREEDOM[name]
 
 
 @pytest.mark.parametrize("name", LIBRARY.names("ee"))
 def test_a_tool_points_out_of_the_hand_and_lies_in_front_of_it(name):
     part = load_part(LIBRARY.manifest(name))
-    T_root_link = forward_kinematics(part.body, part.body.home)
-    T_root_tool = T_root_link[part.body.link_index[part.tool.link]] @ part.tool.T_link_frame.matrix
+    T_root_link = forward_kinematics(part.fragment, part.fragment.home)
+    T_root_tool = (
+        T_root_link[part.fragment.link_index[part.tool.link]] @ part.tool.T_link_frame.matrix
+    )
     T_mount_tool = part.T_root_mount.inverse().matrix @ T_root_tool
     assert T_mount_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-3)
     beside, ahead = np.hypot(*T_mount_tool[:2, 3]), T_mount_tool[2, 3]
@@ -104,7 +106,7 @@ def test_templates_and_real_parts_of_every_kind_are_there():
     assert {"ur5", "lwr", "widowx"} <= set(LIBRARY.names("arm"))
     assert {"none", "stick", "robotiq_2f85", "rethink", "sake_ez"} <= set(LIBRARY.names("ee"))
     kinds = [manifest.kind for manifest in LIBRARY.manifests()]
-    assert kinds == sorted(kinds, key=KINDS.index)
+    assert kinds == sorted(kinds, key=PART_KINDS.index)
     assert len(kinds) == len(LIBRARY.names())
 
 
@@ -139,13 +141,15 @@ def test_a_folder_of_ones_own_adds_parts(tmp_path):
 def test_the_environment_names_folders_like_a_path(tmp_path, monkeypatch):
     write_part(tmp_path / "a", name="pincer_a")
     write_part(tmp_path / "b", name="pincer_b")
-    monkeypatch.setenv(ENVIRONMENT, os.pathsep.join([str(tmp_path / "a"), str(tmp_path / "b")]))
+    monkeypatch.setenv(
+        LIBRARY_VARIABLE, os.pathsep.join([str(tmp_path / "a"), str(tmp_path / "b")])
+    )
     assert {"pincer_a", "pincer_b"} <= set(default_library().names("ee"))
 
 
 def test_a_folder_that_is_given_twice_is_one_folder(tmp_path, monkeypatch):
     write_part(tmp_path)
-    monkeypatch.setenv(ENVIRONMENT, str(tmp_path))
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
     monkeypatch.chdir(tmp_path)
     assert "pincer" in default_library([tmp_path, tmp_path.relative_to(tmp_path)]).names()
 

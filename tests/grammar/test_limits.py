@@ -8,13 +8,13 @@ import pytest
 
 from helpers.grammars import LIBRARY, grammar
 from morphgen.errors import GrammarError
-from morphgen.grammar.analysis import faults
-from morphgen.grammar.choosers import First, Random
+from morphgen.grammar.analysis import check_grammar
+from morphgen.grammar.choosers import FirstChooser, RandomChooser
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.derive import derive
+from morphgen.grammar.grammar_file import grammar_text, load_grammar
 from morphgen.grammar.limits import MAX_COUNT, MAX_NESTING, MAX_PARTS
-from morphgen.grammar.model import grammar_text, load_grammar
-from morphgen.grammar.structures import SearchError, count, enumerate_structures
+from morphgen.grammar.structures import SearchError, count_structures, enumerate_structures
 from morphgen.grammar.syntax import parse_condition
 
 SOON = 10.0
@@ -57,14 +57,19 @@ def test_what_is_beyond_a_limit_is_refused_with_the_limit(lines, message):
 def test_what_is_within_the_limits_is_read():
     x = "+".join(["1"] * MAX_NESTING)
     found = grammar(f"let x = {x}", "robot -> " + "|".join(["@weight(x) cubes"] * 1000))
-    assert count(found) == 1000
-    assert faults(found, LIBRARY) == []
+    assert count_structures(found) == 1000
+    assert check_grammar(found, LIBRARY) == []
     brackets = "(" * 20_000
-    assert count(grammar(f"let x = {brackets}1{brackets.replace('(', ')')}", "robot -> cubes")) == 1
+    assert (
+        count_structures(
+            grammar(f"let x = {brackets}1{brackets.replace('(', ')')}", "robot -> cubes")
+        )
+        == 1
+    )
 
 
 def test_blank_lines_take_linear_time():
-    assert count(grammar("robot -> cubes", "\n" * 60_000, " | cartpole")) == 2
+    assert count_structures(grammar("robot -> cubes", "\n" * 60_000, " | cartpole")) == 2
 
 
 def test_conditions_have_the_same_limits():
@@ -84,7 +89,7 @@ def test_conditions_have_the_same_limits():
     ],
 )
 def test_huge_numbers_of_structures_are_counted_at_once(lines, number):
-    found = count(grammar(*lines))
+    found = count_structures(grammar(*lines))
     assert found == number
     assert found != math.inf
 
@@ -92,7 +97,7 @@ def test_huge_numbers_of_structures_are_counted_at_once(lines, number):
 @pytest.mark.parametrize("last", ["a64 -> bead", "a64 -> bead | beam"])
 def test_a_grammar_of_too_large_robots_alone_is_faulty(last):
     found = grammar("robot -> slides a0", *DOUBLING, last)
-    assert faults(found, LIBRARY) == [
+    assert check_grammar(found, LIBRARY) == [
         f"g:1:1: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
     ]
     assert list(enumerate_structures(found, LIBRARY)) == []
@@ -102,7 +107,7 @@ def test_alternatives_that_lead_to_too_large_robots_are_left_out_of_the_list():
     found = grammar("robot -> slides a0 | slides cube", *DOUBLING, "a64 -> bead | beam")
     (only,) = enumerate_structures(found, LIBRARY)
     assert [node.part for node in only.walk()] == ["slides", "cube"]
-    assert faults(found, LIBRARY) == []
+    assert check_grammar(found, LIBRARY) == []
 
 
 def test_an_endless_grammar_of_many_alternatives_is_listed_from_its_smallest():
@@ -110,7 +115,7 @@ def test_an_endless_grammar_of_many_alternatives_is_listed_from_its_smallest():
     found = grammar("robot -> slides a", "a -> b a | a a bead | bead", f"b -> {many}")
     listed = itertools.islice(enumerate_structures(found, LIBRARY), 3)
     assert [sum(1 for _ in each.walk()) for each in listed] == [2, 3, 3]
-    assert faults(found, LIBRARY) == []
+    assert check_grammar(found, LIBRARY) == []
 
 
 def test_a_search_for_another_structure_is_given_up():
@@ -133,7 +138,7 @@ def test_a_search_for_another_structure_is_given_up():
     ],
 )
 def test_numbers_that_are_not_finite_are_faults(line, message):
-    (fault,) = faults(grammar(line, "robot -> @weight(x) cubes"), LIBRARY)
+    (fault,) = check_grammar(grammar(line, "robot -> @weight(x) cubes"), LIBRARY)
     assert fault.startswith("g:1:")
     assert message in fault
 
@@ -141,7 +146,7 @@ def test_numbers_that_are_not_finite_are_faults(line, message):
 def test_weights_that_sum_to_no_finite_number_are_refused():
     found = grammar("robot -> @weight(1e308) cubes | @weight(1e308) cartpole")
     with pytest.raises(GrammarError, match="g:1:1: the weights of 'robot' sum to no finite number"):
-        derive(found, LIBRARY, First())
+        derive(found, LIBRARY, FirstChooser())
 
 
 def test_the_smallest_weight_draws_its_own_alternative():
@@ -150,11 +155,13 @@ def test_the_smallest_weight_draws_its_own_alternative():
             return 1 - 2**-53
 
     found = grammar("robot -> @weight(5e-324) cubes | @weight(0) cartpole")
-    assert derive(found, LIBRARY, Random(Last())).part == "cubes"
+    assert derive(found, LIBRARY, RandomChooser(Last())).part == "cubes"
 
 
 def test_many_faults_are_reported_as_the_first_of_them():
-    found = faults(grammar("robot -> fixed " + " ".join(f"u{i}" for i in range(9000))), LIBRARY)
+    found = check_grammar(
+        grammar("robot -> fixed " + " ".join(f"u{i}" for i in range(9000))), LIBRARY
+    )
     assert len(found) == 20
 
 

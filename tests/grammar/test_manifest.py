@@ -4,7 +4,7 @@ import pytest
 
 from helpers.parts import MANIFEST, write_part
 from morphgen.errors import PartError
-from morphgen.grammar.manifest import PackageSource, Placement, read_manifest
+from morphgen.grammar.manifest import FrameSpec, PackageSource, read_manifest
 
 REAL = {
     "file": None,
@@ -35,7 +35,7 @@ def test_a_template_has_a_xacro_beside_it_and_parameters(tmp_path):
     manifest = read_manifest(path)
     assert manifest.is_template
     assert manifest.source == tmp_path / "pincer.xacro"
-    assert manifest.tool == Placement("palm", (0.0, 0.0, "${length + 0.05}"))
+    assert manifest.tool == FrameSpec("palm", (0.0, 0.0, "${length + 0.05}"))
     length = manifest.parameters["length"]
     assert (length.minimum, length.default, length.maximum, length.unit) == (0.1, 0.2, 0.5, "m")
     assert manifest.home == {"left_slide": 0.01, "wheel": 0.5}

@@ -7,10 +7,9 @@ import pytest
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
 from morphgen.formats.card import rounded
-from morphgen.grammar import mutation
+from morphgen.grammar import sampling
 from morphgen.grammar.derivation import difference
-from morphgen.grammar.mutation import mutate
-from morphgen.grammar.sampling import SamplingError, draw
+from morphgen.grammar.sampling import SamplingError, mutate, sample_robot
 
 
 def as_in_index(choices):
@@ -34,7 +33,7 @@ def assert_one_choice_differs(before, after):
 @pytest.mark.parametrize("category", [name for name in CATEGORIES if name != "panda_variations"])
 def test_one_choice_differs_and_what_it_opens(category):
     found = shipped(category)
-    origin = draw(found, LIBRARY, 3)
+    origin = sample_robot(found, LIBRARY, 3)
     for neighbour in neighbours(found, origin, 5):
         assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
         assert neighbour.derivation != origin.derivation
@@ -46,7 +45,7 @@ def test_all_else_stays_to_the_last_digit():
         "robot -> gantry(low=uniform(0.1, 0.2), stroke=r*17) plane(size=1.7*r/0.9)",
     )
     for index in range(10):
-        origin = draw(found, LIBRARY, index)
+        origin = sample_robot(found, LIBRARY, index)
         for neighbour in neighbours(found, origin, 3, seed=index):
             lines = difference(origin.derivation, neighbour.derivation)
             names = {line[2:].split(" = ")[0] for line in lines}
@@ -57,10 +56,10 @@ def test_a_choice_that_a_file_rounded_is_kept():
     found = grammar(
         "robot -> gantry plane(size=uniform(0.1, 0.2), mount_yaw=choice(60deg, 60deg, 30deg))"
     )
-    turned = [i for i in range(20) if max(draw(found, LIBRARY, i).choices.values()) > 1]
+    turned = [i for i in range(20) if max(sample_robot(found, LIBRARY, i).choices.values()) > 1]
     assert turned
     for index in turned[:5]:
-        origin = draw(found, LIBRARY, index)
+        origin = sample_robot(found, LIBRARY, index)
         for neighbour in neighbours(found, origin, 4):
             assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
 
@@ -68,7 +67,9 @@ def test_a_choice_that_a_file_rounded_is_kept():
 def test_another_alternative_brings_its_own_parameters():
     found = grammar("robot -> gantry ee", "ee -> plane(size=uniform(0.1, 0.2)) | stick")
     origin = next(
-        o for o in (draw(found, LIBRARY, i) for i in range(9)) if "stick" in str(o.derivation)
+        o
+        for o in (sample_robot(found, LIBRARY, i) for i in range(9))
+        if "stick" in str(o.derivation)
     )
     for neighbour in neighbours(found, origin, 3):
         assert set(neighbour.choices) == {"robot/1.ee", "robot/1.ee/plane.size"}
@@ -78,7 +79,7 @@ def test_conditions_hold_for_neighbours_too():
     found = grammar(
         "robot -> post beam(length=uniform(0.1, 0.3)){2,5} jaw", "where 0.5 < reach < 0.9"
     )
-    origin = draw(found, LIBRARY, 0)
+    origin = sample_robot(found, LIBRARY, 0)
     drawn = neighbours(found, origin, 10)
     assert all(0.5 < neighbour.properties.reach < 0.9 for neighbour in drawn)
     assert sum(len(neighbour.rejected) for neighbour in drawn) > 0
@@ -86,7 +87,7 @@ def test_conditions_hold_for_neighbours_too():
 
 def test_neighbours_are_the_same_for_a_seed_however_many_are_drawn():
     found = shipped("chain")
-    origin = draw(found, LIBRARY, 0)
+    origin = sample_robot(found, LIBRARY, 0)
     few, many = neighbours(found, origin, 2, seed=4), neighbours(found, origin, 5, seed=4)
     assert [str(n.derivation) for n in few] == [str(n.derivation) for n in many[:2]]
     assert [n.robot.name for n in few] == ["chain-000000-m0000", "chain-000000-m0001"]
@@ -96,11 +97,13 @@ def test_neighbours_are_the_same_for_a_seed_however_many_are_drawn():
 
 def test_a_grammar_without_choices_has_no_neighbours():
     with pytest.raises(GrammarError, match="leaves nothing to choose: no neighbours"):
-        neighbours(grammar("robot -> cubes"), draw(grammar("robot -> cubes"), LIBRARY, 0), 1)
+        neighbours(
+            grammar("robot -> cubes"), sample_robot(grammar("robot -> cubes"), LIBRARY, 0), 1
+        )
 
 
 def test_a_choice_that_cannot_change_anything_is_told(monkeypatch):
-    monkeypatch.setattr(mutation, "MAX_ATTEMPTS", 20)
+    monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 20)
     found = grammar("robot -> cubes(size=choice(0.1, 0.1))")
     with pytest.raises(SamplingError, match="in 20 draws: 20 x nothing changed"):
-        neighbours(found, draw(found, LIBRARY, 0), 1)
+        neighbours(found, sample_robot(found, LIBRARY, 0), 1)

@@ -40,20 +40,20 @@ def real(tmp_path, monkeypatch):
 
 
 def test_a_part_begins_at_its_root(tmp_path):
-    body = template(tmp_path).body
+    body = template(tmp_path).fragment
     assert [link.name for link in body.links] == ["palm", "left", "right", "disc"]
     assert [joint.name for joint in body.joints] == ["left_slide", "right_slide", "wheel"]
 
 
 def test_links_that_it_goes_without_are_cut_off_with_their_joints(tmp_path):
-    body = template(tmp_path, without=["disc"], home={"left_slide": 0.01}).body
+    body = template(tmp_path, without=["disc"], home={"left_slide": 0.01}).fragment
     assert [link.name for link in body.links] == ["palm", "left", "right"]
     assert body.home == (0.01,)
 
 
 def test_parameters_shape_the_links_and_the_frames(tmp_path):
     part = template(tmp_path, {"length": 0.4})
-    assert part.body.link("palm").collisions[0].geometry == Box((0.02, 0.02, 0.4))
+    assert part.fragment.link("palm").collisions[0].geometry == Box((0.02, 0.02, 0.4))
     assert part.tool.T_link_frame.position == pytest.approx((0, 0, 0.45))
     assert part.values == {"length": 0.4}
     assert template(tmp_path).values == {"length": 0.2}
@@ -61,12 +61,12 @@ def test_parameters_shape_the_links_and_the_frames(tmp_path):
 
 def test_expressions_stand_in_home_too(tmp_path):
     part = template(tmp_path, {"length": 0.3}, home={"left_slide": "${length / 10}"})
-    assert part.body.home == pytest.approx((0.03, 0.0))
+    assert part.fragment.home == pytest.approx((0.03, 0.0))
 
 
 def test_the_density_gives_masses_where_there_are_none(tmp_path):
     part = template(tmp_path)
-    palm = part.body.link("palm").inertial
+    palm = part.fragment.link("palm").inertial
     assert palm.mass == pytest.approx(BAR * 0.2)
     assert palm.com == pytest.approx((0, 0, 0.1))
     assert palm.inertia[0] == pytest.approx(palm.mass * (0.02**2 + 0.2**2) / 12)
@@ -80,7 +80,7 @@ def test_the_same_part_is_built_once(tmp_path):
 
 
 def test_home_effort_and_velocity_of_the_manifest_replace_the_sources(tmp_path):
-    body = template(tmp_path, effort={"wheel": 7}, velocity={"left_slide": 0.3}).body
+    body = template(tmp_path, effort={"wheel": 7}, velocity={"left_slide": 0.3}).fragment
     left, right, wheel = body.joints
     assert body.home == (0.01, 0.5)
     assert (left.effort, left.velocity) == (10, 0.3)
@@ -89,7 +89,7 @@ def test_home_effort_and_velocity_of_the_manifest_replace_the_sources(tmp_path):
 
 
 def test_a_continuous_joint_has_no_limits(tmp_path):
-    assert template(tmp_path).body.joints[2].limits is None
+    assert template(tmp_path).fragment.joints[2].limits is None
 
 
 def test_names_that_loaders_dislike_are_made_safe_in_every_place(tmp_path):
@@ -98,8 +98,8 @@ def test_names_that_loaders_dislike_are_made_safe_in_every_place(tmp_path):
     part = template(
         tmp_path, xacro=xacro, root="the palm", mount=link, tool=link, home={"big/wheel": 1}
     )
-    assert part.body.root.name == part.tool.link == "the_palm"
-    assert part.body.joints[2].name == "big_wheel"
+    assert part.fragment.root.name == part.tool.link == "the_palm"
+    assert part.fragment.joints[2].name == "big_wheel"
 
 
 def test_a_mount_may_lie_behind_a_fixed_joint(tmp_path):
@@ -111,7 +111,7 @@ def test_a_mount_may_lie_behind_a_fixed_joint(tmp_path):
 
 
 def test_a_mass_of_the_manifest_brings_the_inertia_of_the_geometry(real):
-    body = real(mass={"palm": 2}).body
+    body = real(mass={"palm": 2}).fragment
     palm = body.link("palm").inertial
     assert palm.mass == 2
     assert palm.com == pytest.approx((0, 0, 0.1))
@@ -120,11 +120,11 @@ def test_a_mass_of_the_manifest_brings_the_inertia_of_the_geometry(real):
 
 
 def test_a_mass_of_zero_takes_the_inertial_away(real):
-    assert real(mass={"palm": 0, "left": 1}).body.link("palm").inertial is None
+    assert real(mass={"palm": 0, "left": 1}).fragment.link("palm").inertial is None
 
 
 def test_visual_shapes_can_stand_for_collision_shapes(real):
-    palm = real(collision_from_visual=["palm"]).body.link("palm")
+    palm = real(collision_from_visual=["palm"]).fragment.link("palm")
     assert [shape.geometry for shape in palm.collisions] == [Box((0.02, 0.02, 0.2))]
     assert palm.collisions[0].rgba is None
     assert palm.visuals[0].rgba == (1, 0, 0, 1)
@@ -133,7 +133,7 @@ def test_visual_shapes_can_stand_for_collision_shapes(real):
 def test_a_dropped_mesh_is_gone_from_sight_and_touch():
     """The palm belongs to Jaco's hand, not to the last link of its arm."""
     arm = load_part(default_library().manifest("jaco2"))
-    shapes = [s for link in arm.body.links for s in (*link.visuals, *link.collisions)]
+    shapes = [s for link in arm.fragment.links for s in (*link.visuals, *link.collisions)]
     meshes = {shape.geometry.path.name for shape in shapes}
     assert "hand_3finger.dae" not in meshes
     assert "ring_small.dae" in meshes
@@ -219,24 +219,24 @@ def test_a_part_that_was_edited_is_read_again(tmp_path):
     manifest = write_part(tmp_path, density=1000)
     library = default_library([tmp_path])
     name = manifest.stem
-    light = load_part(library.manifest(name)).body.mass
+    light = load_part(library.manifest(name)).fragment.mass
     write_part(tmp_path, density=3000)
-    assert load_part(library.manifest(name)).body.mass == pytest.approx(3 * light)
+    assert load_part(library.manifest(name)).fragment.mass == pytest.approx(3 * light)
 
 
 def test_a_link_grows_by_a_parameter_and_its_face_stays_on_its_parent(real):
     size = {"size": {"default": 1, "min": 0.5, "max": 2}}
     plain = real(parameters=size, scaling={"disc": "size"})
-    assert plain.body.joints == real().body.joints
+    assert plain.fragment.joints == real().fragment.joints
     for scaling in ({"disc": "size"}, {"disc": {"by": "size"}}):
         manifest = real(parameters=size, scaling=scaling).manifest
-        larger = load_part(manifest, {"size": 2}).body
-        shapes = plain.body.link("disc").collisions
+        larger = load_part(manifest, {"size": 2}).fragment
+        shapes = plain.fragment.link("disc").collisions
         assert larger.link("disc").collisions == tuple(scale_shape(s, 2) for s in shapes)
-        assert larger.joints == plain.body.joints
+        assert larger.joints == plain.fragment.joints
     face = {"disc": {"by": "size", "face": [0, 0, -0.01]}}
-    held = load_part(real(parameters=size, scaling=face).manifest, {"size": 2}).body
-    moved = held.joints[-1].T_parent_joint.inverse() @ plain.body.joints[-1].T_parent_joint
+    held = load_part(real(parameters=size, scaling=face).manifest, {"size": 2}).fragment
+    moved = held.joints[-1].T_parent_joint.inverse() @ plain.fragment.joints[-1].T_parent_joint
     assert moved.position == pytest.approx((0, 0, -0.01))
 
 
@@ -244,10 +244,10 @@ def test_a_link_that_keeps_its_size_may_follow_the_face_of_its_parent(real):
     size = {"size": {"default": 1, "min": 0.5, "max": 2}}
     scaling = {"palm": {"by": "size"}, "disc": {"face": [0, 0, 0.01]}}
     part = real(parameters=size, scaling=scaling)
-    larger = load_part(part.manifest, {"size": 2}).body
-    assert larger.link("disc") == part.body.link("disc")
+    larger = load_part(part.manifest, {"size": 2}).fragment
+    assert larger.link("disc") == part.fragment.link("disc")
     face_before, face_after = (
-        body.joints[-1].T_parent_joint.apply((0, 0, 0.01)) for body in (part.body, larger)
+        body.joints[-1].T_parent_joint.apply((0, 0, 0.01)) for body in (part.fragment, larger)
     )
     assert face_after == pytest.approx([2 * value for value in face_before])
 

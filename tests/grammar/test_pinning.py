@@ -4,19 +4,21 @@ import pytest
 
 from helpers.grammars import LIBRARY, grammar, shipped
 from morphgen.errors import MorphgenError
-from morphgen.grammar.choosers import First
+from morphgen.grammar.choosers import FirstChooser
 from morphgen.grammar.derive import derive
 from morphgen.grammar.pinning import pin
 from morphgen.grammar.request import parse_words
-from morphgen.grammar.sampling import sample
+from morphgen.grammar.sampling import sample_robots
 
 
 def parts(found, *words):
-    return [node.part for node in derive(pin(found, words, LIBRARY), LIBRARY, First()).walk()]
+    return [
+        node.part for node in derive(pin(found, words, LIBRARY), LIBRARY, FirstChooser()).walk()
+    ]
 
 
 def values(found, *words):
-    tree = derive(pin(found, words, LIBRARY), LIBRARY, First())
+    tree = derive(pin(found, words, LIBRARY), LIBRARY, FirstChooser())
     return {node.label: dict(node.parameters) for node in tree.walk()}
 
 
@@ -65,7 +67,7 @@ def test_the_order_of_words_does_not_matter(found):
 
 
 def test_what_is_pinned_is_the_same_in_every_sample(found):
-    drawn = list(sample(pin(found, ["links=2", "r=2cm"], LIBRARY), LIBRARY, 3))
+    drawn = list(sample_robots(pin(found, ["links=2", "r=2cm"], LIBRARY), LIBRARY, 3))
     assert {str(d.derivation).count("=bead") for d in drawn} == {2}
     assert all("radius=0.02" in str(d.derivation) for d in drawn)
 

@@ -7,10 +7,10 @@ import pytest
 from helpers.commands import tree
 from helpers.grammars import shipped
 from morphgen.errors import MorphgenError
-from morphgen.grammar.model import grammar_text
-from morphgen.grammar.ray_workers import make_on_ray
-from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
+from morphgen.grammar.grammar_file import grammar_text
+from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
 from morphgen.grammar.sampling import SamplingError
+from morphgen.grammar.workers import make_on_ray
 
 pytestmark = pytest.mark.slow
 
@@ -27,9 +27,9 @@ def address():
     cluster.shutdown()
 
 
-def plan(folder: Path, where=()) -> SetPlan:
+def plan(folder: Path, where=()) -> SetConfig:
     text = grammar_text(shipped("cubes"))
-    return SetPlan(folder, "cubes", text, 0, where, light=True, picture=False, library=())
+    return SetConfig(folder, "cubes", text, 0, where, light=True, picture=False, library=())
 
 
 def test_ray_makes_the_same_bytes_as_one_process(address, tmp_path):

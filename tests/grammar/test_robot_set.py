@@ -14,13 +14,13 @@ import pytest
 from helpers.commands import start, tree
 from helpers.grammars import shipped
 from morphgen.errors import FormatError
-from morphgen.grammar.model import grammar_text
+from morphgen.grammar.grammar_file import grammar_text
 from morphgen.grammar.robot_set import (
     GRAMMAR,
     INDEX,
     JOURNAL,
     SETTINGS,
-    SetPlan,
+    SetConfig,
     make_serially,
     make_set,
     read_index,
@@ -31,7 +31,7 @@ from morphgen.grammar.workers import make_in_processes
 
 def plan(folder, category="cubes", **changes):
     text = grammar_text(shipped(category))
-    made = SetPlan(folder, category, text, 0, (), light=True, picture=False, library=())
+    made = SetConfig(folder, category, text, 0, (), light=True, picture=False, library=())
     return replace(made, **changes)
 
 

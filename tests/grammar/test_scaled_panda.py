@@ -20,7 +20,7 @@ FACTOR = st.sampled_from([0.5, 1.5]) | st.floats(0.5, 1.5)
 def variation(*factors):
     return load_part(
         default_library().manifest("panda_scaled"), dict(zip(SCALES, factors, strict=True))
-    ).body
+    ).fragment
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
@@ -32,7 +32,7 @@ def test_no_gap_opens_between_neighbours_whatever_the_factors(factors):
 
 
 def test_at_factors_of_one_it_is_the_panda():
-    panda, same = load_part(default_library().manifest("panda")).body, variation(*[1] * 7)
+    panda, same = load_part(default_library().manifest("panda")).fragment, variation(*[1] * 7)
     assert (
         panda.links[8].name == "panda_link8"
     )  # a bare frame, whose pose the scaled part's port has

@@ -9,8 +9,8 @@ from morphgen.grammar.syntax import (
     Expression,
     Include,
     Let,
-    Place,
     Production,
+    SourceLocation,
     Where,
     parse_condition,
     parse_grammar,
@@ -126,7 +126,7 @@ def test_and_binds_closer_than_or_and_comparisons_chain(text, read):
 
 
 def test_a_number_keeps_its_unit_and_what_was_written():
-    assert argument("45deg") == Expression("number", (), Place("g", 1, 17), "deg", 45.0)
+    assert argument("45deg") == Expression("number", (), SourceLocation("g", 1, 17), "deg", 45.0)
 
 
 @pytest.mark.parametrize(
@@ -177,22 +177,23 @@ def test_a_condition_is_told_to_be_none(text, message):
 
 
 NUMBERS = st.builds(
-    lambda value, unit: Expression("number", (), Place("x", 1, 1), unit, value),
+    lambda value, unit: Expression("number", (), SourceLocation("x", 1, 1), unit, value),
     st.floats(0, 1e12),
     st.sampled_from(["", "m", "mm", "deg", "kg"]),
 )
 NAMES = st.builds(
-    lambda name: Expression("name", (), Place("x", 1, 1), name), st.sampled_from(["r", "mass"])
+    lambda name: Expression("name", (), SourceLocation("x", 1, 1), name),
+    st.sampled_from(["r", "mass"]),
 )
 
 
 def combined(below):
     pairs = st.tuples(below, below)
-    place = Place("x", 1, 1)
+    location = SourceLocation("x", 1, 1)
     return st.one_of(
-        st.builds(lambda s, ab: Expression(s, ab, place), st.sampled_from("+-*/"), pairs),
-        st.builds(lambda ab: Expression("call", ab, place, "uniform"), pairs),
-        st.builds(lambda a: Expression("negative", (a,), place), below),
+        st.builds(lambda s, ab: Expression(s, ab, location), st.sampled_from("+-*/"), pairs),
+        st.builds(lambda ab: Expression("call", ab, location, "uniform"), pairs),
+        st.builds(lambda a: Expression("negative", (a,), location), below),
     )
 
 

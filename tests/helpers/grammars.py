@@ -2,8 +2,13 @@
 
 import math
 
+from morphgen.grammar.grammar_file import (
+    find_grammar,
+    grammar_from_text,
+    grammar_names,
+    load_grammar,
+)
 from morphgen.grammar.library import default_library
-from morphgen.grammar.model import find_grammar, grammar_from_text, grammar_names, load_grammar
 
 LIBRARY = default_library()
 CATEGORIES = grammar_names()

@@ -10,9 +10,9 @@ import pytest
 
 from helpers.robots import arm
 from morphgen.formats.bundle import write_bundle
+from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.grammar.model import find_grammar, grammar_text, load_grammar
-from morphgen.grammar.robot_set import SetPlan, make_serially, make_set
+from morphgen.grammar.robot_set import SetConfig, make_serially, make_set
 from morphgen.viewer.app import serve
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -56,7 +56,7 @@ def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("here")
     library = default_library()
     grammar = load_grammar(find_grammar("prims", library.folders), library.folders)
-    plan = SetPlan(
+    plan = SetConfig(
         root / "robots" / "prims", "prims", grammar_text(grammar), 0, (), True, False, ()
     )
     make_set(plan, 30, make_serially)

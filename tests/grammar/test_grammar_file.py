@@ -4,9 +4,9 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.grammar.choosers import First
+from morphgen.grammar.choosers import FirstChooser
 from morphgen.grammar.derive import derive
-from morphgen.grammar.model import (
+from morphgen.grammar.grammar_file import (
     find_grammar,
     grammar_from_text,
     grammar_names,
@@ -29,7 +29,7 @@ def write(tmp_path):
 
 
 def first(grammar):
-    return str(derive(grammar, LIBRARY, First()))
+    return str(derive(grammar, LIBRARY, FirstChooser()))
 
 
 def test_there_is_a_grammar_for_each_category():

@@ -12,7 +12,7 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import FormatError
 from morphgen.formats.urdf_text import urdf_text
-from morphgen.grammar.imported import import_robot
+from morphgen.grammar.robot_source import import_robot
 from morphgen.model.geometry import IDENTITY, Box
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.tree import rename

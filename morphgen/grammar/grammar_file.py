@@ -18,8 +18,8 @@ from morphgen.grammar.syntax import (
     Include,
     Item,
     Let,
-    Place,
     Production,
+    SourceLocation,
     Statement,
     Where,
     parse_grammar,
@@ -106,7 +106,7 @@ def grammar_from_text(text: str, name: str) -> Grammar:
     statements = parse_grammar(text, name)
     for statement in statements:
         if isinstance(statement, Include):
-            raise GrammarError(f"{statement.place}: a grammar given as text includes no other")
+            raise GrammarError(f"{statement.location}: a grammar given as text includes no other")
     _require_unique(statements)
     return _assembled(name, name, list(statements), [text])
 
@@ -151,7 +151,7 @@ def _assembled(name: str, origin: str, statements: list[Statement], texts: list[
     productions = [s for s in statements if isinstance(s, Production)]
     if not productions:
         raise GrammarError(f"{origin}: no production, such as: robot -> base arm ee")
-    own = [p for p in productions if p.place.origin == origin]
+    own = [p for p in productions if p.location.origin == origin]
     start = (own or productions)[0].symbol
     wheres = tuple(s.condition for s in statements if isinstance(s, Where))
     for where in wheres:
@@ -222,7 +222,7 @@ class _Reader:
             try:
                 return find_grammar(include.target, self._folders)
             except GrammarError as error:
-                raise GrammarError(f"{include.place}: {error}") from error
+                raise GrammarError(f"{include.location}: {error}") from error
         target = path.parent / include.target
         try:
             inside = any(target.resolve().is_relative_to(root) for root in self._roots)
@@ -231,23 +231,26 @@ class _Reader:
             inside, is_there = True, False
         if not inside:
             raise GrammarError(
-                f"{include.place}: include {include.target!r} leads outside of {self._roots[0]}; "
-                "an include stays in the folder of its grammar or in a library (--library DIR)"
+                f"{include.location}: include {include.target!r} leads outside of "
+                f"{self._roots[0]}; an include stays in the folder of its grammar or in a "
+                "library (--library DIR)"
             )
         if not is_there:
-            raise GrammarError(f"{include.place}: include {include.target!r}: no such file")
+            raise GrammarError(f"{include.location}: include {include.target!r}: no such file")
         return target
 
 
 def _require_unique(statements: Iterable[Statement]) -> None:
-    seen: dict[tuple[type, str], Place] = {}
+    seen: dict[tuple[type, str], SourceLocation] = {}
     for statement in statements:
         if isinstance(statement, Production | Let):
             name = statement.symbol if isinstance(statement, Production) else statement.name
             key = (type(statement), name)
             if key in seen:
-                raise GrammarError(f"{statement.place}: {name!r} is defined at {seen[key]} already")
-            seen[key] = statement.place
+                raise GrammarError(
+                    f"{statement.location}: {name!r} is defined at {seen[key]} already"
+                )
+            seen[key] = statement.location
 
 
 def _shipped() -> Path:
