@@ -93,11 +93,11 @@ def test_a_files_own_name_cannot_lead_out_of_the_folder(refused, robot_urdf):
     ids=["broken", "empty", "bomb", "dtd", "climbing", "absolute", "mesh", "package", "sdf"],
 )
 def test_a_broken_description_is_refused(refused, urdf, xml, message):
-    started = time.perf_counter()
+    started = time.process_time()  # of this process: other load does not count
     path = urdf(xml)
     assert message in refused("import", path, "--out", "out")
     assert message in refused("show", path)
-    assert time.perf_counter() - started < 5
+    assert time.process_time() - started < 5
 
 
 @pytest.mark.parametrize("xml", ["<robot", f'<!DOCTYPE r [{BOMB}]><robot name="r">&e11;</robot>'])
