@@ -45,7 +45,7 @@ import trimesh
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.fitting.link import FitOptions, fit_solid
+from morphgen.fitting.link_fit import FitOptions, fit_solid
 from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
 from morphgen.formats.fits import shapes_key, shapes_to_fit

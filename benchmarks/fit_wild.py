@@ -24,7 +24,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.errors import MorphgenError
-from morphgen.fitting.link import FitOptions, fit_solid
+from morphgen.fitting.link_fit import FitOptions, fit_solid
 from morphgen.fitting.solid import solid_of
 from morphgen.formats.bundle import read_robot
 from morphgen.formats.fits import are_primitives, shapes_key, shapes_to_fit

@@ -126,8 +126,8 @@ def _members() -> Iterator[Member]:
         split = read_split(name)
         for side in SIDES:
             for member in split.side(side):
-                if (member.body, member.task) not in seen:
-                    seen.add((member.body, member.task))
+                if (member.robot_hash, member.task) not in seen:
+                    seen.add((member.robot_hash, member.task))
                     yield member
 
 

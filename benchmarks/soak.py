@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from morphgen.benchmark.split import robots
+from morphgen.benchmark.split import compose_side
 from morphgen.benchmark.split_file import read_split
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import default_library
@@ -43,7 +43,9 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     args = parser.parse_args()
     split, library = read_split(args.split), default_library(())
-    bodies = [as_primitives(robot, library.folders) for robot in robots(split, "train", library)]
+    bodies = [
+        as_primitives(robot, library.folders) for robot in compose_side(split, "train", library)
+    ]
     tasks = [member.task for member in split.train]
     torch.set_num_threads(1)
     with closing(

@@ -21,12 +21,12 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.contents import Settings
-from morphgen.benchmark.export import build
 from morphgen.benchmark.extrapolation import extrapolation
-from morphgen.benchmark.generate import Order
+from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.split import Split
+from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_text, write_split
+from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.verify import verify
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
@@ -47,7 +47,8 @@ def main() -> int:
     parser.add_argument("--light", action="store_true", help="build URDF and derivation only")
     args = parser.parse_args()
     sizes = tuple(int(text) for text in args.train.split(","))
-    order = Order("scaled", sizes, args.test, seed=args.seed, max_links=25)  # of the longest chain
+    # The longest chain has 25 links.
+    order = SplitRequest("scaled", sizes, args.test, seed=args.seed, max_links=25)
     library = default_library()
     train, test = ([load_grammar(find_grammar(name)) for name in names] for names in (TRAIN, TEST))
     seconds, splits = _timed(lambda: extrapolation(order, train, test, library, jobs=args.jobs))
@@ -64,16 +65,16 @@ def main() -> int:
 
 def _row(split: Split, args: argparse.Namespace) -> tuple[dict[str, object], bool]:
     library, jobs = default_library(), args.jobs
-    settings = Settings(light=args.light)
+    settings = BuildSettings(light=args.light)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         path = folder / "split.yaml"
         write_split(split, path)
         auditing, done = _timed(lambda: audit(split, library, jobs=jobs))
         building, report = _timed(
-            lambda: build(split, folder, library, jobs=jobs, settings=settings)
+            lambda: build_split(split, folder, library, jobs=jobs, settings=settings)
         )
-        again, _ = _timed(lambda: build(split, folder, library, jobs=jobs, settings=settings))
+        again, _ = _timed(lambda: build_split(split, folder, library, jobs=jobs, settings=settings))
         by_file, of_file = _timed(lambda: verify(path, library, jobs=jobs))
         by_folder, of_folder = _timed(lambda: verify(report.folder, library, jobs=jobs))
         files = [each for each in report.folder.rglob("*") if each.is_file()]

@@ -20,9 +20,9 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 import morphgen
-from morphgen.fitting.parts import COLLISION
+from morphgen.fitting.part_fits import COLLISION_OPTIONS
 from morphgen.fitting.replace_collision import stored_primitives, with_primitives
-from morphgen.fitting.robot import fit_links
+from morphgen.fitting.robot_fit import fit_links
 from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
 from morphgen.formats.fits import are_primitives, read_stored, shapes_key
 from morphgen.formats.picture import render
@@ -103,7 +103,7 @@ def _fitted(robot: Robot, library: Library) -> tuple[dict[str, tuple[Shape, ...]
         for link in robot.links
         if link.name in found and not are_primitives(link.collisions)
     ]
-    report = fit_links(robot, COLLISION, only=missing)
+    report = fit_links(robot, COLLISION_OPTIONS, only=missing)
     for finding in report.findings:
         tqdm.write(f"{robot.name}: {finding.where}: {finding.why}")
     found |= {row.link: row.fit.primitives for row in report.links}

@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 import morphgen
-from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
 from morphgen.model.robot import Robot
@@ -36,7 +36,7 @@ def panda_variations() -> list[Robot]:
     """Six of the train robots of interpolation/panda."""
     library = default_library()
     members = read_split("interpolation/panda/reach").train[:6]
-    return [member_robot(member, library) for member in members]
+    return [compose_member(member, library) for member in members]
 
 
 SHEETS: tuple[Callable[[], list[Robot]], ...] = (robots, panda_variations)

@@ -21,7 +21,7 @@ from morphgen.benchmark.similarity import (
     similarity_matrix,
     to_distances,
 )
-from morphgen.benchmark.split import Member, member_robot
+from morphgen.benchmark.split import Member, compose_member
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
@@ -40,10 +40,10 @@ def main() -> int:
     for name in split_names():
         split = read_split(name)
         for member in (*split.train, *split.test):
-            bodies.setdefault(member.body, member)
+            bodies.setdefault(member.robot_hash, member)
     found = []
     for member in tqdm(bodies.values(), unit="robot", file=sys.stderr):
-        robot = member_robot(member, library)
+        robot = compose_member(member, library)
         found.append(features(robot, token_shapes(robot, library.folders)))
     names = [each.name for each in found]
     measure = MEASURES[args.measure]

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from morphgen.benchmark.split import Member, Side, Split, member_robot, robot_hash
-from morphgen.benchmark.split_file import split_text
-from morphgen.benchmark.split_reader import parse_split
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import Member, Side, Split, compose_member
+from morphgen.benchmark.split_file import parse_split, split_text
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
@@ -161,7 +161,7 @@ def require_links(source: RobotSource, max_links: int) -> None:
     library = default_library(tuple(map(Path, source.library)))
     side: Side = "test" if source.side == "train" else "train"
     for member in members(other_side(source, side)):
-        links = len(member_robot(member, library).links)
+        links = len(compose_member(member, library).links)
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 

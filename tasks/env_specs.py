@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.benchmark.split import Member, member_robot
+from morphgen.benchmark.split import Member, compose_member
 from morphgen.errors import TaskError
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library
@@ -81,7 +81,7 @@ def member_with_primitives(member: Member, library: Library) -> Robot:
     Raises:
         MorphgenError: If it cannot be composed, is not the split's, or a link has no primitive.
     """
-    return as_primitives(member_robot(member, library), library.folders)
+    return as_primitives(compose_member(member, library), library.folders)
 
 
 def member_spec(

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.benchmark.audit import Audit
-from morphgen.benchmark.contents import sided
-from morphgen.benchmark.split import Member, Side, Split, robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import Member, Side, Split, sided_members
 from morphgen.errors import MorphgenError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
@@ -69,7 +69,7 @@ def audit_goals(
     Raises:
         MorphgenError: If ``jobs`` is below 1, or a process died.
     """
-    members = sided(split)
+    members = sided_members(split)
     look = _Examination(library.folders, found)
     seen = list(mapped(look, members, jobs, progress))
     return tuple(

@@ -18,8 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.contents import sided
-from morphgen.benchmark.split import Side, Split
+from morphgen.benchmark.split import Side, Split, sided_members
 from morphgen.tasks.goal_making import SplitGoals
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
@@ -46,7 +45,7 @@ def shared(split: Split, found: SplitGoals) -> Iterator[Told]:
         for rival in split.train:
             train = found.of("train", rival.name)
             if test is not None and train is not None and rival.task == member.task:
-                count, what = _common(test, train, rival.body == member.body)
+                count, what = _common(test, train, rival.robot_hash == member.robot_hash)
                 leaks += [(count, what, rival.name)] if count else []
         if test is not None and leaks:
             count, what, name = max(leaks, key=lambda leak: leak[0])
@@ -70,7 +69,7 @@ def _common(test: GoalSet, train: GoalSet, same_body: bool) -> tuple[int, str]:
 
 def repeated(split: Split, found: SplitGoals) -> Iterator[Told]:
     """Goals that a set has twice."""
-    for side, member in sided(split):
+    for side, member in sided_members(split):
         goals = found.of(side, member.name)
         if goals is None:
             continue

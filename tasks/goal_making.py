@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from morphgen.benchmark.contents import sided
-from morphgen.benchmark.split import Member, Side, Split, robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import Member, Side, Split, sided_members
 from morphgen.errors import MorphgenError
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
@@ -131,7 +131,7 @@ def split_goals(
         MorphgenError: If ``jobs`` is below 1, or a process died.
     """
     maker = _Maker(library.folders, config, certified, cache)
-    return list(mapped(maker, sided(split), jobs, progress, chunk=1))
+    return list(mapped(maker, sided_members(split), jobs, progress, chunk=1))
 
 
 @dataclass(frozen=True, eq=False)

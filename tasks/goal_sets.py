@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
-from morphgen.benchmark.split import robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.formats.files import keep
 from morphgen.model.geometry import Pose

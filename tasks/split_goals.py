@@ -14,9 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from morphgen.benchmark.built import README, SUMS, read_sums
-from morphgen.benchmark.contents import sums_text
 from morphgen.benchmark.split import Side
+from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums
+from morphgen.benchmark.split_folder_files import sums_text
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import alone, replacing_folder, write_atomic
@@ -72,11 +72,11 @@ def write_goals(home: Path, made: Sequence[Made], config: GoalConfig) -> Path:
     require_all(made)
     folder = home / GOALS
     files = dict(_files(made, config))
-    read_sums(home / SUMS)  # refuses a folder that is not built, before anything is locked
+    read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
     try:
         with alone(home):
-            sums = read_sums(home / SUMS)
-            (home / SUMS).unlink()
+            sums = read_sums(home / SUMS_FILE)
+            (home / SUMS_FILE).unlink()
             for leftover in home.glob(f".{GOALS}.*"):
                 shutil.rmtree(leftover, ignore_errors=True)
             with replacing_folder(folder) as partial:
@@ -85,7 +85,7 @@ def write_goals(home: Path, made: Sequence[Made], config: GoalConfig) -> Path:
                     (partial / name).write_bytes(content)
             kept = {name: value for name, value in sums.items() if not name.startswith(f"{GOALS}/")}
             added = {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
-            write_atomic(home / SUMS, sums_text(kept | added))
+            write_atomic(home / SUMS_FILE, sums_text(kept | added))
     except OSError as error:
         place = error.filename or home
         raise BenchmarkError(f"cannot write {place}: {error.strerror}") from error
@@ -196,7 +196,7 @@ def _files(made: Sequence[Made], config: GoalConfig) -> Iterator[tuple[str, byte
     head = json.dumps(constants, indent=2).removesuffix("\n}")
     lines = ",\n".join(f"    {json.dumps(record)}" for record in records)
     yield INDEX, f'{head},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
-    yield README, _README.format(index=INDEX, tasks=_readme_of(used)).encode()
+    yield README_FILE, _README.format(index=INDEX, tasks=_readme_of(used)).encode()
 
 
 def record_of(one: Made) -> dict[str, object]:

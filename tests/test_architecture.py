@@ -148,7 +148,7 @@ def test_processes_of_pybullet_load_little_else():
 @pytest.mark.parametrize(
     "module",
     [
-        "benchmark.export",
+        "benchmark.split_build",
         "fitting.token_shapes",
         "model.kinematics",
         "model.inverse_kinematics",

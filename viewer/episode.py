@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
 from morphgen.model.geometry import Pose

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.benchmark.split import COMPOSED, Member, Regime, Split, robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import COMPOSED, Member, Regime, Split
 from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose

@@ -20,9 +20,9 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
-from morphgen.benchmark.built import SPLIT
-from morphgen.benchmark.split import SIDES, Member, Side, Split, member_robot
+from morphgen.benchmark.split import SIDES, Member, Side, Split, compose_member
 from morphgen.benchmark.split_file import find_split, read_split_file, split_names
+from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError, nearest
 from morphgen.formats.bundle import CARD, MJCF, URDF, read_robot, split_colours
 from morphgen.formats.resolve import file_stamp
@@ -130,7 +130,7 @@ def read_robot_uri(place: str, places: FileAccess) -> Robot:
 
 def _read(place: str, places: FileAccess) -> Robot:
     if place.startswith(MEMBER):
-        return member_robot(resolve_member(place, places), places.library)
+        return compose_member(resolve_member(place, places), places.library)
     if derivation := resolve_derivation(place, places):
         return compose(derivation, places.library, _name(place, derivation, places))
     path = places.path(place)
@@ -242,7 +242,7 @@ def resolve_split(text: str, places: FileAccess) -> Split:
     if text in split_names():
         return read_split_file(find_split(text)).split
     path = places.path(text)
-    return read_split_file(path / SPLIT if path.is_dir() else path).split
+    return read_split_file(path / SPLIT_FILE if path.is_dir() else path).split
 
 
 def member_uri(split: str, side: Side, member: Member) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.benchmark.audit import Audit, audited
+from morphgen.benchmark.audit import Audit, audit_survey
 from morphgen.benchmark.similarity import MEASURES, Features
 from morphgen.benchmark.split import SIDES, Member, Split
 from morphgen.benchmark.statistics import summarize_survey
@@ -99,7 +99,7 @@ def conclude(
     survey = _survey(split, found, [m for _, m in sound], matrices)
     whole = len(sound) == len(sided)
     return Study(
-        audited(survey, Library(folders)),
+        audit_survey(survey, Library(folders)),
         summarize_survey(survey) if whole else {},
         tuple(member for _, member in sound),
         tuple(side for side, _ in sound),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from morphgen.benchmark.built import SPLIT
 from morphgen.benchmark.split_file import split_names
+from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import nearest
 from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.viewer.address import Address, Page
@@ -49,7 +49,7 @@ def _single_address(word: str, places: FileAccess) -> Address:
         if path.is_file():
             pages: dict[str, Page] = {SPLIT_SUFFIX: "split", SUFFIX: "compose"}
             return Address(pages.get(path.suffix, "robot"), (word,))
-        if (path / SPLIT).is_file():
+        if (path / SPLIT_FILE).is_file():
             return Address("split", (word,))
         return Address("robot" if is_robot(path) else "gallery", (word,))
     if word in split_names():

@@ -20,7 +20,7 @@ from morphgen.processes import Progress, unseen
 
 
 @dataclass(frozen=True)
-class Near:
+class NearThresholds:
     """Two bodies are near each other if their trees and their tokens are."""
 
     tree: float
@@ -29,7 +29,7 @@ class Near:
     """Cosines above it are near."""
 
 
-NEAR = Near(0.001, 0.99999)
+NEAR_THRESHOLDS = NearThresholds(0.001, 0.99999)
 """Sizes that differ by about one per cent, which is within what a builder calls the same.
 
 Sizes of robots of the shipped grammars, each changed by 1 %, give tree distances of 0.0002 to
@@ -96,7 +96,7 @@ def audit(
     split: Split,
     library: Library,
     *,
-    near: Near = NEAR,
+    near: NearThresholds = NEAR_THRESHOLDS,
     jobs: int = 1,
     progress: Progress = unseen,
 ) -> Audit:
@@ -120,10 +120,12 @@ def audit(
     Raises:
         BenchmarkError: If ``jobs`` is below 1, or what the split says of its making is malformed.
     """
-    return audited(survey_split(split, library, jobs=jobs, progress=progress), library, near)
+    return audit_survey(survey_split(split, library, jobs=jobs, progress=progress), library, near)
 
 
-def audited(found: SplitSurvey, library: Library, near: Near = NEAR) -> Audit:
+def audit_survey(
+    found: SplitSurvey, library: Library, near: NearThresholds = NEAR_THRESHOLDS
+) -> Audit:
     """The audit of a split that was surveyed; see ``audit``."""
     split = found.split
     findings = [
@@ -147,19 +149,21 @@ def _robot_findings(found: SplitSurvey) -> Iterator[Finding]:
     for side, member, robot in _robots(found):
         if isinstance(robot, Fault):
             yield _finding(robot.code, side, member, robot.why)
-        elif robot.robot_hash != member.body:
-            why = f"the split names body {member.body}, its derivation gives {robot.robot_hash}"
+        elif robot.robot_hash != member.robot_hash:
+            why = (
+                f"the split names body {member.robot_hash}, its derivation gives {robot.robot_hash}"
+            )
             yield _finding("body-changed", side, member, why)
 
 
-def _leaks(found: SplitSurvey, near: Near) -> Iterator[Finding]:
+def _leaks(found: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
     """Test robots that are in train, or nearly."""
     split = found.split
     names = {member.name: member for member in split.train}
     tree, cosine = found.by_measure("tree"), found.by_measure("cosine")
     for j, member in enumerate(split.test):
         rivals = [i for i, other in enumerate(split.train) if other.task == member.task]
-        shared = [i for i in rivals if split.train[i].body == member.body]
+        shared = [i for i in rivals if split.train[i].robot_hash == member.robot_hash]
         if shared:
             why = (
                 f"train robot {_others(split, shared)} has the same body, and learns the same task"
@@ -176,7 +180,7 @@ def _leaks(found: SplitSurvey, near: Near) -> Iterator[Finding]:
             )
             yield _finding("body-near", "test", member, why)
         other = names.get(member.name)
-        if other is not None and other.body != member.body:
+        if other is not None and other.robot_hash != member.robot_hash:
             why = "a train robot of another body has the same name"
             yield _finding("name-shared", "test", member, why)
 
@@ -186,7 +190,7 @@ def _repeated(split: Split) -> Iterator[Finding]:
     for side in SIDES:
         first: dict[tuple[object, ...], str] = {}
         for member in split.side(side):
-            key = (member.body, member.task, member.obstacles)
+            key = (member.robot_hash, member.task, member.obstacles)
             earlier = first.setdefault(key, member.name)
             if earlier != member.name:
                 why = f"{side} robot {earlier} has the same body and task"
@@ -207,7 +211,7 @@ def _regime_findings(found: SplitSurvey, library: Library) -> tuple[Finding, ...
 
 def _bound_findings(found: SplitSurvey) -> Iterator[Finding]:
     """Test robots that are not as alike to train as the split was made to be."""
-    text = found.split.made.get("similarity")
+    text = found.split.provenance.get("similarity")
     if text is None:
         return
     try:

@@ -8,9 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morphgen.benchmark.bodies import Body, Maker, Progress, make_all
-from morphgen.benchmark.generate import Order, Search, Stream, assemble_drawn, require_size
+from morphgen.benchmark.generate import (
+    RobotStream,
+    SplitRequest,
+    TestRobotSearch,
+    assemble_drawn,
+    require_size,
+)
 from morphgen.benchmark.regimes import structure
+from morphgen.benchmark.robot_factory import Candidate, Progress, RobotFactory, make_robots
 from morphgen.benchmark.similarity import cosine
 from morphgen.benchmark.split import Split
 from morphgen.errors import BenchmarkError
@@ -54,7 +60,7 @@ def parse_bound(text: str) -> Bound:
 
 
 def extrapolation(
-    order: Order,
+    order: SplitRequest,
     train_grammars: Sequence[Grammar],
     test_grammars: Sequence[Grammar],
     library: Library,
@@ -87,13 +93,15 @@ def extrapolation(
     require_size(order)
     _require_apart(train_grammars, test_grammars)
     trained, tested = (
-        [Stream.of(grammar, grammar.name, order) for grammar in grammars]
+        [RobotStream.of(grammar, grammar.name, order) for grammar in grammars]
         for grammars in (train_grammars, test_grammars)
     )
-    maker = Maker(library.folders, comparable=similarity is not None, max_links=order.max_links)
+    maker = RobotFactory(
+        library.folders, comparable=similarity is not None, max_links=order.max_links
+    )
     turns = (divmod(i, len(trained)) for i in range(order.train[-1]))
     recipes = [trained[which].recipe(number) for number, which in turns]
-    train = make_all(recipes, maker, jobs=jobs, progress=progress)
+    train = make_robots(recipes, maker, jobs=jobs, progress=progress)
     names = {structure(body.derivation, library): body.name for body in reversed(train)}
 
     def why_not(derivation: Derivation) -> str:
@@ -101,7 +109,7 @@ def extrapolation(
         return f"the structure of train robot {twin}" if twin else ""
 
     alike = _Likeness(train, order.train[0], similarity)
-    search = Search(order, train, maker, progress)
+    search = TestRobotSearch(order, train, maker, progress)
     targets = ", ".join(grammar.name for grammar in test_grammars)
     if not search.find(tested, why_not, alike):
         raise BenchmarkError(f"{targets}: {search.failure()}; {alike.advice()}")
@@ -124,13 +132,13 @@ def extrapolation(
 class _Likeness:
     """Whether a body is as alike to the train robots as wanted."""
 
-    def __init__(self, train: Sequence[Body], smallest: int, bound: Bound | None) -> None:
+    def __init__(self, train: Sequence[Candidate], smallest: int, bound: Bound | None) -> None:
         # The largest cosine grows with the set.
         self._train = train[:smallest] if bound and not bound.is_upper else train
         self._bound = bound
         self._nearest: list[tuple[float, str, str]] = []
 
-    def __call__(self, body: Body) -> str:
+    def __call__(self, body: Candidate) -> str:
         """What a body has that it shall not; nothing if it is as wanted."""
         if self._bound is None or body.features is None:
             return ""

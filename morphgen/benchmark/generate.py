@@ -9,16 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morphgen.benchmark.bodies import (
-    Body,
-    Drawn,
-    Maker,
+from morphgen.benchmark.robot_factory import (
+    Candidate,
     Progress,
+    RobotFactory,
+    SampledRecipe,
     members,
-    numbered,
+    numbered_name,
     stream_seed,
 )
-from morphgen.benchmark.split import MADE_MAX_LINKS, Member, Regime, Split
+from morphgen.benchmark.split import MAX_LINKS_KEY, Member, Regime, Split
 from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.choosers import RandomChooser, RecordedChooser
@@ -35,7 +35,7 @@ MAX_COMPOSED = 200
 
 
 @dataclass(frozen=True)
-class Order:
+class SplitRequest:
     """What is asked for in every regime."""
 
     name: str
@@ -64,7 +64,7 @@ class Order:
             raise BenchmarkError(f"--train {sizes}: expected sizes that grow, such as 10,30,100")
 
 
-def require_size(order: Order) -> None:
+def require_size(order: SplitRequest) -> None:
     """Require that an order says how many robots to train on.
 
     Raises:
@@ -75,7 +75,7 @@ def require_size(order: Order) -> None:
 
 
 @dataclass(frozen=True)
-class Stream:
+class RobotStream:
     """Robots of a grammar, by number."""
 
     grammar: Grammar
@@ -85,13 +85,13 @@ class Stream:
     """Of ``morphgen sample``, which draws the same robots."""
 
     @classmethod
-    def of(cls, grammar: Grammar, prefix: str, order: Order) -> Stream:
+    def of(cls, grammar: Grammar, prefix: str, order: SplitRequest) -> RobotStream:
         """The stream of a prefix in a split."""
         return cls(grammar, prefix, stream_seed(order.seed, prefix))
 
-    def recipe(self, number: int) -> Drawn:
+    def recipe(self, number: int) -> SampledRecipe:
         """How to make a robot."""
-        return Drawn(self.grammar, number, self.seed, numbered(self.prefix, number))
+        return SampledRecipe(self.grammar, number, self.seed, numbered_name(self.prefix, number))
 
     def derivation(self, number: int, library: Library) -> Derivation | None:
         """The first derivation drawn for a robot, most often its own; None if it does not end."""
@@ -104,25 +104,32 @@ class Stream:
 
 WhyNot = Callable[[Derivation], str]
 """Why a derivation is none of a test robot; empty if it is."""
-WhyNotBody = Callable[[Body], str]
+WhyNotBody = Callable[[Candidate], str]
 """The same of a body, once composed."""
 
 
-class Search:
+class TestRobotSearch:
     """Looks for test robots, number by number."""
 
     def __init__(
-        self, order: Order, train: Sequence[Body], maker: Maker, progress: Progress
+        self,
+        order: SplitRequest,
+        train: Sequence[Candidate],
+        maker: RobotFactory,
+        progress: Progress,
     ) -> None:
         self._order, self._maker, self._progress = order, maker, progress
         self._before = len(train)
         self._taken = {body.hash: body.name for body in train}
         self._rejected: Counter[str] = Counter()
         self._composed = 0
-        self.found: list[Body] = []
+        self.found: list[Candidate] = []
 
     def find(
-        self, streams: Sequence[Stream], why_not: WhyNot, why_not_body: WhyNotBody = lambda body: ""
+        self,
+        streams: Sequence[RobotStream],
+        why_not: WhyNot,
+        why_not_body: WhyNotBody = lambda body: "",
     ) -> bool:
         """Take test robots from streams in turn; return whether there are as many as ordered."""
         for number in itertools.count():
@@ -136,7 +143,9 @@ class Search:
                     self._rejected[reason] += 1
         return False
 
-    def _try(self, stream: Stream, number: int, why_not: WhyNot, why_not_body: WhyNotBody) -> str:
+    def _try(
+        self, stream: RobotStream, number: int, why_not: WhyNot, why_not_body: WhyNotBody
+    ) -> str:
         """Take a robot, or say what it has that it shall not."""
         derivation = stream.derivation(number, self._maker.library)
         reason = why_not(derivation) if derivation else "no end"
@@ -166,7 +175,7 @@ class Search:
 
 
 def assemble(
-    order: Order,
+    order: SplitRequest,
     regime: Regime,
     summary: str,
     train: Sequence[Member],
@@ -187,7 +196,7 @@ def assemble(
     """
     sizes = order.train or (len(train) // per_robot,)
     several = len(sizes) > 1
-    links = {} if order.max_links == MAX_LINKS else {MADE_MAX_LINKS: order.max_links}
+    links = {} if order.max_links == MAX_LINKS else {MAX_LINKS_KEY: order.max_links}
     return tuple(
         Split(
             f"{order.name}-train{n}" if several else order.name,
@@ -209,11 +218,11 @@ def assemble(
 
 
 def assemble_drawn(
-    order: Order,
+    order: SplitRequest,
     regime: Regime,
     summary: str,
-    train: Sequence[Body],
-    test: Sequence[Body],
+    train: Sequence[Candidate],
+    test: Sequence[Candidate],
     made: Mapping[str, object],
 ) -> tuple[Split, ...]:
     """The splits of an order whose robots all do all tasks; see ``assemble``."""

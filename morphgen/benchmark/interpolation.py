@@ -6,9 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from morphgen.benchmark.bodies import Body, Maker, Progress, make_all
-from morphgen.benchmark.generate import Order, Search, Stream, assemble_drawn, require_size
+from morphgen.benchmark.generate import (
+    RobotStream,
+    SplitRequest,
+    TestRobotSearch,
+    assemble_drawn,
+    require_size,
+)
 from morphgen.benchmark.regimes import HULLS, ON_HULL, hull_distance, parameters, structure
+from morphgen.benchmark.robot_factory import Candidate, Progress, RobotFactory, make_robots
 from morphgen.benchmark.split import Split
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import Derivation
@@ -17,7 +23,7 @@ from morphgen.grammar.library import Library
 
 
 def interpolation(
-    order: Order,
+    order: SplitRequest,
     grammar: Grammar,
     library: Library,
     *,
@@ -50,13 +56,13 @@ def interpolation(
     require_size(order)
     if hull not in HULLS:
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
-    trained = Stream.of(grammar, grammar.name, order)
-    tested = Stream.of(grammar, f"{grammar.name}-test", order)
-    maker = Maker(library.folders, max_links=order.max_links)
+    trained = RobotStream.of(grammar, grammar.name, order)
+    tested = RobotStream.of(grammar, f"{grammar.name}-test", order)
+    maker = RobotFactory(library.folders, max_links=order.max_links)
     recipes = [trained.recipe(i) for i in range(order.train[-1])]
-    train = make_all(recipes, maker, jobs=jobs, progress=progress)
+    train = make_robots(recipes, maker, jobs=jobs, progress=progress)
     wanted = _Wanted(train, order.train[0], hull, library)
-    search = Search(order, train, maker, progress)
+    search = TestRobotSearch(order, train, maker, progress)
     if not search.find([tested], wanted):
         raise BenchmarkError(f"{grammar.name}: {search.failure()}; {wanted.advice()}")
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
@@ -77,7 +83,9 @@ def interpolation(
 class _Wanted:
     """Whether a derivation has the structure of a train robot, and lies where it shall."""
 
-    def __init__(self, train: Sequence[Body], smallest: int, hull: str, library: Library) -> None:
+    def __init__(
+        self, train: Sequence[Candidate], smallest: int, hull: str, library: Library
+    ) -> None:
         self._hull, self._library = hull, library
         self._structures = {structure(body.derivation, library) for body in train[:smallest]}
         self._points: dict[str, list[list[float]]] = {}

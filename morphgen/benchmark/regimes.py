@@ -178,7 +178,7 @@ def _interpolation(split: Split, test: _Read, train: Sequence[_Read]) -> Iterato
             "draw test robots from the grammar of train robots",
         )
         return
-    wanted = str(split.made.get("hull", "any"))
+    wanted = str(split.provenance.get("hull", "any"))
     if wanted not in HULLS[:2]:
         return
     distance = hull_distance(test.parameters, [read.parameters for read in alike])

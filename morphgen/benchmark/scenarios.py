@@ -9,7 +9,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from morphgen.benchmark.bodies import Body, Composed, Drawn, Maker, numbered, stream_seed
+from morphgen.benchmark.robot_factory import (
+    Candidate,
+    ComposedRecipe,
+    RobotFactory,
+    SampledRecipe,
+    numbered_name,
+    stream_seed,
+)
 from morphgen.benchmark.split import Member, Regime, Split
 from morphgen.benchmark.split_file import SUFFIX, write_split
 from morphgen.benchmark.statistics import statistics
@@ -201,7 +208,7 @@ def scenario_splits(name: str, library: Library) -> tuple[Split, ...]:
     if name not in found:
         raise BenchmarkError(f"unknown scenario {name!r}{nearest(name, found)}")
     scenario = found[name]
-    maker = Maker(library.folders)
+    maker = RobotFactory(library.folders)
     train, test = (
         [(body, row.task) for row in rows for body in _bodies(row, maker)]
         for rows in (scenario.train, scenario.test)
@@ -248,19 +255,21 @@ def write_scenarios(folder: Path, names: Iterable[str] = ()) -> list[Path]:
     return paths
 
 
-def _bodies(row: Row, maker: Maker) -> Iterator[Body]:
+def _bodies(row: Row, maker: RobotFactory) -> Iterator[Candidate]:
     if isinstance(row, Given):
-        yield maker(Composed(tuple(row.words.split()), row.name))
+        yield maker(ComposedRecipe(tuple(row.words.split()), row.name))
         return
     folders = maker.library.folders
     grammar = load_grammar(find_grammar(row.grammar, folders), folders)
     grammar = pin(grammar, row.pins.split(), maker.library)
     prefix = row.prefix or row.grammar
     for number in range(row.first, row.first + row.n):
-        yield maker(Drawn(grammar, number, stream_seed(SEED, prefix), numbered(prefix, number)))
+        yield maker(
+            SampledRecipe(grammar, number, stream_seed(SEED, prefix), numbered_name(prefix, number))
+        )
 
 
-def _members(bodies: Iterable[tuple[Body, str | None]], variant: Variant) -> Iterator[Member]:
+def _members(bodies: Iterable[tuple[Candidate, str | None]], variant: Variant) -> Iterator[Member]:
     for body, task in bodies:
         yield Member(
             body.name,

@@ -5,18 +5,44 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
+from typing import Any, cast
 
 import yaml
+from yaml.nodes import MappingNode, Node, SequenceNode
 
-from morphgen.benchmark.split import FORMAT, Member, Split, split_id
-from morphgen.benchmark.split_reader import MEMBER, ROBOT_NAME, SplitFile, parse_split
+from morphgen.benchmark.robot_hash import HASH_LENGTH
+from morphgen.benchmark.split import FORMAT, REGIMES, Member, Regime, Split, split_id
 from morphgen.errors import BenchmarkError, FormatError, nearest
-from morphgen.formats.data_files import read_text
+from morphgen.formats.data_files import read_text, require_plain_yaml
 from morphgen.formats.files import write_atomic
 
+FIELDS = (
+    "format",
+    "morphgen",
+    "name",
+    "id",
+    "regime",
+    "summary",
+    "reference",
+    "made",
+    "accepted",
+    "statistics",
+    "train",
+    "test",
+)
+"""Keys of the file, in order."""
+OPTIONAL = ("reference", "made", "accepted", "statistics")
+MEMBER = ("name", "category", "task", "obstacles", "body", "derivation")
+"""Keys of a robot, in order."""
+ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+
+TASK_NAME = re.compile(r"[a-z][a-z0-9_-]*")
+_BODY = re.compile(rf"[0-9a-f]{{{HASH_LENGTH}}}")
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 SUFFIX = ".yaml"
 _HEAD = (
     "# Robots to train and to test on, by their derivations; `morphgen split verify` with this\n"
@@ -27,6 +53,190 @@ _WORDS = frozenset(("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 _QUOTED = frozenset(("id", "body", "derivation"))
 """Keys whose values are always quoted, as some hashes must be."""
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][\w.-]*(?:/[A-Za-z0-9][\w.-]*)*")
+
+
+@dataclass(frozen=True)
+class SplitFile:
+    """What a file says, true or not."""
+
+    path: Path
+    split: Split
+    version: str
+    """Of the morphgen that wrote it."""
+    id: str
+    """Of the split when it was written."""
+    id_line: int
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the robots are still those that the file was written with."""
+        return self.id == split_id(self.split)
+
+
+def parse_split(text: str, path: Path) -> SplitFile:
+    """Read the text of a file.
+
+    Args:
+        text: YAML, see ``morphgen.benchmark.split_file.split_text``.
+        path: Where it stands, for messages.
+
+    Raises:
+        BenchmarkError: If it is malformed.
+    """
+    try:
+        require_plain_yaml(text, str(path))
+        loader = _Loader(text)
+        try:
+            return _Reader(path, loader).file(loader.get_single_node())
+        finally:
+            loader.dispose()
+    except FormatError as error:
+        raise BenchmarkError(str(error)) from error
+    except yaml.MarkedYAMLError as error:
+        raise BenchmarkError(f"{path}{_place(error)}") from error
+    except yaml.YAMLError as error:
+        raise BenchmarkError(f"{path}: no valid YAML: {error}") from error
+
+
+def _place(error: yaml.MarkedYAMLError) -> str:
+    """Line and problem, and where what was being read begins."""
+    mark = error.problem_mark or error.context_mark
+    line = f":{mark.line + 1}" if mark else ""
+    began = error.context_mark.line + 1 if error.context and error.context_mark else 0
+    context = f" ({error.context} from line {began})" if began else ""
+    return f"{line}: no valid YAML: {error.problem}{context}"
+
+
+class _Reader:
+    """Nodes of YAML to a split."""
+
+    def __init__(self, path: Path, loader: Any) -> None:  # noqa: ANN401
+        self._path, self._loader = path, loader
+
+    def file(self, node: Node | None) -> SplitFile:
+        if node is None:
+            raise BenchmarkError(f"{self._path}: is empty; expected a split")
+        self._require_format(node)
+        fields = self._fields(node, FIELDS, "a split", optional=OPTIONAL)
+        names = {key: self._text(fields[key], key) for key in ("morphgen", "name", "id", "summary")}
+        split = Split(
+            names["name"],
+            cast(Regime, self._choice(fields["regime"], "regime", REGIMES)),
+            names["summary"],
+            self._members(fields["train"], "train"),
+            self._members(fields["test"], "test"),
+            self._free(fields.get("made"), "made"),
+            self._reasons(fields.get("accepted")),
+            self._text(fields["reference"], "reference") if "reference" in fields else "",
+            self._free(fields.get("statistics"), "statistics"),
+        )
+        line = fields["id"].start_mark.line + 1
+        return SplitFile(self._path, split, names["morphgen"], names["id"], line)
+
+    def _fail(self, node: Node, what: str) -> BenchmarkError:
+        return BenchmarkError(f"{self._path}:{node.start_mark.line + 1}: {what}")
+
+    def _require_format(self, node: Node) -> None:
+        """Tell first whether this morphgen can read the rest."""
+        if not isinstance(node, MappingNode):
+            raise self._fail(node, "no split: expected 'format: 1', 'name: ...' and so on")
+        for key, value in node.value:
+            if key.value == "format" and self._value(value) != FORMAT:
+                raise self._fail(
+                    value, f"format: {value.value!r} is not known to this morphgen; valid: {FORMAT}"
+                )
+
+    def _fields(
+        self, node: Node, known: Sequence[str], what: str, optional: Sequence[str] = ()
+    ) -> dict[str, Node]:
+        if not isinstance(node, MappingNode):
+            raise self._fail(node, f"expected {what} with {', '.join(known)}")
+        fields: dict[str, Node] = {}
+        for key, value in node.value:
+            if key.value not in known:
+                raise self._fail(key, f"unknown key {key.value!r}{nearest(str(key.value), known)}")
+            if key.value in fields:
+                raise self._fail(key, f"key {key.value!r} is there twice")
+            fields[key.value] = value
+        missing = [key for key in known if key not in fields and key not in optional]
+        if missing:
+            raise self._fail(node, f"{what} lacks {', '.join(map(repr, missing))}")
+        return fields
+
+    def _members(self, node: Node, side: str) -> tuple[Member, ...]:
+        if not isinstance(node, SequenceNode) or not node.value:
+            raise self._fail(node, f"{side}: expected a list of robots, one at least")
+        members: dict[str, Member] = {}
+        for entry in node.value:
+            member = self._member(entry, side)
+            if member.name in members:
+                raise self._fail(entry, f"{side}: two robots are named {member.name!r}")
+            members[member.name] = member
+        return tuple(members.values())
+
+    def _member(self, node: Node, side: str) -> Member:
+        fields = self._fields(node, MEMBER, f"a robot of {side}")
+        name = self._text(fields["name"], "name")
+        if not ROBOT_NAME.fullmatch(name):
+            raise self._fail(
+                fields["name"], f"name: {name!r}: use letters, digits, '-', '_' and '.'"
+            )
+        body = self._text(fields["body"], "body")
+        if not _BODY.fullmatch(body):
+            raise self._fail(
+                fields["body"], f"body: {body!r} is no hash of {HASH_LENGTH} hexadecimal digits"
+            )
+        task = self._text(fields["task"], "task")
+        if not TASK_NAME.fullmatch(task):
+            raise self._fail(
+                fields["task"],
+                f"task: {task!r}: expected a name of lower-case letters, digits, '-' and '_'",
+            )
+        obstacles = self._value(fields["obstacles"])
+        if not isinstance(obstacles, bool):
+            raise self._fail(fields["obstacles"], f"obstacles: {obstacles!r}; valid: false, true")
+        return Member(
+            name,
+            self._text(fields["category"], "category"),
+            self._text(fields["derivation"], "derivation"),
+            task,
+            obstacles,
+            body,
+        )
+
+    def _text(self, node: Node, key: str) -> str:
+        value = self._value(node)
+        if not isinstance(value, str) or not value:
+            raise self._fail(node, f"{key}: expected text, not {value!r}")
+        return value
+
+    def _choice(self, node: Node, key: str, valid: Sequence[str]) -> str:
+        value = self._text(node, key)
+        if value not in valid:
+            raise self._fail(node, f"{key}: unknown {value!r}{nearest(value, valid)}")
+        return value
+
+    def _free(self, node: Node | None, key: str) -> dict[str, object]:
+        """A mapping of anything."""
+        if node is None:
+            return {}
+        if not isinstance(node, MappingNode):
+            raise self._fail(node, f"{key}: expected keys and values")
+        return {str(key.value): self._value(value) for key, value in node.value}
+
+    def _reasons(self, node: Node | None) -> dict[str, str]:
+        if node is None:
+            return {}
+        if not isinstance(node, MappingNode):
+            raise self._fail(node, "accepted: expected a reason for every code of a finding")
+        return {
+            str(key.value): self._text(value, f"accepted {key.value}") for key, value in node.value
+        }
+
+    def _value(self, node: Node) -> object:
+        if node.tag == "tag:yaml.org,2002:str":
+            return node.value
+        return self._loader.construct_object(node, deep=True)
 
 
 def split_names() -> list[str]:
@@ -126,7 +336,7 @@ def split_text(split: Split) -> str:
     if split.reference:
         head["reference"] = split.reference
     lines = [f"{_pair(key, value)}\n" for key, value in head.items()]
-    blocks = {"made": split.made, "accepted": split.accepted, "statistics": split.statistics}
+    blocks = {"made": split.provenance, "accepted": split.accepted, "statistics": split.statistics}
     lines += [_block(key, value) for key, value in blocks.items() if value]
     for side, members in (("train", split.train), ("test", split.test)):
         lines += [f"{side}:\n", *map(_member_line, members)]
@@ -172,7 +382,9 @@ def _plain_data(value: object) -> object:
 def _member_line(member: Member) -> str:
     if not ROBOT_NAME.fullmatch(member.name):
         raise BenchmarkError(f"robot name {member.name!r}: use letters, digits, '-', '_' and '.'")
-    values = ", ".join(_pair(key, getattr(member, key)) for key in MEMBER)
+    values = ", ".join(
+        _pair(key, member.robot_hash if key == "body" else getattr(member, key)) for key in MEMBER
+    )
     return f"- {{{values}}}\n"
 
 

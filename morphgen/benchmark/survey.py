@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import MEASURES, Features, features
-from morphgen.benchmark.split import Member, Split, robot_hash
+from morphgen.benchmark.split import Member, Split
 from morphgen.errors import MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.card import rounded

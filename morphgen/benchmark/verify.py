@@ -9,30 +9,29 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.benchmark.built import (
-    BUNDLES,
-    ROBOTS,
-    SETTINGS,
-    SPLIT,
-    SUMS,
-    TOKENS,
+from morphgen.benchmark.split import Member, Split, compose_member, sided_members, split_id
+from morphgen.benchmark.split_file import find_split, read_split_file
+from morphgen.benchmark.split_folder import (
+    BUILD_FILE,
+    ROBOTS_DIR,
+    ROBOTS_FILE,
+    SPLIT_FILE,
+    SUMS_FILE,
+    TOKENS_FILE,
     read_records,
     read_settings,
     read_sums,
     read_tokens,
-    require_built,
+    require_split_folder,
 )
-from morphgen.benchmark.contents import (
-    Body,
-    body_of,
-    body_paths,
+from morphgen.benchmark.split_folder_files import (
+    RobotData,
     records,
-    sided,
+    robot_data,
+    robot_paths,
     token_tables,
 )
-from morphgen.benchmark.robot_folder import differences, hashes, same
-from morphgen.benchmark.split import Member, Split, member_robot, split_id
-from morphgen.benchmark.split_file import find_split, read_split_file
+from morphgen.benchmark.split_folder_robots import differences, hashes, same
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.library import Library
@@ -85,8 +84,8 @@ def verify(
     folder = Path(name_or_path)
     is_built = folder.is_dir()
     if is_built:
-        require_built(folder)
-    path = folder / SPLIT if is_built else find_split(name_or_path)
+        require_split_folder(folder)
+    path = folder / SPLIT_FILE if is_built else find_split(name_or_path)
     read = read_split_file(path)
     own = split_id(read.split)
     found = []
@@ -107,7 +106,7 @@ class _Seen:
     """What a worker finds of a robot."""
 
     whys: tuple[str, ...]
-    body: Body | None = None
+    body: RobotData | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +125,13 @@ class _Examination:
 
     def __call__(self, member: Member) -> _Seen:
         try:
-            robot = member_robot(member, self.library)
+            robot = compose_member(member, self.library)
             if self.built is None:
                 return _Seen(())
-            folder = self.built / self.paths[member.body]
+            folder = self.built / self.paths[member.robot_hash]
             named_so = folder.name == member.name
             whys = differences(folder, robot, light=self.light) if named_so else []
-            return _Seen(tuple(whys), body_of(robot, self.folders, self.max_links))
+            return _Seen(tuple(whys), robot_data(robot, self.folders, self.max_links))
         except MorphgenError as error:
             return _Seen((str(error),))
 
@@ -141,28 +140,28 @@ def _seen(
     split: Split, look: _Examination, jobs: int, progress: Progress
 ) -> dict[tuple[str, str], _Seen]:
     """What is found of the robots, by derivation and hash."""
-    members = [member for _, member in reversed(sided(split))]
-    firsts = {(member.derivation, member.body): member for member in members}
+    members = [member for _, member in reversed(sided_members(split))]
+    firsts = {(member.derivation, member.robot_hash): member for member in members}
     found = mapped(look, list(firsts.values()), jobs, progress)
     return dict(zip(firsts, found, strict=True))
 
 
 def _robot_differences(split: Split, seen: Mapping[tuple[str, str], _Seen]) -> Iterator[Difference]:
-    for _, member in sided(split):
-        for why in seen[member.derivation, member.body].whys:
+    for _, member in sided_members(split):
+        for why in seen[member.derivation, member.robot_hash].whys:
             yield Difference(member.name, why)
 
 
 def _built_differences(
     folder: Path, split: Split, library: Library, jobs: int, progress: Progress
 ) -> Iterator[Difference]:
-    id_, light = read_settings(folder / SETTINGS)
+    id_, light = read_settings(folder / BUILD_FILE)
     if id_ != split_id(split):
-        yield Difference(SETTINGS, f"it is of split {id_}, not of {SPLIT}")
+        yield Difference(BUILD_FILE, f"it is of split {id_}, not of {SPLIT_FILE}")
     try:
-        paths = body_paths(split)
+        paths = robot_paths(split)
     except BenchmarkError as error:
-        yield Difference(SPLIT, str(error))
+        yield Difference(SPLIT_FILE, str(error))
         return
     files = list(_file_differences(folder))
     yield from files
@@ -172,31 +171,31 @@ def _built_differences(
     yield from (each for each in _robot_differences(split, seen) if each.where not in told)
     known = {body: one.body for (_, body), one in seen.items() if one.body is not None}
     if known.keys() >= paths.keys():
-        yield from _record_differences(folder / ROBOTS, split, known)
-        yield from _token_differences(folder / TOKENS, split, known)
+        yield from _record_differences(folder / ROBOTS_FILE, split, known)
+        yield from _token_differences(folder / TOKENS_FILE, split, known)
 
 
 def _file_differences(folder: Path) -> Iterator[Difference]:
     """Files that are not as ``SHA256SUMS`` says; those of a robot are told by its name."""
-    expected = read_sums(folder / SUMS)
+    expected = read_sums(folder / SUMS_FILE)
     found = hashes(folder)
-    for name in sorted((expected.keys() | found.keys()) - {SUMS}):
+    for name in sorted((expected.keys() | found.keys()) - {SUMS_FILE}):
         if name not in found:
-            why = f"is missing, but {SUMS} names it"
+            why = f"is missing, but {SUMS_FILE} names it"
         elif name not in expected:
-            why = f"is not named by {SUMS}"
+            why = f"is not named by {SUMS_FILE}"
         elif found[name] != expected[name]:
-            why = f"is not what {SUMS} was written for"
+            why = f"is not what {SUMS_FILE} was written for"
         else:
             continue
         place, _, below = name.partition("/")
         robot, _, file = below.partition("/")
-        where, told = (robot, file) if place == BUNDLES and file else (name, name)
+        where, told = (robot, file) if place == ROBOTS_DIR and file else (name, name)
         yield Difference(where, f"file {told} {why}")
 
 
 def _record_differences(
-    path: Path, split: Split, known: Mapping[str, Body]
+    path: Path, split: Split, known: Mapping[str, RobotData]
 ) -> Iterator[Difference]:
     """Lines of ``robots.jsonl`` that are not as the robots are."""
     try:
@@ -216,7 +215,9 @@ def _record_differences(
             yield Difference(str(wanted["name"]), why)
 
 
-def _token_differences(path: Path, split: Split, known: Mapping[str, Body]) -> Iterator[Difference]:
+def _token_differences(
+    path: Path, split: Split, known: Mapping[str, RobotData]
+) -> Iterator[Difference]:
     """Rows of ``tokens.npz`` that are not as the robots are."""
     try:
         names, tokens, mask = read_tokens(path)
@@ -224,9 +225,9 @@ def _token_differences(path: Path, split: Split, known: Mapping[str, Body]) -> I
         yield Difference(path.name, str(error))
         return
     wanted, wanted_mask = token_tables(split, known)
-    expected = [member.name for _, member in sided(split)]
+    expected = [member.name for _, member in sided_members(split)]
     if names != expected or tokens.shape != wanted.shape:
-        yield Difference(path.name, f"it is not of the {len(expected)} robots of {SPLIT}")
+        yield Difference(path.name, f"it is not of the {len(expected)} robots of {SPLIT_FILE}")
         return
     apart = np.abs(tokens - wanted)
     for shape in (GEOMETRY, SHAPE_POSE):

@@ -24,9 +24,9 @@ from morphgen.cli.options import (
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
-    from morphgen.fitting.link import FitOptions, LinkFit
+    from morphgen.fitting.link_fit import FitOptions, LinkFit
     from morphgen.fitting.quality import Quality
-    from morphgen.fitting.robot import FitReport
+    from morphgen.fitting.robot_fit import FitReport
     from morphgen.model.robot import Robot
 
 IOU, CONFIGURATIONS = 0.9, 1000
@@ -116,7 +116,7 @@ def add_parser(commands: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit, print the table, write."""
     from morphgen.errors import MorphgenError
-    from morphgen.fitting.link import FitOptions
+    from morphgen.fitting.link_fit import FitOptions
     from morphgen.model.mesh import SUFFIXES
 
     if args.all == bool(args.words):
@@ -140,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
     from morphgen.errors import FitError, MorphgenError
-    from morphgen.fitting.link import fit_shapes
+    from morphgen.fitting.link_fit import fit_shapes
     from morphgen.model.geometry import Mesh, Shape
 
     path = Path(args.words[0])
@@ -181,7 +181,7 @@ def _robot(
     from dataclasses import replace
 
     from morphgen.fitting.agreement import agreement
-    from morphgen.fitting.parts import fits_of
+    from morphgen.fitting.part_fits import fits_of
     from morphgen.fitting.replace_collision import with_fits, with_primitives
     from morphgen.formats.fits import read_stored
 
@@ -252,7 +252,7 @@ def _fit(target: Target, options: FitOptions, args: argparse.Namespace) -> FitRe
     from tqdm import tqdm
 
     from morphgen.errors import FitError
-    from morphgen.fitting.robot import fit_links
+    from morphgen.fitting.robot_fit import fit_links
     from morphgen.formats.fits import shapes_to_fit
 
     links = sum(1 for link in target.robot.links if shapes_to_fit(link))
@@ -270,7 +270,7 @@ def _store_all(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from morphgen.errors import MorphgenError
-    from morphgen.fitting.parts import parts_with_meshes, store_parts
+    from morphgen.fitting.part_fits import parts_with_meshes, store_parts
 
     given = {
         "--out": args.out,

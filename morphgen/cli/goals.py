@@ -117,14 +117,14 @@ def read_split_or_built(name: str) -> tuple[Split, Path | None]:
     Raises:
         BenchmarkError: If there is none.
     """
-    from morphgen.benchmark.built import SPLIT, require_built
     from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder import SPLIT_FILE, require_split_folder
 
     folder = Path(name)
     if not folder.is_dir():
         return read_split(name), None
-    require_built(folder)
-    return read_split(folder / SPLIT), folder
+    require_split_folder(folder)
+    return read_split(folder / SPLIT_FILE), folder
 
 
 def require_room_for(home: Path, wanted: bool) -> None:

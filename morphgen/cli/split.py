@@ -71,8 +71,6 @@ def run_list(args: argparse.Namespace) -> int:
 
 def run_show(args: argparse.Namespace) -> int:
     """Print a split."""
-    from dataclasses import asdict
-
     from tabulate import tabulate
 
     from morphgen.benchmark.split import SIDES, split_id
@@ -80,13 +78,13 @@ def run_show(args: argparse.Namespace) -> int:
 
     split = read_split(args.split)
     if args.json:
-        print(json.dumps({"id": split_id(split), **asdict(split)}, indent=2))
+        print(json.dumps({"id": split_id(split), **split.as_dict()}, indent=2))
         return 0
     print(f"{split.name} ({split.regime}): {split.summary}")
     print(f"  id: {split_id(split)}")
     if split.reference:
         print(f"  reference: {split.reference}")
-    for key, value in split.made.items():
+    for key, value in split.provenance.items():
         if args.full or isinstance(value, int | str):
             print(f"  {key}: {_plain(value)}")
     for code, reason in split.accepted.items():
@@ -131,7 +129,7 @@ def _row(member: Member, full: bool) -> tuple[str, ...]:
     if not full and len(text) > SHOWN:
         text = f"{text[: SHOWN - 3]}..."
     task = member.task + (" (obstacles)" if member.obstacles else "")
-    return (member.name, task, member.category, member.body[:8], text)
+    return (member.name, task, member.category, member.robot_hash[:8], text)
 
 
 def _plain(value: object) -> str:

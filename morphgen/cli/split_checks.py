@@ -21,7 +21,7 @@ from morphgen.cli.goals import (
 from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, library_of
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.audit import Audit, Near
+    from morphgen.benchmark.audit import Audit, NearThresholds
     from morphgen.benchmark.split import Split
     from morphgen.benchmark.statistics import PaperRow
     from morphgen.model.findings import Finding
@@ -141,12 +141,12 @@ def run_audit(args: argparse.Namespace) -> int:
     return int(not passed)
 
 
-def _near(text: str | None) -> Near:
-    from morphgen.benchmark.audit import NEAR, Near
+def _near(text: str | None) -> NearThresholds:
+    from morphgen.benchmark.audit import NEAR_THRESHOLDS, NearThresholds
     from morphgen.errors import BenchmarkError
 
     if text is None:
-        return NEAR
+        return NEAR_THRESHOLDS
     try:
         tree, cosine = map(float, text.split(","))
     except ValueError as error:
@@ -157,7 +157,7 @@ def _near(text: str | None) -> Near:
         raise BenchmarkError(
             f"--near {text}: a tree distance is from 0 to 1, and a cosine from -1 to 1"
         )
-    return Near(tree, cosine)
+    return NearThresholds(tree, cosine)
 
 
 def _audit_text(done: Audit, passed: bool, goals: SplitGoals | None) -> str:
@@ -206,31 +206,31 @@ def _shortened(lines: Sequence[str]) -> list[str]:
 
 def run_build(args: argparse.Namespace) -> int:
     """Build and say where."""
-    from morphgen.benchmark.contents import Settings
-    from morphgen.benchmark.export import build, home_of
+    from morphgen.benchmark.split_build import build_split, split_folder_path
     from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.split_folder_files import BuildSettings
     from morphgen.errors import BenchmarkError
 
     if args.light and args.picture:
         raise BenchmarkError("--light writes no pictures; say --light or --picture")
     if args.goal_seed is not None and not args.goals:
         raise BenchmarkError("--goal-seed goes with --goals")
-    settings = Settings(light=args.light, picture=args.picture)
+    settings = BuildSettings(light=args.light, picture=args.picture)
     split = read_split(args.split)
     library = library_of(args)
-    require_room_for(home_of(split, args.out), args.goals)
+    require_room_for(split_folder_path(split, args.out), args.goals)
     goals = ready_goals(args, split) if args.goals else []
     with bar(args) as progress:
-        report = build(
+        report = build_split(
             split, args.out, library, jobs=args.jobs, settings=settings, progress=progress
         )
     if goals:
         ship_goals(args, report.folder, goals)
     if args.json:
-        found = {"folder": str(report.folder), "made": report.made, "kept": report.kept}
+        found = {"folder": str(report.folder), "made": report.num_written, "kept": report.num_kept}
         print(json.dumps(found | ({"goals": len(goals)} if goals else {})))
         return 0
-    print(f"{report.folder}: {report.made} robots made, {report.kept} were there")
+    print(f"{report.folder}: {report.num_written} robots made, {report.num_kept} were there")
     if goals:
         print(f"{len(goals)} goal sets, seed {args.goal_seed or 0}")
     print(f"test it anywhere: morphgen split verify {report.folder}")
@@ -294,10 +294,12 @@ def run_stats(args: argparse.Namespace) -> int:
 
 def _same_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
     """Splits that have the same bodies in the same order, by what their names have in common."""
+    from morphgen.benchmark.split import SIDES
+
     groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
     for split in splits:
-        bodies = tuple(tuple(each.body for each in side) for side in (split.train, split.test))
-        groups.setdefault(bodies, []).append(split)
+        hashes = tuple(tuple(m.robot_hash for m in split.side(side)) for side in SIDES)
+        groups.setdefault(hashes, []).append(split)
     return {_common([split.name for split in group]): group for group in groups.values()}
 
 

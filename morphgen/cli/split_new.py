@@ -20,7 +20,7 @@ from morphgen.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.generate import Order
+    from morphgen.benchmark.generate import SplitRequest
     from morphgen.benchmark.split import Split
     from morphgen.grammar.grammar_file import Grammar
     from morphgen.grammar.library import Library
@@ -177,7 +177,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _interpolation(
-    args: argparse.Namespace, order: Order, library: Library, progress: Progress
+    args: argparse.Namespace, order: SplitRequest, library: Library, progress: Progress
 ) -> Splits:
     from morphgen.benchmark.interpolation import interpolation
 
@@ -186,7 +186,7 @@ def _interpolation(
 
 
 def _composition(
-    args: argparse.Namespace, order: Order, library: Library, progress: Progress
+    args: argparse.Namespace, order: SplitRequest, library: Library, progress: Progress
 ) -> Splits:
     from morphgen.benchmark.composition import composition
 
@@ -194,7 +194,7 @@ def _composition(
 
 
 def _extrapolation(
-    args: argparse.Namespace, order: Order, library: Library, progress: Progress
+    args: argparse.Namespace, order: SplitRequest, library: Library, progress: Progress
 ) -> Splits:
     from morphgen.benchmark.extrapolation import extrapolation, parse_bound
 
@@ -217,8 +217,8 @@ def _subject(args: argparse.Namespace) -> str:
     return "-".join(keys) or "robots"
 
 
-def _order(args: argparse.Namespace) -> Order:
-    from morphgen.benchmark.generate import Order
+def _order(args: argparse.Namespace) -> SplitRequest:
+    from morphgen.benchmark.generate import SplitRequest
     from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.errors import BenchmarkError, nearest
     from morphgen.tasks.registry import TASKS
@@ -240,7 +240,7 @@ def _order(args: argparse.Namespace) -> Order:
     words = [regime, _subject(args), *tasks, *(["obstacles"] if args.obstacles else [])]
     name = args.name or "-".join([*words, f"seed{args.seed}"])
     links = MAX_LINKS if args.max_links is None else args.max_links
-    return Order(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)
+    return SplitRequest(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)
 
 
 def _grammars(names: Sequence[str], library: Library) -> list[Grammar]:
@@ -277,7 +277,7 @@ def _files(out: Path, splits: Splits) -> list[Path]:
         return [out / f"{split.name}.yaml" for split in splits]
     if len(splits) == 1:
         return [out]
-    return [out.with_stem(f"{out.stem}-train{split.made['train']}") for split in splits]
+    return [out.with_stem(f"{out.stem}-train{split.provenance['train']}") for split in splits]
 
 
 def _write(splits: Splits, paths: Sequence[Path]) -> None:
@@ -305,6 +305,6 @@ def _print(split: Split, path: Path) -> None:
     """A line a split, and what is odd about it."""
     print(f"{path}: {split.summary}")
     print(f"  test: {', '.join(member.name for member in split.test)}")
-    repeated = len(split.train) - len({(member.body, member.task) for member in split.train})
+    repeated = len(split.train) - len({(member.robot_hash, member.task) for member in split.train})
     if repeated:
         print(f"  {repeated} train robots have the body and task of an earlier one")

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morphgen.fitting.kinds import Kind
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, Quat, normalize
 from morphgen.typing import Array
+
+Kind = Literal["box", "cylinder", "sphere"]
+"""A primitive that the fitter chooses from."""
+KINDS: tuple[Kind, ...] = ("box", "cylinder", "sphere")
 
 _DECIMALS = 9
 """Decimals beyond which rotations turn alike far."""

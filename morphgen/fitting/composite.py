@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from morphgen.fitting.canonical import canonical, rounded
-from morphgen.fitting.kinds import KINDS, Kind
+from morphgen.fitting.canonical import KINDS, Kind, canonical, rounded
 from morphgen.model.geometry import Box, Cylinder, Pose, Primitive, Shape, Sphere, volume
 from morphgen.typing import Array
 

@@ -20,9 +20,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
-from morphgen.fitting.balls import smallest_balls
-from morphgen.fitting.canonical import least_rotation, rounded
-from morphgen.fitting.kinds import KINDS, Kind
+from morphgen.fitting.bounding_balls import smallest_balls
+from morphgen.fitting.canonical import KINDS, Kind, least_rotation, rounded
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
 from morphgen.model.mesh import is_flat

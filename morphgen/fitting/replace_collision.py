@@ -36,10 +36,13 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
         link.name for link in robot.links if link.name not in fits and has_meshes(link.collisions)
     ]
     if missing:
-        from morphgen.fitting.parts import COLLISION, fits_of  # loads torch, which takes seconds
-        from morphgen.fitting.robot import fit_links
+        from morphgen.fitting.part_fits import (  # loads torch, which takes seconds
+            COLLISION_OPTIONS,
+            fits_of,
+        )
+        from morphgen.fitting.robot_fit import fit_links
 
-        report = fit_links(robot, COLLISION, only=missing)
+        report = fit_links(robot, COLLISION_OPTIONS, only=missing)
         for finding in report.findings:
             if finding.severity != "info":
                 raise FitError(f"{finding.where}: {finding.why}")

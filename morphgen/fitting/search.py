@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from morphgen.errors import FitError
-from morphgen.fitting.canonical import canonical
-from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
-from morphgen.fitting.kinds import KINDS
+from morphgen.fitting.canonical import KINDS, canonical
+from morphgen.fitting.initial_guess import FEWEST, around, by_growth, by_pieces
 from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere

@@ -25,7 +25,7 @@ class Candidates:
     """``n`` guesses of ``k`` primitives each; arrays are (n, k, ...)."""
 
     kinds: NDArray[np.int64]
-    """Index into ``kinds.KINDS``, shape (n, k)."""
+    """Index into ``canonical.KINDS``, shape (n, k)."""
     centres: Array
     """Shape (n, k, 3)."""
     quaternions: Array

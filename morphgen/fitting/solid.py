@@ -20,9 +20,9 @@ import igl
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from morphgen.errors import FitError
-from morphgen.fitting.cavities import Cavities
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.mesh import FLATNESS_TOLERANCE, is_flat, load_mesh
@@ -45,6 +45,8 @@ ENCLOSED = 0.3
 """Openness below which a point lies within a shell. Half-way down a cup as wide as deep: 0.15."""
 SHELL = 0.1
 """Volume within a shell, relative to that of its walls, from which on it is filled."""
+DIRECTIONS = 64
+"""Rays from every point."""
 _WELD = 1e-5
 """Distance below which vertices are welded, relative to the size of the mesh."""
 _PROBES = 4096
@@ -241,3 +243,41 @@ def _filled(solid: Solid) -> Solid:
 def _probes(solid: Solid) -> Array:
     low, high = solid.mesh.bounds
     return np.random.default_rng(0).uniform(low, high, (_PROBES, 3))
+
+
+class Cavities:
+    """Triangles, and which points around them are mostly surrounded by them."""
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self._rays = RayMeshIntersector(mesh)
+
+    def openness(self, points: Array) -> Array:
+        """Share of all directions in which no triangle is met.
+
+        It is at least one half outside of the convex hull.
+
+        Args:
+            points: Shape (n, 3), in the frame of the mesh.
+
+        Returns:
+            Shape (n,), in steps of ``1 / DIRECTIONS``.
+        """
+        if not len(points):
+            return np.zeros(0)
+        directions = _directions()
+        meets = self._rays.intersects_any(
+            np.repeat(points, DIRECTIONS, axis=0), np.tile(directions, (len(points), 1))
+        )
+        return np.asarray(1 - meets.reshape(len(points), DIRECTIONS).mean(axis=1))
+
+
+def _directions() -> Array:
+    """Directions spread evenly, shape (DIRECTIONS, 3): the Fibonacci lattice on the sphere.
+
+    Equal steps along the axis cut zones of equal area; the golden angle spreads them around it.
+    """
+    step = np.arange(DIRECTIONS) + 0.5
+    z = 1 - 2 * step / DIRECTIONS
+    turn = np.pi * (1 + np.sqrt(5)) * step
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)

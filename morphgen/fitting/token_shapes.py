@@ -103,7 +103,7 @@ def _fitted(shapes: Sequence[Shape]) -> Shape | None:
     if are_primitives(shapes):
         return composite(shapes)
     # The search needs torch, which takes seconds to load.
-    from morphgen.fitting.link import FitOptions, fit_shapes
+    from morphgen.fitting.link_fit import FitOptions, fit_shapes
 
     try:
         return fit_shapes(shapes, FitOptions()).primitives[0]

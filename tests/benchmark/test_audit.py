@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
-from morphgen.benchmark.audit import NEAR, Near, audit
+from morphgen.benchmark.audit import NEAR_THRESHOLDS, NearThresholds, audit
 from morphgen.benchmark.similarity import MEASURES, cosine, features, tree_distance
-from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.survey import survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
@@ -31,7 +31,7 @@ def test_a_sound_split_passes():
 def test_the_nearest_train_robot_is_told_by_every_measure():
     made = split([*TRAIN, "base=planar ee=cube ee.size=0.3"], [*TEST, "base=gantry ee=cube"])
     expected = {}
-    robots = {m.name: member_robot(m, LIBRARY) for m in (*made.train, *made.test)}
+    robots = {m.name: compose_member(m, LIBRARY) for m in (*made.train, *made.test)}
     known = {name: features(robot, token_shapes(robot)) for name, robot in robots.items()}
     for test in made.test:
         for name, measure in MEASURES.items():
@@ -65,7 +65,7 @@ def test_a_body_that_is_nearly_in_train_is_a_leak():
     (leak,) = [each for each in done.findings if each.code == "body-near"]
     assert leak.where == "test robot planar-plane"
     assert "train robot near is nearly the same: tree distance" in leak.why
-    assert "body-near" not in {code for code, _ in found(near, near=Near(0.0, 1.0))}
+    assert "body-near" not in {code for code, _ in found(near, near=NearThresholds(0.0, 1.0))}
 
 
 def test_nearness_needs_both_measures():
@@ -73,9 +73,9 @@ def test_nearness_needs_both_measures():
     likeness = survey_split(made, LIBRARY)
     tree, alike = likeness.by_measure("tree")[0, 0], likeness.by_measure("cosine")[0, 0]
     for near, expected in (
-        (Near(tree * 1.01, alike - 1e-12), True),
-        (Near(tree, alike - 1e-12), False),
-        (Near(tree * 1.01, alike), False),
+        (NearThresholds(tree * 1.01, alike - 1e-12), True),
+        (NearThresholds(tree, alike - 1e-12), False),
+        (NearThresholds(tree * 1.01, alike), False),
     ):
         codes = {code for code, _ in found(made, near=near)}
         assert ("body-near" in codes) == expected
@@ -103,7 +103,10 @@ def test_nearness_is_about_one_per_cent_of_size(category):
     def is_near(amount):
         robot = compose(jittered(sample.derivation, amount, rng), LIBRARY, "other")
         other = features(robot, token_shapes(robot))
-        return tree_distance(one, other) < NEAR.tree and cosine(one, other) > NEAR.cosine
+        return (
+            tree_distance(one, other) < NEAR_THRESHOLDS.tree
+            and cosine(one, other) > NEAR_THRESHOLDS.cosine
+        )
 
     assert is_near(0.005)
     assert not is_near(0.06)
@@ -133,7 +136,7 @@ def test_a_part_that_is_not_there_is_told_with_the_nearest():
     ],
 )
 def test_a_robot_that_cannot_be_composed_or_compared_is_told(derivation, why):
-    wrong = replace(member(TRAIN[1]), name="wrong", body="0" * 32, derivation=derivation)
+    wrong = replace(member(TRAIN[1]), name="wrong", robot_hash="0" * 32, derivation=derivation)
     (broken,) = audit(combined(train=[*TRAIN, wrong]), LIBRARY).findings
     assert (broken.code, broken.where) == ("body-broken", "train robot wrong")
     assert why in broken.why
@@ -152,11 +155,13 @@ def test_a_split_without_a_sound_train_robot_can_be_audited():
 
 
 def test_a_body_that_is_another_today_is_told():
-    changed = replace(member(TRAIN[0]), body="0" * 32)
+    changed = replace(member(TRAIN[0]), robot_hash="0" * 32)
     done = audit(combined(train=[changed, *TRAIN[1:]]), LIBRARY)
     (finding,) = done.findings
     assert finding.code == "body-changed"
-    assert f"names body {'0' * 32}, its derivation gives {member(TRAIN[0]).body}" in finding.why
+    assert (
+        f"names body {'0' * 32}, its derivation gives {member(TRAIN[0]).robot_hash}" in finding.why
+    )
 
 
 def test_a_robot_that_is_there_twice_is_a_warning():
@@ -184,11 +189,11 @@ def drawn(category, n, seed, **changes):
         robot = sample_robot(grammar, LIBRARY, i, seed=seed)
         made = member("cubes", f"{category}-{seed}-{i}", category=category)
         body = str(parse_derivation(str(robot.derivation)))
-        yield replace(made, derivation=body, body=_hash(body), **changes)
+        yield replace(made, derivation=body, robot_hash=_hash(body), **changes)
 
 
 def _hash(derivation):
-    from morphgen.benchmark.split import robot_hash
+    from morphgen.benchmark.robot_hash import robot_hash
 
     return robot_hash(compose(parse_derivation(derivation), LIBRARY, "x"))
 
@@ -202,7 +207,7 @@ def test_a_hull_that_was_promised_is_tested():
     assert inside
     assert outside
     for hull, wrong in (("inside", outside), ("outside", inside), ("any", [])):
-        made = split(train, tests, regime="interpolation", made={"hull": hull})
+        made = split(train, tests, regime="interpolation", provenance={"hull": hull})
         told = {where for code, where in found(made) if code == "hull"}
         assert told == {f"test robot {m.name}" for m in wrong}
 
@@ -215,12 +220,12 @@ def test_a_category_that_is_trained_is_no_extrapolation():
 def test_a_bound_on_likeness_that_was_promised_is_tested():
     likeness = survey_split(combined(), LIBRARY).by_measure("cosine").max()
     for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
-        made = combined(made={"similarity": bound})
+        made = combined(provenance={"similarity": bound})
         codes = {code for code, _ in found(made)}
         assert codes == (set() if holds else {"similarity-bound"})
     assert 0.99 < likeness < 1
     with pytest.raises(BenchmarkError, match=r"split 'mine/some': made: .*'<'"):
-        audit(combined(made={"similarity": "small"}), LIBRARY)
+        audit(combined(provenance={"similarity": "small"}), LIBRARY)
 
 
 def test_what_the_author_accepts_is_listed_with_the_reason_and_fails_nothing():

@@ -14,11 +14,11 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.splits import LIBRARY, combined, member, split
-from morphgen.benchmark.built import Robots
-from morphgen.benchmark.contents import BUNDLED, Settings
-from morphgen.benchmark.export import build, load_built
-from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split import compose_member
+from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import read_split, write_split
+from morphgen.benchmark.split_folder import Robots, load_split_folder
+from morphgen.benchmark.split_folder_files import BUNDLED, BuildSettings
 from morphgen.benchmark.token_layout import pad_tokens
 from morphgen.benchmark.tokens import tokens
 from morphgen.errors import BenchmarkError, FormatError
@@ -26,7 +26,7 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_robot
 from morphgen.grammar.robot_set import light_urdf
 
-LIGHT = Settings(light=True)
+LIGHT = BuildSettings(light=True)
 
 
 @pytest.fixture
@@ -37,13 +37,13 @@ def made():
 @pytest.fixture
 def whole(tmp_path, made):
     """A built split."""
-    return build(made, tmp_path / "whole", LIBRARY).folder
+    return build_split(made, tmp_path / "whole", LIBRARY).folder
 
 
 def test_its_folder_has_the_splits_name(tmp_path, made):
-    report = build(made, tmp_path / "data", LIBRARY)
+    report = build_split(made, tmp_path / "data", LIBRARY)
     assert report.folder == tmp_path / "data" / "mine" / "some"
-    assert (report.made, report.kept) == (4, 0)
+    assert (report.num_written, report.num_kept) == (4, 0)
     names = ["README.md", "SHA256SUMS", "build.json", "robots", "robots.jsonl", "split.yaml"]
     assert sorted(path.name for path in report.folder.iterdir()) == [*names, "tokens.npz"]
     assert read_split(report.folder / "split.yaml") == made
@@ -54,7 +54,7 @@ def test_every_robot_is_a_bundle(whole, made):
         folder = whole / "robots" / one.name
         files = {path.name for path in folder.iterdir()}
         assert files == {"robot.urdf", "robot.xml", "card.json"}
-        read, robot = read_robot(folder), member_robot(one, LIBRARY)
+        read, robot = read_robot(folder), compose_member(one, LIBRARY)
         assert (read.name, read.home, len(read.links)) == (one.name, robot.home, len(robot.links))
 
 
@@ -69,13 +69,13 @@ def test_a_line_of_json_tells_a_robot(whole, made):
         "obstacles": False,
         "category": "composed",
         "derivation": made.train[0].derivation,
-        "hash": made.train[0].body,
+        "hash": made.train[0].robot_hash,
         "links": 7,
         "movable": 5,
         "movable_to_tool": 5,
         "dof": 5,
         "reach": pytest.approx(1.167, abs=1e-3),
-        "mass": pytest.approx(member_robot(made.train[0], LIBRARY).mass),
+        "mass": pytest.approx(compose_member(made.train[0], LIBRARY).mass),
         "path": "robots/gantry-plane",
     }
     table = pandas.read_json(whole / "robots.jsonl", lines=True)
@@ -87,7 +87,7 @@ def test_tokens_are_those_of_the_robots(whole, made):
         assert data["tokens"].shape == (4, 23, 48)
         assert data["columns"].tolist()[0] == [0, 1]
         for i, one in enumerate((*made.train, *made.test)):
-            robot = member_robot(one, LIBRARY)
+            robot = compose_member(one, LIBRARY)
             table, mask = pad_tokens(tokens(robot, token_shapes(robot)), 23)
             assert data["names"][i] == one.name
             np.testing.assert_array_equal(data["tokens"][i], table)
@@ -99,15 +99,15 @@ def test_a_robot_with_more_links_than_the_split_allows_is_not_built(tmp_path):
     with pytest.raises(
         BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_links 23"
     ):
-        build(made, tmp_path, LIBRARY, settings=LIGHT)
+        build_split(made, tmp_path, LIBRARY, settings=LIGHT)
 
 
 def test_max_links_of_a_split_widens_all_tokens(tmp_path):
-    made = split(["chain beads=7"], ["base=gantry ee=cube"], made={"max_links": 25})
-    built = load_built(build(made, tmp_path, LIBRARY, settings=LIGHT).folder)
+    made = split(["chain beads=7"], ["base=gantry ee=cube"], provenance={"max_links": 25})
+    built = load_split_folder(build_split(made, tmp_path, LIBRARY, settings=LIGHT).folder)
     assert built.tokens.shape == (2, 25, 48)
     for one, table in zip((*made.train, *made.test), built.tokens, strict=True):
-        robot = member_robot(one, LIBRARY)
+        robot = compose_member(one, LIBRARY)
         expected = tokens(robot, token_shapes(robot), max_links=25)
         np.testing.assert_array_equal(table[: len(expected)], expected)
 
@@ -134,11 +134,11 @@ def test_the_readme_tells_how_to_load_it_and_that_runs(whole, monkeypatch, capsy
 
 def test_a_light_build_names_meshes_where_their_packages_have_them(tmp_path):
     made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
-    folder = build(made, tmp_path, LIBRARY, settings=LIGHT).folder
+    folder = build_split(made, tmp_path, LIBRARY, settings=LIGHT).folder
     own = folder / "robots" / "ur5-plane"
     assert sorted(path.name for path in own.iterdir()) == ["derivation.txt", "robot.urdf"]
     assert (own / "derivation.txt").read_text() == f"{made.train[0].derivation}\n"
-    assert (own / "robot.urdf").read_text() == light_urdf(member_robot(made.train[0], LIBRARY))
+    assert (own / "robot.urdf").read_text() == light_urdf(compose_member(made.train[0], LIBRARY))
     assert 'filename="package://' in (own / "robot.urdf").read_text()
     assert "derivation.txt" in (folder / "README.md").read_text()
 
@@ -146,40 +146,44 @@ def test_a_light_build_names_meshes_where_their_packages_have_them(tmp_path):
 def test_a_body_that_is_named_twice_is_written_once(tmp_path):
     twin = member("base=gantry ee=plane", "twin", task="reach")
     made = combined(test=[twin, *combined().test])
-    report = build(made, tmp_path, LIBRARY, settings=LIGHT)
-    assert report.made == 4
+    report = build_split(made, tmp_path, LIBRARY, settings=LIGHT)
+    assert report.num_written == 4
     assert {path.name for path in (report.folder / "robots").iterdir()} == {
         "gantry-plane",
         "planar-cube",
         "gantry-cylinder",
         "planar-plane",
     }
-    (record,) = [robot for robot in load_built(report.folder).test if robot["name"] == "twin"]
+    (record,) = [
+        robot for robot in load_split_folder(report.folder).test if robot["name"] == "twin"
+    ]
     assert (record["path"], record["task"]) == ("robots/gantry-plane", "reach")
 
 
 def test_pictures_are_drawn_if_asked_for(tmp_path):
     made = split(["cubes"], ["base=planar ee=plane"])
-    folder = build(made, tmp_path, LIBRARY, settings=Settings(picture=True)).folder
+    folder = build_split(made, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).folder
     assert (folder / "robots" / "cubes" / "preview.png").is_file()
-    assert build(made, tmp_path, LIBRARY, settings=Settings(picture=True)).kept == 2
+    assert build_split(made, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).num_kept == 2
 
 
 @pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
 def test_twice_and_in_two_processes_it_is_the_same_bytes(tmp_path, settings):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["arm=ur5 ee=plane"])
-    one = build(made, tmp_path / "one", LIBRARY, settings=settings)
-    two = build(made, tmp_path / "two", LIBRARY, settings=settings, jobs=2)
+    one = build_split(made, tmp_path / "one", LIBRARY, settings=settings)
+    two = build_split(made, tmp_path / "two", LIBRARY, settings=settings, jobs=2)
     assert tree(one.folder) == tree(two.folder)
-    again = build(made, tmp_path / "one", LIBRARY, settings=settings)
-    assert (again.made, again.kept) == (0, 10)
+    again = build_split(made, tmp_path / "one", LIBRARY, settings=settings)
+    assert (again.num_written, again.num_kept) == (0, 10)
     assert tree(one.folder) == tree(two.folder)
 
 
 def test_progress_counts_bodies(tmp_path, made):
     seen = []
-    build(made, tmp_path, LIBRARY, settings=LIGHT, progress=lambda *counts: seen.append(counts))
+    build_split(
+        made, tmp_path, LIBRARY, settings=LIGHT, progress=lambda *counts: seen.append(counts)
+    )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
@@ -190,19 +194,19 @@ class Killed(BaseException):
 @pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
 @pytest.mark.parametrize("done", [1, 3, 4])
 def test_what_was_done_before_an_interruption_is_kept(tmp_path, made, settings, done):
-    whole = build(made, tmp_path / "whole", LIBRARY, settings=settings).folder
+    whole = build_split(made, tmp_path / "whole", LIBRARY, settings=settings).folder
 
     def stop(number, total):
         if number == done:
             raise Killed
 
     with pytest.raises(Killed):
-        build(made, tmp_path / "own", LIBRARY, settings=settings, progress=stop)
+        build_split(made, tmp_path / "own", LIBRARY, settings=settings, progress=stop)
     own = tmp_path / "own" / "mine" / "some"
     with pytest.raises(BenchmarkError, match="is not finished: it has no SHA256SUMS; build it"):
-        load_built(own)
-    report = build(made, tmp_path / "own", LIBRARY, settings=settings)
-    assert (report.made, report.kept) == (4 - done, done)
+        load_split_folder(own)
+    report = build_split(made, tmp_path / "own", LIBRARY, settings=settings)
+    assert (report.num_written, report.num_kept) == (4 - done, done)
     assert tree(own) == tree(whole)
 
 
@@ -229,7 +233,7 @@ def test_what_is_not_as_it_should_be_is_made_again(tmp_path, whole, made, path, 
     else:
         (whole / path).parent.mkdir(exist_ok=True)
         (whole / path).write_bytes(content)
-    build(made, tmp_path / "whole", LIBRARY)
+    build_split(made, tmp_path / "whole", LIBRARY)
     assert tree(whole) == before
 
 
@@ -241,7 +245,7 @@ def test_a_robot_whose_card_was_changed_with_its_file_is_made_again(tmp_path, wh
     card = json.loads((folder / "card.json").read_text())
     card["hashes"]["robot.urdf"] = hashlib.sha256(text.encode()).hexdigest()
     (folder / "card.json").write_text(json.dumps(card))
-    assert build(made, tmp_path / "whole", LIBRARY).made == 1
+    assert build_split(made, tmp_path / "whole", LIBRARY).num_written == 1
     assert tree(whole) == before
 
 
@@ -249,7 +253,7 @@ def test_a_robot_of_another_version_is_made_again(tmp_path, whole, made):
     before = tree(whole)
     path = whole / "robots" / "planar-cube" / "card.json"
     path.write_text(path.read_text().replace('"morphgen": "', '"morphgen": "0.0.'))
-    assert build(made, tmp_path / "whole", LIBRARY).made == 1
+    assert build_split(made, tmp_path / "whole", LIBRARY).num_written == 1
     assert tree(whole) == before
 
 
@@ -268,8 +272,8 @@ def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=30)
     assert not (robots.parent / "SHA256SUMS").exists()
-    whole = build(made, tmp_path / "whole", LIBRARY).folder
-    assert build(made, tmp_path / "killed", LIBRARY).kept > 0
+    whole = build_split(made, tmp_path / "whole", LIBRARY).folder
+    assert build_split(made, tmp_path / "killed", LIBRARY).num_kept > 0
     assert tree(robots.parent) == tree(whole)
 
 
@@ -278,10 +282,10 @@ def test_a_folder_of_another_build_is_refused(tmp_path, whole, made):
     for other, settings, message in (
         (combined(test=["base=planar ee=cylinder"]), BUNDLED, "its split is '[0-9a-f]{32}', not"),
         (made, LIGHT, "its light is False, not True; name another folder"),
-        (made, Settings(picture=True), "its picture is False, not True"),
+        (made, BuildSettings(picture=True), "its picture is False, not True"),
     ):
         with pytest.raises(BenchmarkError, match=message):
-            build(other, tmp_path / "whole", LIBRARY, settings=settings)
+            build_split(other, tmp_path / "whole", LIBRARY, settings=settings)
     assert tree(whole) == before
 
 
@@ -290,7 +294,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path, made):
     (tmp_path / "mine" / "some" / "notes.txt").write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(BenchmarkError, match=r"is no built split \(no build.json\); name another"):
-        build(made, tmp_path, LIBRARY)
+        build_split(made, tmp_path, LIBRARY)
     assert tree(tmp_path) == before
 
 
@@ -299,31 +303,31 @@ def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path, made, place):
     (tmp_path / place).parent.mkdir(exist_ok=True)
     (tmp_path / place).write_text("mine")
     with pytest.raises(BenchmarkError, match=r"exists and is no built split|cannot write"):
-        build(made, tmp_path, LIBRARY)
+        build_split(made, tmp_path, LIBRARY)
     assert (tmp_path / place).read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", ["../up", "a//b", "/tmp/x", "", ".hidden"])
 def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
     with pytest.raises(FormatError, match="use letters, digits"):
-        build(combined(name=name), tmp_path / "data", LIBRARY)
+        build_split(combined(name=name), tmp_path / "data", LIBRARY)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_name_of_two_bodies_is_refused(tmp_path):
     made = combined(test=[member("base=planar ee=cylinder", "gantry-plane")])
     with pytest.raises(BenchmarkError, match="both named 'gantry-plane'; rename one"):
-        build(made, tmp_path / "data", LIBRARY)
+        build_split(made, tmp_path / "data", LIBRARY)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_second_run_into_the_same_folder_is_refused(tmp_path, made):
     def again(done, total):
         with pytest.raises(FormatError, match="is being written by another run"):
-            build(made, tmp_path, LIBRARY, settings=LIGHT)
+            build_split(made, tmp_path, LIBRARY, settings=LIGHT)
 
-    report = build(made, tmp_path, LIBRARY, settings=LIGHT, progress=again)
-    assert len(load_built(report.folder)) == 4
+    report = build_split(made, tmp_path, LIBRARY, settings=LIGHT, progress=again)
+    assert len(load_split_folder(report.folder)) == 4
 
 
 def test_a_disk_that_is_full_is_told_and_nothing_half_written_is_left(tmp_path, made, monkeypatch):
@@ -336,14 +340,14 @@ def test_a_disk_that_is_full_is_told_and_nothing_half_written_is_left(tmp_path, 
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(FormatError, match=r"cannot write .*No space left on device"):
-        build(made, tmp_path, LIBRARY)
+        build_split(made, tmp_path, LIBRARY)
     assert list((tmp_path / "mine" / "some" / "robots").iterdir()) == []
     monkeypatch.undo()
-    assert build(made, tmp_path, LIBRARY).made == 4
+    assert build_split(made, tmp_path, LIBRARY).num_written == 4
 
 
 def test_loading_gives_plain_records_with_tokens(whole, made):
-    built = load_built(whole)
+    built = load_split_folder(whole)
     assert [robot["name"] for robot in built] == [m.name for m in (*made.train, *made.test)]
     assert [len(each) for each in (built, built.train, built.test)] == [4, 3, 1]
     for i, robot in enumerate(built):
@@ -354,13 +358,13 @@ def test_loading_gives_plain_records_with_tokens(whole, made):
         assert (built.folder / robot["path"] / "robot.urdf").is_file()
     assert built.test[0]["name"] == built.train[:2][1]["name"].replace("cube", "plane")
     assert isinstance(built.train[:2], Robots)
-    assert load_built(str(whole)).folder == whole
+    assert load_split_folder(str(whole)).folder == whole
 
 
 def test_loading_needs_no_torch(whole):
     code = (
-        "import sys; from morphgen.benchmark.built import load_built; "
-        f"print(len(load_built({str(whole)!r}).train), 'torch' in sys.modules)"
+        "import sys; from morphgen.benchmark.split_folder import load_split_folder; "
+        f"print(len(load_split_folder({str(whole)!r}).train), 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["3", "False"]
@@ -387,7 +391,7 @@ def test_what_cannot_be_loaded_is_refused_by_name(whole, path, content, message)
     else:
         (whole / path).write_bytes(content)
     with pytest.raises(BenchmarkError, match=message):
-        load_built(whole)
+        load_split_folder(whole)
 
 
 @pytest.mark.parametrize("change", ["tokens", "mask", "names"])
@@ -397,15 +401,15 @@ def test_tokens_that_do_not_go_together_are_refused(whole, change):
     arrays[change] = arrays[change][:2]
     np.savez(whole / "tokens.npz", **arrays)
     with pytest.raises(BenchmarkError, match=r"names, tokens and mask are of shapes \("):
-        load_built(whole)
+        load_split_folder(whole)
     del arrays[change]
     np.savez(whole / "tokens.npz", **arrays)
     with pytest.raises(BenchmarkError, match=f"cannot be read: .*{change}"):
-        load_built(whole)
+        load_split_folder(whole)
 
 
 def test_the_folder_above_hints_at_the_one_that_is_meant(tmp_path, whole):
     with pytest.raises(BenchmarkError, match=r"did you mean .*whole/mine/some\?"):
-        load_built(tmp_path / "whole")
+        load_split_folder(tmp_path / "whole")
     with pytest.raises(BenchmarkError, match="nowhere: no such folder"):
-        load_built(tmp_path / "nowhere")
+        load_split_folder(tmp_path / "nowhere")

@@ -8,16 +8,22 @@ from scipy.spatial import Delaunay
 
 import morphgen
 from helpers.grammars import grammar, shipped
-from morphgen.benchmark import bodies, generate
+from morphgen.benchmark import generate, robot_factory
 from morphgen.benchmark.audit import audit
-from morphgen.benchmark.bodies import Composed, Drawn, Maker, make_all
 from morphgen.benchmark.composition import composition, expand
 from morphgen.benchmark.extrapolation import Bound, extrapolation, parse_bound
-from morphgen.benchmark.generate import Order
+from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.interpolation import interpolation
 from morphgen.benchmark.regimes import parameters, parts, regime_findings, structure
+from morphgen.benchmark.robot_factory import (
+    ComposedRecipe,
+    RobotFactory,
+    SampledRecipe,
+    make_robots,
+)
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import cosine, features
-from morphgen.benchmark.split import member_robot, robot_hash
+from morphgen.benchmark.split import compose_member
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.derivation import parse_derivation
@@ -28,7 +34,7 @@ LIBRARY = default_library()
 
 
 def order(*train, test=1, **changes):
-    return Order("mine", train, test, **changes)
+    return SplitRequest("mine", train, test, **changes)
 
 
 def derivations(members):
@@ -46,17 +52,17 @@ def names(members):
 def require_sound(split):
     """Require that its robots can be made, and that the regime holds."""
     for member in (*split.train, *split.test):
-        assert member_robot(member, LIBRARY).name == member.name
+        assert compose_member(member, LIBRARY).name == member.name
     assert regime_findings(split, LIBRARY) == ()
 
 
 def test_robots_are_those_that_sample_draws():
     (split,) = interpolation(order(3), shipped("cubes"), LIBRARY)
-    seeds = split.made["seeds"]
+    seeds = split.provenance["seeds"]
     drawn = morphgen.sample("cubes", 3, seed=seeds["cubes"])
-    assert [m.body for m in split.train] == [robot_hash(robot) for robot in drawn]
+    assert [m.robot_hash for m in split.train] == [robot_hash(robot) for robot in drawn]
     first = next(morphgen.sample("cubes", 1, seed=seeds["cubes-test"]))
-    assert split.test[0].body == robot_hash(first)
+    assert split.test[0].robot_hash == robot_hash(first)
     assert names(split.train) == ["cubes-000000", "cubes-000001", "cubes-000002"]
     assert names(split.test) == ["cubes-test-000000"]
     assert {m.category for m in (*split.train, *split.test)} == {"cubes"}
@@ -70,8 +76,8 @@ def test_the_seed_decides_and_the_number_of_robots_does_not():
     )
     assert few.train == again.train[:2]
     assert few.test == again.test
-    bodies = {m.body for m in (*few.train, *few.test)}
-    assert bodies.isdisjoint(m.body for m in (*other.train, *other.test))
+    bodies = {m.robot_hash for m in (*few.train, *few.test)}
+    assert bodies.isdisjoint(m.robot_hash for m in (*other.train, *other.test))
 
 
 @pytest.mark.parametrize("hull", ["inside", "outside"])
@@ -85,8 +91,8 @@ def test_test_robots_of_every_size_keep_to_the_hull(hull):
         inside = Delaunay(train[:, varied]).find_simplex(test[:, varied]) >= 0
         assert list(inside) == [hull == "inside"] * 3
         assert regime_findings(split, LIBRARY) == ()
-        assert split.made["hull"] == hull
-        assert split.made["nested"] == [6, 12, 24]
+        assert split.provenance["hull"] == hull
+        assert split.provenance["nested"] == [6, 12, 24]
 
 
 def test_sizes_are_nested_around_the_same_test():
@@ -95,7 +101,7 @@ def test_sizes_are_nested_around_the_same_test():
     assert small.train == middle.train[:2] == large.train[:2]
     assert middle.train == large.train[:3]
     assert small.test == middle.test == large.test
-    assert [split.made["train"] for split in (small, middle, large)] == [2, 3, 5]
+    assert [split.provenance["train"] for split in (small, middle, large)] == [2, 3, 5]
 
 
 def test_a_grammar_of_several_structures_is_tested_by_those_that_are_trained():
@@ -118,7 +124,7 @@ def test_every_robot_does_every_task():
     ]
     assert names(splits[0].train) == names(splits[1].train)[:2]
     assert [m.task for m in splits[0].test] == ["reach", "push"]
-    assert len({m.body for m in splits[0].test}) == 1
+    assert len({m.robot_hash for m in splits[0].test}) == 1
     assert all(m.obstacles for m in splits[0].train)
 
 
@@ -140,8 +146,8 @@ def test_progress_is_told_up_to_the_end():
 def test_a_body_of_train_is_never_tested():
     few = grammar("robot -> gantry plane(size=choice(0.1, 0.2, 0.3))")
     (split,) = interpolation(order(2), few, LIBRARY)
-    bodies = {m.body for m in split.train}
-    assert bodies.isdisjoint(m.body for m in split.test)
+    bodies = {m.robot_hash for m in split.train}
+    assert bodies.isdisjoint(m.robot_hash for m in split.test)
     with pytest.raises(BenchmarkError, match=r"0 of 1 .* in 200 draws; \d+ had the body of g-"):
         interpolation(order(30), few, LIBRARY)
 
@@ -206,7 +212,7 @@ def cosines(split):
     """Of every test robot to every train robot."""
     rows = []
     for side in (split.test, split.train):
-        made = [member_robot(member, LIBRARY) for member in side]
+        made = [compose_member(member, LIBRARY) for member in side]
         rows.append(
             [
                 features(robot, token_shapes(robot, LIBRARY.folders), max_links=split.max_links)
@@ -228,7 +234,7 @@ def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
     for split in splits:
         nearest = cosines(split).max(axis=1)
         assert holds(nearest, 0.55).all()
-        assert split.made["similarity"] == f"{bound.strip()[0]}0.55"
+        assert split.provenance["similarity"] == f"{bound.strip()[0]}0.55"
 
 
 def test_a_robot_with_too_many_links_is_told_unless_all_have_room():
@@ -239,9 +245,11 @@ def test_a_robot_with_too_many_links_is_told_unless_all_have_room():
         extrapolation(wanted, grammars("stick"), grammars("chain"), LIBRARY)
     wide = replace(wanted, max_links=25)
     (made,) = extrapolation(wide, grammars("stick"), grammars("chain"), LIBRARY)
-    assert made.made["max_links"] == made.max_links == 25
+    assert made.provenance["max_links"] == made.max_links == 25
     assert "links-many" not in {each.code for each in audit(made, LIBRARY).findings}
-    narrow = replace(made, made={k: v for k, v in made.made.items() if k != "max_links"})
+    narrow = replace(
+        made, provenance={k: v for k, v in made.provenance.items() if k != "max_links"}
+    )
     told = [each for each in audit(narrow, LIBRARY).findings if each.code == "links-many"]
     assert told
     assert {each.why for each in told} == {"it has 25 links, more than max_links 23"}
@@ -252,7 +260,7 @@ def test_a_robot_with_too_many_links_is_told_unless_all_have_room():
 def test_a_split_that_says_no_number_of_links_is_refused(given):
     (made,) = extrapolation(order(1), grammars("stick"), grammars("cubes"), LIBRARY)
     with pytest.raises(BenchmarkError, match=r"made: max_links: .*; expected a whole number"):
-        audit(replace(made, made={**made.made, "max_links": given}), LIBRARY)
+        audit(replace(made, provenance={**made.provenance, "max_links": given}), LIBRARY)
 
 
 def test_a_bound_that_nothing_meets_is_told_with_the_nearest(monkeypatch):
@@ -313,7 +321,7 @@ def test_composition_holds_out_combinations_whose_parts_are_trained():
 def test_without_a_size_all_is_trained_that_may_be():
     (split,) = composition(order(test=2), FROM, LIBRARY)
     assert len(split.train) == 7
-    assert split.made["from"] == FROM
+    assert split.provenance["from"] == FROM
 
 
 def test_nested_sizes_each_train_every_part_of_the_test_robots():
@@ -416,17 +424,17 @@ def test_an_order_that_makes_no_sense_is_refused(sizes, changes, message):
 
 def test_numbers_that_a_derivation_cannot_write_do_not_matter():
     """The base's default has 16 digits; the hash is that of the robot that the text gives."""
-    body = Maker(LIBRARY.folders)(Composed(("base=planar", "ee=cube")))
+    body = RobotFactory(LIBRARY.folders)(ComposedRecipe(("base=planar", "ee=cube")))
     assert "travel_yaw=3.14159265359" in str(body.derivation)
     assert dict(body.derivation.parameters)["travel_yaw"] == 3.14159265359
     own = grammar("robot -> planar ee", "ee -> cube(size=uniform(0.05, 0.1))")
-    drawn = Maker(LIBRARY.folders)(Drawn(own, 0, 1, "x"))
+    drawn = RobotFactory(LIBRARY.folders)(SampledRecipe(own, 0, 1, "x"))
     again = parse_derivation(str(drawn.derivation))
     assert again == drawn.derivation
 
 
 def test_a_robot_that_fails_its_checks_is_refused(monkeypatch):
     found = [Finding("overlap", "error", "link a", "too deep", "move it")]
-    monkeypatch.setattr(bodies, "check", lambda robot: found)
+    monkeypatch.setattr(robot_factory, "check", lambda robot: found)
     with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
-        make_all([Composed(("base=gantry", "ee=cube"))], Maker(LIBRARY.folders))
+        make_robots([ComposedRecipe(("base=gantry", "ee=cube"))], RobotFactory(LIBRARY.folders))

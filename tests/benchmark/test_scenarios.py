@@ -6,7 +6,7 @@ import pytest
 
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.scenarios import SCENARIOS, scenario_splits, write_scenarios
-from morphgen.benchmark.split import SIDES, member_robot
+from morphgen.benchmark.split import SIDES, compose_member
 from morphgen.benchmark.split_file import find_split, read_split, split_names, split_text
 from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import BenchmarkError
@@ -84,8 +84,8 @@ def test_reach_and_push_share_their_robots(name):
     split, other = read_split(name), read_split(name.replace("push", "reach"))
     for side in SIDES:
         assert {m.task for m in split.side(side)} == {"push"}
-        assert [(m.name, m.body) for m in split.side(side)] == [
-            (m.name, m.body) for m in other.side(side)
+        assert [(m.name, m.robot_hash) for m in split.side(side)] == [
+            (m.name, m.robot_hash) for m in other.side(side)
         ]
         assert {m.task for m in other.side(side)} == {"reach"}
         assert {m.obstacles for m in split.side(side)} == {name.endswith("obstacles")}
@@ -110,14 +110,14 @@ def test_robots_have_as_many_links_and_joints_as_the_papers(name, links, movable
 def test_every_robot_is_composed_to_its_hash_and_fits_into_the_tokens(name):
     split = read_split(name)
     for member in (*split.train, *split.test):
-        assert len(member_robot(member, LIBRARY).links) <= MAX_LINKS
+        assert len(compose_member(member, LIBRARY).links) <= MAX_LINKS
 
 
 def test_robots_of_a_file_are_composed_to_their_hashes():
     split = read_split("extrapolation/arms/push")
     named = {member.name: member for member in (*split.train, *split.test)}
     for name in ("ur5-stick", "lwr", "widowx", "arm5-000000"):
-        assert member_robot(named[name], LIBRARY).name == name
+        assert compose_member(named[name], LIBRARY).name == name
 
 
 def test_an_unknown_scenario_names_the_nearest():

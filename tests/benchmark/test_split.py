@@ -8,15 +8,8 @@ import pytest
 import trimesh
 
 from helpers.robots import arm
-from morphgen.benchmark.split import (
-    COMPOSED,
-    Member,
-    Split,
-    member_robot,
-    robot_hash,
-    robots,
-    split_id,
-)
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import COMPOSED, Member, Split, compose_member, compose_side, split_id
 from morphgen.errors import BenchmarkError, GrammarError, PartError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
@@ -234,33 +227,36 @@ def test_sizes_that_people_write_are_far_from_where_rounding_changes(part):
 
 
 def test_a_member_is_composed_under_its_name():
-    robot = member_robot(member("arm=ur5 ee=plane", "mine"), LIBRARY)
+    robot = compose_member(member("arm=ur5 ee=plane", "mine"), LIBRARY)
     assert (robot.name, len(robot.links)) == ("mine", 10)
     assert robot.ignore_pairs
 
 
 def test_a_robot_of_another_body_is_refused():
-    changed = member("base=gantry ee=plane", body="0" * 32)
-    own = member("base=gantry ee=plane").body
+    changed = member("base=gantry ee=plane", robot_hash="0" * 32)
+    own = member("base=gantry ee=plane").robot_hash
     with pytest.raises(BenchmarkError, match=f"'gantry-plane'.*{'0' * 32}.*{own}"):
-        member_robot(changed, LIBRARY)
+        compose_member(changed, LIBRARY)
 
 
 def test_a_member_that_cannot_be_composed_says_why():
     with pytest.raises(PartError, match="unknown part 'plnae'"):
-        member_robot(member("base=gantry ee=plane", derivation="base=plnae"), LIBRARY)
+        compose_member(member("base=gantry ee=plane", derivation="base=plnae"), LIBRARY)
     with pytest.raises(GrammarError, match=r"derivation of 'mine'.*no derivation"):
-        member_robot(member("base=gantry ee=plane", "mine", derivation="base"), LIBRARY)
+        compose_member(member("base=gantry ee=plane", "mine", derivation="base"), LIBRARY)
 
 
 def test_robots_are_composed_when_asked_for():
-    good, broken = member("base=gantry ee=plane"), member("base=gantry ee=cube", body="0" * 32)
+    good, broken = (
+        member("base=gantry ee=plane"),
+        member("base=gantry ee=cube", robot_hash="0" * 32),
+    )
     split = Split("s", "composition", "", (good, broken), (good,))
-    train = robots(split, "train", LIBRARY)
+    train = compose_side(split, "train", LIBRARY)
     assert next(train).name == "gantry-plane"
     with pytest.raises(BenchmarkError):
         next(train)
-    assert [robot.name for robot in robots(split, "test", LIBRARY)] == ["gantry-plane"]
+    assert [robot.name for robot in compose_side(split, "test", LIBRARY)] == ["gantry-plane"]
 
 
 def split_of_two():
@@ -277,7 +273,7 @@ def test_the_id_is_of_regime_and_robots_alone():
         split,
         name="t",
         summary="two",
-        made={},
+        provenance={},
         accepted={"hull": "why"},
         reference="a paper",
         statistics={"n": 1},
@@ -299,7 +295,7 @@ def test_the_id_is_of_regime_and_robots_alone():
                 {"derivation": "x"},
                 {"task": "push"},
                 {"obstacles": True},
-                {"body": "x"},
+                {"robot_hash": "x"},
             )
         ),
     ]

@@ -14,13 +14,13 @@ from helpers.commands import tree
 from morphgen.benchmark.split import Member, Split, split_id
 from morphgen.benchmark.split_file import (
     find_split,
+    parse_split,
     read_split,
     read_split_file,
     split_names,
     split_text,
     write_split,
 )
-from morphgen.benchmark.split_reader import parse_split
 from morphgen.errors import BenchmarkError
 
 DERIVATION = "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size=0.1, thickness=0.01)]]"
@@ -34,7 +34,7 @@ SPLIT = Split(
     "mine/first",
     "composition",
     "A UR5: with a plane, or not",
-    (robot(), robot("arm3-000001", category="arm3", body="1e5" + "0" * 29)),
+    (robot(), robot("arm3-000001", category="arm3", robot_hash="1e5" + "0" * 29)),
     (robot("ur5-stick", task="push", obstacles=True),),
     {"seed": 3, "train": 2, "from": ["arm={ur5}"], "seeds": {"arm3": 17}},
     {"part-unseen": "the paper's own: so it is"},
@@ -72,7 +72,7 @@ def test_a_robot_has_a_line_of_its_own():
     for member in (*SPLIT.train, *SPLIT.test):
         (line,) = [line for line in text.splitlines() if member.name in line]
         assert member.derivation in line
-        assert member.body in line
+        assert member.robot_hash in line
     fewer = replace(SPLIT, train=SPLIT.train[:1])
     gone = set(text.splitlines()) - set(split_text(fewer).splitlines())
     assert len(gone) == 2, "the robot's line and the id"
@@ -81,9 +81,9 @@ def test_a_robot_has_a_line_of_its_own():
 def test_other_readers_of_yaml_see_the_same():
     data = yaml.safe_load(split_text(SPLIT))
     assert data["id"] == split_id(SPLIT)
-    assert data["train"][1]["body"] == SPLIT.train[1].body
+    assert data["train"][1]["body"] == SPLIT.train[1].robot_hash
     assert data["test"][0]["obstacles"] is True
-    assert data["made"] == SPLIT.made
+    assert data["made"] == SPLIT.provenance
 
 
 def test_what_is_empty_is_left_out():
@@ -104,7 +104,7 @@ def test_any_text_comes_back_as_it_was(name, category, text):
         name=name,
         summary=text,
         train=(robot(name, category=category, derivation=text),),
-        made={"from": [text], category: text},
+        provenance={"from": [text], category: text},
         accepted={"hull": text},
     )
     assert parse_split(split_text(odd), Path("s.yaml")).split == odd

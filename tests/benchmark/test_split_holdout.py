@@ -7,12 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from morphgen.benchmark.holdout import Cell, covering, hold_out
+from morphgen.benchmark.composition import HoldoutCandidate, hold_out, num_covering
 from morphgen.errors import BenchmarkError
 
 
 def cell(arm, ee, task="reach"):
-    return Cell(f"{arm}-{ee}", (), f"{arm}({ee})", f"{arm}[{ee}]", frozenset((arm, ee)), ee, task)
+    return HoldoutCandidate(
+        f"{arm}-{ee}", (), f"{arm}({ee})", f"{arm}[{ee}]", frozenset((arm, ee)), ee, task
+    )
 
 
 def chosen(cells, n=1, left=1, seed=0):
@@ -54,7 +56,7 @@ def test_what_is_held_out_is_fair_and_is_found_if_there_is_any(cells, n, left, s
     assert len(train) == len(set(train)) >= left
     assert {c.combination for c in test}.isdisjoint(c.combination for c in train)
     needed = {what for c in test for what in (*c.parts, c.task)}
-    k = covering(train, test)
+    k = num_covering(train, test)
     assert needed <= {what for c in train[:k] for what in (*c.parts, c.task)}
     assert not needed <= {what for c in train[: k - 1] for what in (*c.parts, c.task)}
 
@@ -67,7 +69,9 @@ def test_the_seed_decides():
 
 def test_different_combinations_are_held_out_before_a_second_of_one():
     cells = [
-        Cell(f"{arm}{ee}{k}", (), f"{arm}{ee}{k}", arm + ee, frozenset((arm, ee)), ee, "reach")
+        HoldoutCandidate(
+            f"{arm}{ee}{k}", (), f"{arm}{ee}{k}", arm + ee, frozenset((arm, ee)), ee, "reach"
+        )
         for arm in "abc"
         for ee in "xyz"
         for k in range(3)

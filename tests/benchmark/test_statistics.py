@@ -7,7 +7,7 @@ import pytest
 
 from helpers.splits import LIBRARY, combined, member, split
 from morphgen.benchmark.similarity import cosine, features
-from morphgen.benchmark.split import member_robot
+from morphgen.benchmark.split import compose_member
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.benchmark.statistics import PAPER, paper_row, robot_set, statistics
 from morphgen.errors import BenchmarkError
@@ -36,8 +36,8 @@ def test_joints_beyond_the_tool_and_mimic_joints_count_as_movable_only():
 def test_masses_reaches_and_cosines_have_mean_and_range():
     made = combined()
     found = statistics(made, LIBRARY)
-    robots = [member_robot(m, LIBRARY) for m in made.train]
-    (test,) = (member_robot(m, LIBRARY) for m in made.test)
+    robots = [compose_member(m, LIBRARY) for m in made.train]
+    (test,) = (compose_member(m, LIBRARY) for m in made.test)
     alike = [
         cosine(features(test, token_shapes(test)), features(robot, token_shapes(robot)))
         for robot in robots

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TRAIN, combined, member, split
-from morphgen.benchmark.contents import Settings
-from morphgen.benchmark.export import build
 from morphgen.benchmark.split import split_id
+from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_names, split_text
+from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.token_layout import GEOMETRY, ORIGIN, PARENT
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError
 
-LIGHT = Settings(light=True)
+LIGHT = BuildSettings(light=True)
 
 
 def found(path, **options):
@@ -31,14 +31,14 @@ def written(folder, made):
     return path
 
 
-@pytest.fixture(params=[Settings(), LIGHT], ids=["bundles", "light"])
+@pytest.fixture(params=[BuildSettings(), LIGHT], ids=["bundles", "light"])
 def whole(tmp_path, request):
-    return build(combined(), tmp_path / "whole", LIBRARY, settings=request.param).folder
+    return build_split(combined(), tmp_path / "whole", LIBRARY, settings=request.param).folder
 
 
 @pytest.fixture
 def bundles(tmp_path):
-    return build(combined(), tmp_path / "whole", LIBRARY).folder
+    return build_split(combined(), tmp_path / "whole", LIBRARY).folder
 
 
 def summed(folder):
@@ -103,7 +103,7 @@ def test_a_robot_that_cannot_be_composed_is_told(tmp_path, derivation, why):
 
 
 def test_every_member_of_a_wrong_derivation_is_told(tmp_path):
-    wrong = replace(member(TRAIN[0]), body="0" * 32)
+    wrong = replace(member(TRAIN[0]), robot_hash="0" * 32)
     path = written(tmp_path, combined(train=[wrong, replace(wrong, name="again", task="reach")]))
     assert [where for where, _ in found(path)] == ["gantry-plane", "again"]
 
@@ -118,7 +118,7 @@ def test_a_built_split_is_verified_wherever_it_was_moved_to(whole, tmp_path):
 def test_processes_change_nothing(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["base=planar ee=plane"])
-    folder = build(made, tmp_path / "data", LIBRARY, settings=LIGHT).folder
+    folder = build_split(made, tmp_path / "data", LIBRARY, settings=LIGHT).folder
     (folder / "robots" / "cube-3" / "robot.urdf").unlink()
     assert [where for where, _ in found(folder)] == ["cube-3"]
     assert found(folder, jobs=2) == found(folder)
@@ -193,7 +193,7 @@ def test_a_card_of_another_machine_may_differ_in_the_last_digits(bundles):
 
 def test_meshes_of_a_real_arm_are_verified(tmp_path):
     made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
-    folder = build(made, tmp_path / "data", LIBRARY).folder
+    folder = build_split(made, tmp_path / "data", LIBRARY).folder
     assert found(folder) == []
     mesh = next((folder / "robots" / "ur5-plane" / "meshes").iterdir())
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"\x01")

@@ -12,7 +12,7 @@ import trimesh
 from helpers.commands import tree
 from helpers.parts import write_part
 from helpers.robots import arm
-from morphgen.fitting import parts as fitting_parts
+from morphgen.fitting import part_fits
 from morphgen.formats import bundle
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.grammar.library import default_library
@@ -40,8 +40,8 @@ def _nothing_is_stored(monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("a test was about to store the fits of the library's parts")
 
-    monkeypatch.setattr(fitting_parts, "parts_with_meshes", forbidden)
-    monkeypatch.setattr(fitting_parts, "store_parts", forbidden)
+    monkeypatch.setattr(part_fits, "parts_with_meshes", forbidden)
+    monkeypatch.setattr(part_fits, "store_parts", forbidden)
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import pytest
 
 from helpers.commands import start
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.contents import Settings
-from morphgen.benchmark.export import build
+from morphgen.benchmark.split_build import build_split
 from morphgen.benchmark.split_file import split_text
+from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.registry import TASKS
 
@@ -136,7 +136,9 @@ def test_one_robot_can_push_among_obstacles(run):
 
 
 def test_a_built_split_is_a_split(run, tmp_path):
-    folder = build(some(), tmp_path / "data", LIBRARY, settings=Settings(light=True)).folder
+    folder = build_split(
+        some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True)
+    ).folder
     assert run("goals", folder)[1].endswith("3 of 3 goal sets are there, seed 0\n")
 
 

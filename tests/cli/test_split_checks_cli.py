@@ -8,9 +8,9 @@ import pytest
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member, split
-from morphgen.benchmark.built import load_built
 from morphgen.benchmark.split import split_id
 from morphgen.benchmark.split_file import split_names, split_text
+from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.statistics import PAPER
 from morphgen.tasks import free_space, goal_sets
 from morphgen.tasks.split_goals import read_goals
@@ -80,7 +80,7 @@ def test_warnings_fail_if_asked_to(run, write):
 
 
 def test_many_findings_are_cut_short(run, write):
-    many = [replace(member(TRAIN[0], f"robot-{i}"), body=f"{i:032d}") for i in range(14)]
+    many = [replace(member(TRAIN[0], f"robot-{i}"), robot_hash=f"{i:032d}") for i in range(14)]
     _, out, _ = run("split", "audit", write(combined(train=[*TRAIN, *many])))
     lines = out.splitlines()
     i = lines.index("error body-changed (14)")
@@ -122,7 +122,7 @@ def test_a_build_says_where_it_is_and_verifies(run, write):
     code, out, _ = run("split", "build", path, "--light", "--json")
     assert json.loads(out) == {"folder": "data/mine/some", "made": 0, "kept": 4}
     assert tree(Path("data")) == first
-    assert len(load_built("data/mine/some").train) == 3
+    assert len(load_split_folder("data/mine/some").train) == 3
     for what in (path, "data/mine/some"):
         code, out, err = run("split", "verify", what)
         assert (code, err) == (0, "")

@@ -52,7 +52,7 @@ def test_show_prints_a_row_a_robot(run):
     assert "\ntest, 1: 1 composed\n" in out
     for member in (*split.train, *split.test):
         (row,) = [line for line in out.splitlines() if line.startswith(f"{member.name} ")]
-        assert row.split()[1:4] == ["reach", member.category, member.body[:8]]
+        assert row.split()[1:4] == ["reach", member.category, member.robot_hash[:8]]
     assert "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size..." in out
     full = run("split", "show", "composition/ee-arm/reach", "--full")[1]
     assert all(member.derivation in full for member in split.train)
@@ -148,7 +148,7 @@ def test_robots_that_are_trained_twice_are_told(run):
     )
     _, out, _ = run("split", "new", "interpolation", "--grammar", "two.grammar", "--train", 5)
     split = read_split("interpolation-two-reach-seed0.yaml")
-    repeated = 5 - len({member.body for member in split.train})
+    repeated = 5 - len({member.robot_hash for member in split.train})
     assert repeated > 2
     assert f"  {repeated} train robots have the body and task of an earlier one\n" in out
 

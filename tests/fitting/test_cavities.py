@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from morphgen.fitting.cavities import Cavities
-from morphgen.fitting.solid import ENCLOSED, solid_of
+from morphgen.fitting.solid import ENCLOSED, Cavities, solid_of
 from morphgen.model.geometry import Mesh, Shape
 
 POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (4000, 3))

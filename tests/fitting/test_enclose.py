@@ -9,8 +9,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
+from morphgen.fitting.canonical import KINDS, Kind
 from morphgen.fitting.enclose import enclose
-from morphgen.fitting.kinds import KINDS, Kind
 from morphgen.fitting.solid import solid_of
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part

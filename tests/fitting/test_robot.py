@@ -12,11 +12,16 @@ from morphgen.cli import main
 from morphgen.errors import FitError
 from morphgen.fitting import token_shapes as token_shapes_module
 from morphgen.fitting.agreement import agreement
-from morphgen.fitting.link import FitOptions, fit_shapes
-from morphgen.fitting.parts import COLLISION, TOKEN, parts_with_meshes, store_part
+from morphgen.fitting.link_fit import FitOptions, fit_shapes
+from morphgen.fitting.part_fits import (
+    COLLISION_OPTIONS,
+    TOKEN_OPTIONS,
+    parts_with_meshes,
+    store_part,
+)
 from morphgen.fitting.quality import quality, signed_distance
 from morphgen.fitting.replace_collision import as_primitives, stored_primitives, with_primitives
-from morphgen.fitting.robot import fit_links
+from morphgen.fitting.robot_fit import fit_links
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.fits import SUFFIX, read_stored, shapes_key, shapes_to_fit
@@ -270,10 +275,10 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("panda_hand", COLLISION),
-        pytest.param("ur5", TOKEN, marks=pytest.mark.slow),
-        pytest.param("ur5", COLLISION, marks=pytest.mark.slow),
-        pytest.param("xarm7", COLLISION, marks=pytest.mark.slow),
+        ("panda_hand", COLLISION_OPTIONS),
+        pytest.param("ur5", TOKEN_OPTIONS, marks=pytest.mark.slow),
+        pytest.param("ur5", COLLISION_OPTIONS, marks=pytest.mark.slow),
+        pytest.param("xarm7", COLLISION_OPTIONS, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_stored_reproduces(name, options):
@@ -283,6 +288,6 @@ def test_what_is_stored_reproduces(name, options):
     for row in fit_links(body, options).links:
         shapes = shapes_to_fit(body.link(row.link))
         fit = stored[shapes_key(shapes)]
-        kept = (fit.token,) if options == TOKEN else fit.collision
+        kept = (fit.token,) if options == TOKEN_OPTIONS else fit.collision
         assert quality(solid_of(shapes), kept).iou == pytest.approx(row.fit.quality.iou, abs=0.01)
         assert len(kept) == len(row.fit.primitives)

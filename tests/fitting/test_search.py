@@ -9,8 +9,8 @@ import torch
 import trimesh
 
 from morphgen.errors import FitError
-from morphgen.fitting.guess import FEWEST, around, by_growth, by_pieces
-from morphgen.fitting.kinds import KINDS
+from morphgen.fitting.canonical import KINDS
+from morphgen.fitting.initial_guess import FEWEST, around, by_growth, by_pieces
 from morphgen.fitting.quality import quality
 from morphgen.fitting.search import DIGITS, best_several, best_single, sampled
 from morphgen.fitting.soft_iou import covered, overlaps

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from morphgen.fitting.kinds import KINDS
+from morphgen.fitting.canonical import KINDS
 from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 
 BOX, CYLINDER, SPHERE = (KINDS.index(kind) for kind in ("box", "cylinder", "sphere"))

@@ -1,6 +1,7 @@
 """Small splits that tests write in code."""
 
-from morphgen.benchmark.split import COMPOSED, Member, Split, robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.split import COMPOSED, Member, Split
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library

@@ -7,7 +7,7 @@ import pytest
 
 import morphgen
 from helpers.splits import member, split
-from morphgen.benchmark.split import robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.robots import robot_of

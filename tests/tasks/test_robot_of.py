@@ -6,7 +6,7 @@ import pytest
 
 import morphgen
 from helpers.robots import arm
-from morphgen.benchmark.split import robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import CompositionError, FormatError, PartError
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.geometry import Mesh

@@ -14,9 +14,9 @@ import pytest
 from helpers.commands import tree
 from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.built import load_built
-from morphgen.benchmark.contents import Settings
-from morphgen.benchmark.export import build
+from morphgen.benchmark.split_build import build_split
+from morphgen.benchmark.split_folder import load_split_folder
+from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.tasks import env_specs, free_space, split_goals
@@ -161,7 +161,7 @@ def home(tmp_path):
 
 
 def built(folder, which):
-    return build(which, folder, LIBRARY, settings=Settings(light=True)).folder
+    return build_split(which, folder, LIBRARY, settings=BuildSettings(light=True)).folder
 
 
 def test_what_ships_is_read_back_as_it_was(home, cache):
@@ -257,9 +257,9 @@ def test_an_interruption_leaves_a_build_that_is_not_finished(home, cache, monkey
         with pytest.raises(KeyboardInterrupt):
             write_goals(home, found, RECIPE)
     with pytest.raises(BenchmarkError, match="is not finished"):
-        load_built(home)
+        load_split_folder(home)
     (home / ".goals.old").mkdir()
-    build(mixed(), home.parents[1], LIBRARY, settings=Settings(light=True))
+    build_split(mixed(), home.parents[1], LIBRARY, settings=BuildSettings(light=True))
     write_goals(home, found, RECIPE)
     assert verify(home, LIBRARY).differences == ()
     assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []

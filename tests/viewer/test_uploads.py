@@ -13,7 +13,7 @@ import trimesh
 
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
-from morphgen.benchmark.split import robot_hash
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library

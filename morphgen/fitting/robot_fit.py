@@ -11,7 +11,7 @@ import numpy as np
 
 from morphgen.errors import FitError
 from morphgen.fitting.congruence import moved, representatives
-from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
+from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.formats.fits import shapes_to_fit

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from morphgen.fitting.link import FitOptions, LinkFit, fit_shapes
+from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import quality
-from morphgen.fitting.robot import FitReport, fit_links
+from morphgen.fitting.robot_fit import FitReport, fit_links
 from morphgen.fitting.solid import solid_of
 from morphgen.formats.files import save
 from morphgen.formats.fits import (
@@ -28,8 +28,8 @@ from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Robot
 from morphgen.processes import mapped
 
-TOKEN = FitOptions(max_primitives=1)
-COLLISION = FitOptions(max_primitives=4, iou=0.9)
+TOKEN_OPTIONS = FitOptions(max_primitives=1)
+COLLISION_OPTIONS = FitOptions(max_primitives=4, iou=0.9)
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
@@ -71,7 +71,7 @@ def store_part(manifest: Manifest) -> Path:
     """
     body = load_part(manifest).fragment
     fits = {}
-    for row in fit_links(body, COLLISION).links:
+    for row in fit_links(body, COLLISION_OPTIONS).links:
         shapes = shapes_to_fit(body.link(row.link))
         fits[shapes_key(shapes)] = stored_of(row.link, shapes, row.fit).scaled(
             1 / shapes_scale(shapes)
@@ -113,7 +113,7 @@ def stored_of(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
         fit: The fit.
     """
     solid = solid_of(shapes)
-    single = fit.single or fit_shapes(shapes, TOKEN, solid=solid).primitives[0]
+    single = fit.single or fit_shapes(shapes, TOKEN_OPTIONS, solid=solid).primitives[0]
     token_iou = quality(solid, [single]).iou
     return StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)
 

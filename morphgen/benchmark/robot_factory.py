@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.similarity import Features, features
-from morphgen.benchmark.split import COMPOSED, Member, robot_hash
+from morphgen.benchmark.split import COMPOSED, Member
 from morphgen.benchmark.token_layout import MAX_LINKS, require_max_links
 from morphgen.checks import check
 from morphgen.errors import BenchmarkError
@@ -28,7 +29,7 @@ Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampledRecipe:
     """A robot drawn from a grammar: what ``morphgen sample`` draws as that number of that seed."""
 
     grammar: Grammar
@@ -38,7 +39,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Composed:
+class ComposedRecipe:
     """A robot given by words of ``morphgen compose``."""
 
     words: tuple[str, ...]
@@ -46,11 +47,11 @@ class Composed:
     """By default from its parts."""
 
 
-Recipe = Drawn | Composed
+Recipe = SampledRecipe | ComposedRecipe
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class Candidate:
     """A robot that was made."""
 
     name: str
@@ -63,7 +64,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Maker:
+class RobotFactory:
     """Makes robots."""
 
     folders: tuple[Path, ...]
@@ -78,7 +79,7 @@ class Maker:
         """Where parts are."""
         return Library(self.folders)
 
-    def __call__(self, recipe: Recipe) -> Body:
+    def __call__(self, recipe: Recipe) -> Candidate:
         """Make a robot.
 
         Raises:
@@ -87,7 +88,7 @@ class Maker:
             SamplingError: If none can be drawn.
             MorphgenError: If the recipe names what does not exist or does not fit.
         """
-        if isinstance(recipe, Drawn):
+        if isinstance(recipe, SampledRecipe):
             sample = sample_robot(
                 recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
             )
@@ -101,7 +102,7 @@ class Maker:
                 )
         return self._body(robot, derivation, category_of(recipe.words, self.library))
 
-    def _body(self, robot: Robot, derivation: Derivation, category: str) -> Body:
+    def _body(self, robot: Robot, derivation: Derivation, category: str) -> Candidate:
         # The text keeps 12 digits of a number; what it says is what counts.
         written = parse_derivation(str(derivation))
         if written != derivation:
@@ -111,16 +112,16 @@ class Maker:
         if self.comparable:
             shapes = token_shapes(robot, self.folders)
             found = features(robot, shapes, max_links=self.max_links)
-        return Body(robot.name, category, written, robot_hash(robot), found)
+        return Candidate(robot.name, category, written, robot_hash(robot), found)
 
 
-def make_all(
+def make_robots(
     recipes: Sequence[Recipe],
-    maker: Maker,
+    maker: RobotFactory,
     *,
     jobs: int = 1,
     progress: Progress = lambda done: None,
-) -> list[Body]:
+) -> list[Candidate]:
     """Make robots, in order.
 
     Args:
@@ -142,7 +143,7 @@ def category_of(words: Sequence[str], library: Library) -> str:
     return COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
 
 
-def numbered(prefix: str, number: int) -> str:
+def numbered_name(prefix: str, number: int) -> str:
     """The name of a drawn robot, such as ``arm3-000004``."""
     return f"{prefix}-{number:06d}"
 
@@ -157,7 +158,9 @@ def stream_seed(seed: int, prefix: str) -> int:
     return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
 
 
-def members(bodies: Iterable[Body], tasks: Sequence[str], obstacles: bool) -> tuple[Member, ...]:
+def members(
+    bodies: Iterable[Candidate], tasks: Sequence[str], obstacles: bool
+) -> tuple[Member, ...]:
     """Every robot at every task; with several tasks the name tells which."""
     return tuple(
         Member(

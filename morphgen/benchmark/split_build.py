@@ -11,41 +11,38 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from morphgen.benchmark.built import (
-    BUNDLES,
-    README,
-    ROBOTS,
-    SETTINGS,
-    SPLIT,
-    SUMS,
-    TOKENS,
-    load_built,
+from morphgen.benchmark.split import Member, Split, compose_member
+from morphgen.benchmark.split_file import split_text
+from morphgen.benchmark.split_folder import (
+    BUILD_FILE,
+    README_FILE,
+    ROBOTS_DIR,
+    ROBOTS_FILE,
+    SPLIT_FILE,
+    SUMS_FILE,
+    TOKENS_FILE,
 )
-from morphgen.benchmark.contents import (
+from morphgen.benchmark.split_folder_files import (
     BUNDLED,
-    Body,
-    Settings,
-    bodies,
-    body_of,
-    body_paths,
+    BuildSettings,
+    RobotData,
     readme_text,
     records_text,
+    robot_data,
+    robot_paths,
     settings_text,
     sums_text,
     tokens_npz,
+    unique_robots,
 )
-from morphgen.benchmark.robot_folder import differences, hashes, is_current, write_robot
-from morphgen.benchmark.split import Member, Split, member_robot
-from morphgen.benchmark.split_file import split_text
+from morphgen.benchmark.split_folder_robots import differences, hashes, is_current, write_robot
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, alone, partial_of, write_atomic
+from morphgen.formats.files import alone, partial_of, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.processes import Progress, mapped, unseen
-
-__all__ = ["LOCK", "BuildReport", "build", "home_of", "load_built"]
 
 
 @dataclass(frozen=True)
@@ -53,19 +50,19 @@ class BuildReport:
     """What a build did."""
 
     folder: Path
-    made: int
+    num_written: int
     """Bodies that were written."""
-    kept: int
+    num_kept: int
     """Bodies that were there."""
 
 
-def build(
+def build_split(
     split: Split,
     folder: Path,
     library: Library,
     *,
     jobs: int = 1,
-    settings: Settings = BUNDLED,
+    settings: BuildSettings = BUNDLED,
     progress: Progress = unseen,
 ) -> BuildReport:
     """Write a split with all its robots below ``folder``, in folders of the split's name.
@@ -86,22 +83,22 @@ def build(
             something else or cannot be written.
         MorphgenError: If a robot cannot be composed.
     """
-    home = home_of(split, folder)
-    firsts = bodies(split)
+    home = split_folder_path(split, folder)
+    firsts = unique_robots(split)
     with _writing(home):
         _prepare(home, split, settings)
         with alone(home):
-            (home / SUMS).unlink(missing_ok=True)
-            _sweep(home / BUNDLES)
+            (home / SUMS_FILE).unlink(missing_ok=True)
+            _sweep(home / ROBOTS_DIR)
             maker = _Maker(library.folders, home, settings, split.max_links)
             results = mapped(maker, firsts, jobs, progress)
-            made = {member.body: one for member, one in zip(firsts, results, strict=True)}
+            made = {member.robot_hash: one for member, one in zip(firsts, results, strict=True)}
             _finish(home, split, settings, made)
     written = sum(one.is_new for one in made.values())
     return BuildReport(home, written, len(made) - written)
 
 
-def home_of(split: Split, folder: Path) -> Path:
+def split_folder_path(split: Split, folder: Path) -> Path:
     """Where a split is built below a folder.
 
     Raises:
@@ -117,7 +114,7 @@ class _Made:
     """A robot that was written or kept."""
 
     is_new: bool
-    body: Body
+    body: RobotData
     hashes: dict[str, str]
 
 
@@ -127,7 +124,7 @@ class _Maker:
 
     folders: tuple[Path, ...]
     home: Path
-    settings: Settings
+    settings: BuildSettings
     max_links: int
 
     @cached_property
@@ -135,39 +132,39 @@ class _Maker:
         return Library(self.folders)
 
     def __call__(self, member: Member) -> _Made:
-        robot = member_robot(member, self.library)
+        robot = compose_member(member, self.library)
         require_max_links(len(robot.links), f"robot {member.name!r}", self.max_links)
-        folder = bundle_folder(self.home / BUNDLES, member.name)
+        folder = bundle_folder(self.home / ROBOTS_DIR, member.name)
         light, picture = self.settings.light, self.settings.picture
         is_kept = not differences(folder, robot, light=light) and is_current(
             folder, light=light, picture=picture
         )
         if not is_kept:
             write_robot(robot, folder, light=light, picture=picture)
-        return _Made(not is_kept, body_of(robot, self.folders, self.max_links), hashes(folder))
+        return _Made(not is_kept, robot_data(robot, self.folders, self.max_links), hashes(folder))
 
 
-def _prepare(home: Path, split: Split, settings: Settings) -> None:
+def _prepare(home: Path, split: Split, settings: BuildSettings) -> None:
     """Make the folder, or see that it holds the same split, built in the same way."""
-    wanted = {SETTINGS: settings_text(split, settings), SPLIT: split_text(split)}
-    if not (home / SETTINGS).is_file():
-        leftover = {partial_of(home / SETTINGS)}
+    wanted = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
+    if not (home / BUILD_FILE).is_file():
+        leftover = {partial_of(home / BUILD_FILE)}
         if home.exists() and not (home.is_dir() and leftover >= set(home.iterdir())):
             raise BenchmarkError(
-                f"{home} exists and is no built split (no {SETTINGS}); name another folder"
+                f"{home} exists and is no built split (no {BUILD_FILE}); name another folder"
             )
         home.mkdir(parents=True, exist_ok=True)
-        write_atomic(home / SETTINGS, wanted[SETTINGS])
-    found = read_json(home / SETTINGS)
+        write_atomic(home / BUILD_FILE, wanted[BUILD_FILE])
+    found = read_json(home / BUILD_FILE)
     if not isinstance(found, dict):
-        raise BenchmarkError(f"{home / SETTINGS}: expected an object, not {type(found).__name__}")
-    for key, value in json.loads(wanted[SETTINGS]).items():
+        raise BenchmarkError(f"{home / BUILD_FILE}: expected an object, not {type(found).__name__}")
+    for key, value in json.loads(wanted[BUILD_FILE]).items():
         if found.get(key) != value:
             raise BenchmarkError(
                 f"{home} holds another build: its {key} is {found.get(key)!r}, not {value!r}; "
                 "name another folder"
             )
-    write_atomic(home / SPLIT, wanted[SPLIT])
+    write_atomic(home / SPLIT_FILE, wanted[SPLIT_FILE])
 
 
 def _sweep(folder: Path) -> None:
@@ -176,18 +173,18 @@ def _sweep(folder: Path) -> None:
         shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _finish(home: Path, split: Split, settings: Settings, made: Mapping[str, _Made]) -> None:
+def _finish(home: Path, split: Split, settings: BuildSettings, made: Mapping[str, _Made]) -> None:
     """Write what is there once, the sums last."""
     known = {body: one.body for body, one in made.items()}
-    write_atomic(home / ROBOTS, records_text(split, known))
-    write_atomic(home / TOKENS, tokens_npz(split, known))
-    write_atomic(home / README, readme_text(split, settings))
-    single = (README, ROBOTS, SETTINGS, SPLIT, TOKENS)
+    write_atomic(home / ROBOTS_FILE, records_text(split, known))
+    write_atomic(home / TOKENS_FILE, tokens_npz(split, known))
+    write_atomic(home / README_FILE, readme_text(split, settings))
+    single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
     sums = {name: hashlib.sha256((home / name).read_bytes()).hexdigest() for name in single}
-    paths = body_paths(split)
+    paths = robot_paths(split)
     for body, one in made.items():
         sums |= {f"{paths[body]}/{name}": value for name, value in one.hashes.items()}
-    write_atomic(home / SUMS, sums_text(sums))
+    write_atomic(home / SUMS_FILE, sums_text(sums))
 
 
 @contextmanager

@@ -27,13 +27,13 @@ from morphgen.benchmark.token_layout import TOKEN_SIZE
 from morphgen.errors import BenchmarkError, FormatError
 from morphgen.formats.data_files import parse_json, read_text
 
-SPLIT = "split.yaml"
-ROBOTS = "robots.jsonl"
-TOKENS = "tokens.npz"
-BUNDLES = "robots"
-README = "README.md"
-SETTINGS = "build.json"
-SUMS = "SHA256SUMS"
+SPLIT_FILE = "split.yaml"
+ROBOTS_FILE = "robots.jsonl"
+TOKENS_FILE = "tokens.npz"
+ROBOTS_DIR = "robots"
+README_FILE = "README.md"
+BUILD_FILE = "build.json"
+SUMS_FILE = "SHA256SUMS"
 
 FORMAT = 1
 """Of the layout."""
@@ -71,7 +71,7 @@ class Robots(Sequence[Record]):
 
 
 @dataclass(frozen=True, eq=False)
-class Built:
+class SplitFolder:
     """A split that was built."""
 
     folder: Path
@@ -102,7 +102,7 @@ class Built:
         return len(self.robots)
 
 
-def load_built(folder: str | Path) -> Built:
+def load_split_folder(folder: str | Path) -> SplitFolder:
     """Read a folder that ``morphgen split build`` wrote; bundles are not looked at.
 
     Args:
@@ -112,17 +112,17 @@ def load_built(folder: str | Path) -> Built:
         BenchmarkError: If it is none, or not finished, or its parts do not go together.
     """
     folder = Path(folder)
-    require_built(folder)
-    records = read_records(folder / ROBOTS)
-    names, tokens, mask = read_tokens(folder / TOKENS)
+    require_split_folder(folder)
+    records = read_records(folder / ROBOTS_FILE)
+    names, tokens, mask = read_tokens(folder / TOKENS_FILE)
     if names != [record["name"] for record in records]:
-        raise BenchmarkError(f"{folder}: {TOKENS} is not of the robots in {ROBOTS}")
+        raise BenchmarkError(f"{folder}: {TOKENS_FILE} is not of the robots in {ROBOTS_FILE}")
     for record, table, present in zip(records, tokens, mask, strict=True):
         record["tokens"], record["mask"] = table, present
-    return Built(folder, Robots(records), tokens, mask)
+    return SplitFolder(folder, Robots(records), tokens, mask)
 
 
-def require_built(folder: Path) -> None:
+def require_split_folder(folder: Path) -> None:
     """Require a finished build.
 
     Raises:
@@ -130,12 +130,12 @@ def require_built(folder: Path) -> None:
     """
     if not folder.is_dir():
         raise BenchmarkError(f"{folder}: no such folder")
-    if not (folder / SETTINGS).is_file():
-        inside = sorted(path.parent for path in folder.glob(f"**/{SETTINGS}"))
+    if not (folder / BUILD_FILE).is_file():
+        inside = sorted(path.parent for path in folder.glob(f"**/{BUILD_FILE}"))
         hint = f"; did you mean {inside[0]}?" if inside else "; morphgen split build makes one"
-        raise BenchmarkError(f"{folder} is no built split: it has no {SETTINGS}{hint}")
-    if not (folder / SUMS).is_file():
-        raise BenchmarkError(f"{folder} is not finished: it has no {SUMS}; build it again")
+        raise BenchmarkError(f"{folder} is no built split: it has no {BUILD_FILE}{hint}")
+    if not (folder / SUMS_FILE).is_file():
+        raise BenchmarkError(f"{folder} is not finished: it has no {SUMS_FILE}; build it again")
 
 
 def read_records(path: Path) -> list[Record]:

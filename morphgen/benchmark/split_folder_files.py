@@ -11,8 +11,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.built import BUNDLES, FORMAT, ROBOTS, SETTINGS, SPLIT, SUMS, TOKENS, Record
 from morphgen.benchmark.split import Member, Side, Split, split_id
+from morphgen.benchmark.split_folder import (
+    BUILD_FILE,
+    FORMAT,
+    ROBOTS_DIR,
+    ROBOTS_FILE,
+    SPLIT_FILE,
+    SUMS_FILE,
+    TOKENS_FILE,
+    Record,
+)
 from morphgen.benchmark.survey import robot_stats
 from morphgen.benchmark.token_layout import LAYOUT, pad_tokens
 from morphgen.benchmark.tokens import tokens
@@ -40,11 +49,11 @@ test on. `{split}` says how they were chosen; its id is `{id}`.
   robots are those of `{split}`
 
 ```python
-from morphgen.benchmark.built import load_built
+from morphgen.benchmark.split_folder import load_split_folder
 
-built = load_built(".")
-for robot in built.train:
-    print(robot["name"], robot["tokens"].shape, built.folder / robot["path"] / "robot.urdf")
+split = load_split_folder(".")
+for robot in split.train:
+    print(robot["name"], robot["tokens"].shape, split.folder / robot["path"] / "robot.urdf")
 ```
 
 Without morphgen: `datasets.load_dataset("json", data_files="{robots}")` and
@@ -61,7 +70,7 @@ _LIGHT = (
 
 
 @dataclass(frozen=True)
-class Settings:
+class BuildSettings:
     """How robots are written."""
 
     light: bool = False
@@ -70,11 +79,11 @@ class Settings:
     """Bundles with ``preview.png``."""
 
 
-BUNDLED = Settings()
+BUNDLED = BuildSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class RobotData:
     """What is known of a body besides its folder."""
 
     facts: Mapping[str, object]
@@ -82,7 +91,7 @@ class Body:
     """Shape (n_links, 48)."""
 
 
-def body_of(robot: Robot, folders: Sequence[Path], max_links: int) -> Body:
+def robot_data(robot: Robot, folders: Sequence[Path], max_links: int) -> RobotData:
     """Measure a robot.
 
     Args:
@@ -94,10 +103,10 @@ def body_of(robot: Robot, folders: Sequence[Path], max_links: int) -> Body:
         BenchmarkError: If the robot has more links.
     """
     table = tokens(robot, token_shapes(robot, folders), max_links=max_links)
-    return Body(robot_stats(robot).as_dict(), table)
+    return RobotData(robot_stats(robot).as_dict(), table)
 
 
-def bodies(split: Split) -> list[Member]:
+def unique_robots(split: Split) -> list[Member]:
     """The first member of every body, train first; the body's folder has its name.
 
     Raises:
@@ -105,9 +114,9 @@ def bodies(split: Split) -> list[Member]:
     """
     firsts: dict[str, Member] = {}
     named: dict[str, str] = {}
-    for _, member in sided(split):
-        firsts.setdefault(member.body, member)
-        if named.setdefault(member.name, member.body) != member.body:
+    for _, member in sided_members(split):
+        firsts.setdefault(member.robot_hash, member)
+        if named.setdefault(member.name, member.robot_hash) != member.robot_hash:
             raise BenchmarkError(
                 f"split {split.name!r}: a train and a test robot of different bodies are both "
                 f"named {member.name!r}; rename one"
@@ -115,19 +124,19 @@ def bodies(split: Split) -> list[Member]:
     return list(firsts.values())
 
 
-def body_paths(split: Split) -> dict[str, str]:
+def robot_paths(split: Split) -> dict[str, str]:
     """The folder of every body below the split's, by the body's hash."""
-    return {member.body: f"{BUNDLES}/{member.name}" for member in bodies(split)}
+    return {member.robot_hash: f"{ROBOTS_DIR}/{member.name}" for member in unique_robots(split)}
 
 
-def records(split: Split, known: Mapping[str, Body]) -> list[Record]:
+def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
     """The lines of ``robots.jsonl``.
 
     Args:
         split: The split.
         known: Every body by its hash.
     """
-    paths = body_paths(split)
+    paths = robot_paths(split)
     return [
         {
             "name": member.name,
@@ -136,28 +145,28 @@ def records(split: Split, known: Mapping[str, Body]) -> list[Record]:
             "obstacles": member.obstacles,
             "category": member.category,
             "derivation": member.derivation,
-            "hash": member.body,
-            **known[member.body].facts,
-            "path": paths[member.body],
+            "hash": member.robot_hash,
+            **known[member.robot_hash].facts,
+            "path": paths[member.robot_hash],
         }
-        for side, member in sided(split)
+        for side, member in sided_members(split)
     ]
 
 
-def records_text(split: Split, known: Mapping[str, Body]) -> str:
+def records_text(split: Split, known: Mapping[str, RobotData]) -> str:
     """``robots.jsonl``."""
     lines = (json.dumps(record, ensure_ascii=False) for record in records(split, known))
     return "".join(f"{line}\n" for line in lines)
 
 
-def token_tables(split: Split, known: Mapping[str, Body]) -> tuple[Array, NDArray[np.bool_]]:
+def token_tables(split: Split, known: Mapping[str, RobotData]) -> tuple[Array, NDArray[np.bool_]]:
     """Tokens (n, max_links, 48) and mask (n, max_links) of all members."""
-    tables = [known[member.body].tokens for _, member in sided(split)]
+    tables = [known[member.robot_hash].tokens for _, member in sided_members(split)]
     both = [pad_tokens(table, split.max_links) for table in tables]
     return np.array([table for table, _ in both]), np.array([mask for _, mask in both])
 
 
-def tokens_npz(split: Split, known: Mapping[str, Body]) -> bytes:
+def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
     """``tokens.npz``."""
     tables, mask = token_tables(split, known)
     content = io.BytesIO()
@@ -165,14 +174,14 @@ def tokens_npz(split: Split, known: Mapping[str, Body]) -> bytes:
         content,
         tokens=tables,
         mask=mask,
-        names=np.array([member.name for _, member in sided(split)]),
+        names=np.array([member.name for _, member in sided_members(split)]),
         layout=np.array([field.name for field in LAYOUT]),
         columns=np.array([(field.start, field.columns.stop) for field in LAYOUT]),
     )
     return content.getvalue()
 
 
-def settings_text(split: Split, settings: Settings) -> str:
+def settings_text(split: Split, settings: BuildSettings) -> str:
     """``build.json``: a build is only continued with the same."""
     data = {
         "format": FORMAT,
@@ -183,7 +192,7 @@ def settings_text(split: Split, settings: Settings) -> str:
     return json.dumps(data, indent=2) + "\n"
 
 
-def readme_text(split: Split, settings: Settings) -> str:
+def readme_text(split: Split, settings: BuildSettings) -> str:
     """``README.md``."""
     return _README.format(
         name=split.name,
@@ -193,12 +202,12 @@ def readme_text(split: Split, settings: Settings) -> str:
         test=len(split.test),
         id=split_id(split),
         bundle=_LIGHT if settings.light else _BUNDLE,
-        split=SPLIT,
-        robots=ROBOTS,
-        tokens=TOKENS,
-        bundles=BUNDLES,
-        settings=SETTINGS,
-        sums=SUMS,
+        split=SPLIT_FILE,
+        robots=ROBOTS_FILE,
+        tokens=TOKENS_FILE,
+        bundles=ROBOTS_DIR,
+        settings=BUILD_FILE,
+        sums=SUMS_FILE,
     )
 
 
@@ -207,7 +216,7 @@ def sums_text(sums: Mapping[str, str]) -> str:
     return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
 
 
-def sided(split: Split) -> list[tuple[Side, Member]]:
+def sided_members(split: Split) -> list[tuple[Side, Member]]:
     """Every member with its side, in the order of all files."""
     train: list[tuple[Side, Member]] = [("train", member) for member in split.train]
     return [*train, *(("test", member) for member in split.test)]

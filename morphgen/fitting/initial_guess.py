@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
-from morphgen.fitting.kinds import KINDS
+from morphgen.fitting.canonical import KINDS
 from morphgen.fitting.soft_iou import Candidates, covered, overlaps
 from morphgen.typing import Array
 
