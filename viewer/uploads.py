@@ -18,7 +18,7 @@ from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import CARD, PICTURE, URDF
 from morphgen.formats.resolve import PackageFinder, resolve_uri
 from morphgen.formats.xml import parse_xml
-from morphgen.model.mesh import SUFFIXES
+from morphgen.model.geometry import MESH_SUFFIXES
 from morphgen.viewer.archives import ArchiveError, is_inside, unpacked
 from morphgen.viewer.messages import LARGEST_UPLOAD
 from morphgen.viewer.robot_uri import UPLOAD, FileAccess, shortened
@@ -112,7 +112,7 @@ def _is_mjcf(data: bytes) -> bool:
 
 
 def _is_mesh(file: PurePosixPath) -> bool:
-    return file.suffix.lower() in SUFFIXES
+    return file.suffix.lower() in MESH_SUFFIXES
 
 
 def _main_file(name: str, every: dict[str, bytes], files: dict[str, bytes]) -> str:

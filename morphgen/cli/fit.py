@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit, print the table, write."""
     from morphgen.errors import MorphgenError
     from morphgen.fitting.link_fit import FitOptions
-    from morphgen.model.mesh import SUFFIXES
+    from morphgen.model.geometry import MESH_SUFFIXES
 
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
     given = {"--visual": args.visual, "--no-picture": args.no_picture}
     if idle := [name for name, value in given.items() if value and not args.out]:
         raise MorphgenError(f"{' '.join(idle)}: only with --out")
-    if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in SUFFIXES:
+    if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
         return _mesh(args, options)
     return _robots(args, options)
 

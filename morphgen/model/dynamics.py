@@ -12,22 +12,23 @@ from morphgen.model.robot import Robot
 from morphgen.typing import Array
 
 BANDWIDTH = 30.0
-"""Natural frequency of the position control that the gains give, rad/s."""
+"""Natural frequency of the position control [rad/s]."""
 MIN_RELATIVE_INERTIA = 0.05
-"""Least inertia of a joint, relative to the robot's largest of its kind, turning or sliding.
+"""Smallest inertia of a joint, relative to the robot's largest among its revolute or its prismatic
+joints.
 
-Geared motors add their rotor's inertia, times the square of the gear ratio, to the joint; a wrist
-with the gains of its own few grams would give way to a touch. Descriptions hardly ever name it.
+Geared motors add the inertia of their rotor, times the square of the gear ratio, to the joint.
+Descriptions hardly ever name it. Without it, gains from the few grams of a wrist would let the
+wrist yield to the lightest contact.
 """
 MIN_ROTATIONAL_INERTIA = 0.02
-"""Least inertia of a joint that turns, kg m^2.
+"""Smallest inertia of a revolute joint [kg m^2], for robots that are light everywhere.
 
-For bodies that are light everywhere: what the motor of a small hobby arm adds would otherwise be
-left out, and the friction of a block of 0.1 kg turn the wrist that pushes it. MuJoCo Menagerie
-(SO-ARM100, UR10e) has 0.1 in every joint.
+It stands for the motor of a small hobby arm, without which the friction of a 0.1 kg block would
+turn the wrist that pushes it. MuJoCo Menagerie (SO-ARM100, UR10e) has 0.1 in every joint.
 """
 MIN_SLIDING_MASS = 1e-5
-"""Least inertia of a joint that slides, kg."""
+"""Smallest inertia of a prismatic joint [kg]."""
 
 
 @dataclass(frozen=True)
@@ -35,24 +36,25 @@ class Actuation:
     """Position control of one independent joint."""
 
     joint: str
+    """Name of the joint."""
     stiffness: float
-    """N m/rad or N/m."""
+    """Proportional gain [N m/rad or N/m]."""
     damping: float
-    """N m s/rad or N s/m."""
+    """Derivative gain [N m s/rad or N s/m]."""
     armature: float
-    """Inertia that the motor adds to the joint, kg m^2 or kg."""
+    """Inertia that the motor adds to the joint [kg m^2 or kg]."""
     effort: float | None
-    """Largest torque or force, N m or N; None where the source names none."""
+    """Effort limit [N m or N]; None if the source names none."""
     velocity: float | None
-    """Largest speed, rad/s or m/s; None where the source names none."""
+    """Velocity limit [rad/s or m/s]; None if the source names none."""
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
-    """Joint-space inertia at one configuration, by body Jacobians: sum of J^T I J.
+    """Return the joint-space inertia at one configuration, the sum of J^T I J over all links.
 
     Args:
-        robot: The body, its root held in the world.
-        q: Independent joint positions, shape (dof,), rad or m.
+        robot: The robot, its root fixed in the world.
+        q: Independent joint positions, shape (dof,) [rad or m].
 
     Returns:
         Symmetric matrix, shape (dof, dof); mimic joints are folded into their leaders.
@@ -74,30 +76,30 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
 
 
 def actuation(robot: Robot) -> tuple[Actuation, ...]:
-    """Gains of every independent joint from the body's inertia at home.
+    """Return the position-control gains of every independent joint, from the inertia at home.
 
-    Stiffness is omega^2 I and damping 2 omega I (critical), with omega = ``BANDWIDTH`` and I
-    the joint's diagonal entry of the joint-space inertia at home, with the motor's: see
-    ``MIN_RELATIVE_INERTIA`` and ``MIN_ROTATIONAL_INERTIA``.
+    A joint with inertia I is critically damped at the frequency omega = ``BANDWIDTH`` by the
+    stiffness omega^2 I and the damping 2 omega I. I is the joint's diagonal entry of the
+    joint-space inertia, raised by an armature to ``MIN_RELATIVE_INERTIA`` and
+    ``MIN_ROTATIONAL_INERTIA`` or ``MIN_SLIDING_MASS``.
     """
     inertia = np.diag(mass_matrix(robot, robot.home))
-    slides = np.array(
-        [robot.joints[k].kind == "prismatic" for k in robot.independent_joints], dtype=bool
-    )
+    joints = [robot.joints[k] for k in robot.independent_joints]
+    prismatic = np.array([joint.kind == "prismatic" for joint in joints], dtype=bool)
     least = np.zeros(robot.dof)
-    for kind, floor in ((slides, MIN_SLIDING_MASS), (~slides, MIN_ROTATIONAL_INERTIA)):
+    for kind, floor in ((prismatic, MIN_SLIDING_MASS), (~prismatic, MIN_ROTATIONAL_INERTIA)):
         least[kind] = max(MIN_RELATIVE_INERTIA * inertia[kind].max(initial=0.0), floor)
     total = np.maximum(inertia, least)
     return tuple(
         Actuation(
-            robot.joints[k].name,
+            joint.name,
             stiffness=BANDWIDTH**2 * value,
             damping=2 * BANDWIDTH * value,
             armature=added,
-            effort=robot.joints[k].effort,
-            velocity=robot.joints[k].velocity,
+            effort=joint.effort,
+            velocity=joint.velocity,
         )
-        for k, value, added in zip(
-            robot.independent_joints, total.tolist(), (total - inertia).tolist(), strict=True
+        for joint, value, added in zip(
+            joints, total.tolist(), (total - inertia).tolist(), strict=True
         )
     )

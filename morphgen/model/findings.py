@@ -1,4 +1,4 @@
-"""What is wrong with a robot: a code, where, why, and what to do."""
+"""``Finding``: a suspicious or wrong property of a robot, with its place, reason and remedy."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ Severity = Literal["error", "warning", "info"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing about a robot that a user should know."""
+    """A property of a robot that a user should know about."""
 
     code: str
-    """Stable, kebab-case, such as ``inertia-missing``."""
+    """Stable identifier in kebab case, such as ``inertia-missing``."""
     severity: Severity
+    """``error``, ``warning`` or ``info``; see ``morphgen.checks``."""
     where: str
     """The link, joint, frame or file concerned."""
     why: str
-    """What is the case, with the value."""
+    """Description of the fault, with the value."""
     fix: str
-    """What to do about it."""
+    """Advice to the user."""
     repair: str = ""
-    """What a repair has changed or would change; empty if there is none."""
+    """The change that a repair made or would make; empty if no repair exists."""
 
     @property
     def fixable(self) -> bool:
-        """Whether ``morphgen check --fix`` repairs it."""
+        """Whether ``morphgen check --fix`` repairs the fault."""
         return bool(self.repair)
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data for JSON."""
+        """Return the finding as plain data for JSON."""
         data = asdict(self)
         del data["repair"]
         return {**data, "fixable": self.fixable}

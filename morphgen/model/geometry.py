@@ -1,4 +1,4 @@
-"""Poses and shapes: what a link looks like and what it collides with."""
+"""Poses, primitives, meshes, and shapes: geometries at a pose on a link."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ from morphgen.typing import Array
 
 Rgba = tuple[float, float, float, float]
 
+MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
+"""Suffixes of the mesh files that can be read, in lower case."""
+
 
 @dataclass(frozen=True)
 class Pose:
     """A rigid transform. Named ``T_a_b``, it maps coordinates in frame b to frame a."""
 
     position: Vec3 = (0.0, 0.0, 0.0)
-    """Origin of b in a, metres."""
+    """Origin of frame b in frame a [m]."""
     quaternion: Quat = rotation.IDENTITY
-    """Rotation of b in a: (w, x, y, z), unit length, w >= 0."""
+    """Rotation of frame b in frame a: (w, x, y, z), unit length, w >= 0."""
 
     @classmethod
     def from_xyz_rpy(cls, xyz: Vec3 = (0, 0, 0), rpy: Vec3 = (0, 0, 0)) -> Pose:
-        """Pose of a URDF ``<origin xyz rpy>``."""
+        """Build from the position [m] and roll-pitch-yaw [rad] of a URDF ``<origin>``."""
         return cls((float(xyz[0]), float(xyz[1]), float(xyz[2])), rotation.from_rpy(rpy))
 
     @classmethod
     def from_matrix(cls, matrix: Array) -> Pose:
-        """Pose of a (4, 4) homogeneous matrix."""
+        """Build from a (4, 4) homogeneous matrix."""
         rows = matrix[:3, :3].tolist()
         x, y, z = matrix[:3, 3].tolist()
         return cls(
@@ -42,7 +45,7 @@ class Pose:
 
     @cached_property
     def matrix(self) -> Array:
-        """The (4, 4) homogeneous matrix; treat it as read-only."""
+        """The homogeneous matrix, shape (4, 4), read-only."""
         matrix = np.eye(4)
         matrix[:3, :3] = rotation.to_matrix(self.quaternion)
         matrix[:3, 3] = self.position
@@ -51,27 +54,27 @@ class Pose:
 
     @property
     def rpy(self) -> Vec3:
-        """URDF's roll, pitch, yaw, radians."""
+        """Roll, pitch and yaw as in URDF [rad]."""
         return rotation.to_rpy(self.quaternion)
 
     @property
     def is_identity(self) -> bool:
-        """Whether the pose moves nothing."""
+        """Whether the pose is exactly the identity."""
         return self.position == (0.0, 0.0, 0.0) and self.quaternion == rotation.IDENTITY
 
     def inverse(self) -> Pose:
-        """The transform from a to b."""
+        """Return ``T_b_a`` for ``T_a_b``."""
         inverse = rotation.conjugate(self.quaternion)
         x, y, z = rotation.rotate(inverse, self.position)
         return Pose((-x, -y, -z), rotation.normalize(inverse))
 
     def apply(self, point: Vec3) -> Vec3:
-        """Coordinates in a of a point given in b."""
+        """Transform a point from frame b to frame a."""
         x, y, z = rotation.rotate(self.quaternion, point)
         return (self.position[0] + x, self.position[1] + y, self.position[2] + z)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """Chain transforms: ``T_a_b @ T_b_c`` is ``T_a_c``."""
+        """Compose transforms: ``T_a_b @ T_b_c`` is ``T_a_c``."""
         return Pose(
             self.apply(other.position), rotation.multiply(self.quaternion, other.quaternion)
         )
@@ -85,7 +88,7 @@ class Box:
     """A box centred on its frame."""
 
     size: Vec3
-    """Full edge lengths, metres."""
+    """Edge lengths along x, y and z [m]."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ class Sphere:
     """A sphere centred on its frame."""
 
     radius: float
+    """Radius [m]."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,9 @@ class Cylinder:
     """A cylinder centred on its frame, along z."""
 
     radius: float
+    """Radius [m]."""
     length: float
+    """Length along z [m]."""
 
 
 @dataclass(frozen=True)
@@ -108,18 +114,20 @@ class Capsule:
     """A capsule centred on its frame, along z."""
 
     radius: float
+    """Radius [m]."""
     length: float
-    """Length of the cylindrical part, without the two caps."""
+    """Length of the cylindrical part, without the two caps [m]."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A reference to triangles in a file; ``morphgen.model.mesh.load_mesh`` reads them."""
+    """A reference to a mesh file, which ``morphgen.model.mesh.load_mesh`` reads."""
 
     path: Path
     scale: Vec3 = (1.0, 1.0, 1.0)
+    """Scale factors along x, y and z; negative ones mirror the mesh."""
     part: int | None = None
-    """One colour group of the file, or None for all of it."""
+    """Index of one colour group of the file (see ``mesh_parts``); None for the whole file."""
 
 
 Primitive = Box | Sphere | Cylinder | Capsule
@@ -128,16 +136,16 @@ Geometry = Primitive | Mesh
 
 @dataclass(frozen=True)
 class Shape:
-    """A geometry placed on a link."""
+    """A geometry at a pose on a link."""
 
     geometry: Geometry
     T_link_shape: Pose = IDENTITY
     rgba: Rgba | None = None
-    """Colour, each in [0, 1]; None where the source names none."""
+    """Colour, each channel in [0, 1]; None if the source names none."""
 
 
 def volume(primitive: Primitive) -> float:
-    """Volume of a primitive, cubic metres."""
+    """Return the volume of a primitive [m^3]."""
     match primitive:
         case Box(size):
             return size[0] * size[1] * size[2]
@@ -150,7 +158,7 @@ def volume(primitive: Primitive) -> float:
 
 
 def dimensions(primitive: Primitive) -> tuple[float, ...]:
-    """The numbers that define a primitive's size, metres."""
+    """Return the edge lengths, the radius, or the radius and the length of a primitive [m]."""
     match primitive:
         case Box(size):
             return size
@@ -162,29 +170,23 @@ def dimensions(primitive: Primitive) -> tuple[float, ...]:
 
 def scale_shape(shape: Shape, factor: float) -> Shape:
     """Return the shape scaled uniformly about the origin of its link's frame."""
-    return replace(
-        shape,
-        geometry=_geometry(shape.geometry, factor),
-        T_link_shape=scale_pose(shape.T_link_shape, factor),
-    )
-
-
-def _geometry(geometry: Geometry, factor: float) -> Geometry:
-    match geometry:
+    geometry: Geometry
+    match shape.geometry:
         case Box(size):
-            return Box(scale_vector(size, factor))
+            geometry = Box(scale_vector(size, factor))
         case Sphere(radius):
-            return Sphere(factor * radius)
+            geometry = Sphere(factor * radius)
         case Cylinder(radius, length):
-            return Cylinder(factor * radius, factor * length)
+            geometry = Cylinder(factor * radius, factor * length)
         case Capsule(radius, length):
-            return Capsule(factor * radius, factor * length)
-        case Mesh():
-            return replace(geometry, scale=scale_vector(geometry.scale, factor))
+            geometry = Capsule(factor * radius, factor * length)
+        case Mesh() as mesh:
+            geometry = replace(mesh, scale=scale_vector(mesh.scale, factor))
+    return replace(shape, geometry=geometry, T_link_shape=scale_pose(shape.T_link_shape, factor))
 
 
 def scale_pose(pose: Pose, factor: float) -> Pose:
-    """Return the pose with its position multiplied by a factor."""
+    """Return the pose with its position scaled and its rotation unchanged."""
     return pose if factor == 1.0 else Pose(scale_vector(pose.position, factor), pose.quaternion)
 
 
@@ -195,18 +197,21 @@ def scale_vector(vector: Vec3, factor: float) -> Vec3:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """The fit of a link's collision shapes, in the link frame."""
+    """Primitives fitted to a link's collision shapes; all shapes are in the link frame."""
 
     link: str
+    """Name of the link."""
     token: Shape
-    """The one primitive that overlaps most."""
+    """The single primitive with the largest overlap, for tokens."""
     collision: tuple[Shape, ...]
-    """A few, for physics."""
+    """A few primitives that approximate the shapes more closely, for physics."""
     token_iou: float
+    """Intersection over union of ``token`` with the shapes, in [0, 1]."""
     collision_iou: float
+    """Intersection over union of ``collision`` with the shapes, in [0, 1]."""
 
     def scaled(self, factor: float) -> StoredFit:
-        """The fit of the shapes, larger or smaller."""
+        """Return the fit of the shapes scaled by a factor."""
         return replace(
             self,
             token=scale_shape(self.token, factor),
@@ -215,4 +220,4 @@ class StoredFit:
 
 
 StoredFits = Mapping[str, StoredFit]
-"""Fits by ``morphgen.formats.fits.shapes_key``: a hash of the shapes that were fitted."""
+"""Fits by ``morphgen.formats.fits.shapes_key``, a hash of the fitted shapes."""

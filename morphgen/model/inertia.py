@@ -1,4 +1,4 @@
-"""Mass properties from geometry and density."""
+"""Mass properties, solid meshes and bounding boxes of shapes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-import manifold3d
 import numpy as np
-import trimesh
 
 from morphgen.errors import RobotError
 from morphgen.model.geometry import (
@@ -19,6 +18,7 @@ from morphgen.model.geometry import (
     Cylinder,
     Geometry,
     Mesh,
+    Primitive,
     Shape,
     Sphere,
     volume,
@@ -27,19 +27,31 @@ from morphgen.model.mesh import convex_hull, load_mesh
 from morphgen.model.robot import Inertial, Link
 from morphgen.typing import Array
 
-_SEGMENTS = 48
+if TYPE_CHECKING:
+    import manifold3d
+    import trimesh
+
+_CYLINDER_SECTIONS = 48
+"""Number of sides of a tessellated cylinder."""
+_CORNER_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+"""Signs of the eight corners of a box, shape (8, 3)."""
 
 
 @dataclass(frozen=True)
 class VolumeIntegrals:
-    """Volume integrals of a solid about the link's origin, in link axes."""
+    """Integrals over the volume of a solid, about the link's origin in link axes."""
 
     volume: float
-    """Integral of 1, m^3."""
+    """Integral of 1 [m^3]."""
     first: Array
-    """Integral of x, shape (3,), m^4."""
+    """Integral of x, shape (3,) [m^4]."""
     second: Array
-    """Integral of x x^T, shape (3, 3), m^5."""
+    """Integral of x x^T, shape (3, 3) [m^5]."""
+
+    @classmethod
+    def zero(cls) -> VolumeIntegrals:
+        """Return the integrals of an empty solid."""
+        return cls(0.0, np.zeros(3), np.zeros((3, 3)))
 
     def __add__(self, other: VolumeIntegrals) -> VolumeIntegrals:
         return VolumeIntegrals(
@@ -53,42 +65,42 @@ class VolumeIntegrals:
 
 
 def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
-    """Mass properties of solid shapes of one density, where they overlap counted once.
+    """Return the mass properties of solid shapes with uniform density, overlaps counted once.
 
-    Closed forms for primitives; a closed mesh counts as its volume, an open one as its convex
-    hull. The overlap of shapes is measured on their tessellations by exact booleans.
+    Primitives use closed forms. A closed mesh counts as its volume, an open one as its convex hull.
+    The overlap of shapes is measured on their tessellations by exact booleans.
 
     Args:
-        shapes: The solids, placed on their link.
-        density: kg/m^3.
+        shapes: The solids, at their poses on the link.
+        density: Density [kg/m^3].
 
     Returns:
-        Mass, centre of mass and inertia; zero mass for no shapes.
+        Mass, centre of mass and inertia; zero mass if there are no shapes.
 
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    moments = union_integrals(shapes)
-    if moments.volume <= 0:
+    integrals = union_integrals(shapes)
+    if integrals.volume <= 0:
         return Inertial(0.0)
-    com = moments.first / moments.volume
-    central = moments.second - moments.volume * np.outer(com, com)
+    com = integrals.first / integrals.volume
+    central = integrals.second - integrals.volume * np.outer(com, com)
     inertia = density * (np.trace(central) * np.eye(3) - central)
     x, y, z = com.tolist()
-    return Inertial.from_matrix(density * moments.volume, (x, y, z), inertia)
+    return Inertial.from_matrix(density * integrals.volume, (x, y, z), inertia)
 
 
 def with_inertia(link: Link, density: float) -> Link:
-    """The link with mass properties of its collision shapes (its visuals if it has none)."""
+    """Return the link with the mass properties of its collision shapes, or else its visuals."""
     shapes = link.collisions or link.visuals
     return replace(link, inertial=inertial_from_density(shapes, density)) if shapes else link
 
 
 def inertial_from_mass(link: Link, mass: float) -> Inertial:
-    """Mass properties of a link's shapes, scaled to a mass.
+    """Return the mass properties of a link's shapes with uniform density and a given mass [kg].
 
     Raises:
-        RobotError: If the link has no shapes to take the inertia from.
+        RobotError: If the link's shapes have no volume.
     """
     unit = inertial_from_density(link.collisions or link.visuals, 1.0)
     if unit.mass <= 0:
@@ -97,29 +109,36 @@ def inertial_from_mass(link: Link, mass: float) -> Inertial:
 
 
 def union_integrals(shapes: Sequence[Shape]) -> VolumeIntegrals:
-    """Volume integrals of the union of shapes about the link's origin; memoised."""
-    return _union_moments(_uncoloured(shapes), _stamps(shapes))
+    """Return the volume integrals of the union of shapes; cached until a mesh file changes."""
+    return _union_integrals(*_cache_key(shapes))
 
 
 @lru_cache(maxsize=4096)
-def _union_moments(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> VolumeIntegrals:
-    """The integrals while mesh files are as at their stamps."""
-    del stamps
-    total = VolumeIntegrals(0.0, np.zeros(3), np.zeros((3, 3)))
+def _union_integrals(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> VolumeIntegrals:
+    total = VolumeIntegrals.zero()
     for shape in shapes:
-        total += _moments(shape)
-    if not _may_overlap(shapes):
+        total += _integrals(shape)
+    boxes = [bounding_box([shape]) for shape in shapes]
+    if not any(
+        np.all(a[0] < b[1]) and np.all(b[0] < a[1]) for a, b in itertools.combinations(boxes, 2)
+    ):
         return total
+    import manifold3d  # here, because it is seldom needed and takes time to load
+
+    # Closed forms are exact, but booleans are not defined on them: subtract only the overlap,
+    # which is the difference between the separate tessellations and their union.
     solids = [_manifold(shape) for shape in shapes]
-    apart = VolumeIntegrals(0.0, np.zeros(3), np.zeros((3, 3)))
+    separate = VolumeIntegrals.zero()
     for solid in solids:
-        apart += _mesh_moments(_as_trimesh(solid))
+        separate += _mesh_integrals(_from_manifold(solid))
     union = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    return total - (apart - _mesh_moments(_as_trimesh(union)))
+    return total - (separate - _mesh_integrals(_from_manifold(union)))
 
 
 def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
-    """A closed triangle mesh of a geometry, in its own frame; open meshes become hulls."""
+    """Return a closed triangle mesh of a geometry, in its own frame; open meshes become hulls."""
+    import trimesh  # here, because commands that read no mesh should start quickly
+
     mesh: trimesh.Trimesh
     match geometry:
         case Box(size):
@@ -127,7 +146,9 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
         case Sphere(radius):
             mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
         case Cylinder(radius, length):
-            mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=_SEGMENTS)
+            mesh = trimesh.creation.cylinder(
+                radius=radius, height=length, sections=_CYLINDER_SECTIONS
+            )
         case Capsule(radius, length):
             mesh = trimesh.creation.capsule(radius=radius, height=length)
             mesh.apply_translation(-np.asarray(mesh.bounds).mean(axis=0))
@@ -138,75 +159,64 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
 
 
 def bounding_box(shapes: Sequence[Shape]) -> Array:
-    """Axis-aligned bounds of shapes in the link frame, shape (2, 3), metres; memoised."""
-    return _bounding_box(_uncoloured(shapes), _stamps(shapes))
+    """Return the axis-aligned bounds of shapes in the link frame, shape (2, 3) [m].
+
+    Cached until a mesh file changes; read-only.
+    """
+    return _bounding_box(*_cache_key(shapes))
 
 
 @lru_cache(maxsize=4096)
-def _bounding_box(shapes: tuple[Shape, ...], stamps: tuple[int, ...]) -> Array:
-    """The bounds while mesh files are as at their stamps."""
-    del stamps
+def _bounding_box(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> Array:
     corners = np.concatenate([_corners(shape) for shape in shapes])
-    bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
-    bounds.setflags(write=False)
-    return bounds
+    box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    box.setflags(write=False)
+    return box
 
 
-def _uncoloured(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
-    """Shapes without what does not matter to their volume."""
-    return tuple(
-        shape if shape.rgba is None else Shape(shape.geometry, shape.T_link_shape)
-        for shape in shapes
+def _cache_key(shapes: Sequence[Shape]) -> tuple[tuple[Shape, ...], tuple[int, ...]]:
+    """Return the shapes without their colours, and the modification times of their meshes."""
+    paths = [shape.geometry.path for shape in shapes if isinstance(shape.geometry, Mesh)]
+    return (
+        tuple(
+            shape if shape.rgba is None else Shape(shape.geometry, shape.T_link_shape)
+            for shape in shapes
+        ),
+        tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in paths),
     )
 
 
-def _stamps(shapes: Sequence[Shape]) -> tuple[int, ...]:
-    """When the mesh files of shapes were changed."""
-    paths = [shape.geometry.path for shape in shapes if isinstance(shape.geometry, Mesh)]
-    return tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in paths)
-
-
 def _corners(shape: Shape) -> Array:
+    """Return the corners of a primitive's bounding box, or a mesh's vertices, in the link frame."""
     match shape.geometry:
         case Box(size):
-            low = -np.array(size) / 2
+            corners = _CORNER_SIGNS * (np.array(size) / 2)
         case Sphere(radius):
-            low = np.full(3, -radius)
+            corners = _CORNER_SIGNS * radius
         case Cylinder(radius, length):
-            low = np.array([-radius, -radius, -length / 2])
+            corners = _CORNER_SIGNS * np.array([radius, radius, length / 2])
         case Capsule(radius, length):
-            low = np.array([-radius, -radius, -length / 2 - radius])
+            corners = _CORNER_SIGNS * np.array([radius, radius, length / 2 + radius])
         case Mesh():
             corners = np.asarray(load_mesh(shape.geometry).vertices)
-            T = shape.T_link_shape.matrix
-            return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
-    corners = np.array(list(itertools.product(*zip(low, -low, strict=True))))
     T = shape.T_link_shape.matrix
     return np.asarray(corners @ T[:3, :3].T + T[:3, 3])
 
 
-def _may_overlap(shapes: Sequence[Shape]) -> bool:
-    boxes = [bounding_box([shape]) for shape in shapes]
-    return any(
-        bool(np.all(a[0] < b[1]) and np.all(b[0] < a[1]))
-        for a, b in itertools.combinations(boxes, 2)
-    )
-
-
-def _moments(shape: Shape) -> VolumeIntegrals:
+def _integrals(shape: Shape) -> VolumeIntegrals:
     geometry, T = shape.geometry, shape.T_link_shape.matrix
     if isinstance(geometry, Mesh):
-        return _mesh_moments(_placed(shape))
+        return _mesh_integrals(_mesh_in_link(shape))
     v = volume(geometry)
     R, p = T[:3, :3], T[:3, 3]
-    local = np.diag(_central_second(geometry))
-    return VolumeIntegrals(v, v * p, R @ local @ R.T + v * np.outer(p, p))
+    central = np.diag(_central_second(geometry))
+    return VolumeIntegrals(v, v * p, R @ central @ R.T + v * np.outer(p, p))
 
 
-def _central_second(geometry: Box | Sphere | Cylinder | Capsule) -> tuple[float, float, float]:
-    """Integrals of x^2, y^2, z^2 over a primitive about its centre, m^5."""
-    v = volume(geometry)
-    match geometry:
+def _central_second(primitive: Primitive) -> tuple[float, float, float]:
+    """Return the integrals of x^2, y^2, z^2 over a primitive about its centre [m^5]."""
+    v = volume(primitive)
+    match primitive:
         case Box(size):
             return (v * size[0] ** 2 / 12, v * size[1] ** 2 / 12, v * size[2] ** 2 / 12)
         case Sphere(radius):
@@ -220,17 +230,17 @@ def _central_second(geometry: Box | Sphere | Cylinder | Capsule) -> tuple[float,
             return (side, side, along)
 
 
-def _mesh_moments(mesh: trimesh.Trimesh) -> VolumeIntegrals:
+def _mesh_integrals(mesh: trimesh.Trimesh) -> VolumeIntegrals:
     v = float(mesh.volume)
     if v <= 0:
-        return VolumeIntegrals(0.0, np.zeros(3), np.zeros((3, 3)))
+        return VolumeIntegrals.zero()
     com = np.asarray(mesh.center_mass)
     inertia = np.asarray(mesh.moment_inertia) / mesh.density
     central = np.trace(inertia) / 2 * np.eye(3) - inertia
     return VolumeIntegrals(v, v * com, central + v * np.outer(com, com))
 
 
-def _placed(shape: Shape) -> trimesh.Trimesh:
+def _mesh_in_link(shape: Shape) -> trimesh.Trimesh:
     mesh = solid_mesh(shape.geometry).copy()
     mesh.apply_transform(shape.T_link_shape.matrix)
     if mesh.volume < 0:
@@ -239,7 +249,10 @@ def _placed(shape: Shape) -> trimesh.Trimesh:
 
 
 def _manifold(shape: Shape) -> manifold3d.Manifold:
-    mesh = _placed(shape)
+    """Return a shape as a manifold; a mesh that is not one becomes its convex hull."""
+    import manifold3d
+
+    mesh = _mesh_in_link(shape)
     solid = _to_manifold(mesh)
     if solid.status() != manifold3d.Error.NoError or solid.is_empty():
         solid = _to_manifold(mesh.convex_hull)
@@ -247,6 +260,8 @@ def _manifold(shape: Shape) -> manifold3d.Manifold:
 
 
 def _to_manifold(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
+    import manifold3d
+
     return manifold3d.Manifold(
         manifold3d.Mesh64(
             vert_properties=np.asarray(mesh.vertices, dtype=np.float64),
@@ -255,7 +270,9 @@ def _to_manifold(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
     )
 
 
-def _as_trimesh(solid: manifold3d.Manifold) -> trimesh.Trimesh:
+def _from_manifold(solid: manifold3d.Manifold) -> trimesh.Trimesh:
+    import trimesh
+
     mesh = solid.to_mesh64()
     return trimesh.Trimesh(
         np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), process=False

@@ -14,14 +14,14 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 
 DAMPING = 0.02
-"""Damping of positions [joint units per metre]; of ``solve_pose_ik`` relative to the largest
+"""Damping of position tasks [m/rad or 1]; in ``solve_pose_ik`` it is relative to the largest
 singular value of the Jacobian."""
 MAX_STEP = 0.3
-"""Largest change of a joint in one iteration, rad or m."""
+"""Largest change of a joint position in one iteration [rad or m]."""
 POSE_ITERATIONS = 24
-"""Most iterations of ``solve_pose_ik``: a drag of the mouse waits for them."""
+"""Maximum number of iterations of ``solve_pose_ik``, which runs while the user drags a gizmo."""
 POSE_TOLERANCE = 1e-5
-"""Error at which ``solve_pose_ik`` stops, metres and radians times ``rotation_weight``."""
+"""Weighted pose error at which ``solve_pose_ik`` stops [m]."""
 
 
 def dls_step(J: Array, error: Array, damping: float) -> Array:
@@ -32,11 +32,11 @@ def dls_step(J: Array, error: Array, damping: float) -> Array:
 
     Args:
         J: Jacobians, shape (..., m, dof).
-        error: Wanted changes, shape (..., m).
-        damping: In units of a singular value of ``J``.
+        error: Task-space errors, shape (..., m).
+        damping: Damping, in units of the singular values of ``J``.
 
     Returns:
-        Changes of the joints, shape (..., dof).
+        Changes of the joint positions, shape (..., dof).
     """
     J_T = J.swapaxes(-1, -2)
     regularized = J @ J_T + damping**2 * np.eye(J.shape[-2])
@@ -56,14 +56,14 @@ def solve_position_ik(
 
     Args:
         robot: The robot, with a tool.
-        q: Configurations to start from, shape (n, dof), rad or m.
-        positions: Goals of the tools in the root frame, shape (n, 3), metres.
-        iterations: Number of steps.
+        q: Initial configurations, shape (n, dof) [rad or m].
+        positions: Goal positions of the tools in the root frame, shape (n, 3) [m].
+        iterations: Number of iterations.
         damping: See ``dls_step``.
-        max_step: Largest change of a joint in one step, rad or m.
+        max_step: Largest change of a joint position in one iteration [rad or m].
 
     Returns:
-        Configurations, shape (n, dof), and the remaining errors, shape (n, 3), metres.
+        Configurations, shape (n, dof), and the remaining position errors, shape (n, 3) [m].
 
     Raises:
         RobotError: If the robot has no tool.
@@ -85,22 +85,22 @@ def solve_pose_ik(
     rotation_weight: float = 0.2,
     frame: str = TOOL,
 ) -> Array:
-    """Bring a frame to a pose by damped least squares, or as near as the iterations lead.
+    """Move a frame to a pose, or as near as possible, by damped least squares.
 
-    Joints at a limit that a step would push beyond it are left out of the step.
+    Joints at a limit that a step would move beyond it are excluded from the step.
 
     Args:
         robot: The robot.
-        T_root_goal: Goal pose of the frame, shape (4, 4).
-        q: Configuration to start from, shape (dof,), rad or m.
-        rotation_weight: Metres that a radian counts for; 0 leaves the orientation free.
+        T_root_goal: Goal pose of the frame in the root frame, shape (4, 4).
+        q: Initial configuration, shape (dof,) [rad or m].
+        rotation_weight: Weight of the rotation error [m/rad]; 0 leaves the orientation free.
         frame: Name of the frame.
 
     Returns:
         The best configuration found, shape (dof,), within the joint limits.
 
     Raises:
-        RobotError: If there is no such frame.
+        RobotError: If the frame is unknown.
     """
     low, high = joint_limits(robot).T
     current = best = np.clip(np.asarray(q, dtype=np.float64), low, high)
@@ -108,19 +108,21 @@ def solve_pose_ik(
     weights = np.repeat([1.0, rotation_weight], 3)
     for _ in range(POSE_ITERATIONS):
         T_root_frame, J = frame_jacobian(robot, current, frame)
-        turn = Rotation.from_matrix(T_root_goal[:3, :3] @ T_root_frame[:3, :3].T).as_rotvec()
-        error = np.concatenate([T_root_goal[:3, 3] - T_root_frame[:3, 3], turn]) * weights
-        size = float(np.linalg.norm(error))
-        if size < least:
-            best, least = current, size
-        if size < POSE_TOLERANCE:
+        R_error = T_root_goal[:3, :3] @ T_root_frame[:3, :3].T
+        position_error = T_root_goal[:3, 3] - T_root_frame[:3, 3]
+        rotation_error = Rotation.from_matrix(R_error).as_rotvec()
+        error = np.concatenate([position_error, rotation_error]) * weights
+        norm = float(np.linalg.norm(error))
+        if norm < least:
+            best, least = current, norm
+        if norm < POSE_TOLERANCE:
             break
-        push = J.T @ error
-        blocked = ((current <= low) & (push < 0)) | ((current >= high) & (push > 0))
+        direction = J.T @ error
+        blocked = ((current <= low) & (direction < 0)) | ((current >= high) & (direction > 0))
         weighted = np.where(blocked, 0.0, J * weights[:, None])
         damping = DAMPING * max(float(np.linalg.norm(weighted, 2)), 1e-9)
         step = dls_step(weighted, error, damping)
-        # All joints in proportion, so that the frame keeps its direction.
-        share = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-9))
-        current = np.clip(current + step * share, low, high)
+        # Scale all joints equally, so that the frame keeps its direction of motion.
+        scale = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-9))
+        current = np.clip(current + step * scale, low, high)
     return best

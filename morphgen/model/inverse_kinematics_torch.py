@@ -16,19 +16,19 @@ ROTATION_DAMPING = 0.1
 """Damping of rotations [joint units per radian]."""
 
 _ROTATION_SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Shares of a rotation that are tried against a rotation budget."""
+"""Fractions of a rotation step that are compared with the rotation budget."""
 
 
 def dls_step(J: torch.Tensor, error: torch.Tensor, damping: float) -> torch.Tensor:
-    """Return J^T (J J^T + damping^2 I)^-1 error; see the NumPy version.
+    """Return the damped least-squares step; see ``inverse_kinematics.dls_step``.
 
     Args:
         J: Jacobians, shape (..., m, J).
-        error: Wanted changes, shape (..., m).
-        damping: In units of a singular value of ``J``.
+        error: Task-space errors, shape (..., m).
+        damping: Damping, in units of the singular values of ``J``.
 
     Returns:
-        Changes of the joints, shape (..., J).
+        Changes of the joint positions, shape (..., J).
     """
     scaled: torch.Tensor = torch.linalg.solve(_regularized(J, damping), error[..., None])
     return (J.transpose(-1, -2) @ scaled)[..., 0]
@@ -49,16 +49,16 @@ def solve_position_ik(
 
     Args:
         chain: Compiled robots.
-        robot_index: Which robot each row is, shape (n,), int64.
-        q: Configurations to start from, shape (n, J), rad or m.
-        positions: Goals of the tools in the root frames, shape (n, 3), metres.
-        limits: Lower and upper joint limits, each (n, J).
-        iterations: Number of steps.
+        robot_index: Compiled robot of each row, shape (n,), int64.
+        q: Initial configurations, shape (n, J) [rad or m].
+        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
+        limits: Lower and upper joint limits, each (n, J) [rad or m].
+        iterations: Number of iterations.
         damping: See ``dls_step``.
-        max_step: Largest change of a joint in one step, rad or m.
+        max_step: Largest change of a joint position in one iteration [rad or m].
 
     Returns:
-        Configurations, shape (n, J), and the remaining errors, shape (n, 3), metres.
+        Configurations, shape (n, J), and the remaining position errors, shape (n, 3) [m].
     """
     q = torch.clamp(q, *limits)
     for _ in range(iterations):
@@ -78,54 +78,57 @@ def pose_ik_step(
     *,
     rotation_budget: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Return configurations whose tools are nearer to poses, first in position, then in rotation.
+    """Move tools towards poses by one step of damped least squares, position before rotation.
 
-    One iteration of damped least squares in two levels of priority: the rotation is corrected only
-    by motion that leaves the position alone (Nakamura, Hanafusa and Yoshikawa, Task-priority based
-    redundancy control of robot manipulators, 1987). Joints that would leave their limits stand
-    still.
+    The rotation error is reduced only in the null space of the position task (Nakamura, Hanafusa
+    and Yoshikawa, Task-priority based redundancy control of robot manipulators, 1987). Joints that
+    would leave their limits do not move.
 
     Args:
         chain: Compiled robots.
-        robot_index: Which robot each row is, shape (n,), int64.
-        q: Joint positions, shape (n, J), rad or m.
-        positions: Goals of the tools in the root frames, shape (n, 3), metres.
+        robot_index: Compiled robot of each row, shape (n,), int64.
+        q: Joint positions, shape (n, J) [rad or m].
+        positions: Goal positions of the tools in the root frames, shape (n, 3) [m].
         rotations: Goal rotations of the tools in the root frames, shape (n, 3, 3).
-        limits: Lower and upper joint limits, each (n, J).
-        rotation_budget: Largest change of each joint, shape (n, J): the tool then rotates only by
-            a share of the way for which no joint exceeds it. By default it rotates all the way.
+        limits: Lower and upper joint limits, each (n, J) [rad or m].
+        rotation_budget: Largest change of each joint position, shape (n, J). The rotation step is
+            shortened until no joint exceeds it. Unlimited by default.
 
     Returns:
         Joint positions within the limits, shape (n, J).
     """
     T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
-    shift = (positions - T_root_tool[:, :3, 3])[..., None]
-    turn = rotvec_from_matrix(rotations @ T_root_tool[:, :3, :3].transpose(1, 2))[..., None]
+    position_error = (positions - T_root_tool[:, :3, 3])[..., None]
+    rotation_error = rotvec_from_matrix(rotations @ T_root_tool[:, :3, :3].transpose(1, 2))[
+        ..., None
+    ]
     lower, upper = limits
     eye = torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
-    target, moves = q, torch.ones_like(q, dtype=torch.bool)
-    for _ in range(2):
-        J = J_root_tool * moves[:, None]
+    target, free = q, torch.ones_like(q, dtype=torch.bool)
+    for _ in range(2):  # the second pass is without the joints that the first moved out of limits
+        J = J_root_tool * free[:, None]
         linear, angular = J[:, :3], J[:, 3:]
         inverse = _damped_inverse(linear, DAMPING)
-        step = inverse @ shift
+        step = inverse @ position_error
         null_space = eye - inverse @ linear
         inverse = _damped_inverse(angular @ null_space, ROTATION_DAMPING)
-        rotation_step = null_space @ (inverse @ (turn - angular @ step))
+        rotation_step = null_space @ (inverse @ (rotation_error - angular @ step))
         if rotation_budget is not None:
-            rotation_step = _within(rotation_budget, step, rotation_step)
+            rotation_step = _limit_rotation(rotation_budget, step, rotation_step)
         target = q + (step + rotation_step)[..., 0]
-        moves = moves & (target >= lower) & (target <= upper)
+        free = free & (target >= lower) & (target <= upper)
     return torch.clamp(target, lower, upper)
 
 
-def _within(budget: torch.Tensor, step: torch.Tensor, extra: torch.Tensor) -> torch.Tensor:
-    """Return the largest share of extra steps (n, J, 1) that the budget (n, J) leaves room for."""
-    largest = torch.zeros_like(extra)
+def _limit_rotation(
+    budget: torch.Tensor, step: torch.Tensor, rotation_step: torch.Tensor
+) -> torch.Tensor:
+    """Return the largest fraction of the rotation steps (n, J, 1) within the budget (n, J)."""
+    limited = torch.zeros_like(rotation_step)
     for share in _ROTATION_SHARES:
-        fits = ((step + share * extra)[..., 0].abs() <= budget).all(dim=1)
-        largest = torch.where(fits[:, None, None], share * extra, largest)
-    return largest
+        fits = ((step + share * rotation_step)[..., 0].abs() <= budget).all(dim=1)
+        limited = torch.where(fits[:, None, None], share * rotation_step, limited)
+    return limited
 
 
 def _damped_inverse(J: torch.Tensor, damping: float) -> torch.Tensor:

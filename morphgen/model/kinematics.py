@@ -1,6 +1,7 @@
 """Kinematics of one robot in NumPy: poses, joint axes, Jacobians and reach, in batches.
 
-``morphgen.model.kinematics_torch`` has the same for many robots in one batch of tensors.
+``morphgen.model.kinematics_torch`` has the same for many robots in one batch of tensors. Joint
+positions ``q`` have shape (..., dof) [rad or m]; poses are homogeneous matrices.
 """
 
 from __future__ import annotations
@@ -12,69 +13,76 @@ from numpy.typing import ArrayLike, NDArray
 
 from morphgen.model import rotation
 from morphgen.model.geometry import Pose
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 from morphgen.model.rotation import Quat, Vec3
 from morphgen.typing import Array
 
 
 def joint_limits(robot: Robot) -> Array:
-    """Lower and upper bound of every independent joint, shape (dof, 2), rad or m.
+    """Return the lower and upper limits of the independent joints, shape (dof, 2) [rad or m].
 
-    Joints without limits get one turn about zero (1 m for prismatic ones).
+    Joints without limits get (-pi, pi) and, if prismatic, (-1, 1).
     """
-    return np.array([robot.joints[k].effective_limits for k in robot.independent_joints]).reshape(
-        -1, 2
-    )
+    joints = [robot.joints[k] for k in robot.independent_joints]
+    return np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
 
 
 def random_configurations(robot: Robot, n: int, rng: np.random.Generator) -> Array:
-    """Configurations drawn uniformly between the bounds, shape (n, dof)."""
+    """Draw configurations uniformly within the joint limits, shape (n, dof)."""
     limits = joint_limits(robot)
     return rng.uniform(limits[:, 0], limits[:, 1], size=(n, robot.dof))
 
 
 def driving_joints(robot: Robot, joints: Collection[int]) -> tuple[int, ...]:
-    """Independent joints, 0 to dof - 1, that are among some of all joints, or that these follow."""
+    """Return the columns of ``q``, 0 to dof - 1, that move any of the given joints.
+
+    Args:
+        robot: The robot.
+        joints: Indices into ``robot.joints``; a mimic joint is moved by its leader.
+    """
     matrix, _ = robot.mimic_map
     rows = [i for i, k in enumerate(robot.movable_joints) if k in joints]
     return tuple(np.flatnonzero((matrix[rows] != 0).any(axis=0)).tolist())
 
 
 def periodic_joints(robot: Robot) -> NDArray[np.bool_]:
-    """Joints that are as they were after a whole turn, shape (dof,): no other joint follows one."""
-    followed = (robot.mimic_map[0] != 0).sum(axis=0) > 1
+    """Return which independent joints may turn by 2 pi without moving any link, shape (dof,).
+
+    These are the rotational joints without mimic joints that follow them.
+    """
+    has_followers = (robot.mimic_map[0] != 0).sum(axis=0) > 1
     kinds = np.array([robot.joints[k].kind for k in robot.independent_joints])
-    return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~followed)
+    return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~has_followers)
 
 
-def unwrap_joints(robot: Robot, start: ArrayLike, q: ArrayLike) -> Array:
-    """The same poses of all links, with joints turned as little as may be.
+def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
+    """Shift periodic joints by whole turns to their positions nearest to a reference.
 
     Args:
-        robot: The body.
-        start: From where, shape (dof,), rad or m.
+        robot: The robot.
+        q_reference: Reference configuration, shape (dof,).
         q: Configurations, shape (..., dof).
 
     Returns:
-        Of the shape of ``q``: joints that may turn more than once around are turned back by whole
-        turns to where they are nearest to the start within their bounds.
+        Configurations within the joint limits that give the same poses of all links, in the shape
+        of ``q``.
     """
-    start, q = np.asarray(start, dtype=np.float64), np.asarray(q, dtype=np.float64)
+    q_reference, q = np.asarray(q_reference, dtype=np.float64), np.asarray(q, dtype=np.float64)
     lower, upper = joint_limits(robot).T
-    turns = np.round((start - q) / (2 * np.pi)) * periodic_joints(robot)
-    least, most = ((bound - q) / (2 * np.pi) for bound in (lower, upper))
-    return np.asarray(q + 2 * np.pi * np.clip(turns, np.ceil(least), np.floor(most)))
+    turns = np.round((q_reference - q) / (2 * np.pi)) * periodic_joints(robot)
+    min_turns, max_turns = ((limit - q) / (2 * np.pi) for limit in (lower, upper))
+    return np.asarray(q + 2 * np.pi * np.clip(turns, np.ceil(min_turns), np.floor(max_turns)))
 
 
 def movable_positions(robot: Robot, q: ArrayLike) -> Array:
-    """Positions of all movable joints, mimic joints following their leaders.
+    """Return the positions of all movable joints, mimic joints following their leaders.
 
     Args:
-        robot: The body.
-        q: Independent joint positions, shape (..., dof), rad or m.
+        robot: The robot.
+        q: Independent joint positions, shape (..., dof).
 
     Returns:
-        Positions in the order of ``robot.movable_joints``, shape (..., n_movable).
+        Positions in the order of ``robot.movable_joints``, shape (..., n_movable) [rad or m].
 
     Raises:
         ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
@@ -87,11 +95,11 @@ def movable_positions(robot: Robot, q: ArrayLike) -> Array:
 
 
 def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
-    """Pose of every link in the root frame.
+    """Return the pose of every link in the root frame.
 
     Args:
-        robot: The body.
-        q: Independent joint positions, shape (..., dof), rad or m.
+        robot: The robot.
+        q: Independent joint positions, shape (..., dof).
 
     Returns:
         ``T_root_link``, shape (..., n_links, 4, 4).
@@ -112,11 +120,11 @@ def forward_kinematics(robot: Robot, q: ArrayLike) -> Array:
     return T_root_link
 
 
-def frame_pose(robot: Robot, q: ArrayLike, frame: str = "tool") -> Array:
-    """Pose of a named frame in the root frame, shape (..., 4, 4).
+def frame_pose(robot: Robot, q: ArrayLike, frame: str = TOOL) -> Array:
+    """Return ``T_root_frame``, the pose of a named frame in the root frame, shape (..., 4, 4).
 
     Raises:
-        RobotError: If the robot has no such frame.
+        RobotError: If the frame is unknown.
     """
     named = robot.frame(frame)
     T_root_link = forward_kinematics(robot, q)[..., robot.link_index[named.link], :, :]
@@ -124,14 +132,15 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = "tool") -> Array:
 
 
 def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
-    """Return an anchor and the axis of the joint that moves each link, in the root frame.
+    """Return a point and the direction of each link's joint axis, in the root frame.
 
     Args:
         robot: The robot.
         T_root_link: Poses of all links, shape (..., n_links, 4, 4).
 
     Returns:
-        Anchors [m] and unit axes, both (..., n_links, 3); zeros where no joint moves the link.
+        Points on the axes [m] and unit axes, both (..., n_links, 3); zeros for the root and for
+        links on fixed joints.
     """
     anchors, axes = np.zeros((2, *T_root_link.shape[:-2], 3))
     for k in robot.movable_joints:
@@ -140,7 +149,7 @@ def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
     return anchors, axes
 
 
-def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Array, Array]:
+def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array, Array]:
     """Return the pose and the geometric Jacobian of a named frame in the root frame.
 
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
@@ -148,7 +157,7 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Arr
 
     Args:
         robot: The robot.
-        q: Independent joint positions, shape (..., dof), rad or m.
+        q: Independent joint positions, shape (..., dof).
         frame: Name of the frame.
 
     Returns:
@@ -157,7 +166,7 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Arr
         leaders.
 
     Raises:
-        RobotError: If there is no such frame.
+        RobotError: If the frame is unknown.
     """
     named = robot.frame(frame)
     T_root_link = forward_kinematics(robot, q)
@@ -173,8 +182,8 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Arr
         if robot.joints[k].kind == "prismatic":
             jacobian[..., :3, :] += axis[..., None] * by_leader
             continue
-        arm = T_root_frame[..., :3, 3] - anchors[..., k + 1, :]
-        jacobian[..., :3, :] += np.cross(axis, arm)[..., None] * by_leader
+        lever = T_root_frame[..., :3, 3] - anchors[..., k + 1, :]
+        jacobian[..., :3, :] += np.cross(axis, lever)[..., None] * by_leader
         jacobian[..., 3:, :] += axis[..., None] * by_leader
     return np.asarray(T_root_frame), jacobian
 
@@ -182,15 +191,16 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = "tool") -> tuple[Arr
 def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
     """Return the spatial Jacobian of every link in the root frame.
 
-    Linear velocities are those of the point of a link that is at the root's origin.
+    Spatial: the linear velocity is that of the link's point that coincides with the root's origin
+    (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 2.2).
 
     Args:
         robot: The robot.
         T_root_link: Poses of all links, shape (..., n_links, 4, 4).
 
     Returns:
-        ``J_root_link``, shape (..., n_links, 6, n_movable): linear, then angular velocity by
-        movable joint, mimic joints as joints of their own.
+        ``J_root_link``, shape (..., n_links, 6, n_movable): linear, then angular velocity per unit
+        velocity of each movable joint; mimic joints have columns of their own.
     """
     anchors, axes = joint_axes(robot, T_root_link)
     jacobians = np.zeros((*T_root_link.shape[:-2], 6, len(robot.movable_joints)))
@@ -200,28 +210,28 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
         if joint.kind == "prismatic":
             jacobians[..., k + 1, :3, column[k]] = axes[..., k + 1, :]
         elif joint.is_movable:
-            turned = -np.cross(axes[..., k + 1, :], anchors[..., k + 1, :])
-            jacobians[..., k + 1, :3, column[k]] = turned
+            linear = -np.cross(axes[..., k + 1, :], anchors[..., k + 1, :])
+            jacobians[..., k + 1, :3, column[k]] = linear
             jacobians[..., k + 1, 3:, column[k]] = axes[..., k + 1, :]
     return jacobians
 
 
-def frame_positions(robot: Robot, q: Array, frame: str = "tool") -> Array:
+def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
     """Return positions of a named frame in the root frame, many times as fast as ``frame_pose``.
 
-    Points are carried from the frame to the root, joint by joint, each turned to its own z axis,
-    instead of multiplying poses.
+    Instead of multiplying poses, points are transformed from the frame to the root, joint by joint.
+    The axis of each joint is aligned with z first, so that a rotation changes x and y only.
 
     Args:
         robot: The robot.
-        q: Independent joint positions, a row per joint, shape (dof, n), rad or m.
+        q: Independent joint positions, a row per joint, shape (dof, n).
         frame: Name of the frame.
 
     Returns:
-        Positions, shape (3, n), metres.
+        Positions, shape (3, n) [m].
 
     Raises:
-        RobotError: If there is no such frame.
+        RobotError: If the frame is unknown.
     """
     gains, offsets = robot.mimic_map
     row = {k: i for i, k in enumerate(robot.movable_joints)}
@@ -234,8 +244,8 @@ def frame_positions(robot: Robot, q: Array, frame: str = "tool") -> Array:
             gain, position = gains[row[k]], offsets[row[k]]
             for column in gain.nonzero()[0]:
                 position = position + gain[column] * q[column]
-            T_joint_axis = Pose(quaternion=_turn_from_z(joint.unit_axis))
-            points = _carried(T_joint_axis.inverse() @ T_joint_point, points)
+            T_joint_axis = Pose(quaternion=_rotation_from_z(joint.unit_axis))
+            points = _transform(T_joint_axis.inverse() @ T_joint_point, points)
             if joint.kind == "prismatic":
                 points[2] += position
             else:
@@ -243,61 +253,62 @@ def frame_positions(robot: Robot, q: Array, frame: str = "tool") -> Array:
                 points[0], points[1] = c * x - s * y, s * x + c * y
             T_joint_point = T_joint_axis
         T_joint_point = joint.T_parent_joint @ T_joint_point
-    return _carried(T_joint_point, points)
+    return _transform(T_joint_point, points)
 
 
-def _carried(T: Pose, points: Array) -> Array:
-    # einsum: a threaded matrix product costs more than it saves here
+def _transform(T: Pose, points: Array) -> Array:
+    # einsum, because starting the threads of a matrix product costs more than it saves
     return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
 
 
-def _turn_from_z(axis: Vec3) -> Quat:
-    """Return a rotation that takes z to a unit axis."""
+def _rotation_from_z(axis: Vec3) -> Quat:
+    """Return a rotation that maps the z axis to a unit axis."""
     x, y, z = axis
-    if z < -0.5:  # near the opposite of z: half a turn about x first
-        return rotation.multiply((0.0, 1.0, 0.0, 0.0), _turn_from_z((x, -y, -z)))
+    if z < -0.5:  # near -z the formula below is singular: first turn by pi about x
+        return rotation.multiply((0.0, 1.0, 0.0, 0.0), _rotation_from_z((x, -y, -z)))
     return rotation.normalize((1 + z, -y, x, 0.0))
 
 
-def reach(robot: Robot, frame: str = "tool", samples: int = 256, rounds: int = 6) -> float:
-    """Largest distance between a frame and the root's origin, metres.
+def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) -> float:
+    """Return the largest distance between a frame and the root's origin [m].
 
-    Random configurations, the best of which climb by shrinking random steps; the seed is
-    fixed, so that the figure is a property of the body. Prismatic bases count.
+    Random search: the best of random configurations are improved by random steps of decreasing
+    size. The seed is fixed, so that the result is a property of the robot. The travel of a
+    prismatic base counts.
 
     Args:
-        robot: The body.
+        robot: The robot.
         frame: Name of the frame.
-        samples: Configurations drawn first.
-        rounds: Rounds of climbing.
+        samples: Number of initial configurations.
+        rounds: Rounds of improvement.
 
     Raises:
-        RobotError: If the robot has no such frame.
+        RobotError: If the frame is unknown.
     """
     rng = np.random.default_rng(0)
-    limits = joint_limits(robot)
+    lower, upper = joint_limits(robot).T
     q = random_configurations(robot, samples, rng)
     distance = _distance(robot, q, frame)
-    keep = np.argsort(-distance, kind="stable")[:8]
-    q, distance = q[keep], distance[keep]
-    width = limits[:, 1] - limits[:, 0]
+    best = np.argsort(-distance, kind="stable")[:8]
+    q, distance = q[best], distance[best]
+    rows = np.arange(len(q))
     for i in range(rounds):
-        step = 0.3 * 0.5**i * width
-        trial = q[:, None, :] + rng.uniform(-1, 1, (len(q), 16, robot.dof)) * step
-        trial = np.clip(trial, limits[:, 0], limits[:, 1])
-        found = _distance(robot, trial, frame)
-        best = found.argmax(axis=1)
-        rows = np.arange(len(q))
-        better = found[rows, best] > distance
-        q = np.where(better[:, None], trial[rows, best], q)
-        distance = np.where(better, found[rows, best], distance)
+        max_step = 0.3 * 0.5**i * (upper - lower)
+        candidates = q[:, None, :] + rng.uniform(-1, 1, (len(q), 16, robot.dof)) * max_step
+        candidates = np.clip(candidates, lower, upper)
+        distances = _distance(robot, candidates, frame)
+        best = distances.argmax(axis=1)
+        improved = distances[rows, best] > distance
+        q = np.where(improved[:, None], candidates[rows, best], q)
+        distance = np.where(improved, distances[rows, best], distance)
     return float(distance.max())
 
 
 def _distance(robot: Robot, q: Array, frame: str) -> Array:
-    """Return distances of a frame from the root's origin at (..., dof), shape (...,), metres.
+    """Return distances of a frame from the root's origin at q (..., dof), shape (...) [m].
 
-    Not by ``frame_positions``: the last bits of ``reach`` are in stored push sets.
+    ``frame_positions`` would be faster, but differs in the last bits, and these are stored in push
+    sets.
     """
     positions = movable_positions(robot, q)
     named = robot.frame(frame)
@@ -306,14 +317,14 @@ def _distance(robot: Robot, q: Array, frame: str) -> Array:
     for k in reversed(robot.joint_chain(named.link)):
         joint = robot.joints[k]
         if joint.is_movable:
-            point = _moved(point, joint.kind, joint.unit_axis, positions[..., column[k], None])
+            point = _move_point(point, joint.kind, joint.unit_axis, positions[..., column[k], None])
         T = joint.T_parent_joint.matrix
         point = point @ T[:3, :3].T + T[:3, 3]
     return np.asarray(np.sqrt((point * point).sum(axis=-1)))
 
 
-def _moved(point: Array, kind: str, axis: tuple[float, float, float], position: Array) -> Array:
-    """Points (..., 3) moved by a joint; a turn by Rodrigues' formula."""
+def _move_point(point: Array, kind: str, axis: Vec3, position: Array) -> Array:
+    """Move points (..., 3) by a joint; rotations use Rodrigues' formula."""
     a = np.array(axis)
     if kind == "prismatic":
         return np.asarray(point + position * a)
@@ -323,8 +334,8 @@ def _moved(point: Array, kind: str, axis: tuple[float, float, float], position: 
     return np.asarray(point * c + cross * s + (point @ a)[..., None] * (1 - c) * a)
 
 
-def _joint_motion(kind: str, axis: tuple[float, float, float], position: Array) -> Array:
-    """Transform of a joint moved to ``position`` (...,), shape (..., 4, 4)."""
+def _joint_motion(kind: str, axis: Vec3, position: Array) -> Array:
+    """Return the transform of a joint at positions (...), shape (..., 4, 4)."""
     T = np.zeros((*position.shape, 4, 4))
     if kind == "prismatic":
         T[..., :, :] = np.eye(4)

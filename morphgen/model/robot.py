@@ -1,23 +1,21 @@
-"""``Robot``, the one currency of morphgen: a kinematic tree with bodies and a home pose."""
+"""``Robot``: a kinematic tree of links, with named frames and a home configuration."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.errors import RobotError, nearest
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import IDENTITY, Pose, Shape
+from morphgen.model.geometry import IDENTITY, Pose, Shape, StoredFits
 from morphgen.model.rotation import Vec3
-
-if TYPE_CHECKING:
-    from morphgen.model.geometry import StoredFits
+from morphgen.typing import Array
 
 JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "continuous", "prismatic", "fixed")
@@ -27,9 +25,9 @@ TOOL = "tool"
 """Name of the frame at a robot's working point."""
 
 DEFAULT_EFFORT = 100.0
-"""What a joint without a largest effort is given where a file must name one, N m or N."""
+"""Effort limit of a joint that names none, where a file format requires one [N m or N]."""
 DEFAULT_VELOCITY = 1.0
-"""What a joint without a largest velocity is given where a file must name one, rad/s or m/s."""
+"""Velocity limit of a joint that names none, where a file format requires one [rad/s or m/s]."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +35,20 @@ class Inertial:
     """Mass properties of a link."""
 
     mass: float
-    """Kilograms."""
+    """Mass [kg]."""
     com: Vec3 = (0.0, 0.0, 0.0)
-    """Centre of mass in the link frame, metres."""
+    """Centre of mass in the link frame [m]."""
     inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    """(ixx, ixy, ixz, iyy, iyz, izz) about the centre of mass, in link axes, kg m^2."""
+    """(ixx, ixy, ixz, iyy, iyz, izz) about the centre of mass, in link axes [kg m^2]."""
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
-        """The (3, 3) inertia about the centre of mass, in link axes."""
+    def matrix(self) -> Array:
+        """The inertia about the centre of mass, in link axes, shape (3, 3) [kg m^2]."""
         xx, xy, xz, yy, yz, zz = self.inertia
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
     @classmethod
-    def from_matrix(cls, mass: float, com: Vec3, matrix: NDArray[np.float64]) -> Inertial:
+    def from_matrix(cls, mass: float, com: Vec3, matrix: Array) -> Inertial:
         """Build from a symmetric (3, 3) inertia about the centre of mass, in link axes."""
         m = matrix.tolist()
         return cls(mass, com, (m[0][0], m[0][1], m[0][2], m[1][1], m[1][2], m[2][2]))
@@ -58,7 +56,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid body."""
+    """A rigid body: its mass properties, visual shapes and collision shapes."""
 
     name: str
     inertial: Inertial | None = None
@@ -67,7 +65,7 @@ class Link:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the link is a bare frame: no mass, nothing to see, nothing to touch."""
+        """Whether the link is a bare frame, with neither mass nor shapes."""
         return (
             not self.visuals
             and not self.collisions
@@ -77,7 +75,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Mimic:
-    """The joint follows another: ``q = multiplier * q[joint] + offset``."""
+    """Couples a joint to another one: ``q = multiplier * q[joint] + offset``."""
 
     joint: str
     multiplier: float = 1.0
@@ -93,26 +91,29 @@ class Joint:
     parent: str
     child: str
     T_parent_joint: Pose = IDENTITY
+    """Pose of the joint frame in the parent link's frame, at position zero."""
     axis: Vec3 = (1.0, 0.0, 0.0)
     """Direction of motion in the joint frame."""
     limits: tuple[float, float] | None = None
-    """(lower, upper) in rad or m; None where there are none."""
+    """Lower and upper position limit [rad or m]; None if the source names none."""
     effort: float | None = None
-    """Largest torque or force, N m or N."""
+    """Effort limit [N m or N]; None if the source names none."""
     velocity: float | None = None
-    """Largest speed, rad/s or m/s."""
+    """Velocity limit [rad/s or m/s]; None if the source names none."""
     damping: float = 0.0
+    """Viscous damping [N m s/rad or N s/m]."""
     friction: float = 0.0
+    """Dry friction [N m or N]."""
     mimic: Mimic | None = None
 
     @property
     def is_movable(self) -> bool:
-        """Whether the joint moves at all."""
+        """Whether the joint is not fixed."""
         return self.kind != "fixed"
 
     @property
     def is_independent(self) -> bool:
-        """Whether the joint moves by itself: neither fixed nor a mimic."""
+        """Whether the joint is neither fixed nor a mimic joint."""
         return self.kind != "fixed" and self.mimic is None
 
     @cached_property
@@ -129,7 +130,7 @@ class Joint:
 
     @property
     def effective_limits(self) -> tuple[float, float]:
-        """Range to draw positions from: the limits, or one turn (1 m) about zero without."""
+        """Position limits [rad or m]; without any, (-pi, pi) and for prismatic joints (-1, 1)."""
         if self.limits is not None and self.kind != "continuous":
             return self.limits
         return (-1.0, 1.0) if self.kind == "prismatic" else (-math.pi, math.pi)
@@ -142,13 +143,31 @@ class Frame:
     name: str
     link: str
     T_link_frame: Pose = IDENTITY
+    """Pose of the frame in the link's frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A finished body, or a fragment of one.
+    """A kinematic tree of links and joints: a whole robot, or a part of one.
 
-    Links are in topological order, the root first; ``joints[k]`` attaches ``links[k + 1]``.
+    Lengths are in metres, angles in radians, masses in kilograms. Joint positions ``q`` have shape
+    (dof,) and contain the independent joints only, in the order of ``independent_joints``.
+
+    Attributes:
+        name: Name of the robot.
+        links: The links in topological order, root first, shape (n_links,).
+        joints: The joints; ``joints[k]`` attaches ``links[k + 1]`` to its parent, shape
+            (n_links - 1,).
+        frames: Named frames on links. The frame ``tool`` is the working point.
+        home: Home configuration, the position of every independent joint, shape (dof,)
+            [rad or m].
+        ignore_pairs: Pairs of links whose contact is not a self-collision; each pair and the
+            whole tuple are sorted.
+        provenance: Plain data about the robot's origin (derivation, parts, licences), which the
+            bundle's card contains.
+        source_findings: Suspicious, repaired or skipped content of the file that the robot was
+            read from.
+        fits: Known primitive fits of the links' collision shapes, by a hash of these shapes.
     """
 
     name: str
@@ -156,70 +175,74 @@ class Robot:
     joints: tuple[Joint, ...] = ()
     frames: tuple[Frame, ...] = ()
     home: tuple[float, ...] = ()
-    """Resting position of every independent joint, in the order of ``joints``, rad or m."""
     ignore_pairs: tuple[Pair, ...] = ()
-    """Sorted pairs of links whose contact is not self-collision."""
     provenance: Mapping[str, object] = field(default_factory=dict)
-    """Where the body comes from, ready for its card: derivation, parts, licences."""
     source_findings: tuple[Finding, ...] = ()
-    """What was suspicious, mended or left out when the robot's file was read."""
     fits: StoredFits = field(default_factory=dict)
-    """Primitives that are known of its links' collision shapes, by the content of these."""
 
     def __repr__(self) -> str:
-        """Return one line; the fields would fill pages."""
+        """Return one line, because the fields would fill pages."""
         return (
             f"Robot({self.name!r}: {len(self.links)} links, {self.dof} independent joints, "
             f"{self.mass:.4g} kg)"
         )
 
     def __post_init__(self) -> None:
+        """Validate names, tree order, mimic joints, home and frames.
+
+        Raises:
+            RobotError: If they contradict each other.
+        """
+        where = f"robot {self.name!r}"
         if not self.links:
-            raise RobotError(f"robot {self.name!r} has no links")
-        _require_unique("link", (link.name for link in self.links), self.name)
-        _require_unique("joint", (joint.name for joint in self.joints), self.name)
-        _require_unique("frame", (frame.name for frame in self.frames), self.name)
+            raise RobotError(f"{where} has no links")
+        self._require_unique("link", (link.name for link in self.links))
+        self._require_unique("joint", (joint.name for joint in self.joints))
+        self._require_unique("frame", (frame.name for frame in self.frames))
         if len(self.joints) != len(self.links) - 1:
             raise RobotError(
-                f"robot {self.name!r}: {len(self.links)} links need {len(self.links) - 1} joints, "
+                f"{where}: {len(self.links)} links need {len(self.links) - 1} joints, "
                 f"not {len(self.joints)}"
             )
         for k, joint in enumerate(self.joints):
             child = self.links[k + 1].name
             if joint.child != child or self.link_index.get(joint.parent, k + 1) > k:
                 raise RobotError(
-                    f"robot {self.name!r}: joint {joint.name!r} ({joint.parent} -> {joint.child}) "
+                    f"{where}: joint {joint.name!r} ({joint.parent} -> {joint.child}) "
                     f"is out of topological order at link {child!r}"
                 )
-        self._require_mimics()
+            self._validate_mimic(joint)
         if len(self.home) != self.dof:
-            raise RobotError(
-                f"robot {self.name!r}: home has {len(self.home)} values for {self.dof} joints"
-            )
+            raise RobotError(f"{where}: home has {len(self.home)} values for {self.dof} joints")
         for frame in self.frames:
             if frame.link not in self.link_index:
                 raise RobotError(
-                    f"robot {self.name!r}: frame {frame.name!r} is on no link {frame.link!r}"
+                    f"{where}: frame {frame.name!r} is on the unknown link {frame.link!r}"
                     + nearest(frame.link, self.link_index)
                 )
 
-    def _require_mimics(self) -> None:
-        for joint in self.joints:
-            chain = [joint.name]
-            while joint.mimic is not None:
-                leader = joint.mimic.joint
-                if leader not in self.joint_index:
-                    raise RobotError(
-                        f"robot {self.name!r}: joint {joint.name!r} mimics {leader!r}, no joint"
-                        + nearest(leader, self.joint_index)
-                    )
-                if leader in chain:
-                    raise RobotError(
-                        f"robot {self.name!r}: joints mimic each other: "
-                        + " -> ".join([*chain, leader])
-                    )
-                chain.append(leader)
-                joint = self.joints[self.joint_index[leader]]
+    def _require_unique(self, element: str, names: Iterable[str]) -> None:
+        repeated = next((name for name, count in Counter(names).items() if count > 1), None)
+        if repeated is not None:
+            raise RobotError(f"robot {self.name!r}: two {element}s are named {repeated!r}")
+
+    def _validate_mimic(self, joint: Joint) -> None:
+        """Follow a mimic joint's leaders to an independent or fixed joint."""
+        chain = [joint.name]
+        while joint.mimic is not None:
+            leader = joint.mimic.joint
+            if leader not in self.joint_index:
+                raise RobotError(
+                    f"robot {self.name!r}: joint {joint.name!r} mimics {leader!r}, an unknown joint"
+                    + nearest(leader, self.joint_index)
+                )
+            if leader in chain:
+                raise RobotError(
+                    f"robot {self.name!r}: joints mimic each other: "
+                    + " -> ".join([*chain, leader])
+                )
+            chain.append(leader)
+            joint = self.joints[self.joint_index[leader]]
 
     @cached_property
     def link_index(self) -> dict[str, int]:
@@ -233,25 +256,22 @@ class Robot:
 
     @cached_property
     def parents(self) -> tuple[int, ...]:
-        """Index of every link's parent; -1 for the root."""
+        """Index of every link's parent link; -1 for the root."""
         return (-1, *(self.link_index[joint.parent] for joint in self.joints))
 
     @cached_property
     def movable_joints(self) -> tuple[int, ...]:
-        """Indices of the joints that move, mimic joints among them."""
+        """Indices of the joints that are not fixed, mimic joints included."""
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_movable)
 
     @cached_property
     def independent_joints(self) -> tuple[int, ...]:
-        """Indices of the joints that move by themselves; ``q`` is in this order."""
+        """Indices of the joints that are neither fixed nor mimic joints, in the order of ``q``."""
         return tuple(k for k, joint in enumerate(self.joints) if joint.is_independent)
 
     @cached_property
-    def mimic_map(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The affine map from independent to movable positions, mimic chains followed.
-
-        Matrix (n_movable, dof) and offset (n_movable,).
-        """
+    def mimic_map(self) -> tuple[Array, Array]:
+        """Matrix M (n_movable, dof) and offset b (n_movable,): movable positions are M q + b."""
         column = {self.joints[k].name: i for i, k in enumerate(self.independent_joints)}
         matrix = np.zeros((len(self.movable_joints), self.dof))
         offset = np.zeros(len(self.movable_joints))
@@ -267,10 +287,10 @@ class Robot:
         return matrix, offset
 
     def joint_chain(self, link: str) -> tuple[int, ...]:
-        """Indices of the joints on the way from the root to a link.
+        """Return the indices of the joints between the root and a link, root first.
 
         Raises:
-            RobotError: If there is no such link.
+            RobotError: If the link is unknown.
         """
         path, i = [], self.link_index[self.link(link).name]
         while i > 0:
@@ -285,19 +305,19 @@ class Robot:
 
     @property
     def mass(self) -> float:
-        """Total mass, kg."""
+        """Total mass [kg]."""
         return math.fsum(link.inertial.mass for link in self.links if link.inertial is not None)
 
     @property
     def root(self) -> Link:
-        """The first link."""
+        """The link at the base of the tree."""
         return self.links[0]
 
     def link(self, name: str) -> Link:
-        """The link of that name.
+        """Return a link by name.
 
         Raises:
-            RobotError: If there is none.
+            RobotError: If the link is unknown.
         """
         if name not in self.link_index:
             raise RobotError(
@@ -306,10 +326,10 @@ class Robot:
         return self.links[self.link_index[name]]
 
     def frame(self, name: str) -> Frame:
-        """The frame of that name.
+        """Return a named frame.
 
         Raises:
-            RobotError: If there is none.
+            RobotError: If the frame is unknown.
         """
         for frame in self.frames:
             if frame.name == name:
@@ -320,19 +340,11 @@ class Robot:
         )
 
     def with_links(self, links: Iterable[Link]) -> Robot:
-        """A copy whose links of the same names are replaced."""
+        """Return a copy in which the given links replace those of the same names."""
         by_name = {link.name: link for link in links}
         return replace(self, links=tuple(by_name.get(link.name, link) for link in self.links))
 
 
 def sorted_pair(a: str, b: str) -> Pair:
-    """The pair in alphabetical order, as ``Robot.ignore_pairs`` keeps it."""
+    """Return the pair in alphabetical order, as in ``Robot.ignore_pairs``."""
     return (a, b) if a <= b else (b, a)
-
-
-def _require_unique(what: str, names: Iterable[str], robot: str) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise RobotError(f"robot {robot!r}: two {what}s are named {name!r}")
-        seen.add(name)

@@ -9,7 +9,7 @@ Quat = tuple[float, float, float, float]
 
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 _GIMBAL, _NEAR_GIMBAL = 1e-12, 1e-3
-"""Cosines of the pitch from which on yaw is zero, and roll and yaw depend on each other."""
+"""Cosines of the pitch below which yaw is set to zero, and roll is computed from the yaw."""
 
 
 def normalize(q: Quat) -> Quat:
@@ -21,7 +21,7 @@ def normalize(q: Quat) -> Quat:
     w, x, y, z = q
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not math.isfinite(norm) or norm < 1e-12:
-        raise ValueError(f"{q} is no rotation quaternion")
+        raise ValueError(f"invalid rotation quaternion: {q}")
     if abs(w) < 1e-15 * norm:
         w = 0.0
     lead = next(value for value in (w, x, y, z) if abs(value) > 1e-15 * norm)
@@ -45,7 +45,7 @@ def multiply(a: Quat, b: Quat) -> Quat:
 
 
 def conjugate(q: Quat) -> Quat:
-    """The inverse rotation."""
+    """Return the inverse rotation."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
@@ -62,7 +62,7 @@ def rotate(q: Quat, v: Vec3) -> Vec3:
 
 
 def to_matrix(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
-    """Rotation matrix of a unit quaternion, as rows."""
+    """Return the rotation matrix of a unit quaternion, as rows."""
     w, x, y, z = q
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -72,7 +72,10 @@ def to_matrix(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def from_matrix(rows: tuple[Vec3, Vec3, Vec3]) -> Quat:
-    """Quaternion of a rotation matrix (Shepperd's method: the largest pivot is used)."""
+    """Return the quaternion of a rotation matrix, given as rows.
+
+    Shepperd, Quaternion from rotation matrix, 1978: the largest of four pivots is used.
+    """
     (a, b, c), (d, e, f), (g, h, i) = rows
     trace = a + e + i
     pivots = (trace, a, e, i)
@@ -87,7 +90,7 @@ def from_matrix(rows: tuple[Vec3, Vec3, Vec3]) -> Quat:
 
 
 def from_rpy(rpy: Vec3) -> Quat:
-    """Quaternion of URDF's fixed-axis roll, pitch, yaw: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the quaternion of fixed-axis roll, pitch, yaw: Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, cp, cy = (math.cos(angle / 2) for angle in rpy)
     sr, sp, sy = (math.sin(angle / 2) for angle in rpy)
     return normalize(
@@ -101,13 +104,13 @@ def from_rpy(rpy: Vec3) -> Quat:
 
 
 def to_rpy(q: Quat) -> Vec3:
-    """Roll, pitch, yaw of a unit quaternion; at the gimbal lock yaw is zero."""
+    """Return roll, pitch and yaw of a unit quaternion [rad]; in gimbal lock yaw is zero."""
     (a, b, c), (d, e, f), (g, h, i) = to_matrix(q)
     cos_pitch = math.hypot(a, d)
     pitch = math.atan2(-g, cos_pitch)
     if cos_pitch > _NEAR_GIMBAL:
         return (math.atan2(h, i), pitch, math.atan2(d, a))
-    # The yaw is uncertain here, as are h and i; the roll is what is left when that yaw is undone.
+    # Near gimbal lock yaw, h and i are inaccurate: undo this yaw, then read the roll that is left.
     yaw = math.atan2(d, a) if cos_pitch > _GIMBAL else 0.0
     cy, sy = math.cos(yaw), math.sin(yaw)
     return (math.atan2(sy * c - cy * f, cy * e - sy * b), pitch, yaw)

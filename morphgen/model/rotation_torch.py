@@ -6,9 +6,9 @@ import torch
 
 
 def quaternion_from_matrix(R: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) as unit quaternions (w, x, y, z), w >= 0, (..., 4).
+    """Return unit quaternions (w, x, y, z), w >= 0, (..., 4) of rotation matrices (..., 3, 3).
 
-    By the method of Bar-Itzhack, New method for extracting the quaternion from a rotation matrix,
+    Bar-Itzhack, New method for extracting the quaternion from a rotation matrix,
     2000: the quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R.flatten(-2).unbind(-1)
@@ -24,7 +24,7 @@ def quaternion_from_matrix(R: torch.Tensor) -> torch.Tensor:
 
 
 def matrix_from_quaternion(quaternion: torch.Tensor) -> torch.Tensor:
-    """Return unit quaternions (w, x, y, z), shape (..., 4), as rotation matrices (..., 3, 3)."""
+    """Return rotation matrices (..., 3, 3) of unit quaternions (w, x, y, z), shape (..., 4)."""
     w, v = quaternion[..., :1, None], quaternion[..., 1:]
     cross = skew(v)
     eye = torch.eye(3, device=quaternion.device)
@@ -32,16 +32,16 @@ def matrix_from_quaternion(quaternion: torch.Tensor) -> torch.Tensor:
 
 
 def skew(v: torch.Tensor) -> torch.Tensor:
-    """Return the matrices K (..., 3, 3) with K u = v x u for vectors v (..., 3)."""
+    """Return the skew-symmetric matrices K (..., 3, 3) of vectors v (..., 3): K u = v x u."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*x.shape, 3, 3)
 
 
 def rotvec_from_matrix(R: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (n, 3, 3) as rotation vectors, angle times axis, (n, 3), rad.
+    """Return rotation vectors, angle times axis, (n, 3) [rad] of rotation matrices (n, 3, 3).
 
-    This is the logarithm of the unit quaternion, which is well-conditioned at 0 and at pi.
+    Computed as the logarithm of the unit quaternion, which is well-conditioned at 0 and at pi.
     """
     quaternion = quaternion_from_matrix(R)
     w, v = quaternion[:, :1], quaternion[:, 1:]

@@ -1,4 +1,4 @@
-"""Surgery on kinematic trees."""
+"""Edit kinematic trees: cut out subtrees, rename, scale, and group rigidly joined links."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass, replace
 
 from morphgen.errors import RobotError, nearest
 from morphgen.model.geometry import Pose, scale_pose, scale_shape, scale_vector
-from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
+from morphgen.model.robot import Inertial, Joint, Link, Robot, sorted_pair
 from morphgen.model.rotation import Vec3, rotate
 
 
 def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
-    """The part of a robot below a link.
+    """Cut out the part of a robot below a link.
 
     Args:
-        robot: The whole.
-        root: Link where the part begins.
-        without: Links that are left out with all below them.
+        robot: The robot.
+        root: The link that becomes the root of the part.
+        without: Links to leave out, each with all links below it.
 
     Returns:
-        The links below ``root`` and the joints, home, frames and ignore pairs among them.
+        ``root`` and the links below it, with the joints, home, frames and ignore pairs among them.
 
     Raises:
-        RobotError: If a link does not exist, or a kept joint mimics one that is not kept.
+        RobotError: If a link is unknown, or a joint of the part mimics one outside it.
     """
     for name in (root, *without):
         robot.link(name)
@@ -40,14 +40,12 @@ def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
                 f"robot {robot.name!r}: joint {joint.name!r} mimics {joint.mimic.joint!r}, "
                 f"which is not in the part below {root!r}" + nearest(joint.mimic.joint, names)
             )
-    rest = {
-        robot.joints[k].name: q for k, q in zip(robot.independent_joints, robot.home, strict=True)
-    }
+    home = dict(zip(robot.independent_joints, robot.home, strict=True))
     return replace(
         robot,
         links=tuple(robot.link(name) for name in (root, *(joint.child for joint in joints))),
         joints=tuple(joints),
-        home=tuple(rest[joint.name] for joint in joints if joint.is_independent),
+        home=tuple(home[robot.joint_index[j.name]] for j in joints if j.is_independent),
         frames=tuple(frame for frame in robot.frames if frame.link in kept),
         ignore_pairs=tuple((a, b) for a, b in robot.ignore_pairs if a in kept and b in kept),
     )
@@ -56,137 +54,135 @@ def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
 def rename(
     robot: Robot, links: Mapping[str, str] | None = None, joints: Mapping[str, str] | None = None
 ) -> Robot:
-    """A robot whose links and joints of the given names have new ones."""
+    """Return a robot whose links and joints have new names, given by their old ones."""
     link_names, joint_names = links or {}, joints or {}
 
-    def link(name: str) -> str:
+    def new_link(name: str) -> str:
         return link_names.get(name, name)
 
-    def joint(name: str) -> str:
+    def new_joint(name: str) -> str:
         return joint_names.get(name, name)
-
-    def mimic(old: Mimic | None) -> Mimic | None:
-        return None if old is None else replace(old, joint=joint(old.joint))
 
     return replace(
         robot,
-        links=tuple(replace(old, name=link(old.name)) for old in robot.links),
+        links=tuple(replace(link, name=new_link(link.name)) for link in robot.links),
         joints=tuple(
             replace(
-                old,
-                name=joint(old.name),
-                parent=link(old.parent),
-                child=link(old.child),
-                mimic=mimic(old.mimic),
+                joint,
+                name=new_joint(joint.name),
+                parent=new_link(joint.parent),
+                child=new_link(joint.child),
+                mimic=joint.mimic and replace(joint.mimic, joint=new_joint(joint.mimic.joint)),
             )
-            for old in robot.joints
+            for joint in robot.joints
         ),
-        frames=tuple(replace(old, link=link(old.link)) for old in robot.frames),
+        frames=tuple(replace(frame, link=new_link(frame.link)) for frame in robot.frames),
         ignore_pairs=tuple(
-            sorted((min(p), max(p)) for a, b in robot.ignore_pairs for p in [(link(a), link(b))])
+            sorted(sorted_pair(new_link(a), new_link(b)) for a, b in robot.ignore_pairs)
         ),
     )
-
-
-@dataclass(frozen=True)
-class RigidGroup:
-    """Links that move as one body."""
-
-    links: tuple[Link, ...]
-    """In topological order; a movable joint attaches the first, unless the group is the root's."""
-    is_root: bool
-    mass: float
-    """Mass of the group, kg; negative masses count as none."""
-    mass_beyond: float
-    """Mass of all groups that hang on it, kg."""
-
-
-def rigid_groups(robot: Robot) -> tuple[RigidGroup, ...]:
-    """Split a robot at its movable joints; the root's group comes first."""
-    first = list(range(len(robot.links)))
-    for k, joint in enumerate(robot.joints):
-        if not joint.is_movable:
-            first[k + 1] = first[robot.parents[k + 1]]
-    own = [_mass(link) for link in robot.links]
-    subtree = list(own)
-    for i in range(len(robot.links) - 1, 0, -1):
-        subtree[robot.parents[i]] += subtree[i]
-    groups = []
-    for start in sorted(set(first)):
-        members = [i for i, group in enumerate(first) if group == start]
-        mass = sum(own[i] for i in members)
-        groups.append(
-            RigidGroup(
-                tuple(robot.links[i] for i in members), start == 0, mass, subtree[start] - mass
-            )
-        )
-    return tuple(groups)
-
-
-def _mass(link: Link) -> float:
-    return link.inertial.mass if link.inertial is not None and link.inertial.mass > 0 else 0.0
 
 
 def scale_links(
     robot: Robot, factors: Mapping[str, float], faces: Mapping[str, Vec3] | None = None
 ) -> Robot:
-    """Scale links in all directions: shapes, the joints and frames on them, and their bodies.
+    """Scale links uniformly: their shapes, mass properties, and the joints and frames on them.
 
-    At equal density, mass goes with the factor's third power and inertia with its fifth.
+    At constant density, mass scales with the third power of the factor and inertia with the fifth.
 
-    A link is scaled about the origin of its frame. A link that meets its parent elsewhere, such as
-    at the foot of a tube below the joint's frame, would so leave its parent or sink into it. Its
-    *face*, the point where the two meet, prevents that: the joint moves so that the face of the
-    scaled link lies where the scaled parent has it. With a face on the joint's axis this only
-    slides the joint's frame along the axis, which changes no motion.
+    A link is scaled about the origin of its frame. A link that touches its parent elsewhere, such
+    as at the foot of a tube below the joint frame, would then separate from its parent or sink
+    into it. ``faces`` prevents that: the joint moves so that the contact point of the scaled link
+    coincides with that of the scaled parent. If the contact point is on the joint's axis, the joint
+    frame only slides along the axis, which does not change its motion.
 
     Args:
-        robot: The body.
-        factors: Factor by the name of the link; links not named keep their size.
-        faces: Where a link meets its parent before scaling, in the link's frame, metres, by the
-            name of the link; the origin for links not named.
+        robot: The robot.
+        factors: Scale factor by link name; other links keep their size.
+        faces: Contact point of a link with its parent before scaling, in the link's frame [m], by
+            link name; by default the origin.
 
     Raises:
-        RobotError: If a link does not exist.
+        RobotError: If a link is unknown.
     """
     faces = faces or {}
     for name in (*factors, *faces):
         robot.link(name)
+
+    def factor(link: str) -> float:
+        return factors.get(link, 1.0)
+
     return replace(
         robot,
-        links=tuple(_link(link, factors.get(link.name, 1.0)) for link in robot.links),
+        links=tuple(_scale_link(link, factor(link.name)) for link in robot.links),
         joints=tuple(
-            _joint(j, factors.get(j.parent, 1.0), factors.get(j.child, 1.0), faces.get(j.child))
-            for j in robot.joints
+            _scale_joint(joint, factor(joint.parent), factor(joint.child), faces.get(joint.child))
+            for joint in robot.joints
         ),
         frames=tuple(
-            replace(f, T_link_frame=scale_pose(f.T_link_frame, factors.get(f.link, 1.0)))
-            for f in robot.frames
+            replace(frame, T_link_frame=scale_pose(frame.T_link_frame, factor(frame.link)))
+            for frame in robot.frames
         ),
     )
 
 
-def _joint(joint: Joint, parent: float, child: float, face: Vec3 | None) -> Joint:
-    """The joint on a parent of that factor, with the child's face held to the parent's."""
+def _scale_joint(joint: Joint, parent: float, child: float, face: Vec3 | None) -> Joint:
+    """Scale a joint's pose by its parent's factor and keep the child's contact point in place."""
     pose = scale_pose(joint.T_parent_joint, parent)
-    if face is None or parent == child:
-        return replace(joint, T_parent_joint=pose)
-    x, y, z = scale_vector(rotate(pose.quaternion, face), parent - child)
-    position = (pose.position[0] + x, pose.position[1] + y, pose.position[2] + z)
-    return replace(joint, T_parent_joint=Pose(position, pose.quaternion))
+    if face is not None and parent != child:
+        x, y, z = scale_vector(rotate(pose.quaternion, face), parent - child)
+        position = (pose.position[0] + x, pose.position[1] + y, pose.position[2] + z)
+        pose = Pose(position, pose.quaternion)
+    return replace(joint, T_parent_joint=pose)
 
 
-def _link(link: Link, factor: float) -> Link:
+def _scale_link(link: Link, factor: float) -> Link:
     if factor == 1.0:
         return link
+    inertial = link.inertial
+    if inertial is not None:
+        xx, xy, xz, yy, yz, zz = (factor**5 * value for value in inertial.inertia)
+        com = scale_vector(inertial.com, factor)
+        inertial = Inertial(factor**3 * inertial.mass, com, (xx, xy, xz, yy, yz, zz))
     return replace(
         link,
-        inertial=link.inertial and _inertial(link.inertial, factor),
+        inertial=inertial,
         visuals=tuple(scale_shape(shape, factor) for shape in link.visuals),
         collisions=tuple(scale_shape(shape, factor) for shape in link.collisions),
     )
 
 
-def _inertial(body: Inertial, factor: float) -> Inertial:
-    xx, xy, xz, yy, yz, zz = (factor**5 * value for value in body.inertia)
-    return Inertial(factor**3 * body.mass, scale_vector(body.com, factor), (xx, xy, xz, yy, yz, zz))
+@dataclass(frozen=True)
+class RigidGroup:
+    """Links that fixed joints hold together, so that they move as one rigid body."""
+
+    links: tuple[Link, ...]
+    """The links in topological order; a movable joint attaches the first, except for the root."""
+    is_root: bool
+    """Whether the group contains the robot's root."""
+    mass: float
+    """Mass of the group [kg]; negative masses count as zero."""
+    mass_beyond: float
+    """Mass of all groups below this one in the tree [kg]."""
+
+
+def rigid_groups(robot: Robot) -> tuple[RigidGroup, ...]:
+    """Split a robot's links at its movable joints; the root's group comes first."""
+    first_link = list(range(len(robot.links)))
+    for k, joint in enumerate(robot.joints):
+        if not joint.is_movable:
+            first_link[k + 1] = first_link[robot.parents[k + 1]]
+    masses = [
+        link.inertial.mass if link.inertial is not None and link.inertial.mass > 0 else 0.0
+        for link in robot.links
+    ]
+    subtree_masses = list(masses)
+    for i in range(len(robot.links) - 1, 0, -1):
+        subtree_masses[robot.parents[i]] += subtree_masses[i]
+    groups = []
+    for first in sorted(set(first_link)):
+        members = [i for i, start in enumerate(first_link) if start == first]
+        mass = sum(masses[i] for i in members)
+        links = tuple(robot.links[i] for i in members)
+        groups.append(RigidGroup(links, first == 0, mass, subtree_masses[first] - mass))
+    return tuple(groups)

@@ -266,5 +266,7 @@ def test_what_mujoco_cannot_tell_at_all_is_an_error(monkeypatch):
         mujoco.get_mju_user_warning()("EPA: out of memory for faces on expanding polytope")
 
     monkeypatch.setattr("mujoco.mj_collision", give_up)
-    with pytest.raises(RobotError, match=r"'slides': MuJoCo cannot say .* \[0\.0, 0\.0\]: EPA"):
+    with pytest.raises(
+        RobotError, match=r"'slides': MuJoCo finds no penetration depth .* \[0\.0, 0\.0\]: EPA"
+    ):
         penetrations(slides(0.0, 0.08), [[0.0, 0.0]])

@@ -52,6 +52,6 @@ def test_matrix_gives_back_the_quaternion_with_positive_w(rpy):
     assert min(np.abs(np.subtract(back, q)).max(), np.abs(np.add(back, q)).max()) < 1e-7
 
 
-def test_zero_is_no_rotation():
-    with pytest.raises(ValueError, match="no rotation"):
+def test_a_zero_quaternion_is_refused():
+    with pytest.raises(ValueError, match="invalid rotation quaternion"):
         rotation.normalize((0.0, 0.0, 0.0, 0.0))
