@@ -248,9 +248,8 @@ def without_materials(path: Path) -> bytes:
 
 
 def _collada(data: bytes) -> etree._Element:
-    if b"<!DOCTYPE" in data.replace(
-        b"\0", b""
-    ):  # without a DOCTYPE, also in UTF-16, no entity can be defined
+    # Without a DOCTYPE, also in UTF-16, no entity can be defined.
+    if b"<!DOCTYPE" in data.replace(b"\0", b""):
         raise ValueError("has a DOCTYPE; a mesh needs none, remove it")
     # huge_tree, because coordinate arrays exceed libxml2's default limit on text.
     parser = etree.XMLParser(
