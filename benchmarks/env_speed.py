@@ -52,7 +52,7 @@ from morphgen.tasks.make import make_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
-from morphgen.tasks.speed import measure, random_actions
+from morphgen.tasks.speed import measure_speed, random_actions
 
 Rate = Callable[[float], float]
 """Measure environment steps per second over at least the given number of seconds."""
@@ -155,7 +155,7 @@ def _ours(
 ) -> float:
     batch = make_batch(task, [robot], envs, sim=sim, workers=workers, contacts=contacts)
     with closing(batch):
-        return measure(batch, seconds).steps_per_second
+        return measure_speed(batch, seconds).steps_per_second
 
 
 def _hasty(rate: Rate, seconds: float) -> float:

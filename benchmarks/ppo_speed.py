@@ -60,8 +60,8 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.heads import INITIAL_LOG_STD
 from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.ppo import Learner
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.config import BINS
 from morphgen.tasks.observation import Observation
 
 Update = Callable[[], tuple[float, float]]
@@ -106,10 +106,10 @@ def main() -> int:
 
 def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Iterator[Row]:  # noqa: ANN401
     """Return the rows of a simulator and a number of threads."""
+    from morphgen.tasks.env_specs import load_robot
     from morphgen.tasks.make import make_batch
-    from morphgen.tasks.robots import robot_of
 
-    body = robot_of(robot)
+    body = load_robot(robot)
     torch.set_num_threads(threads)
     with ExitStack() as stack:
 
@@ -220,12 +220,11 @@ def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
 def _spread(batch: TaskBatch) -> Any:  # noqa: ANN401 - a class of what may not be installed
     """Return the batch for stable-baselines3, with staggered episodes like a learner's."""
     from morphgen.tasks.sb3 import SB3Vector
-    from morphgen.tasks.spaces import arrays
-    from morphgen.tasks.vector import TaskVector
+    from morphgen.tasks.vector import TaskVector, numpy_observation
 
     class Spread(SB3Vector):
         def reset(self) -> dict[str, Any]:
-            return arrays(self.vector.batch.reset(spread=True))
+            return numpy_observation(self.vector.batch.reset(spread=True))
 
     return Spread(TaskVector(batch))
 

@@ -40,7 +40,7 @@ from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import member_spec
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.registry import SIMULATORS, TASKS
 
 Row = dict[str, float | str]
@@ -66,7 +66,7 @@ class Measuring:
         spec = member_spec(replace(member, obstacles=self.obstacles), self.library)
         row: Row = {"robot": member.name, "task": member.task}
         for sim in self.sims:
-            with closing(batch_of([spec], self.envs, sim=sim)) as batch:
+            with closing(batch_from_specs([spec], self.envs, sim=sim)) as batch:
                 acting = BASELINES[baselines_for(member.task)[0]].make(0)
                 good = run_episodes(batch, acting, self.episodes)
                 chance = run_episodes(batch, Random(0), self.episodes)
@@ -134,11 +134,11 @@ def _members() -> Iterator[Member]:
 def _drift(batch: TaskBatch) -> float:
     """Return the largest tool motion in an episode without actions [mm]."""
     batch.reset()
-    start = frame_positions(batch.bodies.chain, batch.body, batch.q)
+    start = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, batch.q)
     acting, farthest = Zero(), 0.0
-    for _ in range(int(batch.longest.min()) - 1):
+    for _ in range(int(batch.max_episode_steps.min()) - 1):
         batch.step(acting.act(batch))
-        now = frame_positions(batch.bodies.chain, batch.body, batch.q)
+        now = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, batch.q)
         farthest = max(farthest, float((now - start).norm(dim=1).max()))
     return 1000 * farthest
 

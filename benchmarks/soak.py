@@ -72,7 +72,7 @@ def _run(batch: TaskBatch, seconds: float) -> tuple[int, int, int, int, int]:
                 early = _memory()
             step = batch.step(actions[steps % len(actions)])
             lost += not _is_finite(step)
-            unstable += int(step.unstable.sum())
+            unstable += int(step.diverged.sum())
             steps += 1
             bar.update(int(elapsed) - bar.n)
     return steps, early, _memory(), lost, unstable

@@ -12,7 +12,7 @@ A package names its tasks in the entry point group ``morphgen.tasks`` instead.
 
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -20,11 +20,10 @@ import torch
 
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL
-from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.rows import padded_rows, row_norms
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Scene
 from morphgen.tasks.task import GOAL, Marker, StepResult, Task, TaskEnvs
 
 
@@ -34,8 +33,8 @@ class FollowConfig:
 
     task: ClassVar[str] = "follow"
 
-    steps: int = 200
-    """Control steps of an episode."""
+    max_episode_steps: int = 200
+    """Duration of an episode [control steps]."""
     num_goals: int = 20
     """Number of starts in a robot's goal set."""
     radius: float = 0.05
@@ -46,10 +45,6 @@ class FollowConfig:
     """Distance of tool and goal that counts as success, metres."""
     obstacles: int = 0
     obstacle_size: tuple[float, float] = (0.06, 0.15)
-
-    def with_num_goals(self, num_goals):
-        """Return the same constants with another number of starts."""
-        return replace(self, num_goals=num_goals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +95,7 @@ class FollowEnvs(TaskEnvs):
         """Move the goal on, and compare the tool with it."""
         self.time += CONTROL_PERIOD
         distance = row_norms(state.tool - self.goal[:, :3])
-        success = (distance < self.config.near) & ~state.unstable
+        success = (distance < self.config.near) & ~state.diverged
         terms = {"distance": -distance, "near": 0.1 * success.float()}
         return StepResult(success, torch.zeros_like(success), distance, success.float(), terms)
 

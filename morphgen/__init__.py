@@ -1,16 +1,15 @@
 """morphgen: procedural robot morphologies with embedded tasks.
 
 The public functions and the package ``tasks`` are loaded when first used, so that
-``import morphgen`` costs nothing; it tells Gymnasium of the environments ``morphgen/Reach-v0`` and
-``morphgen/Push-v0``.
+``import morphgen`` costs nothing. If Gymnasium has been imported before, the environments
+``morphgen/Reach-v0`` and ``morphgen/Push-v0`` are registered with it; see ``morphgen.tasks``.
 """
 
 from __future__ import annotations
 
+import sys as _sys
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
-
-from morphgen.tasks.registration import register as _register_environments
 
 if TYPE_CHECKING:
     from morphgen import tasks
@@ -49,4 +48,5 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_register_environments()
+if "gymnasium" in _sys.modules:
+    _import_module("morphgen.tasks")

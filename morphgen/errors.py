@@ -46,7 +46,7 @@ class SimulationError(MorphgenError):
     """A simulator that cannot hold a scene, became unstable or died."""
 
 
-class UnstableError(SimulationError):
+class DivergedError(SimulationError):
     """Environments whose numbers mean nothing any more, until they are reset; all others are well.
 
     Its text is the reason of the first.

@@ -25,7 +25,7 @@ from morphgen.rl.scores import Score
 from morphgen.rl.training import checkpoint_files
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, default_configs
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
@@ -321,7 +321,7 @@ def _batch(
     library: tuple[Path, ...],
 ) -> TaskBatch:
     """Build some of the environments of each robot; ``envs`` counts them per robot."""
-    return batch_of(
+    return batch_from_specs(
         specs,
         len(envs) * len(specs),
         first=envs.start * len(specs),
@@ -369,5 +369,5 @@ def eval_config_of(
         config.sim,
         seed,
         workers,
-        tuple(each.with_num_goals(type(each)().num_goals) for each in config.tasks),
+        tuple(replace(each, num_goals=type(each)().num_goals) for each in config.tasks),
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from morphgen.tasks.config import BINS
+from morphgen.tasks.actions import BINS
 
 MIN_LOG_STD, MAX_LOG_STD, INITIAL_LOG_STD = -4.0, 0.5, -0.7
 """Log of the Gaussian's standard deviation: its bounds, and its initial value. 0.5 is half of a

@@ -10,10 +10,10 @@ from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
-from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.renderer import Frame
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 STRIDE = 2
 """Control steps between two frames."""
@@ -68,8 +68,10 @@ def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
     require_policy(name, env.task)
     if _is_file(name):
         run, learner = read_checkpoint(Path(name))
-        if run.policy.kind != env.batch.kind:
-            raise TaskError(f"{name}: its actions are {run.policy.kind}, not {env.batch.kind}")
+        if run.policy.kind != env.batch.action_kind:
+            raise TaskError(
+                f"{name}: its actions are {run.policy.kind}, not {env.batch.action_kind}"
+            )
         policy = Policy(learner, "deterministic", seed)
         policy.require(env.batch.observe())
         return PolicyController(policy)
@@ -112,7 +114,7 @@ def play(
             if over or len(scores) % STRIDE == 0:
                 yield from _shown(env)
         score = TASKS[env.task].episode_score(sum(scores), scores[-1], len(scores))
-        facts = info["success"], info["distance"], score, len(scores), info["unstable"]
+        facts = info["success"], info["distance"], score, len(scores), info["diverged"]
         report(Episode(0, 0, *facts))
 
 

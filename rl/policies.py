@@ -12,7 +12,7 @@ from morphgen.rl.agents.encoder import Network
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.heads import Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
 from morphgen.rl.observation_layout import Layout, last_link
-from morphgen.tasks.config import BINS
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.observation import Observation
 
 

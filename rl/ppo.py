@@ -64,14 +64,16 @@ class Learner:
             TaskError: If the batch takes other actions, or rollouts cannot be split into
                 minibatches.
         """
-        if batch.kind != policy.kind:
-            raise TaskError(f"the policy's actions are {policy.kind}, the batch's {batch.kind}")
+        if batch.action_kind != policy.kind:
+            raise TaskError(
+                f"the policy's actions are {policy.kind}, the batch's {batch.action_kind}"
+            )
         self.batch, self.policy, self.config = batch, policy, config
         self.device = torch.device(device)
         self.update, self.num_updates = 0, config.num_updates(batch.num_envs)
         self._minibatch_size = config.minibatch_size(batch.num_envs)
-        self._env_robot_index = batch.body.to(self.device)
-        self._num_robots = int(batch.body.max()) + 1
+        self._env_robot_index = batch.env_robot_index.to(self.device)
+        self._num_robots = int(batch.env_robot_index.max()) + 1
         self._observation: Observation | None = None
         first = self._current_observation()
         self.layout, self._rows = layout_of(first), rows_needed(policy, first)
@@ -174,7 +176,7 @@ class Learner:
         buffer.final_observations = self._visible(
             {name: torch.cat([final[name] for final in final_observations]) for name in obs}
         )
-        metrics = buffer.metrics(self.batch.body, self._num_robots)
+        metrics = buffer.metrics(self.batch.env_robot_index, self._num_robots)
         metrics["terms"] = {
             name: float(torch.stack([terms[name] for terms in reward_terms]).mean())
             for name in reward_terms[0]

@@ -14,9 +14,8 @@ from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.tasks.env_specs import GoalConfig, env_spec, member_spec
-from morphgen.tasks.robots import robot_of
-from morphgen.tasks.split_goals import read_goals, shipped_set
+from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
+from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec, GoalSet
 
 
@@ -73,16 +72,16 @@ def robot_source(
     goal_seed: int = 0,
     library: tuple[Path, ...] = (),
 ) -> RobotSource:
-    """Return one robot, named in any way that ``morphgen.tasks.robots.robot_of`` reads.
+    """Return one robot, named in any way that ``morphgen.tasks.env_specs.load_robot`` reads.
 
     Raises:
-        MorphgenError: As ``robot_of``.
+        MorphgenError: As ``load_robot``.
     """
     return RobotSource(
         str(Path(robot).resolve()) if is_robot_file(robot) else robot,
         task=task,
         obstacles=obstacles,
-        robot_hash=robot_hash(robot_of(robot, library=library)),
+        robot_hash=robot_hash(load_robot(robot, library=library)),
         goal_seed=goal_seed,
         library=tuple(str(folder.resolve()) for folder in library),
     )
@@ -143,10 +142,13 @@ def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
         config: Constants of the tasks.
     """
     if source.task is not None:
-        return config.of(source.task).obstacles if source.obstacles else 0
+        return config.task_config(source.task).obstacles if source.obstacles else 0
     sides: tuple[Side, ...] = ("train", "test")
     both = (member for side in sides for member in members(other_side(source, side)))
-    return max((config.of(member.task).obstacles for member in both if member.obstacles), default=0)
+    return max(
+        (config.task_config(member.task).obstacles for member in both if member.obstacles),
+        default=0,
+    )
 
 
 def require_links(source: RobotSource, max_links: int) -> None:
@@ -182,7 +184,7 @@ def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
         return [_of_member(member, own, config) for member in members(source)]
     if source.task is None:
         raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
-    robot = robot_of(source.name, library=map(Path, source.library))
+    robot = load_robot(source.name, library=map(Path, source.library))
     if source.robot_hash not in ("", robot_hash(robot)):
         raise TaskError(f"{source.name}: the robot has changed since the run began")
     return [env_spec(robot, source.task, config, obstacles=source.obstacles)]
@@ -191,7 +193,7 @@ def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
 @lru_cache(maxsize=64)
 def _of_member(member: Member, source: RobotSource, config: GoalConfig) -> EnvSpec:
     sets = _shipped(source.goal_dir, source.side) if source.goal_dir else None
-    shipped = shipped_set(sets, member.name, source.goal_dir)
+    shipped = shipped_goal_set(sets, member.name, source.goal_dir)
     library = default_library(tuple(map(Path, source.library)))
     return member_spec(member, library, config, shipped=shipped)
 

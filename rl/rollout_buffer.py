@@ -7,7 +7,7 @@ import torch
 from morphgen.rl.metrics import Metrics
 from morphgen.tasks.observation import Observation
 
-STEP_KEYS = ("reward", "score", "success", "terminated", "truncated", "unstable")
+STEP_KEYS = ("reward", "score", "success", "terminated", "truncated", "diverged")
 """Fields of a control step's result that a rollout keeps, besides observations and actions."""
 
 
@@ -41,7 +41,7 @@ class RolloutBuffer:
         self.success = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
-        self.unstable = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
+        self.diverged = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.last_observation: Observation = {}
         """The observation after the rollout, tensors (n, ...)."""
         self.final_observations: Observation = {}
@@ -65,5 +65,5 @@ class RolloutBuffer:
             "scores": tuple((scores / count).tolist()),
             "success": float(self.success[ended].float().mean()),
             "episodes": int(ended.sum()),
-            "unstable": int(self.unstable.sum()),
+            "unstable": int(self.diverged.sum()),
         }

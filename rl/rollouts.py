@@ -9,8 +9,8 @@ from typing import Protocol
 import torch
 
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.registry import TASKS
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 
 class Controller(Protocol):
@@ -68,7 +68,7 @@ def run_episodes(
     batch.reset()
     n = batch.num_envs
     episodes: list[list[Episode]] = [[] for _ in range(n)]
-    robot_indices = batch.body.tolist()
+    robot_indices = batch.env_robot_index.tolist()
     total = torch.zeros(n, device=batch.device)
     steps = torch.zeros(n, dtype=torch.int64, device=batch.device)
     done = 0
@@ -90,10 +90,10 @@ def run_episodes(
                         float(step.distance[env]),
                         TASKS[batch.specs[robot_indices[env]].task].episode_score(*numbers),
                         int(steps[env]),
-                        bool(step.unstable[env]),
+                        bool(step.diverged[env]),
                     )
                 )
                 done += 1
         total[ended], steps[ended] = 0, 0
-        progress(done + float((steps / batch.longest)[left > 0].sum()))
+        progress(done + float((steps / batch.max_episode_steps)[left > 0].sum()))
     return [episode for own in episodes for episode in own]

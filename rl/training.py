@@ -29,7 +29,7 @@ from morphgen.rl.runs import (
     write_checkpoint,
 )
 from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.make import batch_from_specs
 
 MIN_CHECKPOINT_STEPS, MAX_CHECKPOINT_STEPS = 1500, 3000
 """Control steps per environment between checkpoints: five and ten episodes of the tasks.
@@ -231,7 +231,7 @@ def _learner(part: Subrun, execution: ExecutionConfig) -> Iterator[Learner]:
     """Build the learner of a part, and resume its checkpoint if there is one."""
     config, interface = part.config, part.config.interface
     specs = specs_of(config.source, GoalConfig(tasks=config.tasks))
-    batch = batch_of(
+    batch = batch_from_specs(
         specs,
         config.num_envs,
         sim=config.sim,

@@ -9,71 +9,82 @@ from typing import Any
 import numpy as np
 import torch
 
-from morphgen.errors import TaskError, UnstableError
+from morphgen.errors import DivergedError, TaskError
 from morphgen.model.kinematics_torch import FramePositions
-from morphgen.tasks.actions import ActionKind, Targets, shares_of
-from morphgen.tasks.bodies import Bodies
-from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
 from morphgen.tasks.observation import (
     LinkTokens,
     Observation,
     ObservationConfig,
+    PointClouds,
+    joint_to_link,
     obstacle_tokens,
-    of_links,
 )
-from morphgen.tasks.points import PointClouds
+from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
-from morphgen.tasks.sim.base import Simulation
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
 from morphgen.tasks.task import EnvSpec, TaskState
-from morphgen.tasks.task_groups import StepRows, TaskGroups
+from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What an action led to; where an episode ended, the next one has begun.
+    """Result of a control step; where an episode ended, the next one has begun.
 
-    All tensors belong to the caller: the batch does not use them again.
+    The caller owns all tensors: the batch does not use them again.
     """
 
     observation: Observation
-    """After the action, or of the next episode's start."""
+    """Observation after the action, or at the start of the next episode where one ended."""
     reward: torch.Tensor
-    """Shape (n,)."""
+    """Sum of the reward terms, shape (n,)."""
     terminated: torch.Tensor
     """Whether the task ended the episode, shape (n,), bool."""
     truncated: torch.Tensor
-    """Whether time did, or physics (see ``unstable``), shape (n,), bool."""
-    unstable: torch.Tensor
-    """Whether its simulation became unstable, shape (n,), bool; the step is then as if robot and
-    block had stopped where they were before."""
+    """Whether the time limit or a diverged simulation ended the episode, shape (n,), bool."""
+    diverged: torch.Tensor
+    """Whether the simulation diverged, shape (n,), bool. Robot and block are then put back to
+    where they were before the step, and the episode is truncated."""
     final_observation: Observation
-    """After the action, whatever followed: to bootstrap from where time ran out."""
+    """Observation after the action, also where an episode ended: to bootstrap the value there."""
     success: torch.Tensor
-    """Whether the task is fulfilled now, shape (n,), bool; never where the simulation became
-    unstable."""
+    """Whether the task is fulfilled now, shape (n,), bool; never where a simulation diverged."""
     distance: torch.Tensor
-    """Distance from success, such as of tool and goal, shape (n,), metres."""
+    """Distance from success, such as between tool and goal, shape (n,) [m]."""
     score: torch.Tensor
     """Score of the step, shape (n,); see ``Task.episode_score``."""
     terms: dict[str, torch.Tensor]
-    """Reward terms by name, each of shape (n,), zero where a task has no such term."""
+    """Reward terms by name, each of shape (n,); zero where the task has no such term."""
     q: torch.Tensor
-    """Joint positions after the action, whatever followed, shape (n, J)."""
+    """Joint positions after the action, also where an episode ended, shape (n, J) [rad or m]."""
     block_pose: torch.Tensor
-    """Poses of the blocks likewise, shape (n, 7)."""
+    """Poses of the blocks after the action, also where an episode ended, shape (n, 7)."""
 
 
 class TaskBatch:
-    """Environments; each has a robot at a task, and a stream of random numbers.
+    """Environments; each has a robot at a task, and its own stream of random numbers.
 
     Robots stand at the origin of the world.
+
+    Attributes:
+        robot_tables: The robots as tensors.
+        specs: Specification of the environments of each robot.
+        env_robot_index: Index of each environment's robot and specification, shape (n,), int64.
+        simulation: Simulation of the environments.
+        groups: The environments grouped by task.
+        action_kind: ``continuous`` or ``discrete``.
+        action_mask: Links whose joint obeys actions, shape (n, L), bool.
+        max_episode_steps: Time limit of episodes, shape (n,) [control steps].
+        episode_step: Control steps since the episode began, shape (n,), int64.
+        targets: JointTargets of the independent joints, shape (n, J) [rad or m].
+        device: Device of all tensors.
     """
 
     def __init__(
         self,
-        bodies: Bodies,
+        robot_tables: RobotTables,
         specs: Sequence[EnvSpec],
-        body: Sequence[int],
+        env_robot_index: Sequence[int],
         simulation: Simulation,
         *,
         kind: ActionKind = "continuous",
@@ -81,92 +92,91 @@ class TaskBatch:
         seed: int = 0,
         first: int = 0,
     ) -> None:
-        """Set up; ``reset`` begins.
+        """Set up; ``reset`` begins the episodes.
 
         Args:
-            bodies: The robots.
-            specs: Specification of each of the robots' environments.
-            body: Index of each environment's robot and specification.
+            robot_tables: The robots.
+            specs: Specification of the environments of each robot.
+            env_robot_index: Index of each environment's robot and specification.
             simulation: Simulation of the environments, with the scenes of their specifications.
             kind: Kind of the actions.
-            observe: Entries of observations that are not there by default.
+            observe: Optional entries of observations.
             seed: Seed of all episodes.
-            first: Number of the first environment: the same number and seed give the same episodes,
-                in whichever batch.
+            first: Number of the first environment. An environment's episodes depend on its number
+                and the seed only, whatever batch it is in.
 
         Raises:
             TaskError: If a task is unknown, has different constants, or too few goals of a robot.
         """
-        self.bodies, self.specs, self.kind = bodies, tuple(specs), kind
-        self.simulation, self.device = simulation, bodies.device
-        observe = observe or ObservationConfig()
-        n, joints, device = len(body), bodies.max_joints, self.device
-        self.body = torch.tensor(list(body), device=device)
-        self.groups = TaskGroups(self.specs, self.body, joints)
-        own = [self.specs[i] for i in body]
-        self.mask = torch.where(
+        self.robot_tables, self.specs, self.action_kind = robot_tables, tuple(specs), kind
+        self.simulation, self.device = simulation, robot_tables.device
+        device, n = self.device, len(env_robot_index)
+        self.env_robot_index = index = torch.tensor(list(env_robot_index), device=device)
+        self.groups = TaskGroups(self.specs, index, robot_tables.max_joints)
+        self.action_mask = torch.where(
             self.groups.moves_fingers[:, None],
-            bodies.action_mask(fingers=True)[self.body],
-            bodies.action_mask(fingers=False)[self.body],
+            robot_tables.action_mask(fingers=True)[index],
+            robot_tables.action_mask(fingers=False)[index],
         )
-        self._numbers = range(first, first + n)
-        self._streams = _streams(seed, self._numbers)
-        self.longest = self.groups.longest
-        """Control steps of an episode at most, shape (n,)."""
-        self._joints = simulation.q.shape[1]
-        self.targets = torch.zeros(n, joints, device=device)
-        self.elapsed = torch.zeros(n, dtype=torch.int64, device=device)
-        self._qd = torch.zeros(n, joints, device=device)
-        self._shares = torch.zeros(n, bodies.max_links, device=device)
-        self._lower, self._upper = bodies.lower[self.body], bodies.upper[self.body]
-        self._config = observe
-        self._tokens = LinkTokens(bodies, self.body)
-        self._tools = FramePositions(bodies.chain, self.body)
-        self._moved = Targets(bodies, self.body, self.mask)
-        self._fixed = {
-            "links": bodies.links[self.body],
-            "actions": self.mask,
+        self.max_episode_steps = self.groups.max_episode_steps
+        self.targets = torch.zeros(n, robot_tables.max_joints, device=device)
+        self.episode_step = torch.zeros(n, dtype=torch.int64, device=device)
+        self._env_numbers = range(first, first + n)
+        self._streams = _random_streams(seed, self._env_numbers)
+        # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more
+        self._num_sim_joints = simulation.q.shape[1]
+        self._qd = torch.zeros(n, robot_tables.max_joints, device=device)
+        self._previous_action = torch.zeros(n, robot_tables.max_links, device=device)
+        self._lower, self._upper = robot_tables.lower[index], robot_tables.upper[index]
+        self._observe = observe or ObservationConfig()
+        self._tokens = LinkTokens(robot_tables, index)
+        self._tool_positions = FramePositions(robot_tables.tool_chain, index)
+        self._joint_targets = JointTargets(robot_tables, index, self.action_mask)
+        scenes = [self.specs[i].scene for i in env_robot_index]
+        self._constant_entries = {
+            "links": robot_tables.link_mask[index],
+            "actions": self.action_mask,
             **self.groups.masks,
-            **obstacle_tokens([each.scene for each in own], observe.obstacles, device),
+            **obstacle_tokens(scenes, self._observe.obstacles, device),
         }
         self._points: PointClouds | None = None
-        if observe.points:
-            self._points = PointClouds([each.scene for each in own], observe.points, device)
-            self._fixed["point_mask"] = self._points.mask
+        if self._observe.points:
+            self._points = PointClouds(scenes, self._observe.points, device)
+            self._constant_entries["point_mask"] = self._points.mask
 
     @property
     def num_envs(self) -> int:
-        """How many environments, n."""
-        return len(self.body)
+        """Number of environments, n."""
+        return len(self.env_robot_index)
 
     @property
     def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J), rad or m; J is that of ``bodies``."""
+        """Positions of the independent joints, shape (n, J) [rad or m]; a copy."""
         return self._q.clone()
 
-    def does(self, task: str) -> torch.Tensor:
+    def task_mask(self, task: str) -> torch.Tensor:
         """Return which environments are at a task, shape (n,), bool."""
-        return self.groups.does(task)
+        return self.groups.task_mask(task)
 
     def field(self, name: str) -> torch.Tensor:
-        """Return an observation field of the tasks as it is now, shape (n, size); see ``Task``."""
+        """Return the current value of an observation field of the tasks, shape (n, size)."""
         return self.groups.fields(self.simulation.block_pose)[name]
 
     def reset(self, seed: int | None = None, *, spread: bool = False) -> Observation:
-        """Begin an episode everywhere.
+        """Begin an episode in every environment.
 
         Args:
-            seed: Of all episodes from now on; by default they go on.
-            spread: Whether these first episodes are as if some of their time had passed, another
-                share in each environment: learners want episodes that do not end all at once.
+            seed: Seed of all episodes from now on; by default the random streams continue.
+            spread: Whether these first episodes begin at random fractions of their time limit, so
+                that they do not all end at the same step; for learners.
         """
         if seed is not None:
-            self._streams = _streams(seed, self._numbers)
+            self._streams = _random_streams(seed, self._env_numbers)
         self._begin(torch.arange(self.num_envs, device=self.device))
         if spread:
-            passed = [stream.random() for stream in self._streams["random"]]
-            shares = torch.tensor(passed, device=self.device)
-            self.elapsed = (shares * self.longest).long()
+            fractions = [stream.random() for stream in self._streams["random"]]
+            fraction = torch.tensor(fractions, device=self.device)
+            self.episode_step = (fraction * self.max_episode_steps).long()
         return self.observe()
 
     def step(self, actions: torch.Tensor) -> Step:
@@ -176,26 +186,30 @@ class TaskBatch:
             actions: Shape (n, L); continuous: in [-1, 1], clipped; discrete: indices of ``BINS``.
 
         Raises:
-            TaskError: If the actions are none.
+            TaskError: If the actions are invalid.
             SimulationError: If the simulator failed.
         """
         self._act(actions)
-        unstable = self._move()
-        self.elapsed += 1
-        result = self._evaluate(unstable)
-        truncated = ((self.elapsed >= self.longest) | unstable) & ~result.terminated
-        final = self.observe()
+        diverged = self._simulate()
+        self.episode_step += 1
+        result = self._evaluate(diverged)
+        timed_out = self.episode_step >= self.max_episode_steps
+        truncated = (timed_out | diverged) & ~result.terminated
+        final_observation = self.observe()
         q, block_pose = self.q, self.simulation.block_pose.clone()
-        over = torch.nonzero(truncated | result.terminated)[:, 0]
-        if len(over):
-            self._begin(over)
+        ended = torch.nonzero(truncated | result.terminated)[:, 0]
+        if len(ended):
+            self._begin(ended)
+            observation = self.observe()
+        else:
+            observation = _copied(final_observation)
         return Step(
-            observation=self.observe() if len(over) else _copied(final),
+            observation=observation,
             reward=result.reward,
             terminated=result.terminated,
             truncated=truncated,
-            unstable=unstable,
-            final_observation=final,
+            diverged=diverged,
+            final_observation=final_observation,
             success=result.success,
             distance=result.distance,
             score=result.score,
@@ -205,33 +219,34 @@ class TaskBatch:
         )
 
     def observe(self) -> Observation:
-        """Return what agents see now, in tensors that belong to the caller."""
-        seen = {
+        """Return the current observation, in tensors that the caller owns."""
+        observation = {
             "tokens": self._tokens(self._q),
             **self.groups.fields(self.simulation.block_pose),
-            **_copied(self._fixed),
+            **_copied(self._constant_entries),
         }
-        if self._config.velocity:
-            qd = self._widened(self.simulation.qd)
-            seen["velocity"] = of_links(self.bodies, self.body, qd)
-        if self._config.previous_action:
-            seen["previous_action"] = self._shares.clone()
-        if self._config.tool:
-            seen["tool"] = self._tools(self._q)
+        if self._observe.velocity:
+            qd = self._padded(self.simulation.qd)
+            observation["velocity"] = joint_to_link(self.robot_tables, self.env_robot_index, qd)
+        if self._observe.previous_action:
+            observation["previous_action"] = self._previous_action.clone()
+        if self._observe.tool:
+            observation["tool"] = self._tool_positions(self._q)
         if self._points is not None:
-            seen["points"] = self._points(self.simulation.block_pose)
-        return seen
+            observation["points"] = self._points(self.simulation.block_pose)
+        return observation
 
     def advance(self, progress: float) -> None:
-        """Follow the curricula of the tasks that have one.
+        """Advance the curricula of the tasks that have one.
 
         Args:
-            progress: Progress of the training, 0 to 1. Until this is called, all is as at the end.
+            progress: Fraction of the training that is done, 0 to 1. Before the first call,
+                curricula are at their end.
         """
         self.groups.advance(progress)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what the next ``reset`` follows from: random streams, and states of the tasks."""
+        """Return the state that the next ``reset`` depends on: random streams and tasks' states."""
         states = {
             name: [stream.bit_generator.state for stream in streams]
             for name, streams in self._streams.items()
@@ -239,14 +254,14 @@ class TaskBatch:
         return {**states, **self.groups.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on as a batch of the same environments would; ``reset`` must follow.
+        """Restore what ``state_dict`` returned; ``reset`` must follow.
 
         Raises:
-            TaskError: If the state is of another number of environments, or of an older morphgen.
+            TaskError: If the state has another number of environments, or is of an older morphgen.
         """
         if len(state["random"]) != self.num_envs:
             raise TaskError(
-                f"the state is of {len(state['random'])} environments; there are {self.num_envs}"
+                f"the state is of {len(state['random'])} environments; expected {self.num_envs}"
             )
         if self._streams.keys() - state.keys():
             raise TaskError("the state is of an older morphgen: points had no stream of their own")
@@ -260,69 +275,72 @@ class TaskBatch:
         self.simulation.close()
 
     def _act(self, actions: torch.Tensor) -> None:
-        shape = (self.num_envs, self.bodies.max_links)
-        self._shares = shares_of(actions, self.kind, shape, self.device) * self.mask
-        self.targets = self._moved(self.targets, self._shares)
+        shape = (self.num_envs, self.robot_tables.max_links)
+        normalized = decode_actions(actions, self.action_kind, shape, self.device)
+        self._previous_action = normalized * self.action_mask
+        self.targets = self._joint_targets(self.targets, self._previous_action)
 
-    def _move(self) -> torch.Tensor:
-        """Let physics go on; what became unstable is put back to where it was, (n,) bool."""
-        unstable = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+    def _simulate(self) -> torch.Tensor:
+        """Step the simulation; restore the previous state where it diverged, (n,) bool."""
+        diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
         try:
-            self.simulation.step(self.targets[:, : self._joints].contiguous())
-        except UnstableError as error:
+            self.simulation.step(self.targets[:, : self._num_sim_joints].contiguous())
+        except DivergedError as error:
             envs = torch.tensor(list(error.reasons), device=self.device)
-            unstable[envs] = True
+            diverged[envs] = True
             self.simulation.reset(envs, q[envs], block[envs])
             self._qd[envs] = 0
-        return unstable
+        return diverged
 
-    def _evaluate(self, unstable: torch.Tensor) -> StepRows:
-        q, qd = self._q, self._widened(self.simulation.qd)
+    def _evaluate(self, diverged: torch.Tensor) -> BatchResult:
+        q, qd = self._q, self._padded(self.simulation.qd)
         state = TaskState(
-            tool=self._tools(q),
+            tool=self._tool_positions(q),
             block_pose=self.simulation.block_pose,
             limit_violation=limit_violation(q, self._lower, self._upper),
             acceleration=row_sums((qd - self._qd).abs()) / CONTROL_PERIOD,
-            unstable=unstable,
+            diverged=diverged,
         )
         self._qd = qd.clone()
         return self.groups.evaluate(state)
 
     def _begin(self, envs: torch.Tensor) -> None:
-        starts = torch.zeros(len(envs), self.bodies.max_joints, device=self.device)
-        blocks = torch.zeros(len(envs), 7, device=self.device)
-        for rows, (q, block) in self.groups.begin(envs, self._streams["random"]):
-            starts[rows], blocks[rows] = q, block
+        """Begin an episode in some environments, shape (k,), int64."""
+        q = torch.zeros(len(envs), self.robot_tables.max_joints, device=self.device)
+        block_pose = torch.zeros(len(envs), 7, device=self.device)
+        for rows, (task_q, task_block_pose) in self.groups.begin(envs, self._streams["random"]):
+            q[rows], block_pose[rows] = task_q, task_block_pose
         if self._points is not None:
             for env in envs.tolist():
                 self._points.begin(env, self._streams["points"][env])
-        self.simulation.reset(envs, starts[:, : self._joints].contiguous(), blocks)
-        self.targets[envs] = starts
-        self.elapsed[envs] = 0
+        self.simulation.reset(envs, q[:, : self._num_sim_joints].contiguous(), block_pose)
+        self.targets[envs] = q
+        self.episode_step[envs] = 0
         self._qd[envs] = 0
-        self._shares[envs] = 0
+        self._previous_action[envs] = 0
 
     @property
     def _q(self) -> torch.Tensor:
-        """``q``, or a view of the simulation's own."""
-        return self._widened(self.simulation.q)
+        """Joint positions; a view of the simulation's tensor where nothing has to be padded."""
+        return self._padded(self.simulation.q)
 
-    def _widened(self, values: torch.Tensor) -> torch.Tensor:
-        """Values of the simulation's joints, padded to those of ``bodies``."""
-        more = self.bodies.max_joints - self._joints
-        return torch.nn.functional.pad(values, (0, more)) if more else values
+    def _padded(self, values: torch.Tensor) -> torch.Tensor:
+        """Return values of the simulation's joints padded to J columns."""
+        missing = self.robot_tables.max_joints - self._num_sim_joints
+        return torch.nn.functional.pad(values, (0, missing)) if missing else values
 
 
 def _copied(observation: Observation) -> Observation:
     return {name: values.clone() for name, values in observation.items()}
 
 
-def _streams(seed: int, numbers: Sequence[int]) -> dict[str, list[np.random.Generator]]:
-    """What environments draw episodes and points from: by number, whatever else is in the batch."""
-
-    def drawn(*of: int) -> list[np.random.Generator]:
-        own = (np.random.SeedSequence(seed, spawn_key=(number, *of)) for number in numbers)
-        return [np.random.default_rng(sequence) for sequence in own]
-
-    return {"random": drawn(), "points": drawn(0)}
+def _random_streams(seed: int, env_numbers: Sequence[int]) -> dict[str, list[np.random.Generator]]:
+    """Return a stream for episodes and one for points per environment, by its number only."""
+    return {
+        name: [
+            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, *suffix)))
+            for number in env_numbers
+        ]
+        for name, suffix in (("random", ()), ("points", (0,)))
+    }

@@ -1,20 +1,21 @@
-"""Make environment specifications: robots at tasks, with their scenes and goal sets."""
+"""Environment specifications: robots at tasks, with their scenes and goal sets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from morphgen.benchmark.split import Member, compose_member
 from morphgen.errors import TaskError
 from morphgen.fitting.replace_collision import as_primitives
-from morphgen.grammar.library import Library
+from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.robot_source import find_robot, read_source
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
@@ -24,20 +25,25 @@ from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec, GoalSet, TaskConfig
 
-_GROUND_STEP = 1e-4
-"""A lower ground is on this grid, metres, so that all machines agree."""
+GROUND_STEP = 1e-4
+"""Resolution of the height of a lowered ground, so that all machines agree [m]."""
+_FILE_KEYS = {
+    "reach": {"max_episode_steps": "steps", "num_goals": "goals"},
+    "push": {"max_episode_steps": "steps", "num_goals": "starts"},
+}
+"""Keys in files of the config fields that have another name there."""
 
 
 @dataclass(frozen=True)
 class GoalConfig:
-    """What goal sets follow from, besides robots, tasks and obstacles."""
+    """What goal sets depend on besides robots, tasks and obstacles."""
 
     seed: int = 0
     """Seed of all goals, the same in training and evaluation."""
     tasks: tuple[TaskConfig, ...] = ()
     """Constants of tasks, at most one config of a type; other tasks have their defaults."""
 
-    def of(self, task: str) -> TaskConfig:
+    def task_config(self, task: str) -> TaskConfig:
         """Return the constants of a task.
 
         Raises:
@@ -47,24 +53,33 @@ class GoalConfig:
         return next((config for config in self.tasks if config.task == task), default)
 
     def as_data(self, used: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
-        """Return constants by task, for JSON: of morphgen's own tasks, ours, and those used."""
-        names = dict.fromkeys((*TASKS.builtin, *(config.task for config in self.tasks), *used))
-        return {name: asdict(self.of(name)) for name in names}
+        """Return the constants by task as JSON data, which ``task_configs`` reads.
+
+        Args:
+            used: Tasks to include besides morphgen's own and those of ``tasks``.
+        """
+        data = {}
+        for name in dict.fromkeys((*TASKS.builtin, *(c.task for c in self.tasks), *used)):
+            keys = _FILE_KEYS.get(name, {})
+            constants = asdict(self.task_config(name))
+            data[name] = {keys.get(field, field): value for field, value in constants.items()}
+        return data
 
 
 def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...]:
-    """Read what JSON keeps of ``GoalConfig.as_data``.
+    """Read the JSON data of ``GoalConfig.as_data``.
 
     Raises:
-        TaskError: If a task is unknown.
+        TaskError: If a task is unknown or a constant invalid.
         TypeError: If a constant is unknown.
     """
-    return tuple(
-        TASKS[name].config_type(
-            **{k: tuple(v) if isinstance(v, list) else v for k, v in constants.items()}
-        )
-        for name, constants in data.items()
-    )
+    configs = []
+    for name, constants in data.items():
+        fields = {key: field for field, key in _FILE_KEYS.get(name, {}).items()}
+        values = {k: tuple(v) if isinstance(v, list) else v for k, v in constants.items()}
+        config_type = TASKS[name].config_type
+        configs.append(config_type(**{fields.get(key, key): v for key, v in values.items()}))
+    return tuple(configs)
 
 
 def default_configs() -> tuple[TaskConfig, ...]:
@@ -72,14 +87,37 @@ def default_configs() -> tuple[TaskConfig, ...]:
     return tuple(TASKS[name].config_type() for name in TASKS.builtin)
 
 
-BENCHMARK = GoalConfig()
+def load_robot(
+    source: str | Path | Robot,
+    geometry: Literal["primitive", "mesh"] = "primitive",
+    library: Iterable[Path] = (),
+) -> Robot:
+    """Return the robot that a user names, with fitted primitives as its collision shapes.
+
+    A robot has the same goals and scores whether it is named by words, by its bundle, by the
+    bundle's URDF, or passed as ``morphgen.compose`` or ``morphgen.read`` returns it.
+
+    Args:
+        source: The robot, or its name: a file, a bundle, words of ``morphgen compose`` or parts
+            joined by dashes; see ``morphgen.grammar.robot_source``.
+        geometry: Collision shapes: fitted boxes, cylinders and spheres, or the original ones.
+        library: Folders of your own parts.
+
+    Raises:
+        CompositionError: If the name is unknown, or the parts do not fit together.
+        FormatError: If the file is broken.
+        MorphgenError: If the words name something unknown.
+    """
+    parts = default_library(library)
+    robot = source if isinstance(source, Robot) else read_source(find_robot(source, parts), parts)
+    return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 
 
 def member_with_primitives(member: Member, library: Library) -> Robot:
     """Return the robot of a split's member with fitted primitives as its collision shapes.
 
     Raises:
-        MorphgenError: If it cannot be composed, is not the split's, or a link has no primitive.
+        MorphgenError: If it cannot be composed, differs from the split's, or has an unfitted link.
     """
     return as_primitives(compose_member(member, library), library.folders)
 
@@ -87,7 +125,7 @@ def member_with_primitives(member: Member, library: Library) -> Robot:
 def member_spec(
     member: Member,
     library: Library,
-    config: GoalConfig = BENCHMARK,
+    config: GoalConfig | None = None,
     *,
     cache: Path | None = None,
     shipped: GoalSet | None = None,
@@ -102,29 +140,30 @@ def member_spec(
 def env_spec(
     robot: Robot,
     task: str,
-    config: GoalConfig = BENCHMARK,
+    config: GoalConfig | None = None,
     *,
     obstacles: bool = False,
     cache: Path | None = None,
     shipped: GoalSet | None = None,
 ) -> EnvSpec:
-    """Return the specification of a robot at a task.
+    """Return the specification of a robot at a task, whose goal set is sampled if not cached.
 
     Args:
         robot: The robot, with a tool.
         task: Name of the task.
-        config: Seed and constants.
+        config: Seed and constants of the goal set; by default those of the benchmark.
         obstacles: Whether there are obstacles.
-        cache: Folder of stored goal sets; by default the user's.
-        shipped: The goal set that a split brings, if it does.
+        cache: Folder of stored goal sets; by default one in the user's cache.
+        shipped: Goal set that came with a split.
 
     Raises:
-        TaskError: If the task is unknown, or that set is another robot's, task's or config's.
+        TaskError: If the task is unknown, or ``shipped`` is of another robot, task or config.
         MorphgenError: As ``goal_set``.
     """
-    kind, constants, ground = TASKS[task], config.of(task), ground_under(robot)
+    config = config or GoalConfig()
+    kind, constants, ground = TASKS[task], config.task_config(task), ground_under(robot)
     if shipped is not None and not isinstance(shipped, kind.goal_set_type):
-        raise TaskError(f"robot {robot.name!r}: the set that is shipped is not for {task}")
+        raise TaskError(f"robot {robot.name!r}: the shipped goal set is not for task {task}")
     goals = goal_set(
         robot,
         kind,
@@ -139,15 +178,16 @@ def env_spec(
 
 
 def ground_under(robot: Robot) -> float:
-    """Return the height of the ground in the root frame, metres: 0, or less for low links.
+    """Return the height of the ground in the root frame: 0, or below links that reach lower [m].
 
-    The root stands on the ground; a link that a joint moves may not be in it. A robot that is
-    scaled down joint by joint, as those of ``panda_variations`` are, may have its first link there.
+    The root stands on the ground, but movable links must not penetrate it at home. Robots that are
+    scaled down joint by joint, such as those of ``panda_variations``, may have their first link
+    below their root.
     """
-    above, anywhere = (
+    free_above_ground, free_without = (
         FreeSpace(Scene(robot, ground=ground)).free([robot.home])[0] for ground in (0.0, None)
     )
-    if above or not anywhere:
+    if free_above_ground or not free_without:
         return 0.0
     T_root_link = forward_kinematics(robot, np.array(robot.home))
     heights = [0.0]
@@ -155,4 +195,4 @@ def ground_under(robot: Robot) -> float:
         if link.collisions:
             corners = np.array(list(product(*bounding_box(link.collisions).T)))
             heights.append(float((corners @ T[2, :3] + T[2, 3]).min()))
-    return math.floor(min(heights) / _GROUND_STEP) * _GROUND_STEP
+    return math.floor(min(heights) / GROUND_STEP) * GROUND_STEP

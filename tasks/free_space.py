@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
-from morphgen.model.kinematics import random_configurations
+from morphgen.model.kinematics import joint_limits, random_configurations
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
 from morphgen.model.rotation import Vec3, normalize, to_rpy
 from morphgen.model.tree import rigid_groups
@@ -200,6 +200,19 @@ class FreeSpace:
             raise ValueError("a pose of the block is not finite")
         turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
         return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
+
+
+def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
+    """Find joints that are outside of their limits in configurations (n, dof).
+
+    Yields:
+        The row of the configuration, and what is wrong with it.
+    """
+    names = [robot.joints[k].name for k in robot.independent_joints]
+    low, high = joint_limits(robot).T
+    outside = (q < low) | (q > high) | ~np.isfinite(q)
+    for i, j in np.argwhere(outside).tolist():
+        yield i, f"joint {names[j]!r} is at {q[i, j]:g}, outside ({low[j]:g}, {high[j]:g})"
 
 
 def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Robot:

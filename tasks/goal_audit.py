@@ -1,7 +1,18 @@
-"""What the goal sets of a split give away, or promise and do not keep."""
+"""Audit of a split's goal sets: sets that do not match their robots, and goals that leak.
+
+A goal of a test robot has leaked if a train robot at the same task has it too. For the same robot,
+any such goal counts. Different robots reach a pose in different configurations, so a shared goal
+reveals nothing, and robots that can move little share some by chance. But if most of a set is
+shared, in its goals or in its configurations, then the two sets were not drawn independently, and
+memorised goals of one would count as skill with the other.
+
+The goal of reach is the pose of the tool; of push, the pose of the block at the start, together
+with the start configuration if the robots are the same.
+"""
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,10 +31,14 @@ from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 from morphgen.processes import Progress, mapped, unseen
 from morphgen.tasks.env_specs import GoalConfig, env_spec, member_with_primitives
-from morphgen.tasks.goal_leaks import repeated, shared
-from morphgen.tasks.goal_making import Made, SplitGoals, unproven
 from morphgen.tasks.goal_sets import arrays_of
+from morphgen.tasks.split_goals import GoalResult, SplitGoals, certify_goal_set
 from morphgen.tasks.task import GoalSet
+from morphgen.typing import Array
+
+Mask = NDArray[np.bool_]
+SidedReason = tuple[Side, str, str]
+"""Side and name of a robot, and the reason of its finding."""
 
 _FIXES = {
     "goals-missing": "leave the robot out, or build again: morphgen split build --goals",
@@ -38,121 +53,129 @@ _FIXES = {
 }
 CODES = frozenset(_FIXES)
 
-_EXACT = 1e-6
-"""Largest difference of numbers of a set from those of a set drawn anew."""
+EXACT = 1e-6
+"""Largest difference between numbers of a set and those of the same set sampled anew."""
+NEAR = 1e-3
+"""Distance below which positions of goals or blocks are the same [m]."""
+NEAR_TURN = math.radians(1)
+"""Angle below which orientations are the same [rad]."""
+NEAR_JOINT = 1e-3
+"""Difference of every joint below which configurations are the same [rad or m]."""
+MAX_SHARED = 0.5
+"""Fraction of a set that two different robots may have in common."""
 
 
 def audit_goals(
     split: Split,
-    found: SplitGoals,
+    goals: SplitGoals,
     library: Library,
     *,
     jobs: int = 1,
     progress: Progress = unseen,
 ) -> tuple[Finding, ...]:
-    """Look for goals that leak, and for sets that are not those of the split's robots.
+    """Find goals that leak, and sets that do not match the split's robots.
 
-    Every set is drawn anew for comparison, and every goal tested with its configuration. Errors:
-    ``goals-missing`` (a member has no set, or none can be drawn), ``goals-unknown`` (a set of no
-    member), ``goals-body`` (of another body), ``goals-seed`` and ``goals-config`` (made with
-    another seed or other constants than those of the split's sets), ``goals-changed`` (not what is
-    drawn), ``goals-unproven`` (out of reach or in collision), ``goals-shared`` (by train and test,
-    see ``goal_leaks``). Warning: ``goals-repeated`` (within a set).
+    Every set is sampled anew for comparison, and every goal is tested with its configuration.
+    Errors: ``goals-missing`` (a member has no set, or none can be sampled), ``goals-unknown`` (a
+    set without a member), ``goals-body`` (of another robot), ``goals-seed`` and ``goals-config``
+    (made with another seed or other constants than those of the split's sets), ``goals-changed``
+    (differs from the set sampled anew), ``goals-unproven`` (out of reach or in collision),
+    ``goals-shared`` (by train and test, see the module). Warning: ``goals-repeated`` (within a
+    set).
 
     Args:
         split: The split.
-        found: Its goal sets, and with what they are said to be made.
-        library: Where its parts are.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        goals: Its goal sets, with the config that made them.
+        library: Library of its parts.
+        jobs: Number of processes.
+        progress: Called with the number of finished robots and their total.
 
     Raises:
         MorphgenError: If ``jobs`` is below 1, or a process died.
     """
     members = sided_members(split)
-    look = _Examination(library.folders, found)
-    seen = list(mapped(look, members, jobs, progress))
-    return tuple(
-        [
-            *_set_findings(split, found, members, seen),
-            *(_finding("goals-shared", *each) for each in shared(split, found)),
-            *(_finding("goals-repeated", *each, "warning") for each in repeated(split, found)),
-        ]
+    examiner = _MemberExaminer(library.folders, goals)
+    examined = list(mapped(examiner, members, jobs, progress))
+    return (
+        *_set_findings(split, goals, members, examined),
+        *(_finding("goals-shared", *reason) for reason in shared_goals(split, goals)),
+        *(_finding("goals-repeated", *reason, "warning") for reason in _repeated(split, goals)),
     )
 
 
-def with_goals(done: Audit, split: Split, findings: Sequence[Finding] | None) -> Audit:
-    """An audit with findings about goals, of which the split accepts what it accepts.
+def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] | None) -> Audit:
+    """Return an audit with findings about goals added, those that the split accepts as accepted.
 
     Args:
-        done: The audit of the robots.
-        split: What it is of.
-        findings: About goals; None if nobody looked, so that nothing is known of those accepted.
+        audit: Audit of the robots.
+        split: The audited split.
+        findings: Findings about goals; None if goals were not audited, so that acceptances of
+            goal findings do not count as unused.
     """
     codes = CODES if findings is None else {finding.code for finding in findings}
-    looked_for = {f"accepted {code}" for code in codes}
-    left = [
-        each
-        for each in done.findings
-        if not (each.code == "accepted-unused" and each.where in looked_for)
+    used_acceptances = {f"accepted {code}" for code in codes}
+    remaining = [
+        finding
+        for finding in audit.findings
+        if not (finding.code == "accepted-unused" and finding.where in used_acceptances)
     ]
     new = findings or ()
-    known = tuple((each, split.accepted[each.code]) for each in new if each.code in split.accepted)
-    left += [each for each in new if each.code not in split.accepted]
-    return replace(done, findings=tuple(left), accepted=(*done.accepted, *known))
+    accepted = tuple((one, split.accepted[one.code]) for one in new if one.code in split.accepted)
+    remaining += [one for one in new if one.code not in split.accepted]
+    return replace(audit, findings=tuple(remaining), accepted=(*audit.accepted, *accepted))
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What a worker finds of a member's set."""
+class _Examined:
+    """A member's goal set, compared with the same set sampled anew."""
 
     key: str = ""
-    """Of the set as it is drawn today; empty if it cannot be."""
-    body: str = ""
-    """Hash of the body that it is drawn for."""
-    why: str = ""
-    """Why it cannot be drawn."""
+    """Key of the set sampled anew; empty if it cannot be sampled."""
+    robot_hash: str = ""
+    """Hash of the member's robot."""
+    error: str = ""
+    """Reason why the set cannot be sampled."""
     is_same: bool = False
-    """Whether the set is as it is drawn."""
-    unproven: tuple[str, ...] = ()
+    """Whether the set equals the one sampled anew."""
+    certificate_errors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class _Examination:
-    """How a worker sees to the set of a member."""
+class _MemberExaminer:
+    """Samples and compares the goal set of a member in a worker process."""
 
     folders: tuple[Path, ...]
-    found: SplitGoals
+    goals: SplitGoals
 
     @cached_property
     def library(self) -> Library:
         return Library(self.folders)
 
-    def __call__(self, sided_member: tuple[Side, Member]) -> _Seen:
+    def __call__(self, sided_member: tuple[Side, Member]) -> _Examined:
         side, member = sided_member
-        made = self.found.sets.get((side, member.name))
+        result = self.goals.sets.get((side, member.name))
         try:
             robot = member_with_primitives(member, self.library)
-            body = robot_hash(robot, visuals=False)
+            digest = robot_hash(robot, visuals=False)
             with tempfile.TemporaryDirectory() as folder:
                 spec = env_spec(
                     robot,
                     member.task,
-                    self.found.config,
+                    self.goals.config,
                     obstacles=member.obstacles,
                     cache=Path(folder),
                 )
-            drawn = spec.goals
-            if made is None or made.goals is None:
-                return _Seen(drawn.key, body)
-            lines = () if made.body != body else unproven(made.goals, spec)
-            return _Seen(drawn.key, body, "", _same(made.goals, drawn), lines)
+            key = spec.goals.key
+            if result is None or result.goals is None:
+                return _Examined(key, digest)
+            errors = certify_goal_set(result.goals, spec) if result.robot_hash == digest else ()
+            return _Examined(key, digest, "", _same(result.goals, spec.goals), errors)
         except MorphgenError as error:
-            return _Seen(why=str(error))
+            return _Examined(error=str(error))
 
 
 def _same(a: GoalSet, b: GoalSet) -> bool:
-    """Whether two sets are the same but for rounding; proofs of pushes are tested on their own."""
+    """Return whether two sets are equal up to rounding, in the fields that are compared."""
     if type(a) is not type(b):
         return False
     ours, theirs = arrays_of(a), arrays_of(b)
@@ -162,68 +185,65 @@ def _same(a: GoalSet, b: GoalSet) -> bool:
 def _close(a: NDArray[Any], b: NDArray[Any]) -> bool:
     if a.shape != b.shape or a.dtype.kind != b.dtype.kind:
         return False
-    return bool(np.allclose(a, b, 0, _EXACT) if a.dtype.kind == "f" else (a == b).all())
+    return bool(np.allclose(a, b, 0, EXACT) if a.dtype.kind == "f" else (a == b).all())
 
 
 def _set_findings(
     split: Split,
-    found: SplitGoals,
+    goals: SplitGoals,
     members: Sequence[tuple[Side, Member]],
-    seen: Sequence[_Seen],
+    examined: Sequence[_Examined],
 ) -> Iterator[Finding]:
-    """Sets that are missing, or not those that belong to the robots, or cannot be proven."""
+    """Yield findings about sets that are missing, of another robot or config, or uncertified."""
     owners = {
         one.key: f"{side} robot {member.name}"
-        for (side, member), one in zip(members, seen, strict=True)
+        for (side, member), one in zip(members, examined, strict=True)
         if one.key
     }
-    for (side, member), one in zip(members, seen, strict=True):
-        made = found.sets.get((side, member.name))
-        if one.why or made is None or made.goals is None:
-            why = one.why or "there is no set of it"
+    for (side, member), one in zip(members, examined, strict=True):
+        result = goals.sets.get((side, member.name))
+        if one.error or result is None or result.goals is None:
+            why = one.error or "it has no goal set"
             yield _finding("goals-missing", side, member.name, why)
             continue
-        told = _foreign(made, made.goals, member, one, owners, found.config)
-        if told:
-            yield _finding(told[0], side, member.name, told[1])
-        if one.unproven:
-            more = f" (and {len(one.unproven) - 1} more)" if one.unproven[1:] else ""
-            yield _finding("goals-unproven", side, member.name, one.unproven[0] + more)
+        mismatch = _mismatch(result, result.goals, member, one, owners, goals.config)
+        if mismatch:
+            yield _finding(mismatch[0], side, member.name, mismatch[1])
+        if errors := one.certificate_errors:
+            more = f" (and {len(errors) - 1} more)" if errors[1:] else ""
+            yield _finding("goals-unproven", side, member.name, errors[0] + more)
     known = {(side, member.name) for side, member in members}
-    for side, name in sorted(found.sets.keys() - known):
+    for side, name in sorted(goals.sets.keys() - known):
         yield _finding("goals-unknown", side, name, f"split {split.name} has no such robot")
 
 
-def _foreign(
-    made: Made,
+def _mismatch(
+    result: GoalResult,
     goals: GoalSet,
     member: Member,
-    seen: _Seen,
+    examined: _Examined,
     owners: Mapping[str, str],
     config: GoalConfig,
 ) -> tuple[str, str] | None:
-    """Code and reason if a set is not the one that is drawn for its member."""
-    if goals.key == seen.key and made.body == seen.body:
-        changed = f"its goals are not those that seed {config.seed} gives"
-        return None if seen.is_same else ("goals-changed", changed)
-    if goals.key != seen.key and goals.key in owners:
+    """Return the code and reason if a set is not the one that is sampled for its member."""
+    if goals.key == examined.key and result.robot_hash == examined.robot_hash:
+        why = f"its goals are not those that seed {config.seed} gives"
+        return None if examined.is_same else ("goals-changed", why)
+    if goals.key != examined.key and goals.key in owners:
         return "goals-body", f"its set is that of {owners[goals.key]}"
-    if made.body != seen.body:
-        return "goals-body", f"its set is of body {made.body}, not of {seen.body}"
+    if result.robot_hash != examined.robot_hash:
+        why = f"its set is of body {result.robot_hash}, not of {examined.robot_hash}"
+        return "goals-body", why
     if goals.seed != config.seed:
-        return (
-            "goals-seed",
-            f"its set was made with seed {goals.seed}, the split's with {config.seed}",
-        )
-    if (made.task, bool(goals.obstacles)) != (member.task, member.obstacles):
-        wanted = _task_text(member.task, member.obstacles)
-        return (
-            "goals-config",
-            f"its set is for {_task_text(made.task, bool(goals.obstacles))}, not {wanted}",
-        )
+        why = f"its set was made with seed {goals.seed}, the split's with {config.seed}"
+        return "goals-seed", why
+    made_for = _task_text(result.task, bool(goals.obstacles))
+    wanted = _task_text(member.task, member.obstacles)
+    if made_for != wanted:
+        return "goals-config", f"its set is for {made_for}, not {wanted}"
     return "goals-config", (
         f"its set, of {len(goals.q)} goals, was made with other constants or another version: its "
-        f"key is {goals.key[:8]}, not {seen.key[:8]}"
+        f"key is {goals.key[:8]}, not {examined.key[:8]}"
     )
 
 
@@ -233,3 +253,65 @@ def _task_text(task: str, obstacles: bool) -> str:
 
 def _finding(code: str, side: Side, name: str, why: str, severity: Severity = "error") -> Finding:
     return Finding(code, severity, f"{side} robot {name}", why, _FIXES[code])
+
+
+def shared_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
+    """Yield test robots whose goals leaked into the set of a train robot."""
+    for member in split.test:
+        test = goals.get("test", member.name)
+        leaks: list[tuple[int, str, str]] = []
+        for rival in split.train:
+            train = goals.get("train", rival.name)
+            if test is not None and train is not None and rival.task == member.task:
+                count, noun = _num_shared(test, train, rival.robot_hash == member.robot_hash)
+                leaks += [(count, noun, rival.name)] if count else []
+        if test is not None and leaks:
+            count, noun, name = max(leaks, key=lambda leak: leak[0])
+            more = f" (and {len(leaks) - 1} more)" if leaks[1:] else ""
+            why = f"train robot {name}{more} has {count} of its {len(test.q)} {noun}"
+            yield "test", member.name, why
+
+
+def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, str]:
+    """Return how many goals of a test set leaked into a train set, and a noun for them."""
+    same_q = _near_joints(test.q, train.q)
+    same_pose = _near(test.goal_poses, train.goal_poses)
+    if same_robot:
+        same = same_pose & same_q if test.start_belongs_to_goal else same_pose
+        return int(same.any(axis=1).sum()), "goals"
+    counts = {
+        "goals": int(same_pose.any(axis=1).sum()),
+        "configurations": int(same_q.any(axis=1).sum()),
+    }
+    noun, count = max(counts.items(), key=lambda item: item[1])
+    return (count, noun) if count > MAX_SHARED * len(test.q) else (0, noun)
+
+
+def _repeated(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
+    """Yield robots whose set has a goal twice."""
+    for side, member in sided_members(split):
+        one = goals.get(side, member.name)
+        if one is None:
+            continue
+        same = _near(one.goal_poses, one.goal_poses)
+        if one.start_belongs_to_goal:
+            same &= _near_joints(one.q, one.q)
+        pairs = np.argwhere(np.triu(same, 1)).tolist()
+        if pairs:
+            more = f" (and {len(pairs) - 1} more pairs)" if pairs[1:] else ""
+            why = f"goals {pairs[0][0]} and {pairs[0][1]} of its set are the same{more}"
+            yield side, member.name, why
+
+
+def _near(a: Array, b: Array) -> Mask:
+    """Return which poses (n, 7) and (m, 7) are the same, shape (n, m)."""
+    distance = np.linalg.norm(a[:, None, :3] - b[None, :, :3], axis=2)
+    aligned = np.abs(a[:, 3:] @ b[:, 3:].T)
+    return np.asarray((distance <= NEAR) & (aligned >= math.cos(NEAR_TURN / 2)))
+
+
+def _near_joints(a: Array, b: Array) -> Mask:
+    """Return which configurations (n, dof) and (m, dof) are the same, shape (n, m)."""
+    if a.shape[1] != b.shape[1]:
+        return np.zeros((len(a), len(b)), dtype=np.bool_)
+    return np.asarray((np.abs(a[:, None] - b[None]) <= NEAR_JOINT).all(axis=2))

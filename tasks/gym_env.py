@@ -12,21 +12,26 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Step
-from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.observation import Observation, ObservationConfig
-from morphgen.tasks.registry import TASKS
-from morphgen.tasks.renderer import SIZE, Frame, Moment, Renderer, moment
-from morphgen.tasks.sim.base import Contacts
-from morphgen.tasks.spaces import NumpyObservation, action_space, arrays, observation_space
+from morphgen.tasks.registry import TASKS, register_gym_envs
+from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
+from morphgen.tasks.vector import (
+    NumpyObservation,
+    action_space,
+    numpy_observation,
+    observation_space,
+)
 
 RENDER_MODES = ("rgb_array",)
+
+register_gym_envs()
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
@@ -38,7 +43,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     An action is a number for each joint that the task moves, in the order of their links: for reach
     the joints on the way to the tool, for push fingers too. ``action_joints`` has their names,
     ``action_links`` their links, the rows of the tokens. Continuous actions are shares of a joint's
-    largest step, in [-1, 1]; discrete ones are indices of ``morphgen.tasks.config.BINS``.
+    largest step, in [-1, 1]; discrete ones are indices of ``morphgen.tasks.actions.BINS``.
 
     ``info`` has ``success``, ``distance``, ``score`` and ``terms`` (see ``Step``), and whether
     links touch each other, ``self_collision``. Episodes end by themselves: no time limit is needed.
@@ -56,7 +61,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         task: str,
         robot: str | Path | Robot = "ur5-plane",
         *,
-        sim: str = "pybullet",
+        sim: str | None = None,
         obstacles: bool = False,
         kind: ActionKind = "continuous",
         observe: ObservationConfig | None = None,
@@ -65,7 +70,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         goal_seed: int = 0,
         cache: Path | None = None,
         library: Iterable[Path] = (),
-        max_links: int | None = MAX_LINKS,
+        max_links: int | None = None,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
@@ -73,9 +78,10 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
 
         Args:
             task: Name of a task, such as ``reach`` or ``push``.
-            robot: A robot, or what ``robot_of`` knows: ``ur5-plane``, words of ``morphgen
+            robot: A robot, or what ``load_robot`` knows: ``ur5-plane``, words of ``morphgen
                 compose``, a bundle's folder or a URDF, with fitted primitives as collision shapes.
-            sim: Name of a simulator, such as ``pybullet`` or ``mujoco``.
+            sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
+                ``default_simulator()``.
             obstacles: Whether there are any.
             kind: Actions are ``continuous`` or ``discrete``.
             observe: Entries of observations that are not there by default.
@@ -84,8 +90,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             goal_seed: Of goals, starts and obstacles.
             cache: Folder of these; by default the user's.
             library: Folders of your own parts.
-            max_links: Links that observations and actions are padded to; None for what the robot
-                needs, and the paper's at least.
+            max_links: Number that link indices in tokens are relative to; by default the paper's
+                23, or the links of the robot if it has more.
             render_mode: ``rgb_array`` or None.
             size: Width and height of what is rendered, pixels.
 
@@ -125,10 +131,12 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         own = self.env_spec.robot
         other_fields = set(STANDARD_FIELDS) - set(TASKS[task].fields)
         self._hidden = {field.name for field in other_fields}
-        self.action_links: tuple[int, ...] = tuple(torch.nonzero(self.batch.mask[0])[:, 0].tolist())
+        self.action_links: tuple[int, ...] = tuple(
+            torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
+        )
         self.action_joints = tuple(own.joints[link - 1].name for link in self.action_links)
         self._running = self._closed = self._was_reset = False
-        self._last: Moment | None = None
+        self._last: RenderState | None = None
         seen = self._seen(self.batch.observe())
         self.observation_space = cast(
             gym.Space[NumpyObservation], observation_space({k: v[None] for k, v in seen.items()})
@@ -161,7 +169,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         if not self._running:
             raise TaskError("no episode is running; call reset()")
         actions = self._padded(action)
-        now = moment(self.batch)
+        now = render_state(self.batch)
         step = self.batch.step(actions)
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         if terminated or truncated:
@@ -180,7 +188,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             return None
         if self._renderer is None:
             self._renderer = Renderer.of_spec(self.env_spec, self._size)
-        return self._renderer.frame(self._last or moment(self.batch))
+        return self._renderer.frame(self._last or render_state(self.batch))
 
     def close(self) -> None:
         """Free everything; a second time does nothing."""
@@ -200,7 +208,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         if given.shape != expected:
             joints = ", ".join(self.action_joints)
             raise TaskError(f"the action has shape {given.shape}; expected {expected}: {joints}")
-        actions = torch.zeros(self.batch.mask.shape, dtype=torch.from_numpy(given).dtype)
+        actions = torch.zeros(self.batch.action_mask.shape, dtype=torch.from_numpy(given).dtype)
         actions[0, list(self.action_links)] = torch.from_numpy(given)
         return actions
 
@@ -211,7 +219,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         rows["previous_action"] = list(self.action_links)
         return {
             name: np.array(values[0][rows.get(name, slice(None))])
-            for name, values in arrays(observation).items()
+            for name, values in numpy_observation(observation).items()
             if values.dtype == np.float32 and name not in self._hidden
         }
 
@@ -220,13 +228,13 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             "success": bool(step.success[0]),
             "distance": float(step.distance[0]),
             "score": float(step.score[0]),
-            "unstable": bool(step.unstable[0]),
+            "diverged": bool(step.diverged[0]),
             "terms": {name: float(term[0]) for name, term in step.terms.items()},
             "self_collision": self._contacts.self_collision,
         }
 
 
-def _moved(before: Moment, step: Step) -> Moment:
+def _moved(before: RenderState, step: Step) -> RenderState:
     """Return the moment after a step, whatever episode has begun since."""
     block = None if before.block is None else step.block_pose[0].cpu().numpy()
     return replace(before, q=step.q[0, : len(before.q)].cpu().numpy(), block=block)

@@ -1,4 +1,4 @@
-"""Batches of environments from robots or a split, in one call."""
+"""Batches of environments from robots, a split or specifications, in one call."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from morphgen.grammar.library import default_library
 from morphgen.model.robot import Robot
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.bodies import bodies_of
-from morphgen.tasks.env_specs import GoalConfig, env_spec, member_spec
+from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.registry import SIMULATORS
-from morphgen.tasks.robots import robot_of
+from morphgen.tasks.registry import SIMULATORS, default_simulator
+from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import Contacts
-from morphgen.tasks.split_goals import read_goals, shipped_set
+from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 if TYPE_CHECKING:
@@ -29,9 +28,9 @@ T = TypeVar("T")
 
 
 class BatchOptions(TypedDict, total=False):
-    """Keyword arguments of ``batch_of``, which every function here takes."""
+    """Keyword arguments that every function of this module passes to ``batch_from_specs``."""
 
-    sim: str
+    sim: str | None
     seed: int
     kind: ActionKind
     workers: int
@@ -53,41 +52,40 @@ def make_batch(
     library: Iterable[Path] = (),
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
-    """Environments of robots at tasks; environment i has robot i modulo their number.
+    """Make environments of robots at tasks; environment i has robot i modulo their number.
 
     Args:
         task: Name of a task, such as ``reach`` or ``push``; one for all robots, or one for each.
-        robots: Robots, or what ``robot_of`` knows: words of ``morphgen compose``, a bundle's folder
-            or a URDF. Their collision shapes are the fitted primitives, see ``as_primitives``.
-        num_envs: How many environments, n.
-        obstacles: Whether there are any; one for all robots, or one for each.
+        robots: Robots, or names that ``load_robot`` accepts: words of ``morphgen compose``, a
+            bundle's folder or a URDF. Their collision shapes are the fitted primitives.
+        num_envs: Number of environments, n.
+        obstacles: Whether there are obstacles; one for all robots, or one for each.
         goal_seed: Seed of goals, starts and obstacles, which are kept in a cache.
         configs: Constants of tasks, such as a ``ReachConfig``; other tasks have their defaults.
-        cache: Folder of this; by default the user's.
+        cache: Folder of stored goal sets; by default one in the user's cache.
         library: Folders of your own parts.
-        **options: See ``batch_of``.
+        **options: Arguments of ``batch_from_specs``.
 
     Raises:
-        TaskError: If an argument is none of the choices.
+        TaskError: If an argument is invalid.
         BenchmarkError: If a robot cannot do its task.
         SimulationError: If the simulator cannot hold a scene.
         MissingDependencyError: If the simulator is not installed.
-        MorphgenError: If a robot cannot be made or read.
+        MorphgenError: If a robot cannot be composed or read.
     """
     if isinstance(robots, (str, Path, Robot)):
         raise TaskError(f"robots {robots!r}: expected a list, [{robots!r}]")
-    _require_enough(num_envs, len(robots))
+    _require_env_for_each(num_envs, len(robots))
     folders = tuple(library)
-    tasks: list[str] = _one_each("task", task, robots)
-    boxes: list[bool] = _one_each("obstacles", obstacles, robots)
+    tasks: list[str] = _one_for_each("task", task, robots)
+    with_obstacles: list[bool] = _one_for_each("obstacles", obstacles, robots)
     config = GoalConfig(goal_seed, tuple(configs))
-    made: dict[Robot | str | Path, Robot] = {}
-    specs = []
-    for robot, does, has in zip(robots, tasks, boxes, strict=True):
-        if robot not in made:
-            made[robot] = robot_of(robot, library=folders)
-        specs.append(env_spec(made[robot], does, config, obstacles=has, cache=cache))
-    return batch_of(specs, num_envs, library=folders, **options)
+    loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
+    specs = [
+        env_spec(loaded[source], name, config, obstacles=has_obstacles, cache=cache)
+        for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True)
+    ]
+    return batch_from_specs(specs, num_envs, library=folders, **options)
 
 
 def make_split_batch(
@@ -102,73 +100,74 @@ def make_split_batch(
     library: Iterable[Path] = (),
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
-    """Environments of a split's robots, each at its task, with obstacles where it has them.
+    """Make environments of a split's robots, at the tasks and with the obstacles of the split.
 
     Args:
         split: Robots to train and to test on.
-        side: Which of them.
-        num_envs: How many environments, n; environment i has robot i modulo their number.
+        side: ``train`` or ``test``.
+        num_envs: Number of environments, n; environment i has robot i modulo their number.
         goal_seed: Seed of goals, starts and obstacles.
         configs: Constants of tasks, such as a ``ReachConfig``; other tasks have their defaults.
-        goals: The folder where the split is built with goals: the sets there are taken.
-        cache: Folder of these; by default the user's.
+        goals: Folder of a split built with goals, whose goal sets are used.
+        cache: Folder of stored goal sets; by default one in the user's cache.
         library: Folders of your own parts.
-        **options: See ``batch_of``.
+        **options: Arguments of ``batch_from_specs``.
 
     Raises:
-        MorphgenError: As ``make_batch``; or if a robot is not the one that the split was made with,
-            or a set that is shipped not the one that it says.
+        MorphgenError: As ``make_batch``; or if a robot differs from the one that the split was
+            made with, or a shipped goal set is not the one that would be sampled.
     """
     folders = tuple(library)
     parts, config = default_library(folders), GoalConfig(goal_seed, tuple(configs))
     members = split.side(side)
-    _require_enough(num_envs, len(members))
-    shipped = read_goals(goals, side) if goals is not None else None
+    _require_env_for_each(num_envs, len(members))
+    sets = read_goals(goals, side) if goals is not None else None
     specs = [
         member_spec(
             member,
             parts,
             config,
             cache=cache,
-            shipped=shipped_set(shipped, member.name, goals),
+            shipped=shipped_goal_set(sets, member.name, goals),
         )
         for member in members
     ]
-    return batch_of(specs, num_envs, library=folders, **options)
+    return batch_from_specs(specs, num_envs, library=folders, **options)
 
 
-def batch_of(
+def batch_from_specs(
     specs: Sequence[EnvSpec],
     num_envs: int,
     *,
-    sim: str = "pybullet",
+    sim: str | None = None,
     seed: int = 0,
     kind: ActionKind = "continuous",
     workers: int = 1,
     contacts: Contacts | None = None,
     observe: ObservationConfig | None = None,
-    max_links: int | None = MAX_LINKS,
+    max_links: int | None = None,
     first: int = 0,
     library: Iterable[Path] = (),
 ) -> TaskBatch:
-    """Make a batch of environments.
+    """Make a batch of environments from their specifications.
 
     Args:
         specs: Specifications; environment i has specification i modulo their number.
-        num_envs: How many environments, n.
-        sim: Name of a simulator, such as ``pybullet`` or ``mujoco``.
-        seed: Of episodes: the same gives the same.
+        num_envs: Number of environments, n.
+        sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
+            ``default_simulator()``.
+        seed: Seed of the episodes.
         kind: Actions are ``continuous``, in [-1, 1], or ``discrete``, indices of ``BINS``.
-        workers: Processes of PyBullet, threads of MuJoCo.
-        contacts: What may touch what; by default everything.
-        observe: Entries of observations that are not there by default.
-        max_links: L, links that observations and actions are padded to; None for what the largest
-            robot needs, and the paper's at least.
+        workers: Number of processes of PyBullet, or of threads of MuJoCo.
+        contacts: Pairs of things that collide; by default everything.
+        observe: Optional entries of observations.
+        max_links: Number of links, L, that observations and actions are padded to; by default the
+            paper's 23, or the links of the largest robot if it has more.
         first: Number of the first environment, where a batch is made in parts.
         library: Folders of your own parts.
 
     Raises:
-        TaskError: If an argument is none of the choices.
+        TaskError: If an argument is invalid.
         BenchmarkError: If a robot has more links than ``max_links``.
         SimulationError: If the simulator cannot hold a scene.
         MissingDependencyError: If the simulator is not installed.
@@ -182,20 +181,19 @@ def batch_of(
         raise TaskError(f"seed {seed}: expected 0 or more")
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
+    simulator = SIMULATORS[sim or default_simulator()]
     robots = [spec.robot for spec in specs]
     if max_links is None:
         max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
-    bodies = bodies_of(
-        robots,
-        default_library(tuple(library)).folders,
-        max_links=max_links,
+    tables = build_robot_tables(
+        robots, default_library(tuple(library)).folders, max_links=max_links
     )
-    body = [(first + i) % len(specs) for i in range(num_envs)]
-    simulation = SIMULATORS[sim].load([specs[i].scene for i in body], contacts, workers)
+    env_robot_index = [(first + i) % len(specs) for i in range(num_envs)]
+    simulation = simulator.load([specs[i].scene for i in env_robot_index], contacts, workers)
     return TaskBatch(
-        bodies,
+        tables,
         specs,
-        body,
+        env_robot_index,
         simulation,
         kind=kind,
         observe=observe,
@@ -204,16 +202,18 @@ def batch_of(
     )
 
 
-def _require_enough(num_envs: int, robots: int) -> None:
-    """Require an environment for every robot: what has none would silently not be there."""
-    if num_envs < robots:
-        raise TaskError(f"{num_envs} environments for {robots} robots: expected one each at least")
+def _require_env_for_each(num_envs: int, num_robots: int) -> None:
+    """Require an environment for every robot: a robot without one would silently be missing."""
+    if num_envs < num_robots:
+        raise TaskError(
+            f"{num_envs} environments for {num_robots} robots: expected at least one each"
+        )
 
 
-def _one_each(what: str, given: T | Sequence[T], robots: Sequence[object]) -> list[T]:
-    """What is given for every robot, or for all."""
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        return [given] * len(robots)
-    if len(given) != len(robots):
-        raise TaskError(f"{what}: {len(given)} are given for {len(robots)} robots")
-    return list(given)
+def _one_for_each(name: str, value: T | Sequence[T], robots: Sequence[object]) -> list[T]:
+    """Return an argument for every robot, which is given for each of them or once for all."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return [value] * len(robots)
+    if len(value) != len(robots):
+        raise TaskError(f"{name}: {len(value)} values for {len(robots)} robots; expected one each")
+    return list(value)

@@ -1,99 +1,117 @@
-"""Observations: what they have besides the fields of tasks, and tokens of links and boxes."""
+"""Observations: optional entries, tokens of links and boxes, and point clouds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
-from morphgen.tasks.bodies import Bodies
-from morphgen.tasks.sim.base import Scene
+from morphgen.errors import TaskError
+from morphgen.model.rotation_torch import matrix_from_quaternion
+from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.sim.base import Block, Scene
 
 Observation = dict[str, torch.Tensor]
 """``tokens`` (n, L, 48), ``links`` and ``actions`` (n, L) bool; ``obstacles`` (n, O, 13) and
-``obstacle_mask`` (n, O) bool; the fields of tasks with their masks: of ``task.STANDARD_FIELDS``
+``obstacle_mask`` (n, O) bool; the fields of tasks with their masks, of ``task.STANDARD_FIELDS``:
 ``goal`` (n, 7), ``object`` (n, 13) and ``line`` (n, 1), ``goal_mask`` and ``object_mask`` (n,)
-bool. If asked for, ``velocity`` (n, L), ``previous_action`` (n, L), ``tool`` (n, 3), ``points``
+bool. On request: ``velocity`` (n, L), ``previous_action`` (n, L), ``tool`` (n, 3), ``points``
 (n, P, 3) and ``point_mask`` (n, P) bool."""
+
+NOISE = 0.005
+"""Standard deviation of a point's position along each axis, as of a depth camera [m]."""
 
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """Entries of an observation that are not there by default; the paper has only the points."""
+    """Entries of an observation that are off by default; the paper uses only the points."""
 
     velocity: bool = False
-    """Velocities of the links' independent joints, rad/s or m/s."""
+    """Whether to observe the velocities of the links' independent joints [rad/s or m/s]."""
     previous_action: bool = False
-    """The action before, as shares of the joints' largest steps."""
+    """Whether to observe the previous normalized action."""
     tool: bool = False
-    """Position of the tool in the world, metres."""
+    """Whether to observe the position of the tool in the world [m]."""
     points: int = 0
     """Number of points of a point cloud of block and obstacles."""
     obstacles: int = 0
-    """Least number of rows for obstacles: for policies that meet more of them elsewhere."""
+    """Minimum number of obstacle rows, for policies that meet more obstacles elsewhere."""
+
+    def __post_init__(self) -> None:
+        """Require counts."""
+        if self.points < 0 or self.obstacles < 0:
+            raise TaskError(
+                f"observation of {self.points} points and {self.obstacles} obstacles; "
+                "expected 0 or more"
+            )
 
 
 class LinkTokens:
-    """Tokens of the links of a batch's environments; only codes of joint positions move."""
+    """Tokens of the links of a batch's environments; only codes of joint positions change."""
 
-    def __init__(self, bodies: Bodies, body: torch.Tensor) -> None:
-        """Prepare.
+    def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
+        """Gather the tables of every environment.
 
         Args:
-            bodies: The robots.
-            body: Which robot each row is, shape (n,), int64.
+            tables: The robots.
+            env_robot_index: Robot of each environment, shape (n,), int64.
         """
-        moving = bodies.moving[body]
-        most = int(moving.sum(dim=1).max())
-        self._links = (~moving).int().argsort(dim=1, stable=True)[:, :most]
-        """Links that move, before others where a robot has fewer, shape (n, M)."""
-        self._rows = torch.arange(len(body), device=body.device)[:, None]
-        self._still = bodies.tokens[body]
-        each = body[:, None], self._links
-        gains = bodies.to_link[each]
-        self._joint = gains.abs().argmax(dim=2)
+        device = env_robot_index.device
+        movable = tables.movable_links[env_robot_index]
+        max_movable = int(movable.sum(dim=1).max())
+        # Indices of movable links (n, M); robots with fewer are filled up with other links.
+        self._links = (~movable).int().argsort(dim=1, stable=True)[:, :max_movable]
+        self._rows = torch.arange(len(env_robot_index), device=device)[:, None]
+        self._constant = tables.tokens[env_robot_index]
+        index = env_robot_index[:, None], self._links
+        gains = tables.position_gain[index]
+        self._joint = gains.abs().argmax(dim=2)  # each link follows one independent joint
         self._gain = torch.gather(gains, 2, self._joint[..., None])[..., 0]
-        self._offset, self._turns = bodies.at_link[each], bodies.turns[each]
-        self._counts = bodies.moving[each][..., None]
-        self._frequencies = torch.from_numpy(FREQUENCIES).float().to(body.device)
+        self._offset, self._wraps = tables.position_offset[index], tables.wraps[index]
+        self._is_movable = tables.movable_links[index][..., None]
+        self._frequencies = torch.from_numpy(FREQUENCIES).float().to(device)
 
     def __call__(self, q: torch.Tensor) -> torch.Tensor:
-        """Tokens (n, L, 48) at independent joint positions (n, J)."""
+        """Return the tokens (n, L, 48) at independent joint positions (n, J)."""
         x = self._gain * torch.gather(q, 1, self._joint) + self._offset
-        x = torch.where(self._turns, x - 2 * torch.ceil((x - 1) / 2), x)
+        x = torch.where(self._wraps, x - 2 * torch.ceil((x - 1) / 2), x)
         angles = x[..., None] * self._frequencies
-        codes = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1) * self._counts
-        made = self._still.clone()
-        made[..., POSITION.columns][self._rows, self._links] = codes
-        return made
+        codes = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1) * self._is_movable
+        tokens = self._constant.clone()
+        tokens[..., POSITION.columns][self._rows, self._links] = codes
+        return tokens
 
 
-def of_links(bodies: Bodies, body: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Values of independent joints (n, J) as those of the links that they move, shape (n, L)."""
-    joint = bodies.joint_of_link[body]
+def joint_to_link(
+    tables: RobotTables, env_robot_index: torch.Tensor, values: torch.Tensor
+) -> torch.Tensor:
+    """Return values of independent joints (n, J) at the links that they move, shape (n, L)."""
+    joint = tables.joint_of_link[env_robot_index]
     return torch.gather(values, 1, joint.clamp(min=0)) * (joint >= 0)
 
 
 def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
-    """Tokens of boxes: pose (..., 7) and edges (..., 3) to (..., 13)."""
+    """Return tokens of boxes, shape (..., 13), from poses (..., 7) and edge lengths (..., 3)."""
     shape = torch.zeros_like(size)
     shape[..., 2] = 1
     return torch.cat([pose, shape, size], dim=-1)
 
 
-def obstacle_tokens(scenes: Sequence[Scene], least: int, device: torch.device) -> Observation:
-    """Return tokens of the obstacles in scenes, (n, O, 13), and which there are, (n, O).
+def obstacle_tokens(scenes: Sequence[Scene], min_rows: int, device: torch.device) -> Observation:
+    """Return tokens of the obstacles in scenes, (n, O, 13), and the mask of real ones, (n, O).
 
     Args:
-        scenes: One for each environment.
-        least: Least number of rows, O.
+        scenes: Scene of each environment.
+        min_rows: Minimum number of rows, O.
         device: Device of the tensors.
     """
-    most = max(least, *(len(scene.obstacles) for scene in scenes))
-    pose, size = torch.zeros(len(scenes), most, 7), torch.zeros(len(scenes), most, 3)
-    mask = torch.zeros(len(scenes), most, dtype=torch.bool)
+    num_rows = max(min_rows, *(len(scene.obstacles) for scene in scenes))
+    pose, size = torch.zeros(len(scenes), num_rows, 7), torch.zeros(len(scenes), num_rows, 3)
+    mask = torch.zeros(len(scenes), num_rows, dtype=torch.bool)
     for i, scene in enumerate(scenes):
         for k, block in enumerate(scene.obstacles):
             pose[i, k] = torch.tensor([*block.pose.position, *block.pose.quaternion])
@@ -101,3 +119,71 @@ def obstacle_tokens(scenes: Sequence[Scene], least: int, device: torch.device) -
             mask[i, k] = True
     tokens = box_tokens(pose, size) * mask[..., None]
     return {"obstacles": tokens.to(device), "obstacle_mask": mask.to(device)}
+
+
+class PointClouds:
+    """P points on the surfaces of every environment's block and obstacles.
+
+    Each episode draws its points and their noise at its beginning.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
+        """Prepare; ``begin`` draws the points.
+
+        Args:
+            scenes: Scene of each environment.
+            num_points: Number of points of each environment, P.
+            device: Device of the tensors.
+        """
+        n = len(scenes)
+        self._boxes = [
+            ([scene.block] if scene.block is not None else []) + list(scene.obstacles)
+            for scene in scenes
+        ]
+        self._has_block = [scene.block is not None for scene in scenes]
+        self._num_points = num_points
+        self._local = torch.zeros(n, num_points, 3, device=device)
+        self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
+        has_boxes = torch.tensor([bool(boxes) for boxes in self._boxes], device=device)
+        self.mask = has_boxes[:, None].repeat(1, num_points)
+        """Existing points, shape (n, P), bool."""
+
+    def begin(self, env: int, rng: np.random.Generator) -> None:
+        """Draw the points of an episode, uniformly over the surfaces of all boxes."""
+        boxes = self._boxes[env]
+        if not boxes:
+            return
+        areas = np.array([_face_areas(box).sum() for box in boxes])
+        box_index = rng.choice(len(boxes), self._num_points, p=areas / areas.sum())
+        local = np.array([_surface_point(boxes[k], rng) for k in box_index])
+        local += rng.normal(0.0, NOISE, local.shape)
+        on_block = (box_index == 0) & self._has_block[env]
+        for row in np.flatnonzero(~on_block):
+            local[row] = boxes[box_index[row]].pose.apply(tuple(local[row]))
+        self._local[env] = torch.from_numpy(local).to(self._local)
+        self._on_block[env] = torch.from_numpy(on_block).to(self._on_block.device)
+
+    def __call__(self, block_pose: torch.Tensor) -> torch.Tensor:
+        """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes.
+
+        Args:
+            block_pose: Poses of the blocks, shape (n, 7).
+        """
+        R = matrix_from_quaternion(block_pose[:, 3:])
+        moved = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
+        return torch.where(self._on_block[..., None], moved, self._local)
+
+
+def _face_areas(box: Block) -> NDArray[np.float64]:
+    """Return the areas of the faces across x, y and z [m^2]."""
+    x, y, z = box.size
+    return np.array([y * z, x * z, x * y])
+
+
+def _surface_point(box: Block, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw a point uniformly on the surface, in the box's frame."""
+    areas = _face_areas(box)
+    axis = rng.choice(3, p=areas / areas.sum())
+    point = rng.uniform(-0.5, 0.5, 3) * np.array(box.size)
+    point[axis] = rng.choice([-0.5, 0.5]) * box.size[axis]
+    return np.asarray(point)

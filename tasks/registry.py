@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from morphgen.errors import TaskError, nearest
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Named(Protocol):
-    """An object that a registry holds."""
+    """An object with the name under which a registry holds it."""
 
     @property
     def name(self) -> str:
@@ -26,20 +28,20 @@ T = TypeVar("T", bound=Named)
 
 
 class Registry(Generic[T]):
-    """Objects by name; each is imported when it is first asked for.
+    """Objects by name; each is imported when it is first requested.
 
-    Names come from three places: the rows of morphgen itself, the entry points of installed
-    packages, and ``register``. Iterating over a registry, and asking whether a name is in it,
-    imports none of the objects, so a registry may serve as ``choices`` of a command line option.
+    Names come from morphgen's own table, the entry points of installed packages, and ``register``.
+    Iterating and testing for a name import none of the objects, so a registry can serve as the
+    ``choices`` of a command line option.
     """
 
     def __init__(self, kind: str, group: str, builtin: Mapping[str, str]) -> None:
-        """Set up.
+        """Create a registry.
 
         Args:
-            kind: What the objects are called in messages.
-            group: Group of the entry points of other packages.
-            builtin: Names of morphgen's own objects and where they are, as ``module:attribute``.
+            kind: Noun for the objects in messages.
+            group: Entry point group of other packages.
+            builtin: Locations of morphgen's own objects by name, as ``module:attribute``.
         """
         self.kind, self.group = kind, group
         self.builtin = tuple(builtin)
@@ -50,7 +52,8 @@ class Registry(Generic[T]):
     def register(self, item: T) -> T:
         """Add an object for the rest of this process; return it.
 
-        Worker processes import morphgen anew and know only rows and entry points.
+        Worker processes (``--jobs``) do not know it: they import morphgen anew, and know only its
+        own table and entry points. Use an entry point where several processes are needed.
 
         Raises:
             TaskError: If another object has this name.
@@ -101,10 +104,10 @@ class Registry(Generic[T]):
 
     @cached_property
     def _entry_points(self) -> dict[str, str]:
-        """Names and places of what installed packages bring; looking them up takes 4 ms."""
+        """Locations by name of the objects of installed packages; the lookup takes 4 ms."""
         from importlib.metadata import entry_points  # takes 50 ms to import
 
-        return {each.name: each.value for each in entry_points(group=self.group)}
+        return {entry.name: entry.value for entry in entry_points(group=self.group)}
 
 
 TASKS: Registry[Task[Any, Any]] = Registry(
@@ -122,3 +125,30 @@ SIMULATORS: Registry[Simulator] = Registry(
     },
 )
 """Simulators; see ``morphgen.tasks.sim.base.Simulator``."""
+
+
+@cache
+def default_simulator() -> str:
+    """Return the simulator to use unless one is named: PyBullet if installed, else MuJoCo.
+
+    Logs a warning once if it is MuJoCo: seeds then give other episodes than with PyBullet.
+    """
+    if find_spec("pybullet") is not None:
+        return "pybullet"
+    logging.getLogger(__name__).warning("PyBullet is not installed; using simulator MuJoCo")
+    return "mujoco"
+
+
+def register_gym_envs() -> None:
+    """Register ``morphgen/<Task>-v0`` of every task with Gymnasium; repeating it does nothing."""
+    from gymnasium.envs.registration import register, registry
+
+    for task in TASKS:
+        env_id = f"morphgen/{task.capitalize()}-v0"
+        if env_id not in registry:
+            register(
+                id=env_id,
+                entry_point="morphgen.tasks.gym_env:TaskEnv",
+                vector_entry_point="morphgen.tasks.vector:task_vector",
+                kwargs={"task": task},
+            )

@@ -48,7 +48,7 @@ _STARTS = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class RenderState:
     """The state of an environment that is drawn."""
 
     q: NDArray[np.float32]
@@ -116,7 +116,7 @@ class Renderer:
         markers = task.markers(spec.config, spec.goals)
         return cls(spec.scene, markers, configurations, task.points_in_view(spec.goals), size)
 
-    def frame(self, moment: Moment) -> Frame:
+    def frame(self, moment: RenderState) -> Frame:
         """Draw a moment.
 
         Returns:
@@ -160,18 +160,20 @@ class Renderer:
         return np.ascontiguousarray(pixels[::-1])
 
 
-def moment(batch: TaskBatch, env: int = 0) -> Moment:
+def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
     """Return the state of an environment of a batch as it is now."""
-    spec = batch.specs[int(batch.body[env])]
+    spec = batch.specs[int(batch.env_robot_index[env])]
     block = None if spec.scene.block is None else _copied(batch.simulation.block_pose[env])
-    return Moment(_copied(batch.q[env, : spec.robot.dof]), block, batch.groups.marker_poses(env))
+    return RenderState(
+        _copied(batch.q[env, : spec.robot.dof]), block, batch.groups.marker_poses(env)
+    )
 
 
 def _copied(values: torch.Tensor) -> NDArray[np.float32]:
     return np.array(values.cpu().numpy(), dtype=np.float32)
 
 
-def require_film(path: Path) -> None:
+def require_video_path(path: Path) -> None:
     """Require that a film can be written there, before anything is drawn.
 
     Raises:
@@ -183,7 +185,7 @@ def require_film(path: Path) -> None:
         raise FormatError(f"cannot write {path}: there is no folder {path.parent}")
 
 
-def write_film(frames: Iterable[Frame], path: Path, fps: float) -> None:
+def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
     """Write frames as they come: H.264 in ``.mp4``, or an endless ``.gif``.
 
     Nothing is there until all is written. The same frames give the same bytes.
@@ -197,7 +199,7 @@ def write_film(frames: Iterable[Frame], path: Path, fps: float) -> None:
         FormatError: If it cannot be written there, or ffmpeg is missing, fails or is killed; then
             nothing is left.
     """
-    require_film(path)
+    require_video_path(path)
     written = 0
     try:
         with replacing_file(path) as partial:
@@ -214,11 +216,11 @@ def write_film(frames: Iterable[Frame], path: Path, fps: float) -> None:
                 _require_whole(partial, written)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
-    except FilmError as error:
+    except VideoError as error:
         raise FormatError(f"cannot write {path}: {error}") from error
 
 
-class FilmError(Exception):
+class VideoError(Exception):
     """Why ffmpeg did not write a film."""
 
 
@@ -231,27 +233,27 @@ def _append(
     except OSError as error:
         if error.errno is not None:
             raise
-        raise FilmError(
+        raise VideoError(
             "ffmpeg ended early; does it have the codec libx264, and is there room on the disk?"
         ) from error
     except RuntimeError as error:
-        raise FilmError(str(error)) from error
+        raise VideoError(str(error)) from error
 
 
 def _require_whole(film: Path, frames: int) -> None:
     """Require that a film has all frames: ffmpeg's exit code is not known, and it may have failed.
 
     Raises:
-        FilmError: If it has not, as on a full disk.
+        VideoError: If it has not, as on a full disk.
     """
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(film))
     except RuntimeError as error:
-        raise FilmError(
+        raise VideoError(
             "ffmpeg left a film that cannot be read; is the disk full, or was ffmpeg ended?"
         ) from error
     if count != frames:
-        raise FilmError(
+        raise VideoError(
             f"ffmpeg wrote {count} of {frames} frames; is the disk full, or was ffmpeg ended?"
         )
 

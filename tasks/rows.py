@@ -1,4 +1,4 @@
-"""Rows of tensors, one for each environment; their bits depend on no other environment."""
+"""Row-wise tensor functions, a row per environment, whose bits depend on no other row."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def row_norms(vectors: torch.Tensor) -> torch.Tensor:
 
 
 def limit_violation(q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
-    """Return how far joints are outside of their limits, all together, shape (n,), rad and m."""
+    """Return the sum over joints of their distance outside of the limits, shape (n,) [rad, m]."""
     return row_sums(torch.clamp(torch.maximum(q - upper, lower - q), min=0))
 
 
 def padded_rows(
     tables: Sequence[NDArray[np.float64]], width: int, device: torch.device
 ) -> torch.Tensor:
-    """Return tables (S_i, w_i) as one tensor, shape (R, largest S, width), padded with zeros."""
+    """Stack tables (S_i, w_i) into one tensor, shape (R, largest S, width), padded with zeros."""
     padded = torch.zeros(len(tables), max(map(len, tables)), width)
     for row, table in zip(padded, tables, strict=True):
         row[: table.shape[0], : table.shape[1]] = torch.from_numpy(table)

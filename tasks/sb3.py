@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import MissingDependencyError, TaskError
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.spaces import NumpyObservation
-from morphgen.tasks.vector import TaskVector
+from morphgen.tasks.vector import NumpyObservation, TaskVector
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -74,7 +73,7 @@ class SB3Vector(VecEnv):
             infos[env]["terminal_observation"] = facts["final_obs"][env]
             infos[env]["TimeLimit.truncated"] = bool(truncated[env])
             infos[env]["is_success"] = bool(facts["success"][env])
-            infos[env]["unstable"] = bool(facts["unstable"][env])
+            infos[env]["diverged"] = bool(facts["diverged"][env])
         return seen, reward, over, infos
 
     def close(self) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import BINS
 from morphgen.tasks.sim.base import SUBSTEPS
 
 WARM_UP = 20
@@ -36,15 +36,15 @@ class Speed:
 def random_actions(batch: TaskBatch, count: int, seed: int) -> list[torch.Tensor]:
     """Actions drawn evenly from all there are."""
     generator = torch.Generator().manual_seed(seed)
-    shape = (count, *batch.mask.shape)
-    if batch.kind == "discrete":
+    shape = (count, *batch.action_mask.shape)
+    if batch.action_kind == "discrete":
         drawn = torch.randint(len(BINS), shape, generator=generator)
     else:
         drawn = 2 * torch.rand(shape, generator=generator) - 1
     return list(drawn.to(batch.device).unbind(0))
 
 
-def measure(
+def measure_speed(
     batch: TaskBatch,
     seconds: float,
     *,
@@ -75,7 +75,7 @@ def measure(
         "around the simulator": [(batch.simulation, "step")],
         "simulator": list(own),
     }
-    episode = int(batch.longest.max())
+    episode = int(batch.max_episode_steps.max())
     actions = random_actions(batch, episode, seed)
     batch.reset()
     for action in actions[:WARM_UP]:

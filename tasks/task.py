@@ -1,21 +1,23 @@
-"""What a task is: the protocol behind which reach, push and tasks of other packages stand.
+"""The interface of tasks: reach, push, and tasks of other packages.
 
-A ``Task`` is one object. It draws the goal sets of robots and certifies them (``sample``,
-``certify``), says what stands in the scene (``scene``), and makes ``TaskEnvs``, which hold the
-goals of a batch's environments at this task and evaluate every step of them as tensors.
-``morphgen.tasks.registry`` knows tasks by their names.
+A ``Task`` is one object. It samples and certifies the goal sets of robots (``sample``,
+``certify``), defines the scene (``scene``), and makes ``TaskEnvs``, which hold the goals of a
+batch's environments at this task and evaluate every step of them as tensors.
+``morphgen.tasks.registry`` finds tasks by name.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.errors import TaskError
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.sim.base import Block, Scene
@@ -33,23 +35,43 @@ class TaskConfig(Protocol):
     """Name of the task."""
 
     @property
-    def steps(self) -> int:
-        """Control steps of an episode at most."""
-
-    @property
-    def obstacles(self) -> int:
-        """Number of boxes among which robots work if obstacles are asked for."""
-
-    @property
-    def obstacle_size(self) -> tuple[float, float]:
-        """Range of the edges of these boxes, relative to the robot's reach."""
+    def max_episode_steps(self) -> int:
+        """Time limit of an episode [control steps]."""
 
     @property
     def num_goals(self) -> int:
         """Number of goals in a robot's goal set."""
 
-    def with_num_goals(self, num_goals: int) -> TaskConfig:
-        """Return the same constants with another number of goals."""
+    @property
+    def obstacles(self) -> int:
+        """Number of boxes in the scene if obstacles are requested."""
+
+    @property
+    def obstacle_size(self) -> tuple[float, float]:
+        """Range of the edge lengths of these boxes, relative to the robot's reach."""
+
+
+def require_task_config(config: TaskConfig) -> None:
+    """Require valid values of the constants that every task has, and only finite numbers.
+
+    Raises:
+        TaskError: If a constant is out of its range.
+    """
+    name = type(config).__name__
+    for field in fields(config):
+        value = getattr(config, field.name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
+            raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
+    for field_name, minimum in (("max_episode_steps", 1), ("num_goals", 1), ("obstacles", 0)):
+        value = getattr(config, field_name)
+        if not isinstance(value, int) or value < minimum:
+            raise TaskError(f"{name}: {field_name} {value!r}: expected an integer >= {minimum}")
+    low, high = config.obstacle_size
+    if not 0 < low <= high:
+        raise TaskError(
+            f"{name}: obstacle_size {config.obstacle_size}: expected 0 < lowest <= highest"
+        )
 
 
 class GoalSet(Protocol):
@@ -108,15 +130,24 @@ class EnvSpec:
     """Constants of the task."""
 
 
+BOUND = 1000.0
+"""Largest magnitude of an observed number [m, rad, m/s or rad/s]; no episode gets there."""
+
+
 @dataclass(frozen=True)
 class ObservationField:
-    """An entry of an observation: a vector for each environment whose task has it, else zeros."""
+    """A vector in the observation, filled by tasks that declare it and zero in other rows."""
 
     name: str
+    """Name of the entry, shape (n, size)."""
     size: int
     """Length of the vector."""
     mask: str
-    """Entry that says which environments have the field, shape (n,), bool."""
+    """Name of the entry that marks environments with the field, shape (n,), bool."""
+    low: float = -BOUND
+    """Smallest value of a number in the vector."""
+    high: float = BOUND
+    """Largest value of a number in the vector."""
 
 
 GOAL = ObservationField("goal", 7, "goal_mask")
@@ -152,7 +183,7 @@ class TaskState:
     """Sum over joints of how far they are outside of their limits, shape (k,), rad and m."""
     acceleration: torch.Tensor
     """Sum over joints of the absolute mean acceleration in the step, shape (k,)."""
-    unstable: torch.Tensor
+    diverged: torch.Tensor
     """Whether the simulation diverged, shape (k,), bool; such a step is never a success."""
 
 

@@ -23,7 +23,7 @@ from morphgen.tasks.task import (
 
 
 @dataclass(frozen=True, eq=False)
-class StepRows(StepResult):
+class BatchResult(StepResult):
     """How a step went, for all environments of a batch."""
 
     reward: torch.Tensor
@@ -43,24 +43,26 @@ class _Group:
 class TaskGroups:
     """The environments of a batch by task; tensors of the batch have n rows."""
 
-    def __init__(self, specs: Sequence[EnvSpec], body: torch.Tensor, num_joints: int) -> None:
+    def __init__(
+        self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, num_joints: int
+    ) -> None:
         """Group environments.
 
         Args:
             specs: Specifications.
-            body: Index of each environment's specification, shape (n,), int64.
+            env_robot_index: Index of each environment's specification, shape (n,), int64.
             num_joints: Independent joints of a row, padding included.
 
         Raises:
             TaskError: If a task is unknown or has different constants in the batch.
         """
-        n, device = len(body), body.device
-        used = [specs[i] for i in body.tolist()]
+        n, device = len(env_robot_index), env_robot_index.device
+        used = [specs[i] for i in env_robot_index.tolist()]
         self._groups: dict[str, _Group] = {}
         self._row = torch.zeros(n, dtype=torch.int64, device=device)
         """Row of each environment in its group."""
-        self.longest = torch.zeros(n, dtype=torch.int64, device=device)
-        """Control steps of an episode at most, shape (n,)."""
+        self.max_episode_steps = torch.zeros(n, dtype=torch.int64, device=device)
+        """Time limit of episodes, shape (n,) [control steps]."""
         self.moves_fingers = torch.zeros(n, dtype=torch.bool, device=device)
         """Whether actions move joints beyond the tool, shape (n,)."""
         for name in dict.fromkeys(spec.task for spec in used):
@@ -70,13 +72,13 @@ class TaskGroups:
                 raise TaskError(f"environments at {name} have different constants; expected one")
             of_spec = torch.zeros(len(specs), dtype=torch.int64)
             of_spec[own] = torch.arange(len(own))
-            does = torch.tensor([spec.task == name for spec in used], device=device)
-            rows = torch.nonzero(does)[:, 0]
-            spec = of_spec.to(device)[body[rows]]
+            is_at_task = torch.tensor([spec.task == name for spec in used], device=device)
+            rows = torch.nonzero(is_at_task)[:, 0]
+            spec = of_spec.to(device)[env_robot_index[rows]]
             envs = task.make_envs([specs[i] for i in own], spec, num_joints)
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
-            self.longest[rows] = config.steps
+            self.max_episode_steps[rows] = config.max_episode_steps
             self.moves_fingers[rows] = task.moves_fingers
         every = (field for group in self._groups.values() for field in group.task.fields)
         self._fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *every)))
@@ -93,12 +95,12 @@ class TaskGroups:
         """Return the environments of a task."""
         return self._groups[task].envs
 
-    def does(self, task: str) -> torch.Tensor:
+    def task_mask(self, task: str) -> torch.Tensor:
         """Return which environments are at a task, shape (n,), bool."""
-        does = torch.zeros_like(self.moves_fingers)
+        mask = torch.zeros_like(self.moves_fingers)
         if task in self._groups:
-            does[self._groups[task].rows] = True
-        return does
+            mask[self._groups[task].rows] = True
+        return mask
 
     def begin(
         self, envs: torch.Tensor, random: Sequence[np.random.Generator]
@@ -113,13 +115,13 @@ class TaskGroups:
             For each task, which rows of ``envs`` it has, and what ``TaskEnvs.begin`` returns.
         """
         for name, group in self._groups.items():
-            rows = torch.nonzero(self.does(name)[envs])[:, 0]
+            rows = torch.nonzero(self.task_mask(name)[envs])[:, 0]
             if len(rows):
                 own = envs[rows]
                 streams = [random[i] for i in own.tolist()]
                 yield rows, group.envs.begin(self._row[own], streams)
 
-    def evaluate(self, state: TaskState) -> StepRows:
+    def evaluate(self, state: TaskState) -> BatchResult:
         """Evaluate a step of all environments."""
         results = [
             (group.rows, group.envs.evaluate(self._of(group, state)))
@@ -127,12 +129,12 @@ class TaskGroups:
         ]
         rewards = [torch.stack(list(each.terms.values())).sum(dim=0) for _, each in results]
         if len(results) == 1:
-            return StepRows(**vars(results[0][1]), reward=rewards[0])
+            return BatchResult(**vars(results[0][1]), reward=rewards[0])
         rows = [rows for rows, _ in results]
         each = [result for _, result in results]
         names = dict.fromkeys(name for result in each for name in result.terms)
         none = [torch.zeros_like(result.distance) for result in each]
-        return StepRows(
+        return BatchResult(
             success=self._scattered(rows, [result.success for result in each]),
             terminated=self._scattered(rows, [result.terminated for result in each]),
             distance=self._scattered(rows, [result.distance for result in each]),

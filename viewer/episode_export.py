@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.tasks.renderer import SIZE, Frame, Moment, Renderer, write_film
+from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, write_video
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.viewer.access import AccessPolicy
 from morphgen.viewer.episode import Episode, Track
@@ -32,7 +32,7 @@ def film(episode: Episode) -> bytes:
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "episode.mp4"
-        write_film(_frames(episode), path, 1 / (STRIDE * episode.period))
+        write_video(_frames(episode), path, 1 / (STRIDE * episode.period))
         return path.read_bytes()
 
 
@@ -89,7 +89,7 @@ def _frame(renderer: Renderer, track: Track, step: int) -> Frame:
     at = min(step, track.steps)
     block = track.block[at] if track.block else None
     markers = {name: poses[at] for name, poses in track.marker_poses.items()}
-    return renderer.frame(Moment(track.q[at], block, markers))
+    return renderer.frame(RenderState(track.q[at], block, markers))
 
 
 def _tiled(tiles: list[Frame], columns: int) -> Frame:

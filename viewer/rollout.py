@@ -22,11 +22,11 @@ from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import read_checkpoint
 from morphgen.tasks.batch import Step
-from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import SIMULATORS, TASKS
-from morphgen.tasks.renderer import moment
-from morphgen.tasks.robots import robot_of
+from morphgen.tasks.renderer import render_state
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.viewer.episode import Array, Episode, Track
 from morphgen.viewer.robot_uri import (
     CHECKPOINT,
@@ -131,7 +131,7 @@ class Rollout:
                 self.faults[place] = str(error)
         if not self._players:
             raise first or UriError("no robot is named: add one with &robot=")
-        self.longest = max(int(each.env.batch.longest[0]) for each in self._players)
+        self.longest = max(int(each.env.batch.max_episode_steps[0]) for each in self._players)
         self.episode = Episode(
             wanted.task,
             wanted.policy,
@@ -217,7 +217,7 @@ def trained_with(policy: str, places: FileAccess) -> tuple[str, bool, list[tuple
     elif words and words[0].endswith(SUFFIX):
         robot = read_robot_uri(WORDS + source.name, places)
     else:
-        robot = robot_of(source.name, library=places.folders)
+        robot = load_robot(source.name, library=places.folders)
     derivation = robot.provenance.get("derivation")
     place = f"{DERIVED}{derivation}" if derivation else source.name
     assert source.task is not None  # a split says it of its robots, which are looked at above
@@ -244,7 +244,7 @@ def _player(wanted: RolloutConfig, place: str, policy: str, places: FileAccess) 
     except MorphgenError:
         env.close()
         raise
-    now, spec = moment(env.batch), env.env_spec
+    now, spec = render_state(env.batch), env.env_spec
     track = Track(
         split_colours(read),
         place,
@@ -278,7 +278,7 @@ def _step(player: _Player) -> None:
     track.success.append(bool(step.success[0]))
     track.q.append(_numbers(step.q[0, : track.robot.dof]))
     player.running = not over
-    if step.unstable[0]:
+    if step.diverged[0]:
         track.fault = "the simulation became unstable"
 
 

@@ -180,7 +180,7 @@ def _episodes(args: argparse.Namespace) -> int:
 
     if args.episodes is not None:
         return int(args.episodes)
-    return episodes_for(args.steps, max(each.steps for each in default_configs()))
+    return episodes_for(args.steps, max(each.max_episode_steps for each in default_configs()))
 
 
 def _sources(args: argparse.Namespace) -> list[RobotSource]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from morphgen.benchmark.split import Split
     from morphgen.processes import Progress
     from morphgen.tasks.env_specs import GoalConfig
-    from morphgen.tasks.goal_making import Made, SplitGoals
+    from morphgen.tasks.split_goals import GoalResult, SplitGoals
 
 HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
 
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
             )
     config = goal_config(args.seed)
     made = _of_robot(args, config) if args.task else _of_split(args, config)
-    failed = [one for one in made if one.goals is None or one.unproven]
+    failed = [one for one in made if one.goals is None or one.certificate_errors]
     if args.json:
         print(json.dumps(_data(made, config.seed) | {"passed": not failed}))
     else:
@@ -87,21 +87,23 @@ def goal_config(seed: int) -> GoalConfig:
     return GoalConfig(seed)
 
 
-def _of_robot(args: argparse.Namespace, config: GoalConfig) -> list[Made]:
-    from morphgen.tasks.goal_making import robot_goals
-    from morphgen.tasks.robots import robot_of
+def _of_robot(args: argparse.Namespace, config: GoalConfig) -> list[GoalResult]:
+    from morphgen.tasks.env_specs import load_robot
+    from morphgen.tasks.split_goals import sample_robot_goals
 
-    robot = robot_of(" ".join(args.words), library=args.library)
-    made = robot_goals(robot, args.task, config, obstacles=args.obstacles, certified=args.certify)
+    robot = load_robot(" ".join(args.words), library=args.library)
+    made = sample_robot_goals(
+        robot, args.task, config, obstacles=args.obstacles, certified=args.certify
+    )
     return [made]
 
 
-def _of_split(args: argparse.Namespace, config: GoalConfig) -> list[Made]:
-    from morphgen.tasks.goal_making import split_goals
+def _of_split(args: argparse.Namespace, config: GoalConfig) -> list[GoalResult]:
+    from morphgen.tasks.split_goals import sample_split_goals
 
     split, _ = read_split_or_built(args.words[0])
     with bar(args) as progress:
-        return split_goals(
+        return sample_split_goals(
             split,
             library_of(args),
             config,
@@ -146,23 +148,24 @@ def require_room_for(home: Path, wanted: bool) -> None:
         )
 
 
-def ready_goals(args: argparse.Namespace, split: Split) -> list[Made]:
+def ready_goals(args: argparse.Namespace, split: Split) -> list[GoalResult]:
     """The goal sets of a split that is to be built.
 
     Raises:
         BenchmarkError: If a robot has none.
     """
-    from morphgen.tasks.goal_making import split_goals
-    from morphgen.tasks.split_goals import require_all
+    from morphgen.tasks.split_goals import require_goal_sets, sample_split_goals
 
     config = goal_config(args.goal_seed or 0)
     with bar(args, "goals") as progress:
-        made = split_goals(split, library_of(args), config, jobs=args.jobs, progress=progress)
-    require_all(made)
+        made = sample_split_goals(
+            split, library_of(args), config, jobs=args.jobs, progress=progress
+        )
+    require_goal_sets(made)
     return made
 
 
-def ship_goals(args: argparse.Namespace, home: Path, made: Sequence[Made]) -> None:
+def ship_goals(args: argparse.Namespace, home: Path, made: Sequence[GoalResult]) -> None:
     """Write the goal sets of a split into the folder where it is built."""
     from morphgen.tasks.split_goals import write_goals
 
@@ -176,14 +179,14 @@ def audit_with_goals(
     accepts = any(code.startswith("goals-") for code in split.accepted)
     if folder is None and not args.goals and not accepts:
         return done, None
-    from morphgen.tasks.goal_audit import audit_goals, with_goals
+    from morphgen.tasks.goal_audit import audit_goals, with_goal_findings
 
     goals = _goals_to_audit(args, split, folder)
     if goals is None:
-        return with_goals(done, split, None), None
+        return with_goal_findings(done, split, None), None
     with bar(args, "goals") as progress:
         findings = audit_goals(split, goals, library_of(args), jobs=args.jobs, progress=progress)
-    return with_goals(done, split, findings), goals
+    return with_goal_findings(done, split, findings), goals
 
 
 def _goals_to_audit(
@@ -192,8 +195,12 @@ def _goals_to_audit(
     """Those that are shipped, else, if asked for, those that tasks would have."""
     from dataclasses import replace
 
-    from morphgen.tasks.goal_making import gathered, split_goals
-    from morphgen.tasks.split_goals import has_goals, read_split_goals
+    from morphgen.tasks.split_goals import (
+        SplitGoals,
+        has_goals,
+        read_split_goals,
+        sample_split_goals,
+    )
 
     if folder is not None and has_goals(folder):
         found = read_split_goals(folder)
@@ -203,8 +210,10 @@ def _goals_to_audit(
         return None
     config = goal_config(args.goal_seed or 0)
     with bar(args, "goals") as progress:
-        made = split_goals(split, library_of(args), config, jobs=args.jobs, progress=progress)
-    return gathered(made, config)
+        made = sample_split_goals(
+            split, library_of(args), config, jobs=args.jobs, progress=progress
+        )
+    return SplitGoals.from_results(made, config)
 
 
 @contextmanager
@@ -222,44 +231,48 @@ def bar(args: argparse.Namespace, title: str | None = None) -> Iterator[Progress
         yield show
 
 
-def _text(made: Sequence[Made], seed: int) -> str:
+def _text(made: Sequence[GoalResult], seed: int) -> str:
     from tabulate import tabulate
 
     lines = [tabulate([_row(one) for one in made], HEADERS, disable_numparse=True)]
     for one in made:
         who = f"{one.side} robot {one.robot}" if one.side else f"robot {one.robot}"
         if one.goals is None:
-            lines.append(f"{who}: {one.why}")
-        elif one.unproven:
-            more = f" (and {len(one.unproven) - 1} more)" if one.unproven[1:] else ""
-            lines.append(f"{who}: {one.unproven[0]}{more}")
+            lines.append(f"{who}: {one.error}")
+        elif one.certificate_errors:
+            more = (
+                f" (and {len(one.certificate_errors) - 1} more)"
+                if one.certificate_errors[1:]
+                else ""
+            )
+            lines.append(f"{who}: {one.certificate_errors[0]}{more}")
     ready = sum(one.goals is not None for one in made)
     lines.append(f"{ready} of {len(made)} goal sets are there, seed {seed}")
     return "\n".join(lines)
 
 
-def _row(one: Made) -> tuple[str, ...]:
-    certified = "" if one.unproven is None else "NO" if one.unproven else "yes"
+def _row(one: GoalResult) -> tuple[str, ...]:
+    certified = "" if one.certificate_errors is None else "NO" if one.certificate_errors else "yes"
     rate = "" if one.acceptance is None else f"{one.acceptance:.3g}"
     count = "none" if one.goals is None else str(len(one.goals.q))
     boxes = str(len(one.goals.obstacles)) if one.goals else "yes" if one.obstacles else "0"
     return (one.robot, one.side or "", one.task, count, rate, boxes, certified)
 
 
-def _data(made: Sequence[Made], seed: int) -> dict[str, object]:
-    from morphgen.tasks.split_goals import record_of
+def _data(made: Sequence[GoalResult], seed: int) -> dict[str, object]:
+    from morphgen.tasks.split_goals import goal_record
 
     sets = [
-        record_of(one)
+        goal_record(one)
         | {
-            "certified": None if one.unproven is None else not one.unproven,
-            "unproven": list(one.unproven or ()),
+            "certified": None if one.certificate_errors is None else not one.certificate_errors,
+            "unproven": list(one.certificate_errors or ()),
         }
         for one in made
         if one.goals
     ]
     failures = [
-        {"robot": one.robot, "side": one.side, "task": one.task, "why": one.why}
+        {"robot": one.robot, "side": one.side, "task": one.task, "why": one.error}
         for one in made
         if one.goals is None
     ]

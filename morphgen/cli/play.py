@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
     from morphgen.tasks.gym_env import TaskEnv
     from morphgen.tasks.registry import TASKS
-    from morphgen.tasks.renderer import require_film, write_film
+    from morphgen.tasks.renderer import require_video_path, write_video
 
     if args.episodes < 1 or args.seed < 0:
         raise TaskError(
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         )
     require_policy(args.policy, args.task)
     if args.out is not None:
-        require_film(args.out)
+        require_video_path(args.out)
     interface = interface_of(args.policy)
     env = TaskEnv(
         args.task,
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         if args.out is None:
             deque(frames, maxlen=0)
         else:
-            write_film(frames, args.out, FPS)
+            write_video(frames, args.out, FPS)
             print(args.out)
     finally:
         env.close()

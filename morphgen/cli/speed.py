@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from morphgen.errors import TaskError
     from morphgen.tasks.make import make_batch
     from morphgen.tasks.registry import SIMULATORS
-    from morphgen.tasks.speed import measure
+    from morphgen.tasks.speed import measure_speed
 
     if not args.seconds > 0:
         raise TaskError(f"--seconds {args.seconds:g}: expected more than 0")
@@ -59,9 +59,9 @@ def run(args: argparse.Namespace) -> int:
         library=args.library,
     )
     try:
-        module, step = SIMULATORS[args.sim].own_step
+        module, step = SIMULATORS[args.sim].native_step
         own = [(import_module(module), step)] if args.workers == 1 else []
-        found = measure(batch, args.seconds, own=own)
+        found = measure_speed(batch, args.seconds, own=own)
     finally:
         batch.close()
     if args.json:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from morphgen.benchmark.split import Split
     from morphgen.benchmark.statistics import PaperRow
     from morphgen.model.findings import Finding
-    from morphgen.tasks.goal_making import SplitGoals
+    from morphgen.tasks.split_goals import SplitGoals
 
 LISTED = 10
 """Findings of one code, or differences, that are printed."""

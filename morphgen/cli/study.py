@@ -100,7 +100,7 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     if args.ray is None and not args.report:
         require_device(args.device)
-    longest = max(config.steps for config in default_configs())
+    longest = max(config.max_episode_steps for config in default_configs())
     eval_config = EvalConfig(episodes_for(args.eval_steps, longest), args.sim)
     args.on, args.obstacles = "train", False
     agents, seeds = parse_agents(args.agents), seeds_of(args.seeds)

@@ -275,6 +275,8 @@ def _tasks(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]
     Raises:
         TaskError: If they are too few, or the split ships its own goals.
     """
+    from dataclasses import replace
+
     from morphgen.errors import TaskError
     from morphgen.rl.robot_source import tasks_of
     from morphgen.tasks.registry import TASKS
@@ -290,7 +292,7 @@ def _tasks(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]
             f"--train-goals {num_goals}: {source.goal_dir} ships the goals to train on; name the "
             f"split itself, {source.name}, to have others"
         )
-    return tuple(config.with_num_goals(num_goals) for config in configs)
+    return tuple(replace(config, num_goals=num_goals) for config in configs)
 
 
 def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:

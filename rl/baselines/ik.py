@@ -9,10 +9,10 @@ import torch
 
 from morphgen.model.inverse_kinematics_torch import solve_position_ik
 from morphgen.rl.baselines.path_planner import FreeWays, Routes, Way, shares_to
-from morphgen.tasks.actions import actions_of
+from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
@@ -52,11 +52,11 @@ class InverseKinematics:
             self._spaces = [FreeSpace(spec.scene) for spec in task.specs]
         if self._task is not task:
             self._task, self._routes = task, Routes(task)
-        new = torch.nonzero(task.elapsed == 0)[:, 0]
+        new = torch.nonzero(task.episode_step == 0)[:, 0]
         if len(new):
             self._plan(task, new)
         self._routes.go_on()
-        return actions_of(shares_to(task, self._routes.wanted), task.kind)
+        return encode_actions(shares_to(task, self._routes.wanted), task.action_kind)
 
     def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
         for attempt in range(ROUNDS):
@@ -74,8 +74,8 @@ class InverseKinematics:
 
     def _solved(self, task: TaskBatch, envs: torch.Tensor, attempt: int) -> list[Array]:
         """Of each environment those configurations that arrive, nearest first; or the best."""
-        body, starts = task.body[envs], task.targets[envs]
-        tried = random_starts(task.bodies, body, starts, self._generator)
+        body, starts = task.env_robot_index[envs], task.targets[envs]
+        tried = random_starts(task.robot_tables, body, starts, self._generator)
         if attempt:
             for i, robot in enumerate(body.tolist()):
                 ways, q = self._ways_of(task, robot, starts[i])
@@ -83,18 +83,18 @@ class InverseKinematics:
                 tried[:, i, : len(q)] = torch.from_numpy(nodes)
         rows = body.repeat(STARTS)
         found, error = solve_position_ik(
-            task.bodies.chain,
+            task.robot_tables.tool_chain,
             rows,
             tried.flatten(0, 1),
             task.field("goal")[envs, :3].repeat(STARTS, 1),
-            (task.bodies.lower[rows], task.bodies.upper[rows]),
+            (task.robot_tables.lower[rows], task.robot_tables.upper[rows]),
             iterations=ITERATIONS,
             damping=DAMPING,
             max_step=MAX_STEP,
         )
         found = found.view_as(tried)
         left = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
-        step = task.bodies.step[body].clamp(min=1e-9)
+        step = task.robot_tables.max_step[body].clamp(min=1e-9)
         far = ((found - starts) / step).abs().amax(dim=2)
         order = torch.where(left < CLOSE, far, 1e9 * (1 + left)).argsort(dim=0)
         count = (left < CLOSE).sum(dim=0).clamp(min=1).tolist()
@@ -105,7 +105,7 @@ class InverseKinematics:
 
     def _way(self, task: TaskBatch, env: int, ends: Array, attempt: int) -> Way | None:
         """A free way to one of the ends."""
-        robot = int(task.body[env])
+        robot = int(task.env_robot_index[env])
         ends = ends[self._spaces[robot].free(ends)]
         if not len(ends):
             return None
@@ -118,7 +118,10 @@ class InverseKinematics:
         """The ways of a robot, and where its joints are, from (J,) to (dof,)."""
         dof = task.specs[robot].robot.dof
         if robot not in self._ways:
-            step, moves = task.bodies.step[robot, :dof], task.bodies.moves_tool[robot, :dof]
+            step, moves = (
+                task.robot_tables.max_step[robot, :dof],
+                task.robot_tables.moves_tool[robot, :dof],
+            )
             rng = np.random.default_rng([self._seed, robot])
             space = self._spaces[robot]
             self._ways[robot] = FreeWays(space, _numbers(step), rng, moves.cpu().numpy())
@@ -126,13 +129,13 @@ class InverseKinematics:
 
 
 def random_starts(
-    bodies: Bodies, body: torch.Tensor, near: torch.Tensor, generator: torch.Generator
+    robot_tables: RobotTables, body: torch.Tensor, near: torch.Tensor, generator: torch.Generator
 ) -> torch.Tensor:
     """Configurations to start from, shape (STARTS, n, J): those given (n, J), and random ones."""
-    lower, upper = bodies.lower[body], bodies.upper[body]
+    lower, upper = robot_tables.lower[body], robot_tables.upper[body]
     drawn = torch.rand(STARTS - 1, *near.shape, generator=generator).to(near.device)
     starts = torch.cat([near[None], lower + (upper - lower) * drawn])
-    return torch.where(bodies.moves_tool[body], starts, near)
+    return torch.where(robot_tables.moves_tool[body], starts, near)
 
 
 def _numbers(values: torch.Tensor) -> Array:

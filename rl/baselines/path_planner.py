@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from morphgen.model.kinematics import joint_limits, unwrap_joints
 from morphgen.rl.baselines.rrt_connect import FreePart, Tree, connected, explored, shortened
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import BINS
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.typing import Array
 
@@ -249,7 +249,7 @@ class Routes:
     def go_on(self) -> torch.Tensor:
         """Begin the next leg where one is at its end; where the last is, shape (n,), bool."""
         task = self._task
-        step = task.bodies.step[task.body].clamp(min=1e-9)
+        step = task.robot_tables.max_step[task.env_robot_index].clamp(min=1e-9)
         done = ((self.wanted - task.targets) / step).abs().amax(dim=1) < NEAR
         final: torch.Tensor = done & (self._leg == self._last)
         self._leg = torch.where(done & ~final, self._leg + 1, self._leg)
@@ -261,9 +261,9 @@ def shares_to(task: TaskBatch, wanted: torch.Tensor) -> torch.Tensor:
 
     All joints get there at once.
     """
-    step = task.bodies.step[task.body]
+    step = task.robot_tables.max_step[task.env_robot_index]
     ahead = wanted - task.targets
     shares = torch.where(step > 0, ahead / step.clamp(min=1e-9), torch.zeros_like(ahead))
     shares = shares / shares.abs().amax(dim=1, keepdim=True).clamp(min=1)
-    joint = task.bodies.joint_of_link[task.body]
+    joint = task.robot_tables.joint_of_link[task.env_robot_index]
     return torch.gather(shares, 1, joint.clamp(min=0)) * (joint >= 0)

@@ -14,10 +14,10 @@ from morphgen.model.kinematics import frame_jacobian, unwrap_joints
 from morphgen.rl.baselines.cartesian import OneTool
 from morphgen.rl.baselines.path_planner import FreeWays, Price, Way
 from morphgen.rl.baselines.push_contacts import Poised, leaning, poised, touches
-from morphgen.tasks.bodies import Bodies
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.feasibility import free_within
+from morphgen.tasks.push.feasibility import sample_tools_in_box
 from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.sim.base import GRAVITY
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
@@ -117,12 +117,14 @@ class Plan:
 class PushPlanner:
     """Plans for one robot and its block."""
 
-    def __init__(self, spec: EnvSpec, bodies: Bodies, index: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, spec: EnvSpec, robot_tables: RobotTables, index: int, rng: np.random.Generator
+    ) -> None:
         """Collect free configurations that are low and where the block is pushed.
 
         Args:
             spec: A robot that pushes.
-            bodies: Robots.
+            robot_tables: Robots.
             index: Which of them the specification is of.
             rng: Where configurations come from.
 
@@ -132,18 +134,18 @@ class PushPlanner:
         pushes, robot = spec.goals, spec.robot
         if not isinstance(pushes, PushStartSet):
             raise ValueError(f"{robot.name} does not push")
-        self._robot, self._tool = robot, OneTool(bodies, index)
+        self._robot, self._tool = robot, OneTool(robot_tables, index)
         self._edge, self._line, self._ground = pushes.block.size[0], pushes.line, pushes.ground
         self._friction = pushes.block.friction * pushes.block.mass * GRAVITY
         self._stiffness = np.array([gain.stiffness for gain in actuation(robot)])
-        self._others = ~bodies.moves_tool[index, : robot.dof].cpu().numpy()
+        self._others = ~robot_tables.moves_tool[index, : robot.dof].cpu().numpy()
         self._space = FreeSpace(spec.scene)
-        step = bodies.step[index, : robot.dof].double().cpu().numpy()
+        step = robot_tables.max_step[index, : robot.dof].double().cpu().numpy()
         self._ways = FreeWays(self._space, step, rng)
         edge, first, last = self._edge, pushes.blocks.min(axis=0), pushes.blocks.max(axis=0)
         low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
         high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
-        self._bank, self._tools = free_within(self._space, low, high, rng)
+        self._bank, self._tools = sample_tools_in_box(self._space, low, high, rng)
 
     def plan(self, q: Array, block: Array, attempt: int = 0, left: float = np.inf) -> Plan | None:
         """Look for a way to push.

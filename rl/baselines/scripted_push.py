@@ -12,10 +12,10 @@ from morphgen.model.inverse_kinematics_torch import pose_ik_step
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.baselines.path_planner import Routes, shares_to
 from morphgen.rl.baselines.push_planner import SPEED, Plan, PushPlanner
-from morphgen.tasks.actions import actions_of
+from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import CONTROL_PERIOD
 from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import EnvSpec
 
 PLANS = 8
@@ -74,9 +74,9 @@ class ScriptedPush:
         if state is None or state.task is not task:
             state = self._state = _no_state(task)
         block = task.simulation.block_pose
-        tool = frame_positions(task.bodies.chain, task.body, task.q)
-        pushes = task.does("push")
-        new = pushes & (task.elapsed == 0)
+        tool = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.q)
+        pushes = task.task_mask("push")
+        new = pushes & (task.episode_step == 0)
         state.plans[new] = 0
         failed = _watched(state, task, block, tool) | (pushes & ~state.active)
         for env in torch.nonzero(new | (failed & (state.plans < PLANS)))[:, 0].tolist():
@@ -85,26 +85,28 @@ class ScriptedPush:
         pushed = _pushed(state, task, block, tool)
         wanted = torch.where(state.pushing[:, None], pushed, state.routes.wanted)
         wanted = torch.where(state.active[:, None], wanted, task.targets)
-        return actions_of(shares_to(task, wanted), task.kind)
+        return encode_actions(shares_to(task, wanted), task.action_kind)
 
     def _blocked(self, state: _State, task: TaskBatch) -> torch.Tensor:
         """Whether arms that push are to be where something is in their way, shape (n,), bool."""
         found = torch.zeros_like(state.active)
         for index, planner in self._planners.items():
-            rows = torch.nonzero(state.active & state.pushing & (task.body == index))[:, 0]
+            rows = torch.nonzero(state.active & state.pushing & (task.env_robot_index == index))[
+                :, 0
+            ]
             dof = task.specs[index].robot.dof
             q = task.targets[rows, :dof].double().cpu().numpy()
             found[rows] = ~torch.from_numpy(planner.free(q)).to(found.device)
         return found
 
     def _plan(self, state: _State, task: TaskBatch, env: int, block: torch.Tensor) -> None:
-        index = int(task.body[env])
+        index = int(task.env_robot_index[env])
         if index not in self._planners:
             rng = np.random.default_rng([self._seed, index])
-            self._planners[index] = PushPlanner(task.specs[index], task.bodies, index, rng)
+            self._planners[index] = PushPlanner(task.specs[index], task.robot_tables, index, rng)
         q = task.targets[env, : task.specs[index].robot.dof].double().cpu().numpy()
         attempt = int(state.plans[env])
-        left = int(task.longest[env] - task.elapsed[env])
+        left = int(task.max_episode_steps[env] - task.episode_step[env])
         plan = self._planners[index].plan(q, block.double().cpu().numpy(), attempt, left)
         state.plans[env] += 1
         state.active[env] = plan is not None
@@ -157,7 +159,7 @@ class _State:
 def _no_state(task: TaskBatch) -> _State:
     """No plans."""
     n, device = task.num_envs, task.device
-    sets = [task.specs[i].goals for i in task.body.tolist()]
+    sets = [task.specs[i].goals for i in task.env_robot_index.tolist()]
     edges = [each.block.size[0] if isinstance(each, PushStartSet) else 1.0 for each in sets]
 
     def count() -> torch.Tensor:
@@ -211,7 +213,7 @@ def _pushed(
     state: _State, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor
 ) -> torch.Tensor:
     """Targets whose tools are a bit farther on, and aside where the blocks are."""
-    goal = frame_positions(task.bodies.chain, task.body, task.targets)
+    goal = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.targets)
     lead = goal[:, 1] - tool[:, 1]
     stands = task.simulation.block_velocity[:, 1] < MOVES
     more = state.pushing & stands & (lead > state.lead - SPEED)
@@ -221,15 +223,21 @@ def _pushed(
     goal += torch.stack([aside.clamp(-SPEED, SPEED), on, torch.zeros_like(on)], dim=1)
     goal[:, 2] = state.height
     wanted = pose_ik_step(
-        task.bodies.chain,
-        task.body,
+        task.robot_tables.tool_chain,
+        task.env_robot_index,
         task.targets,
         goal,
         state.rotation,
-        (task.bodies.lower[task.body], task.bodies.upper[task.body]),
-        rotation_budget=task.bodies.step[task.body],
+        (
+            task.robot_tables.lower[task.env_robot_index],
+            task.robot_tables.upper[task.env_robot_index],
+        ),
+        rotation_budget=task.robot_tables.max_step[task.env_robot_index],
     )
-    missed = goal[:, 1] - frame_positions(task.bodies.chain, task.body, wanted)[:, 1]
+    missed = (
+        goal[:, 1]
+        - frame_positions(task.robot_tables.tool_chain, task.env_robot_index, wanted)[:, 1]
+    )
     stands = state.pushing & (on > 0) & (missed > 0.8 * SPEED)
     state.stuck = torch.where(stands, state.stuck + 1, 0)
     return wanted

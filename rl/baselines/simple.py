@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from morphgen.tasks.actions import actions_of
+from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.config import BINS
 
 
 class Zero:
@@ -17,7 +16,8 @@ class Zero:
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return actions that change no target, shape (n, L)."""
-        return actions_of(torch.zeros(task.mask.shape, device=task.mask.device), task.kind)
+        mask = task.action_mask
+        return encode_actions(torch.zeros(mask.shape, device=mask.device), task.action_kind)
 
 
 class Random:
@@ -28,8 +28,8 @@ class Random:
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return actions (n, L), uniform over [-1, 1] or over the bins."""
-        if task.kind == "discrete":
-            actions = torch.randint(len(BINS), task.mask.shape, generator=self._generator)
+        if task.action_kind == "discrete":
+            actions = torch.randint(len(BINS), task.action_mask.shape, generator=self._generator)
         else:
-            actions = 2 * torch.rand(task.mask.shape, generator=self._generator) - 1
-        return actions.to(task.mask.device)
+            actions = 2 * torch.rand(task.action_mask.shape, generator=self._generator) - 1
+        return actions.to(task.action_mask.device)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 from typing import ClassVar
+
+from morphgen.errors import TaskError
+from morphgen.tasks.task import require_task_config
 
 
 @dataclass(frozen=True)
@@ -12,30 +16,31 @@ class PushConfig:
 
     task: ClassVar[str] = "push"
 
-    steps: int = 300
-    """Control steps of an episode at most: 6 s."""
+    max_episode_steps: int = 300
+    """Time limit of an episode, 6 s [control steps]."""
     line: float = 0.2
-    """y that the block must cross, metres; scaled down for robots that reach less than 0.4 m."""
+    """y that the block must cross, scaled down for robots that reach less than 0.4 m [m]."""
     start: float = -0.15
-    """y that the block starts below, metres; scaled likewise."""
+    """Largest y of the block at the start, scaled likewise [m]."""
     start_depth: float = 0.05
-    """How far below that at most, uniformly drawn, metres; scaled likewise (the paper gives no
-    lower end)."""
-    starts: int = 100
+    """Extent of the range of y below ``start``, scaled likewise (not given in the paper) [m]."""
+    num_goals: int = 100
     """Number of starts in a robot's push set, as many as goals in a goal set of reach."""
     arm_x: tuple[float, float] = (0.4, 0.6)
-    """Range of the block's x at the start for arms, in effective reach beyond the shoulder."""
+    """Range of the block's x at the start for arms, in effective reaches beyond the shoulder."""
     free_x: tuple[float, float] = (-0.2, 0.2)
-    """The same range for robots that slide freely over the ground, metres; scaled likewise."""
+    """The same range for robots that slide freely over the ground, scaled likewise [m]."""
     block_size: tuple[float, float] = (0.15, 0.2)
-    """Range of the block's edge: relative to an arm's effective reach, or metres for robots that
-    slide."""
+    """Range of the block's edge length: relative to an arm's effective reach, or for robots that
+    slide in metres."""
     block_mass: float = 0.1
+    """Mass of the block [kg]."""
     friction: float = 1.0
+    """Friction coefficient of the block."""
     obstacles: int = 3
-    """Number of boxes if obstacles are asked for."""
+    """Number of boxes if obstacles are requested."""
     obstacle_size: tuple[float, float] = (0.06, 0.15)
-    """Range of the edges of these boxes, relative to the robot's reach."""
+    """Range of the edge lengths of these boxes, relative to the robot's reach."""
     curriculum_steps: int = 50
     """Number of equal steps in which the line moves during the first half of the training."""
     curriculum_start: float = 0.1
@@ -44,14 +49,28 @@ class PushConfig:
     distance_weight: float = 1.0
     success_weight: float = 10.0
     approach_weight: float = 0.5
-    """Weight of the distance of tool and block: in the released code, not in the paper; never
-    scored."""
+    """Weight of the distance between tool and block: in the released code, not in the paper; never
+    part of the score."""
 
-    @property
-    def num_goals(self) -> int:
-        """Number of starts in a robot's push set."""
-        return self.starts
+    def __post_init__(self) -> None:
+        """Require constants that describe a push.
 
-    def with_num_goals(self, num_goals: int) -> PushConfig:
-        """Return the same constants with another number of starts."""
-        return replace(self, starts=num_goals)
+        Raises:
+            TaskError: If a constant is out of its range.
+        """
+        require_task_config(self)
+        low, high = self.block_size
+        if self.curriculum_steps < 1:
+            raise TaskError(f"a curriculum of {self.curriculum_steps} steps: expected 1 or more")
+        if not (self.block_mass > 0 and self.friction >= 0):
+            raise TaskError(
+                f"a block of {self.block_mass:g} kg with friction {self.friction:g}: expected a "
+                "positive mass and no negative friction"
+            )
+        nearest_line = self.line * min(1.0, self.curriculum_start)
+        if not (0 < low <= high < math.inf and self.start < nearest_line and self.start_depth >= 0):
+            raise TaskError(
+                f"a block of {low:g} to {high:g} that starts {self.start_depth:g} below "
+                f"{self.start:g} and is to cross {self.line:g}: sizes must be positive, and the "
+                "start before the line"
+            )

@@ -50,7 +50,7 @@ class PushEnvs(TaskEnvs):
         """Compare the block with the line."""
         y = state.block_pose[:, 1]
         to_go = torch.clamp(self.line - y, min=0)
-        success = (y > self.line) & ~state.unstable
+        success = (y > self.line) & ~state.diverged
         approach = row_norms(state.tool - state.block_pose[:, :3])
         return StepResult(
             success=success,

@@ -70,7 +70,7 @@ class FeasibilityTest:
         edge = region.edge
         low = np.array([region.x[0] - edge, region.y[0] - 2 * edge, self._ground])
         high = np.array([region.x[1] + edge, region.line + edge, self._ground + 1.5 * edge])
-        self._bank, self._tools = free_within(space, low, high, rng)
+        self._bank, self._tools = sample_tools_in_box(space, low, high, rng)
 
     def __call__(self, blocks: Array) -> Feasibility:
         """Test blocks.
@@ -178,7 +178,7 @@ def clear_obstacles(
     )
 
 
-def free_within(
+def sample_tools_in_box(
     space: FreeSpace, low: Array, high: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Draw random free configurations whose tools are in a box.

@@ -13,8 +13,7 @@ from morphgen.errors import TaskError
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
-from morphgen.tasks.certificates import outside_limits
-from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.feasibility import CLOSE, FeasibilityTest, clear_obstacles
 from morphgen.tasks.push.region import Region, draw_blocks, push_region
@@ -69,24 +68,6 @@ class PushStartSet:
         return self.blocks
 
 
-def require_sound(config: PushConfig) -> None:
-    """Require that the constants describe a push.
-
-    Raises:
-        TaskError: If a number is out of its range.
-    """
-    low, high = config.block_size
-    if config.curriculum_steps < 1:
-        raise TaskError(f"a curriculum of {config.curriculum_steps} steps: expected 1 or more")
-    nearest_line = config.line * min(1.0, config.curriculum_start)
-    if not (0 < low <= high < np.inf and config.start < nearest_line and config.start_depth >= 0):
-        raise TaskError(
-            f"a block of {low:g} to {high:g} that starts {config.start_depth:g} below "
-            f"{config.start:g} and is to cross {config.line:g}: sizes are positive, and it starts "
-            "before the line"
-        )
-
-
 def sample_starts(
     robot: Robot,
     config: PushConfig,
@@ -119,7 +100,7 @@ def sample_starts(
         placed = clear_obstacles(robot, config, region, block, ground, of_obstacles)
     space = FreeSpace(Scene(robot, block=block, obstacles=placed, ground=ground))
     test = FeasibilityTest(space, region, np.random.default_rng(of_proofs))
-    kept, tried = _proven(robot, config.starts, region, test, ground, of_places)
+    kept, tried = _proven(robot, config.num_goals, region, test, ground, of_places)
     blocks = np.array([each[0] for each in kept])
     return PushStartSet(
         q=_starts(space, blocks, of_starts),

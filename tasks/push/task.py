@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from morphgen.model.robot import Robot
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.starts import PushStartSet, certify_starts, require_sound, sample_starts
+from morphgen.tasks.push.starts import PushStartSet, certify_starts, sample_starts
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import LINE, OBJECT, EnvSpec, Marker, Task
 
@@ -40,16 +40,12 @@ class Push(Task[PushConfig, PushStartSet]):
   y = `line`
 """
 
-    def check(self, robot: Robot, config: PushConfig) -> None:
-        """Refuse constants that describe no push."""
-        require_sound(config)
-
     def key_parts(self, config: PushConfig) -> list[object]:
         """Return the number of starts, and what they are drawn from."""
         ranges = [*config.block_size, *config.arm_x, *config.free_x]
         numbers = [config.line, config.start, config.start_depth]
         numbers += [config.block_mass, config.friction]
-        return [config.starts, [*map(float, ranges), *map(float, numbers)]]
+        return [config.num_goals, [*map(float, ranges), *map(float, numbers)]]
 
     def sample(
         self,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
+
+from morphgen.errors import TaskError
+from morphgen.tasks.task import require_task_config
 
 
 @dataclass(frozen=True)
@@ -12,30 +15,32 @@ class ReachConfig:
 
     task: ClassVar[str] = "reach"
 
-    steps: int = 300
-    """Control steps of an episode: 6 s."""
-    goals: int = 100
+    max_episode_steps: int = 300
+    """Duration of an episode, 6 s [control steps]."""
+    num_goals: int = 100
     """Number of configurations in a robot's goal set."""
     near: float = 0.03
-    """Distance of tool and goal that counts as success, metres (paper, table of rewards)."""
+    """Distance between tool and goal that counts as success (paper, table of rewards) [m]."""
     obstacles: int = 3
-    """Number of boxes if obstacles are asked for."""
+    """Number of boxes if obstacles are requested."""
     obstacle_size: tuple[float, float] = (0.06, 0.15)
-    """Range of the edges of these boxes, relative to the robot's reach."""
+    """Range of the edge lengths of these boxes, relative to the robot's reach."""
     joint_limit_weight: float = 1.0
     joint_acceleration_weight: float = 1e-5
     distance_weight: float = 1.0
     near_weight: float = 1.0
-    """Weight of being near. The paper gives the four reward terms and no weights."""
+    """Reward for being near. The paper gives the four reward terms and no weights."""
     score_square: float = 50.0
+    """Factor c of the score -c d^2 of a step at distance d from the goal (released evaluation)."""
     score_near: float = 200.0
-    """``anybody_score`` of a step: -50 d^2, or +200 where near (the released evaluation)."""
+    """Score of a step near the goal (released evaluation)."""
 
-    @property
-    def num_goals(self) -> int:
-        """Number of goals in a robot's goal set."""
-        return self.goals
+    def __post_init__(self) -> None:
+        """Require constants that describe a reach.
 
-    def with_num_goals(self, num_goals: int) -> ReachConfig:
-        """Return the same constants with another number of goals."""
-        return replace(self, goals=num_goals)
+        Raises:
+            TaskError: If a constant is out of its range.
+        """
+        require_task_config(self)
+        if not self.near > 0:
+            raise TaskError(f"near {self.near:g}: expected a positive distance [m]")

@@ -56,8 +56,8 @@ class ReachEnvs(TaskEnvs):
         """Compare the tool with its goal."""
         distance = row_norms(state.tool - self.goal[:, :3])
         return StepResult(
-            success=(distance < self._config.near) & ~state.unstable,
-            terminated=torch.zeros_like(state.unstable),
+            success=(distance < self._config.near) & ~state.diverged,
+            terminated=torch.zeros_like(state.diverged),
             distance=distance,
             score=anybody_score(self._config, distance),
             terms=reach_terms(self._config, distance, state.limit_violation, state.acceleration),

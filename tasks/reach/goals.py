@@ -15,9 +15,8 @@ from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
-from morphgen.tasks.certificates import outside_limits
 from morphgen.tasks.cspace_components import cspace_components, in_other_component
-from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.obstacles import draw_obstacles
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
@@ -77,7 +76,7 @@ def sample_goals(
     space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
     planes = cspace_components(robot)
     q, tried = space.draw(
-        config.goals, of_goals, lambda each: not in_other_component(planes, each).any()
+        config.num_goals, of_goals, lambda each: not in_other_component(planes, each).any()
     )
     poses = _vectors(frame_pose(robot, q, TOOL))
     return ReachGoalSet(

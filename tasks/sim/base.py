@@ -14,9 +14,11 @@ if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to
     import torch
 
 TIMESTEP = 0.005
-"""Physics step, seconds: 200 Hz, as the benchmark has it."""
+"""Physics step: 200 Hz, as in AnyBody [s]."""
 SUBSTEPS = 4
-"""Physics steps of a control step: 50 Hz."""
+"""Number of physics steps per control step."""
+CONTROL_PERIOD = TIMESTEP * SUBSTEPS
+"""Duration of a control step: actions come at 50 Hz [s]."""
 GRAVITY = 9.81
 """m/s^2, along -z. Robots carry their own weight, as the controllers of real arms see to it."""
 
@@ -102,7 +104,7 @@ class Simulation(Protocol):
             targets: Target positions of the independent joints, shape (n, J).
 
         Raises:
-            UnstableError: If simulations became unstable; it names them, and each must be reset
+            DivergedError: If simulations became unstable; it names them, and each must be reset
                 before the next step. All others have moved.
             SimulationError: If a worker died.
         """
@@ -120,7 +122,7 @@ class Simulator:
     """Loads scenes: one for each environment, what may touch what, and the number of workers.
 
     It raises a SimulationError if the simulator cannot hold a scene."""
-    own_step: tuple[str, str]
+    native_step: tuple[str, str]
     """Names of the module and function of the library's own step, which ``speed`` times."""
     max_envs: int
     """Number of environments that are held at once at most, where a task can be divided."""

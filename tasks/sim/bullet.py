@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from morphgen.errors import SimulationError, UnstableError
+from morphgen.errors import DivergedError, SimulationError
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator
 from morphgen.tasks.sim.bullet_batch import BulletBatch, most_joints
 from morphgen.tasks.sim.bullet_files import export_robots
@@ -119,7 +119,7 @@ class BulletSimulation(RowTensors):
 
         Raises:
             ValueError: If the shape is wrong, or a target is not finite.
-            UnstableError: If environments became unstable.
+            DivergedError: If environments became unstable.
             SimulationError: If the simulation is closed, or a worker died; in the last case it is
                 closed thereby.
         """
@@ -179,10 +179,10 @@ def _as_one(failures: Sequence[Exception]) -> Exception:
     """What processes found unstable is one error, if nothing else failed."""
     reasons: dict[int, str] = {}
     for failure in failures:
-        if not isinstance(failure, UnstableError):
+        if not isinstance(failure, DivergedError):
             return failure
         reasons |= failure.reasons
-    return UnstableError(reasons)
+    return DivergedError(reasons)
 
 
 def _free(
@@ -197,6 +197,6 @@ def _free(
 SIMULATOR = Simulator(
     "pybullet",
     lambda scenes, contacts, workers: BulletSimulation(scenes, contacts, processes=workers),
-    own_step=("pybullet", "stepSimulation"),
+    native_step=("pybullet", "stepSimulation"),
     max_envs=128,  # one takes 36 MB
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.errors import UnstableError
+from morphgen.errors import DivergedError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
@@ -156,7 +156,7 @@ class BulletBatch:
             targets: Of all environments, shape (n, J), contiguous and finite.
 
         Raises:
-            UnstableError: If environments are unstable: not finite, or beyond ``MAX_VELOCITY``.
+            DivergedError: If environments are unstable: not finite, or beyond ``MAX_VELOCITY``.
                 All have stepped; these must be reset before the next step.
         """
         self._require_stable()
@@ -218,7 +218,7 @@ class BulletBatch:
 
     def _require_stable(self) -> None:
         if self._unstable:
-            raise UnstableError(self._unstable)
+            raise DivergedError(self._unstable)
 
     def _name(self, i: int) -> str:
         return f"environment {self._envs[i]} ({self._scenes[i].robot.name!r})"

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from morphgen.checks.self_collision import capture_mujoco_warnings
-from morphgen.errors import SimulationError, UnstableError
+from morphgen.errors import DivergedError, SimulationError
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
 from morphgen.tasks.sim.mujoco_clock import unclocked
@@ -135,7 +135,7 @@ class MujocoSimulation:
 
         Raises:
             ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
-            UnstableError: If environments became unstable, or their contacts do not fit into
+            DivergedError: If environments became unstable, or their contacts do not fit into
                 MuJoCo's memory; all others have moved, and these remain so until they are reset.
             SimulationError: If the simulation is closed.
         """
@@ -157,7 +157,7 @@ class MujocoSimulation:
             self._state.read()
         faults = self._state.faults() | refused
         if faults:
-            raise UnstableError({env: f"{self._where(env)}: {why}" for env, why in faults.items()})
+            raise DivergedError({env: f"{self._where(env)}: {why}" for env, why in faults.items()})
 
     def close(self) -> None:
         """Free everything; a second time does nothing."""
@@ -226,6 +226,6 @@ def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
 SIMULATOR = Simulator(
     "mujoco",
     lambda scenes, contacts, workers: MujocoSimulation(scenes, contacts, threads=workers),
-    own_step=("mujoco", "mj_step"),
+    native_step=("mujoco", "mj_step"),
     max_envs=1024,
 )

@@ -47,7 +47,7 @@ class RowTensors:
         return self._block_velocity
 
     def _checked_targets(self, targets: torch.Tensor) -> Float32:
-        """Targets of ``step``, contiguous.
+        """JointTargets of ``step``, contiguous.
 
         Raises:
             ValueError: If the shape is wrong, or a target is not finite; padding may be anything.

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step
-from morphgen.tasks.config import BINS
 
 LINKS = 4
 STRIDE = 0.25
@@ -17,13 +17,13 @@ class OnALine:
     """
 
     def __init__(self, num_envs, *, kind="discrete", seed=0, horizon=12):
-        self.num_envs, self.kind, self.horizon = num_envs, kind, horizon
+        self.num_envs, self.action_kind, self.horizon = num_envs, kind, horizon
         self.device = torch.device("cpu")
-        self.body = torch.arange(num_envs) % 2
-        self.pushes = self.body == 1
-        self.mask = torch.zeros(num_envs, LINKS, dtype=torch.bool)
-        self.mask[torch.arange(num_envs), 1 + self.body] = True
-        self.elapsed = torch.zeros(num_envs, dtype=torch.int64)
+        self.env_robot_index = torch.arange(num_envs) % 2
+        self.pushes = self.env_robot_index == 1
+        self.action_mask = torch.zeros(num_envs, LINKS, dtype=torch.bool)
+        self.action_mask[torch.arange(num_envs), 1 + self.env_robot_index] = True
+        self.episode_step = torch.zeros(num_envs, dtype=torch.int64)
         self.q, self.goal = torch.zeros(num_envs), torch.zeros(num_envs)
         self.progress = []
         self._random = np.random.default_rng(seed)
@@ -34,14 +34,16 @@ class OnALine:
         return self.observe()
 
     def step(self, actions):
-        shares = torch.tensor(BINS)[actions] if self.kind == "discrete" else actions.clamp(-1, 1)
+        shares = (
+            torch.tensor(BINS)[actions] if self.action_kind == "discrete" else actions.clamp(-1, 1)
+        )
         way = torch.where(self.pushes, -1.0, 1.0)
-        self.q = self.q + STRIDE * way * (shares * self.mask).sum(dim=1)
-        self.elapsed += 1
+        self.q = self.q + STRIDE * way * (shares * self.action_mask).sum(dim=1)
+        self.episode_step += 1
         distance = (self.q - self.goal).abs()
         near = distance < NEAR
         terminated = near & self.pushes
-        truncated = (self.elapsed >= self.horizon) & ~terminated
+        truncated = (self.episode_step >= self.horizon) & ~terminated
         final, q = self.observe(), self.q
         self._begin(terminated | truncated)
         terms = {"distance": -distance, "near": near.float()}
@@ -50,7 +52,7 @@ class OnALine:
             reward=terms["distance"] + terms["near"],
             terminated=terminated,
             truncated=truncated,
-            unstable=torch.zeros_like(truncated),
+            diverged=torch.zeros_like(truncated),
             final_observation=final,
             success=near,
             distance=distance,
@@ -64,8 +66,8 @@ class OnALine:
         n = self.num_envs
         tokens = torch.zeros(n, LINKS, 48)
         rows = torch.arange(n)
-        tokens[rows, 1 + self.body, 20] = torch.where(self.pushes, -1.0, 1.0)
-        tokens[rows, 1 + self.body, 32] = self.q
+        tokens[rows, 1 + self.env_robot_index, 20] = torch.where(self.pushes, -1.0, 1.0)
+        tokens[rows, 1 + self.env_robot_index, 32] = self.q
         links = torch.zeros(n, LINKS, dtype=torch.bool)
         links[:, :3] = True
         goal, thing = torch.zeros(n, 7), torch.zeros(n, 13)
@@ -74,7 +76,7 @@ class OnALine:
         return {
             "tokens": tokens,
             "links": links,
-            "actions": self.mask,
+            "actions": self.action_mask,
             "goal": goal,
             "goal_mask": ~self.pushes,
             "object": thing,
@@ -97,4 +99,4 @@ class OnALine:
         drawn = torch.from_numpy(self._random.uniform(-1, 1, (2, int(envs.sum())))).float()
         self.q, self.goal = self.q.clone(), self.goal.clone()
         self.q[envs], self.goal[envs] = drawn
-        self.elapsed[envs] = 0
+        self.episode_step[envs] = 0

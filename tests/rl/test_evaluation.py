@@ -24,7 +24,7 @@ from morphgen.rl.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs import read_checkpoint, write_checkpoint
 from morphgen.rl.scores import scores_to_json
 from morphgen.rl.training import checkpoint_files, subruns_of, train
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
 
@@ -102,9 +102,9 @@ def test_robots_that_do_not_fit_at_once_have_the_same_episodes(run, monkeypatch)
 
     def noted(settings, num_envs, **options):
         made.append((options["first"], num_envs))
-        return batch_of(settings, num_envs, **options)
+        return batch_from_specs(settings, num_envs, **options)
 
-    monkeypatch.setattr(evaluation, "batch_of", noted)
+    monkeypatch.setattr(evaluation, "batch_from_specs", noted)
     at_most(4, monkeypatch)
     evaluation._random_cache.clear()
     parts = evaluate_run(run, "train", config, "deterministic")

@@ -16,7 +16,7 @@ from morphgen.rl.heads import (
     MaskedMultiDiscrete,
     bounded_log_std,
 )
-from morphgen.tasks.config import BINS
+from morphgen.tasks.actions import BINS
 
 MASK = torch.tensor([[False, True, True, False], [True, False, True, True], [False] * 4])
 

@@ -15,15 +15,14 @@ from morphgen.rl.baselines.path_planner import LEGS, FreeWays, Routes, shares_to
 from morphgen.rl.baselines.rrt_connect import explored
 from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.actions import actions_of
-from morphgen.tasks.config import CONTROL_PERIOD
+from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Scene
 
-REACH, PUSH = ReachConfig(goals=10), PushConfig(starts=4)
+REACH, PUSH = ReachConfig(num_goals=10), PushConfig(num_goals=4)
 CLAW, CHAIN = "arm=arm3 ee=claw", "nlink"
 
 
@@ -53,9 +52,9 @@ def test_a_robot_gets_past_a_stop(made, kind):
     routes.take(0, [stop, end])
     for _ in range(200):
         final = routes.go_on()
-        batch.step(actions_of(shares_to(batch, routes.wanted), kind))
+        batch.step(encode_actions(shares_to(batch, routes.wanted), kind))
     assert final.all()
-    step = batch.bodies.step[0]
+    step = batch.robot_tables.max_step[0]
     assert ((batch.targets[0] - torch.from_numpy(end)).abs() <= step / 16 + 1e-6).all()
 
 
@@ -121,11 +120,13 @@ def test_a_tree_that_cannot_grow_is_its_start():
 def test_starts_are_the_given_one_and_others_that_leave_fingers_alone(made):
     batch = made(CLAW, 6)
     near = batch.targets.clone()
-    starts = random_starts(batch.bodies, batch.body, near, torch.Generator().manual_seed(0))
+    starts = random_starts(
+        batch.robot_tables, batch.env_robot_index, near, torch.Generator().manual_seed(0)
+    )
     assert len(starts) == STARTS
     assert torch.equal(starts[0], near)
     assert (starts[1:] != near).any()
-    idle = ~batch.bodies.moves_tool[0]
+    idle = ~batch.robot_tables.moves_tool[0]
     assert idle.any()
     assert torch.equal(starts[..., idle], near[:, idle].expand(STARTS, -1, -1))
 
@@ -157,6 +158,6 @@ def test_an_episode_of_reach_scores_the_mean_of_its_steps(made):
     batch.step = watched
     (episode,) = run_episodes(batch, InverseKinematics(0), 1)
     found = [float(each.score[0]) for each in scores]
-    assert episode.steps == len(found) == REACH.steps
+    assert episode.steps == len(found) == REACH.max_episode_steps
     assert episode.score == pytest.approx(np.mean(found), rel=1e-4)
     assert episode.score != pytest.approx(found[-1], rel=1e-4)

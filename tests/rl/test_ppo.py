@@ -102,7 +102,7 @@ def test_the_metrics_of_a_rollout_by_hand():
     buffer.success[:] = torch.tensor([[true, true, false], [false, false, true]])
     buffer.terminated[:] = torch.tensor([[true, false, false], [false, false, false]])
     buffer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
-    buffer.unstable[:] = torch.tensor([[false, false, true], [false, false, false]])
+    buffer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
     found = buffer.metrics(torch.tensor([1, 0, 1]), 3)
     assert (found["reward"], found["score"]) == (3.5, 2.0)
     assert found["scores"][:2] == (2.0, 2.0)

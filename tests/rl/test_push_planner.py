@@ -14,20 +14,20 @@ from morphgen.rl.baselines import push_planner
 from morphgen.rl.baselines.cartesian import OneTool
 from morphgen.rl.baselines.push_contacts import poised
 from morphgen.rl.baselines.push_planner import SPEED, PushPlanner
-from morphgen.tasks.bodies import bodies_of
 from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.robot_tables import build_robot_tables
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
-PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)
+PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 
 
 def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
-    planner = PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
-    space, tool = FreeSpace(setting.scene), OneTool(bodies_of([setting.robot]), 0)
+    planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
+    space, tool = FreeSpace(setting.scene), OneTool(build_robot_tables([setting.robot]), 0)
     for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
         plan = planner.plan(q, block)
         points = [q, *plan.way]
@@ -46,7 +46,7 @@ def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
 def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
     """Configurations near the first plan's last one are said to, on the way of the push."""
     setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
-    planner = PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
+    planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
     q, block = setting.goals.q[0], setting.goals.blocks[0]
     first = planner.plan(q, block).way[-1]
 
@@ -66,7 +66,7 @@ def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
 def test_a_setting_of_another_task_is_refused(tmp_path):
     setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
-        PushPlanner(setting, bodies_of([setting.robot]), 0, np.random.default_rng(0))
+        PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
 
 
 @pytest.mark.slow
@@ -75,8 +75,8 @@ def test_arms_in_each_others_way_push_below_the_middle(tmp_path):
     members = read_split("extrapolation/arms/push").train
     member = next(each for each in members if each.name == "yumi")
     setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
-    bodies = bodies_of([setting.robot])
-    planner = PushPlanner(setting, bodies, 0, np.random.default_rng(0))
+    robot_tables = build_robot_tables([setting.robot])
+    planner = PushPlanner(setting, robot_tables, 0, np.random.default_rng(0))
     space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
     over = []
     for i in (3, 4, 29, 31, 36, 39):

@@ -13,7 +13,7 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 
 UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
-PUSH, REACH = PushConfig(starts=8), ReachConfig(goals=4)
+PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 
 
 def batch(words, n, cache, task="push", **options):
@@ -21,7 +21,7 @@ def batch(words, n, cache, task="push", **options):
     return make_batch(task, robots, n, cache=cache, configs=(REACH, PUSH), **options)
 
 
-def successes(task, controller, steps=PUSH.steps):
+def successes(task, controller, steps=PUSH.max_episode_steps):
     """Which of the first episodes end with the block across, shape (n,), bool."""
     task.reset()
     over = torch.zeros(task.num_envs, dtype=torch.bool)
@@ -98,7 +98,7 @@ def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
     task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
     task.reset()
     env = torch.tensor([0])
-    for i in range(PUSH.steps):
+    for i in range(PUSH.max_episode_steps):
         if i % 60 == 59:
             away = task.simulation.block_pose.clone()
             away[0, 0] = -away[0, 0] + (0.15 if away[0, 0] < 0 else -0.15)
@@ -111,9 +111,9 @@ def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
     assert 2 <= len(made) <= PLANS
     assert not np.allclose(made[0][1], made[1][1])
     left = [args[3] for args in made]
-    assert left[0] == PUSH.steps
+    assert left[0] == PUSH.max_episode_steps
     assert left == sorted(left, reverse=True)
-    assert left[1] <= PUSH.steps - 59
+    assert left[1] <= PUSH.max_episode_steps - 59
 
 
 @pytest.mark.parametrize("free", [True, False])
@@ -129,7 +129,13 @@ def test_a_tool_whose_arm_gets_into_something_rises(free, tmp_path, monkeypatch)
     while len(heights) < 12:
         acting = controller.act(task)
         if controller._state.pushing[0]:
-            heights.append(float(frame_positions(task.bodies.chain, task.body, task.targets)[0, 2]))
+            heights.append(
+                float(
+                    frame_positions(
+                        task.robot_tables.tool_chain, task.env_robot_index, task.targets
+                    )[0, 2]
+                )
+            )
         assert not task.step(acting).terminated.any()
     task.close()
     rise = 0.0 if free else RISE

@@ -7,22 +7,21 @@ import torch
 import morphgen
 from morphgen.errors import TaskError
 from morphgen.grammar.library import default_library
-from morphgen.tasks.actions import Targets, shares_of
-from morphgen.tasks.bodies import bodies_of
-from morphgen.tasks.config import BINS
+from morphgen.tasks.actions import BINS, JointTargets, decode_actions
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.envs import curriculum_line, push_terms
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import anybody_score, reach_terms
+from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.rows import limit_violation
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def bodies():
+def robot_tables():
     robots = [morphgen.compose(words) for words in ("arm=ur5 ee=plane", "arm=panda ee=panda_hand")]
-    return bodies_of(robots, default_library(()).folders)
+    return build_robot_tables(robots, default_library(()).folders)
 
 
 def test_bins_are_symmetric_and_hold_zero():
@@ -33,9 +32,9 @@ def test_bins_are_symmetric_and_hold_zero():
 
 
 def test_continuous_actions_are_clipped_and_discrete_ones_looked_up():
-    shares = shares_of(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
+    shares = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
     assert shares.tolist() == [[1.0, -0.5]]
-    shares = shares_of(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
+    shares = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
     assert shares.tolist() == [[-1.0, 0.0, 1.0]]
 
 
@@ -46,35 +45,35 @@ def test_continuous_actions_are_clipped_and_discrete_ones_looked_up():
         (torch.tensor([[0.0, np.nan]]), "continuous", "environment 0, link 1 is not finite"),
         (torch.tensor([[0, 11]]), "discrete", "environment 0, link 1: .* 0 to 10"),
         (torch.tensor([[0, -1]]), "discrete", "from 0 to 10"),
-        (torch.tensor([[0.0, 1.0]]), "discrete", "whole numbers"),
+        (torch.tensor([[0.0, 1.0]]), "discrete", "integers from 0"),
     ],
 )
 def test_what_is_no_action_is_refused(actions, kind, words):
     with pytest.raises(TaskError, match=words):
-        shares_of(actions, kind, (1, 2), CPU)
+        decode_actions(actions, kind, (1, 2), CPU)
 
 
-def test_targets_move_by_the_step_of_each_joint_from_the_targets_before(bodies):
+def test_targets_move_by_the_step_of_each_joint_from_the_targets_before(robot_tables):
     body = torch.tensor([0, 1, 1])
-    mask = bodies.action_mask(fingers=True)[body]
-    before = bodies.home[body]
-    shares = torch.ones(3, bodies.max_links)
-    after = Targets(bodies, body, mask)(before, shares)
-    expected = torch.minimum(before + bodies.step[body], bodies.upper[body])
+    mask = robot_tables.action_mask(fingers=True)[body]
+    before = robot_tables.home[body]
+    shares = torch.ones(3, robot_tables.max_links)
+    after = JointTargets(robot_tables, body, mask)(before, shares)
+    expected = torch.minimum(before + robot_tables.max_step[body], robot_tables.upper[body])
     assert torch.equal(after, expected)
     assert (after[0, 6:] == 0).all()
 
 
-def test_targets_stay_within_limits_and_masked_links_do_not_move(bodies):
+def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
     body = torch.tensor([1])
-    mask = bodies.action_mask(fingers=False)[body]
-    targets = bodies.home[body]
-    moved_by = Targets(bodies, body, mask)
+    mask = robot_tables.action_mask(fingers=False)[body]
+    targets = robot_tables.home[body]
+    moved_by = JointTargets(robot_tables, body, mask)
     for _ in range(400):
-        targets = moved_by(targets, torch.ones(1, bodies.max_links))
-    moved = bodies.moves_tool[1]
-    assert torch.equal(targets[0, moved], bodies.upper[1, moved])
-    assert torch.equal(targets[0, ~moved], bodies.home[1, ~moved])
+        targets = moved_by(targets, torch.ones(1, robot_tables.max_links))
+    moved = robot_tables.moves_tool[1]
+    assert torch.equal(targets[0, moved], robot_tables.upper[1, moved])
+    assert torch.equal(targets[0, ~moved], robot_tables.home[1, ~moved])
 
 
 def test_terms_of_reach():

@@ -14,14 +14,12 @@ from morphgen.model.kinematics_torch import frame_positions
 from morphgen.model.robot import TOOL
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.simple import Random, Zero
-from morphgen.tasks.actions import actions_of
-from morphgen.tasks.config import BINS
-from morphgen.tasks.make import batch_of, make_batch
-from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.points import NOISE
+from morphgen.tasks.actions import BINS, encode_actions
+from morphgen.tasks.make import batch_from_specs, make_batch
+from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
 
-CONFIG = replace(ReachConfig(), goals=20)
+CONFIG = replace(ReachConfig(), num_goals=20)
 WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
 
 
@@ -49,7 +47,7 @@ def made(settings):
     def make(num_envs=3, robots=(0, 1, 2), obstacles=False, config=CONFIG, **options):
         chosen = [replace(settings[obstacles][i], config=config) for i in robots]
         options = {"sim": "mujoco", **options}
-        opened.append(batch_of(chosen, num_envs, **options))
+        opened.append(batch_from_specs(chosen, num_envs, **options))
         return opened[-1]
 
     yield make
@@ -66,7 +64,7 @@ def test_observations_have_the_shapes_they_claim(made):
     channels = ObservationConfig(velocity=True, previous_action=True, tool=True, points=50)
     batch = made(obstacles=True, observe=channels)
     seen = batch.reset()
-    n, links = 3, batch.bodies.max_links
+    n, links = 3, batch.robot_tables.max_links
     assert {name: tuple(value.shape) for name, value in seen.items()} == {
         "tokens": (n, links, 48),
         "links": (n, links),
@@ -89,7 +87,7 @@ def test_observations_have_the_shapes_they_claim(made):
 
 
 def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
-    batch = made(config=replace(CONFIG, steps=5))
+    batch = made(config=replace(CONFIG, max_episode_steps=5))
     batch.reset()
     goal = batch.field("goal").clone()
     controller = Random(0)
@@ -101,11 +99,11 @@ def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
     assert step.truncated.all()
     assert not step.terminated.any()
     assert not torch.equal(batch.field("goal"), goal)
-    assert (batch.elapsed == 0).all()
+    assert (batch.episode_step == 0).all()
 
 
 def test_the_final_observation_is_before_the_next_start(made):
-    batch = made(config=replace(CONFIG, steps=3))
+    batch = made(config=replace(CONFIG, max_episode_steps=3))
     batch.reset()
     for _ in range(3):
         goal = batch.field("goal").clone()
@@ -121,32 +119,32 @@ def test_a_start_is_never_the_goals_own_configuration(made):
         batch.reset()
         goal_q = batch.groups["reach"].goal_configuration
         assert ((batch.targets - goal_q).abs().amax(dim=1) > 1e-3).all()
-        there = frame_positions(batch.bodies.chain, batch.body, goal_q)
+        there = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, goal_q)
         assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
 
 
 def test_doing_nothing_moves_nothing(made):
     batch = made()
     batch.reset()
-    before = frame_positions(batch.bodies.chain, batch.body, batch.q)
-    for _ in range(CONFIG.steps - 1):
+    before = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, batch.q)
+    for _ in range(CONFIG.max_episode_steps - 1):
         batch.step(Zero().act(batch))
-    after = frame_positions(batch.bodies.chain, batch.body, batch.q)
+    after = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, batch.q)
     assert (after - before).norm(dim=1).max() < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
-    steps = run(made(12, robots=(0,), kind=kind), InverseKinematics(0), CONFIG.steps)
+    steps = run(made(12, robots=(0,), kind=kind), InverseKinematics(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() >= 0.9
     assert steps[-1].score[steps[-1].success].unique().tolist() == [CONFIG.score_near]
-    steps = run(made(12, robots=(0,), kind=kind), Random(0), CONFIG.steps)
+    steps = run(made(12, robots=(0,), kind=kind), Random(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() <= 0.2
 
 
 def test_inverse_kinematics_goes_around_what_is_in_the_way(made):
     batch = made(12, robots=(1, 1, 2))
-    steps = run(batch, InverseKinematics(0), CONFIG.steps)
+    steps = run(batch, InverseKinematics(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() >= 0.9
 
 
@@ -159,7 +157,9 @@ def test_the_reward_is_the_sum_of_its_terms(made):
 def test_an_environment_is_the_same_in_whichever_batch(made):
     whole = made(4, seed=7)
     part = made(2, seed=7, first=2)
-    actions = torch.rand(30, 4, whole.bodies.max_links, generator=torch.Generator().manual_seed(0))
+    actions = torch.rand(
+        30, 4, whole.robot_tables.max_links, generator=torch.Generator().manual_seed(0)
+    )
     whole.reset()
     part.reset()
     for action in 2 * actions - 1:
@@ -171,7 +171,9 @@ def test_an_environment_is_the_same_in_whichever_batch(made):
 @pytest.mark.parametrize("others", [(), (1,), (1, 2), (0, 0, 0, 0, 0, 0, 0)])
 def test_no_bit_of_a_reward_depends_on_the_rest_of_the_batch(made, others):
     alone, beside = (made(1 + len(more), robots=(0, *more), seed=7) for more in ((), others))
-    actions = torch.rand(30, 1, alone.bodies.max_links, generator=torch.Generator().manual_seed(0))
+    actions = torch.rand(
+        30, 1, alone.robot_tables.max_links, generator=torch.Generator().manual_seed(0)
+    )
     alone.reset()
     beside.reset()
     for action in 2 * actions - 1:
@@ -205,7 +207,7 @@ def test_a_negative_seed_is_refused(made):
 
 def test_shares_become_the_nearest_bins_towards_zero():
     shares = torch.tensor([[0.0, 1.0, -1.0, 0.3, -0.3, 0.01]])
-    found = [BINS[i] for i in actions_of(shares, "discrete")[0].tolist()]
+    found = [BINS[i] for i in encode_actions(shares, "discrete")[0].tolist()]
     assert found == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
 
 
@@ -221,7 +223,7 @@ def test_a_batch_goes_on_from_its_state(made):
     other.reset()
     assert torch.equal(one.field("goal"), other.field("goal"))
     assert torch.equal(one.targets, other.targets)
-    with pytest.raises(TaskError, match="the state is of 3 environments; there are 2"):
+    with pytest.raises(TaskError, match="the state is of 3 environments; expected 2"):
         made(2).load_state_dict(state)
 
 
@@ -235,7 +237,7 @@ def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
 
     def tensors(step):
         parts = {"now": step.observation, "final": step.final_observation, "terms": step.terms}
-        plain = ("reward", "terminated", "truncated", "unstable", "success", "distance", "score")
+        plain = ("reward", "terminated", "truncated", "diverged", "success", "distance", "score")
         named = {f"{of} {k}": v for of, part in parts.items() for k, v in part.items()}
         return named | {k: getattr(step, k) for k in (*plain, "q", "block_pose")}
 
@@ -271,13 +273,13 @@ def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
 def test_first_episodes_may_be_spread_over_time(made):
     batch = made(60, robots=(0,), seed=1)
     batch.reset(spread=True)
-    passed = batch.elapsed.clone()
+    passed = batch.episode_step.clone()
     assert passed.unique().numel() > 40
-    assert 0 <= passed.min() < 60 < 240 < passed.max() < CONFIG.steps
+    assert 0 <= passed.min() < 60 < 240 < passed.max() < CONFIG.max_episode_steps
     batch.reset(seed=1, spread=True)
-    assert torch.equal(batch.elapsed, passed)
+    assert torch.equal(batch.episode_step, passed)
     over = torch.zeros(60, dtype=torch.bool)
-    for _ in range(CONFIG.steps - int(passed.max())):
+    for _ in range(CONFIG.max_episode_steps - int(passed.max())):
         over |= batch.step(Zero().act(batch)).truncated
     assert torch.equal(over, passed == passed.max())
 
@@ -285,10 +287,12 @@ def test_first_episodes_may_be_spread_over_time(made):
 def test_velocities_and_actions_are_those_of_the_links(made):
     batch = made(observe=ObservationConfig(velocity=True, previous_action=True))
     assert batch.reset()["velocity"].abs().max() == 0
-    action = torch.ones(batch.mask.shape)
+    action = torch.ones(batch.action_mask.shape)
     seen = batch.step(action).observation
-    assert torch.equal(seen["previous_action"] != 0, batch.mask)
-    assert ((seen["velocity"] != 0) <= (batch.bodies.joint_of_link[batch.body] >= 0)).all()
+    assert torch.equal(seen["previous_action"] != 0, batch.action_mask)
+    assert (
+        (seen["velocity"] != 0) <= (batch.robot_tables.joint_of_link[batch.env_robot_index] >= 0)
+    ).all()
     assert (seen["velocity"].abs().amax(dim=1) > 0.01).all()
 
 
@@ -296,7 +300,7 @@ def test_the_tool_is_where_the_joints_bring_it(made):
     batch = made(observe=ObservationConfig(tool=True))
     batch.reset()
     for _ in range(5):
-        step = batch.step(torch.ones(batch.mask.shape))
+        step = batch.step(torch.ones(batch.action_mask.shape))
     for env, each in enumerate(batch.specs):
         q = batch.q[env, : each.robot.dof].double().numpy()
         expected = frame_pose(each.robot, q[None], TOOL)[0, :3, 3]

@@ -9,7 +9,7 @@ import torch
 
 from helpers.pybullet_states import PUSHING, client_of, reset, starts, state, touching, wander
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
-from morphgen.errors import SimulationError, UnstableError
+from morphgen.errors import DivergedError, SimulationError
 from morphgen.tasks.sim import bullet_files
 from morphgen.tasks.sim.bullet import BulletSimulation
 
@@ -138,7 +138,7 @@ def test_an_unstable_environment_is_named_and_can_be_reset(simulate):
     loaded = client_of(simulation, 2)
     pybullet.resetJointState(loaded.robot, loaded.driven[0], np.nan, physicsClientId=loaded.id)
     for _ in range(2):
-        with pytest.raises(UnstableError, match=r"environment 2 \('ur5-plane'\).* step 2 after"):
+        with pytest.raises(DivergedError, match=r"environment 2 \('ur5-plane'\).* step 2 after"):
             simulation.step(q)
     reset(simulation, envs=torch.tensor([2]))
     fresh = simulate(real_arm_scene())

@@ -17,7 +17,7 @@ import torch
 from helpers.commands import heed_ctrl_c
 from helpers.pybullet_states import state
 from helpers.scenes import mixed_scenes, push_scene
-from morphgen.errors import SimulationError, UnstableError
+from morphgen.errors import DivergedError, SimulationError
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.sim.bullet import BulletSimulation, divide
@@ -124,7 +124,7 @@ def test_what_is_unstable_is_named_wherever_it_is_and_the_others_step(heavy):
         others = sorted({0, 1, 2, 3} - heavy)
         before = state(simulation)[others]
         message = rf"environment {min(heavy)} \('prims'\) became unstable"
-        with pytest.raises(UnstableError, match=message) as found:
+        with pytest.raises(DivergedError, match=message) as found:
             simulation.step(q)
         assert found.value.reasons.keys() == heavy
         assert (state(simulation)[others] != before).any(dim=1).all()

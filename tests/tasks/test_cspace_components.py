@@ -91,10 +91,10 @@ def test_goals_are_on_the_larger_side(tmp_path):
     body = walled(ACROSS)
     both, _ = FreeSpace(Scene(body)).draw(40, np.random.default_rng(0))
     assert 5 < (both[:, 0] > 0.5).sum() < 35
-    goals = draw_goals(body, ReachConfig(goals=40), obstacles=False, seed=0, cache=tmp_path)
+    goals = draw_goals(body, ReachConfig(num_goals=40), obstacles=False, seed=0, cache=tmp_path)
     assert (goals.q[:, 0] < 0.5).all()
     assert goals.accepted == 40 < goals.tried
-    few = draw_goals(body, ReachConfig(goals=7), obstacles=False, seed=0, cache=tmp_path)
+    few = draw_goals(body, ReachConfig(num_goals=7), obstacles=False, seed=0, cache=tmp_path)
     assert (few.q == goals.q[:7]).all()
     assert certify_goals(goals, body, Scene(body)) == []
 
@@ -111,7 +111,9 @@ def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
 
 
 def test_a_certificate_notices_what_is_beyond(tmp_path):
-    goals = draw_goals(ball(0.2), ReachConfig(goals=12), obstacles=False, seed=0, cache=tmp_path)
+    goals = draw_goals(
+        ball(0.2), ReachConfig(num_goals=12), obstacles=False, seed=0, cache=tmp_path
+    )
     body = walled(ACROSS)
     lines = certify_goals(goals, body, Scene(body))
     there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]

@@ -10,13 +10,12 @@ from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.split_file import read_split
 from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.goal_audit import CODES, audit_goals, with_goals
-from morphgen.tasks.goal_leaks import NEAR
-from morphgen.tasks.goal_making import gathered, split_goals
+from morphgen.tasks.goal_audit import CODES, NEAR, audit_goals, with_goal_findings
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.split_goals import SplitGoals, sample_split_goals
 
-RECIPE = GoalConfig(0, (ReachConfig(goals=12), PushConfig(starts=4)))
+RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
 REACH = "train", "gantry-plane"
 PUSH = "train", "gantry-cylinder"
 LAST = "test", "planar-plane"
@@ -34,7 +33,7 @@ def some(**more):
 
 
 def made(which, cache, config=RECIPE):
-    return gathered(split_goals(which, LIBRARY, config, cache=cache), config)
+    return SplitGoals.from_results(sample_split_goals(which, LIBRARY, config, cache=cache), config)
 
 
 @pytest.fixture
@@ -93,12 +92,12 @@ def test_sets_of_another_seed_are_found(cache):
 @pytest.mark.parametrize(
     "recipe",
     [
-        replace(RECIPE, tasks=(ReachConfig(goals=10), PushConfig(starts=3))),
+        replace(RECIPE, tasks=(ReachConfig(num_goals=10), PushConfig(num_goals=3))),
         replace(
             RECIPE,
             tasks=(
-                ReachConfig(goals=12, obstacles=2),
-                PushConfig(starts=4, block_size=(0.1, 0.12)),
+                ReachConfig(num_goals=12, obstacles=2),
+                PushConfig(num_goals=4, block_size=(0.1, 0.12)),
             ),
         ),
     ],
@@ -120,7 +119,7 @@ def test_a_set_without_the_obstacles_of_its_member_is_found(cache):
 
 def test_a_set_of_another_body_is_found(sets):
     body = "0" * 32
-    told = audit_goals(some(), changed(sets, REACH, {"key": "1" * 64}, body=body), LIBRARY)
+    told = audit_goals(some(), changed(sets, REACH, {"key": "1" * 64}, robot_hash=body), LIBRARY)
     assert [(each.code, each.where) for each in told] == [
         ("goals-body", "train robot gantry-plane")
     ]
@@ -306,19 +305,19 @@ def test_what_a_split_accepts_does_not_fail(cache):
     which = replace(twins("reach"), accepted=reasons, regime="interpolation")
     done = audit(which, LIBRARY)
     findings = audit_goals(which, made(which, cache), LIBRARY)
-    joined = with_goals(done, which, findings)
+    joined = with_goal_findings(done, which, findings)
     assert {each.code: why for each, why in joined.accepted} == reasons
     assert "goals-shared" not in {each.code for each in joined.findings}
     strict = replace(which, accepted={"body-shared": "a reason"})
-    assert not with_goals(audit(strict, LIBRARY), strict, findings).passed()
+    assert not with_goal_findings(audit(strict, LIBRARY), strict, findings).passed()
 
 
 def test_an_accepted_finding_about_goals_is_unused_only_if_somebody_looked(sets):
     which = replace(some(), accepted={"goals-shared": "on purpose"}, regime="interpolation")
     done = audit(which, LIBRARY)
     unused = "accepted goals-shared"
-    assert unused not in {each.where for each in with_goals(done, which, None).findings}
-    assert unused in {each.where for each in with_goals(done, which, ()).findings}
+    assert unused not in {each.where for each in with_goal_findings(done, which, None).findings}
+    assert unused in {each.where for each in with_goal_findings(done, which, ()).findings}
 
 
 def test_every_code_has_a_fix(sets):

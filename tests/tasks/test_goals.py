@@ -1,6 +1,7 @@
 """Goal sets, and the faults of the released code that they must not have."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -26,7 +27,7 @@ from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
 
-CONFIG = ReachConfig(goals=12)
+CONFIG = ReachConfig(num_goals=12)
 LIFTED = -0.4
 WORDS = (
     "arm=ur5 ee=plane",
@@ -85,7 +86,7 @@ def test_goals_are_above_the_ground_wherever_it_is(body, cache):
 def test_goals_are_never_inside_an_obstacle(words, cache):
     """Neither the witness's links nor the tool's point, which may be where no link is."""
     body = robot(words)
-    config = replace(CONFIG, goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
+    config = replace(CONFIG, num_goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
     found = made(body, cache, obstacles=True, config=config, ground=0.0)
     assert not FreeSpace(scene_of(body, found, 0.0)).obstacle_hits(found.q).any()
     for box in found.obstacles:
@@ -128,14 +129,17 @@ def test_no_room_for_obstacles_is_an_error_not_fewer(body, cache):
     assert not cache.exists()
 
 
-@pytest.mark.parametrize(
-    ("count", "size"), [(0, (0.06, 0.15)), (1, (0.0, 0.1)), (1, (0.2, 0.1)), (1, (0.1, np.inf))]
-)
-def test_obstacles_that_are_none_are_refused(body, cache, count, size):
-    config = replace(CONFIG, obstacles=count, obstacle_size=size)
-    with pytest.raises(BenchmarkError, match=f"{count} obstacles of size"):
+def test_obstacles_without_a_number_are_refused(body, cache):
+    config = replace(CONFIG, obstacles=0)
+    with pytest.raises(BenchmarkError, match="0 obstacles of size"):
         made(body, cache, obstacles=True, config=config)
     assert len(made(body, cache, config=config).q) == 12
+
+
+@pytest.mark.parametrize("size", [(0.0, 0.1), (0.2, 0.1), (0.1, np.inf)])
+def test_invalid_sizes_of_obstacles_are_refused(body, size):
+    with pytest.raises(BenchmarkError, match="1 obstacles of size"):
+        draw_obstacles(body, 1, size, np.random.default_rng(0))
 
 
 def test_the_cache_knows_the_seed(body, cache):
@@ -149,7 +153,7 @@ def test_the_cache_knows_the_seed(body, cache):
 def changes(body):
     return {
         "obstacles": {"obstacles": True},
-        "goals": {"config": replace(CONFIG, goals=13)},
+        "goals": {"config": replace(CONFIG, num_goals=13)},
         "ground": {"ground": -0.2},
         "body": {"body": replace(body, home=(0.0, *body.home[1:]))},
         "pairs": {"body": replace(body, ignore_pairs=(*body.ignore_pairs, ("base", "slider")))},
@@ -168,7 +172,7 @@ def test_the_cache_knows_all_that_matters_and_nothing_else(body, cache):
     keys.append(made(body, cache).key)
     assert len(set(keys)) == len(keys)
     count = len(files(cache))
-    same = replace(CONFIG, near=0.1, steps=5, obstacles=7)
+    same = replace(CONFIG, near=0.1, max_episode_steps=5, obstacles=7)
     other = replace(body, name="other")
     assert made(other, cache, config=same).robot == "other"
     assert (made(other, cache).q == made(body, cache).q).all()
@@ -193,11 +197,12 @@ def test_every_run_gives_the_same_bytes(body, tmp_path):
     made(body, tmp_path / "here", obstacles=True)
     code = (
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
-        "from dataclasses import replace; from robots import arm; "
+        "from dataclasses import replace; from helpers.robots import arm; "
         "from morphgen.checks.self_collision import survey_collisions; "
-        "from morphgen.tasks.reach.config import ReachConfig; from goal_draws import draw_goals; "
+        "from morphgen.tasks.reach.config import ReachConfig; "
+        "from helpers.goal_sets import draw_goals; "
         "body = replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs); "
-        "draw_goals(body, ReachConfig(goals=12), obstacles=True, seed=0, ground=-0.4, "
+        "draw_goals(body, ReachConfig(num_goals=12), obstacles=True, seed=0, ground=-0.4, "
         "cache=Path(sys.argv[1]))"
     )
     tests = Path(__file__).parents[1]
@@ -209,7 +214,7 @@ def test_every_run_gives_the_same_bytes(body, tmp_path):
 
 def test_fewer_goals_are_the_first_of_more(body, cache):
     few = made(body, cache)
-    more = made(body, cache, config=replace(CONFIG, goals=30))
+    more = made(body, cache, config=replace(CONFIG, num_goals=30))
     assert (more.q[:12] == few.q).all()
 
 
@@ -240,10 +245,29 @@ def test_a_tool_that_does_not_move_is_refused(body, cache):
         made(replace(body, frames=()), cache)
 
 
-@pytest.mark.parametrize(("goals", "seed"), [(0, 0), (5, -1)])
-def test_numbers_that_mean_nothing_are_refused(body, cache, goals, seed):
-    with pytest.raises(BenchmarkError, match=f"{goals} goals with seed {seed}"):
-        made(body, cache, seed=seed, config=replace(CONFIG, goals=goals))
+def test_a_negative_seed_is_refused(body, cache):
+    with pytest.raises(BenchmarkError, match="12 goals with seed -1"):
+        made(body, cache, seed=-1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"num_goals": 0}, "num_goals 0: expected an integer >= 1"),
+        ({"num_goals": 2.5}, "num_goals 2.5: expected an integer >= 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps 0: expected an integer >= 1"),
+        ({"obstacles": -1}, "obstacles -1: expected an integer >= 0"),
+        ({"near": 0.0}, "near 0: expected a positive distance"),
+        ({"distance_weight": np.nan}, "distance_weight nan: expected finite numbers"),
+        ({"near_weight": "1"}, "near_weight '1': expected finite numbers"),
+        ({"obstacle_size": (0.0, 0.1)}, "expected 0 < lowest <= highest"),
+        ({"obstacle_size": (0.2, 0.1)}, "expected 0 < lowest <= highest"),
+        ({"obstacle_size": (0.1, np.inf)}, "expected finite numbers"),
+    ],
+)
+def test_invalid_constants_are_refused(changes, text):
+    with pytest.raises(TaskError, match=re.escape(text)):
+        replace(CONFIG, **changes)
 
 
 @pytest.mark.parametrize("keep", [0, 100, -200])

@@ -11,7 +11,7 @@ import torch
 from helpers.robots import arm
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.checks.self_collision import adjacent_pairs
-from morphgen.errors import SimulationError, UnstableError
+from morphgen.errors import DivergedError, SimulationError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_limits, movable_positions
@@ -296,13 +296,13 @@ def test_what_explodes_is_named_and_can_be_reset(tmp_path, monkeypatch):
     sim.step(home[0])
     sim._data[1].qvel[0] = math.nan
     name = sim.scenes[1].robot.name
-    with pytest.raises(UnstableError, match=rf"environment 1 \(robot '{name}', 2 steps"):
+    with pytest.raises(DivergedError, match=rf"environment 1 \(robot '{name}', 2 steps"):
         sim.step(home[0])
     assert sim.q[[0, 2]].isfinite().all()
     put_back(sim, [1], home)
     sim.step(home[0])
     sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
-    with pytest.raises(UnstableError, match=r"environment 0 .*beyond 10000") as found:
+    with pytest.raises(DivergedError, match=r"environment 0 .*beyond 10000") as found:
         sim.step(home[0])
     assert list(found.value.reasons) == [0, 2]
     assert list(Path(tmp_path).iterdir()) == []
@@ -328,7 +328,7 @@ def test_contacts_without_room_are_of_one_environment_alone(monkeypatch, memory,
     inside = home[1].clone()
     inside[1, :3] = torch.tensor([0.5, 0.2, 0.02])  # in an obstacle and the ground
     put_back(sim, [0, 1], (home[0], inside))
-    with pytest.raises(UnstableError, match=rf"environment 1 \(robot 'prims'.*{words}") as info:
+    with pytest.raises(DivergedError, match=rf"environment 1 \(robot 'prims'.*{words}") as info:
         sim.step(home[0])
     assert list(info.value.reasons) == [1]
     assert "\n" not in str(info.value)

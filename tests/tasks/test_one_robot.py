@@ -8,12 +8,12 @@ import pytest
 import morphgen
 from helpers.splits import member, split
 from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.robots import robot_of
 
 WORDS = "arm=ur5 ee=stick"
-CONFIG = ReachConfig(goals=8)
+CONFIG = ReachConfig(num_goals=8)
 STEPS = 40
 NAMES = ("words", "bundle", "urdf", "robot", "read", "primitives", "bundle of primitives", "member")
 
@@ -64,7 +64,7 @@ def scores(batches):
         rng = np.random.default_rng(0)
         batch.reset(0)
         found[name] = [
-            float(batch.step(batch.mask * float(rng.uniform(-1, 1))).reward[0])
+            float(batch.step(batch.action_mask * float(rng.uniform(-1, 1))).reward[0])
             for _ in range(STEPS)
         ]
     return found
@@ -92,7 +92,7 @@ def test_goals_are_the_same(batches, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tokens_are_the_same(batches, name):
-    ours, theirs = (batches[each].bodies.tokens for each in ("words", name))
+    ours, theirs = (batches[each].robot_tables.tokens for each in ("words", name))
     assert (theirs == ours).all()
 
 
@@ -103,15 +103,15 @@ def test_the_score_is_the_same(scores, name):
 
 
 def test_what_is_only_seen_does_not_count():
-    robot = robot_of("arm=ur5 ee=stick")
+    robot = load_robot("arm=ur5 ee=stick")
     bare = robot.with_links([replace(link, visuals=()) for link in robot.links])
     assert robot_hash(bare, visuals=False) == robot_hash(robot, visuals=False)
     assert robot_hash(bare) != robot_hash(robot)
 
 
 def test_what_it_is_made_of_stays():
-    once = robot_of("arm=ur5 ee=stick")
-    twice = robot_of(once)
+    once = load_robot("arm=ur5 ee=stick")
+    twice = load_robot(once)
     assert [link.collisions for link in twice.links] == [link.collisions for link in once.links]
     assert twice.fits == once.fits
     assert twice.ignore_pairs == once.ignore_pairs

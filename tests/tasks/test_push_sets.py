@@ -20,7 +20,7 @@ from morphgen.tasks.push.region import effective_reach, push_region
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import Block, Scene
 
-CONFIG = PushConfig(starts=5)
+CONFIG = PushConfig(num_goals=5)
 ARMS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm=arm3 ee=claw")
 FREE = ("prims", "cubes", "chain beads=3")
 SWEEPS = ("stick", "nlink")
@@ -126,7 +126,7 @@ def test_the_block_is_as_the_config_has_it(cache):
 
 
 def test_blocks_are_turned_and_placed_at_random(cache):
-    found = made("prims", cache, config=replace(CONFIG, starts=60))
+    found = made("prims", cache, config=replace(CONFIG, num_goals=60))
     assert np.histogram(found.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
     yaw = 2 * np.arctan2(found.blocks[:, 6], found.blocks[:, 3])
     assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
@@ -134,7 +134,7 @@ def test_blocks_are_turned_and_placed_at_random(cache):
 
 def test_fewer_starts_are_the_first_of_more(cache):
     few = made("arm=ur5 ee=plane", cache)
-    more = made("arm=ur5 ee=plane", cache, config=replace(CONFIG, starts=40))
+    more = made("arm=ur5 ee=plane", cache, config=replace(CONFIG, num_goals=40))
     for name in ("q", "blocks", "behind", "across"):
         assert (getattr(more, name)[:5] == getattr(few, name)).all()
 
@@ -164,7 +164,7 @@ def test_the_key_knows_all_that_matters_and_nothing_else(cache):
     base = {"config": CONFIG}
     changes = [
         base,
-        {"config": replace(CONFIG, starts=6)},
+        {"config": replace(CONFIG, num_goals=6)},
         {"config": replace(CONFIG, start_depth=0.01)},
         {"config": replace(CONFIG, block_size=(0.15, 0.16))},
         {"config": replace(CONFIG, block_mass=0.2)},
@@ -174,7 +174,7 @@ def test_the_key_knows_all_that_matters_and_nothing_else(cache):
     ]
     keys = [made("prims", cache, **change).key for change in changes]
     assert len(set(keys)) == len(keys)
-    same = replace(CONFIG, steps=5, success_weight=3.0, curriculum_steps=2, obstacles=9)
+    same = replace(CONFIG, max_episode_steps=5, success_weight=3.0, curriculum_steps=2, obstacles=9)
     other = replace(robot("prims"), name="other")
     found = draw_goals(other, same, obstacles=False, seed=0, cache=cache)
     assert (found.key, found.robot) == (keys[0], "other")
@@ -209,9 +209,9 @@ def test_obstacles_that_always_stand_in_the_way_are_an_error(cache, monkeypatch)
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"starts": 0}, "0 goals with seed 0: at least one goal"),
+        ({"num_goals": 0}, "PushConfig: num_goals 0: expected an integer >= 1"),
         ({"block_size": (0.2, 0.1)}, "a block of 0.2 to 0.1"),
-        ({"start": 0.3}, "is to cross 0.2: sizes are positive, and it starts before the line"),
+        ({"start": 0.3}, "is to cross 0.2: sizes must be positive, and the start"),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(changes, text, cache):

@@ -7,8 +7,7 @@ import torch
 from helpers.robots import finger
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.geometry import Pose
-from morphgen.tasks.config import CONTROL_PERIOD
-from morphgen.tasks.sim.base import GRAVITY, Block, Scene
+from morphgen.tasks.sim.base import CONTROL_PERIOD, GRAVITY, Block, Scene
 from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 

@@ -15,13 +15,13 @@ from helpers.goal_sets import draw_spec
 from morphgen.model.dynamics import actuation
 from morphgen.rl.baselines.simple import Random
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Contacts
 
 SIMS = ("pybullet", "mujoco")
-FEW = replace(ReachConfig(), goals=12, steps=40)
+FEW = replace(ReachConfig(), num_goals=12, max_episode_steps=40)
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +42,11 @@ def test_joints_are_reset_within_their_limits_and_stay_there(robot, sim, cache):
     """
     setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
     free = Contacts(False, False)
-    with closing(batch_of([setting], 4, sim=sim, contacts=free)) as batch:
+    with closing(batch_from_specs([setting], 4, sim=sim, contacts=free)) as batch:
         batch.reset()
-        low, high = batch.bodies.lower, batch.bodies.upper
-        outwards = torch.ones(batch.mask.shape)
-        for k in range(2 * FEW.steps):
+        low, high = batch.robot_tables.lower, batch.robot_tables.upper
+        outwards = torch.ones(batch.action_mask.shape)
+        for k in range(2 * FEW.max_episode_steps):
             assert (batch.targets >= low).all()
             assert (batch.targets <= high).all()
             step = batch.step(outwards)
@@ -89,7 +89,7 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
     ends = []
     for body in (robot, heavy):
         setting = draw_spec(body, FEW, obstacles=False, seed=0, cache=cache)
-        with closing(batch_of([setting], 1, sim=sim)) as batch:
+        with closing(batch_from_specs([setting], 1, sim=sim)) as batch:
             batch.reset()
             start = torch.tensor(body.home)[None].float()
             batch.simulation.reset(torch.tensor([0]), start, torch.zeros(1, 7))
@@ -103,10 +103,10 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_obstacles_of_an_episode_never_hold_its_goal_or_start(robot, task, cache):
     """Their goals could lie inside the obstacle that was there at the time."""
-    config = FEW if task == "reach" else replace(PushConfig(), starts=6, steps=40)
+    config = FEW if task == "reach" else replace(PushConfig(), num_goals=6, max_episode_steps=40)
     setting = draw_spec(robot, config, obstacles=True, seed=0, cache=cache)
     space = FreeSpace(setting.scene)
-    with closing(batch_of([setting], 6, sim="mujoco")) as batch:
+    with closing(batch_from_specs([setting], 6, sim="mujoco")) as batch:
         for seed in range(3):
             batch.reset(seed)
             blocks = batch.simulation.block_pose.numpy() if task == "push" else None
@@ -118,10 +118,10 @@ def test_obstacles_of_an_episode_never_hold_its_goal_or_start(robot, task, cache
 def test_one_goal_holds_for_the_whole_episode(robot, cache):
     """Theirs was drawn again inside the episode."""
     setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
-    with closing(batch_of([setting], 3, sim="mujoco")) as batch:
+    with closing(batch_from_specs([setting], 3, sim="mujoco")) as batch:
         batch.reset()
         goal, acting = batch.field("goal").clone(), Random(0)
-        for _ in range(FEW.steps - 1):
+        for _ in range(FEW.max_episode_steps - 1):
             batch.step(acting.act(batch))
             assert torch.equal(batch.field("goal"), goal)
         batch.step(acting.act(batch))
@@ -131,11 +131,11 @@ def test_one_goal_holds_for_the_whole_episode(robot, cache):
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_episodes_follow_their_seed(robot, task, cache):
     """Generators of theirs had none."""
-    config = FEW if task == "reach" else replace(PushConfig(), starts=6)
+    config = FEW if task == "reach" else replace(PushConfig(), num_goals=6)
     setting = draw_spec(robot, config, obstacles=False, seed=0, cache=cache)
     seen = []
     for seed in (5, 5, 6):
-        with closing(batch_of([setting], 4, sim="mujoco", seed=seed)) as batch:
+        with closing(batch_from_specs([setting], 4, sim="mujoco", seed=seed)) as batch:
             batch.reset()
             seen.append(
                 torch.cat([batch.q, batch.field("goal"), batch.simulation.block_pose], dim=1)

@@ -12,11 +12,17 @@ from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
 from morphgen.tasks import renderer
+from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.renderer import Moment, Renderer, moment, require_film, write_film
-from morphgen.tasks.robots import robot_of
+from morphgen.tasks.renderer import (
+    Renderer,
+    RenderState,
+    render_state,
+    require_video_path,
+    write_video,
+)
 from morphgen.tasks.sim.base import Block, Scene
 
 SIZE = (160, 120)
@@ -29,14 +35,14 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def reach(cache):
-    config = ReachConfig(goals=10)
-    return draw_spec(robot_of("arm3-stick"), config, obstacles=True, seed=0, cache=cache)
+    config = ReachConfig(num_goals=10)
+    return draw_spec(load_robot("arm3-stick"), config, obstacles=True, seed=0, cache=cache)
 
 
 @pytest.fixture(scope="module")
 def push(cache):
-    config = PushConfig(starts=10)
-    return draw_spec(robot_of("prims"), config, obstacles=False, seed=0, cache=cache)
+    config = PushConfig(num_goals=10)
+    return draw_spec(load_robot("prims"), config, obstacles=False, seed=0, cache=cache)
 
 
 @pytest.fixture
@@ -70,7 +76,7 @@ def plain():
 
 def at_goal(spec, i):
     """The first start, with a goal."""
-    return Moment(spec.goals.q[0], markers={"goal": spec.goals.poses[i]})
+    return RenderState(spec.goals.q[0], markers={"goal": spec.goals.poses[i]})
 
 
 def changed(a, b):
@@ -82,7 +88,7 @@ def test_a_frame_is_of_its_size_and_its_bytes_are_always_the_same(on, reach):
     drawing = on(reach)
     frame = drawing.frame(at_goal(reach, 1))
     assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
-    drawing.frame(Moment(reach.goals.q[5]))
+    drawing.frame(RenderState(reach.goals.q[5]))
     again = [drawing.frame(at_goal(reach, 1))]
     again.append(on(reach).frame(at_goal(reach, 1)))
     assert all(np.array_equal(frame, each) for each in again)
@@ -90,13 +96,13 @@ def test_a_frame_is_of_its_size_and_its_bytes_are_always_the_same(on, reach):
 
 def test_the_robot_is_where_its_joints_are(on, reach):
     drawing = on(reach)
-    a, b = (drawing.frame(Moment(q)) for q in reach.goals.q[:2])
+    a, b = (drawing.frame(RenderState(q)) for q in reach.goals.q[:2])
     assert 50 < changed(a, b).sum() < a.size / 6
 
 
 def test_the_goal_is_green_and_only_where_it_is_asked_for(on, reach):
     drawing = on(reach)
-    without = drawing.frame(Moment(reach.goals.q[0]))
+    without = drawing.frame(RenderState(reach.goals.q[0]))
     shown = [drawing.frame(at_goal(reach, i)) for i in (1, 2)]
     spots = [changed(without, frame) for frame in shown]
     assert all(8 < spot.sum() < 600 for spot in spots)
@@ -110,12 +116,12 @@ def test_the_block_is_drawn_where_it_is_and_the_line_on_the_ground(on, push):
     start, line, q = push.goals.blocks[0], push.goals.line, push.goals.q[0]
     x = push.goals.blocks[:, 0]
     markers = {"line": ((x.min() + x.max()) / 2, line, 0.0, 1.0, 0.0, 0.0, 0.0)}
-    here = drawing.frame(Moment(q, start, markers))
+    here = drawing.frame(RenderState(q, start, markers))
     aside = start.copy()
     aside[1] = line
-    there = drawing.frame(Moment(q, aside, markers))
+    there = drawing.frame(RenderState(q, aside, markers))
     assert changed(here, there).sum() > 30
-    no_line = drawing.frame(Moment(q, start))
+    no_line = drawing.frame(RenderState(q, start))
     strip = changed(here, no_line)
     assert 20 < strip.sum() < 1500
     assert here[strip].mean(axis=0).argmax() == 1
@@ -127,7 +133,7 @@ def test_obstacles_are_drawn(on, reach):
     points = on(reach)._model.points
     drawing = on(bare)
     drawing._camera = renderer._camera(points, SIZE[0] / SIZE[1])
-    assert changed(on(reach).frame(Moment(q)), drawing.frame(Moment(q))).sum() > 50
+    assert changed(on(reach).frame(RenderState(q)), drawing.frame(RenderState(q))).sum() > 50
 
 
 @pytest.mark.parametrize("name", ["reach", "push"])
@@ -155,24 +161,24 @@ def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(plain):
     robot = arm()
     bare = replace(robot, links=tuple(replace(link, visuals=()) for link in robot.links))
     still = plain(Scene(bare, ground=None))
-    a, b = (still.frame(Moment(q)) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
+    a, b = (still.frame(RenderState(q)) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
     assert changed(a, b).sum() > 50
 
 
 def test_a_scene_without_anything_else_can_be_drawn(plain):
     block = Block((0.2, 0.2, 0.2), Pose((0.2, -0.5, 0.1)), 0.1)
     drawn = plain(Scene(arm(), block=block))
-    with_block = drawn.frame(Moment(arm().home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
-    assert changed(with_block, drawn.frame(Moment(arm().home))).sum() > 50
+    with_block = drawn.frame(RenderState(arm().home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
+    assert changed(with_block, drawn.frame(RenderState(arm().home))).sum() > 50
 
 
 def test_two_renderers_do_not_disturb_each_other(on, reach, push):
     one, other = on(reach), on(push, (100, 80))
-    first = one.frame(Moment(reach.goals.q[0]))
-    small = other.frame(Moment(push.goals.q[0]))
+    first = one.frame(RenderState(reach.goals.q[0]))
+    small = other.frame(RenderState(push.goals.q[0]))
     assert small.shape == (80, 100, 3)
     other.close()
-    assert np.array_equal(one.frame(Moment(reach.goals.q[0])), first)
+    assert np.array_equal(one.frame(RenderState(reach.goals.q[0])), first)
 
 
 def test_a_closed_renderer_says_so(on, reach):
@@ -180,7 +186,7 @@ def test_a_closed_renderer_says_so(on, reach):
     drawing.close()
     drawing.close()
     with pytest.raises(ValueError, match="closed"):
-        drawing.frame(Moment(reach.goals.q[0]))
+        drawing.frame(RenderState(reach.goals.q[0]))
 
 
 def test_a_moment_is_an_environment_of_a_batch(cache):
@@ -189,11 +195,11 @@ def test_a_moment_is_an_environment_of_a_batch(cache):
         ["arm3-stick", "prims"],
         2,
         sim="mujoco",
-        configs=(ReachConfig(goals=10), PushConfig(starts=10)),
+        configs=(ReachConfig(num_goals=10), PushConfig(num_goals=10)),
         cache=cache,
     )
     batch.reset()
-    reaching, pushing = moment(batch, 0), moment(batch, 1)
+    reaching, pushing = render_state(batch, 0), render_state(batch, 1)
     assert reaching.block is None
     assert np.array_equal(pushing.block, batch.simulation.block_pose[1].numpy())
     assert np.array_equal(reaching.markers["goal"], batch.field("goal")[0].numpy())
@@ -210,7 +216,7 @@ FRAMES = [np.full((48, 64, 3), value, dtype=np.uint8) for value in range(0, 250,
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_a_film_has_its_frames_its_speed_and_the_same_bytes(tmp_path, suffix):
     for name in ("a", "b"):
-        write_film(iter(FRAMES), tmp_path / f"{name}{suffix}", fps=25)
+        write_video(iter(FRAMES), tmp_path / f"{name}{suffix}", fps=25)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"a{suffix}", f"b{suffix}"]
     assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     with imageio.get_reader(tmp_path / f"a{suffix}") as reader:
@@ -232,7 +238,7 @@ def test_a_film_is_there_whole_or_not_at_all(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_film(broken(), path, fps=25)
+        write_video(broken(), path, fps=25)
     assert [each.name for each in tmp_path.iterdir()] == ["film.mp4"]
     assert path.read_bytes() == b"old"
 
@@ -247,9 +253,9 @@ def test_a_film_is_there_whole_or_not_at_all(tmp_path):
 )
 def test_where_no_film_can_be_written_is_said_at_once(tmp_path, name, says):
     with pytest.raises(FormatError, match=says):
-        require_film(tmp_path / name)
+        require_video_path(tmp_path / name)
     with pytest.raises(FormatError, match=says):
-        write_film(FRAMES, tmp_path / name, fps=25)
+        write_video(FRAMES, tmp_path / name, fps=25)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -268,7 +274,7 @@ def full_disk():
 @pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
 def test_a_film_that_the_disk_has_no_room_for_is_an_error(tmp_path, full_disk, name):
     with pytest.raises(FormatError, match=rf"cannot write .*{name}: (ffmpeg .* full, or|File too)"):
-        write_film(NOISE, tmp_path / name, fps=25)
+        write_video(NOISE, tmp_path / name, fps=25)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -289,6 +295,6 @@ def test_a_film_of_a_failing_or_missing_ffmpeg_is_an_error(tmp_path, monkeypatch
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
     (tmp_path / "films").mkdir()
     with pytest.raises(FormatError, match=rf"cannot write .*film.mp4: ({says})") as refused:
-        write_film(NOISE, tmp_path / "films" / "film.mp4", fps=25)
+        write_video(NOISE, tmp_path / "films" / "film.mp4", fps=25)
     assert "\n" not in str(refused.value)
     assert list((tmp_path / "films").iterdir()) == []

@@ -9,8 +9,8 @@ from helpers.robots import arm
 from helpers.scenes import robot
 from morphgen.checks.self_collision import untested_pairs
 from morphgen.model.dynamics import mass_matrix
+from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.robots import robot_of
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.sim.rigid_bodies import rigid_bodies
 
@@ -42,7 +42,7 @@ def test_links_that_ignore_others_are_not_joined():
 
 
 def test_neighbours_are_ignored_whoever_reads_the_robot():
-    made = robot_of("arm3-stick")
+    made = load_robot("arm3-stick")
     bare = replace(made, ignore_pairs=())
     assert set(untested_pairs(bare)) <= set(untested_pairs(made)) == set(made.ignore_pairs)
     _, tried = FreeSpace(Scene(bare, ground=-1.0)).draw(20, np.random.default_rng(0))

@@ -9,8 +9,8 @@ import torch
 from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, joint_limits
-from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
-from morphgen.tasks.sim.base import Block, Contacts, Scene
+from morphgen.tasks.robot_tables import STEP_SLIDE, STEP_TURN
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")

@@ -11,9 +11,9 @@ import morphgen
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
-from morphgen.tasks.speed import measure
+from morphgen.tasks.speed import measure_speed
 
-CONFIG = replace(ReachConfig(), goals=4, steps=10)
+CONFIG = replace(ReachConfig(), num_goals=4, max_episode_steps=10)
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +23,11 @@ def robot():
 
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
 def test_shares_sum_up_and_the_simulators_own_step_is_told_apart(robot, sim, tmp_path):
-    ticks, (module, step) = count(), SIMULATORS[sim].own_step
+    ticks, (module, step) = count(), SIMULATORS[sim].native_step
     with closing(
         make_batch("reach", [robot], 3, sim=sim, configs=(CONFIG,), cache=tmp_path)
     ) as batch:
-        found = measure(
+        found = measure_speed(
             batch, 2000, own=[(import_module(module), step)], clock=lambda: float(next(ticks))
         )
         assert "step" not in vars(batch.simulation)
@@ -45,7 +45,7 @@ def test_without_it_all_within_the_simulation_is_one(robot, tmp_path):
     with closing(
         make_batch("reach", [robot], 2, sim="mujoco", configs=(CONFIG,), cache=tmp_path)
     ) as batch:
-        found = measure(batch, 507, clock=lambda: float(next(ticks)))
-        assert batch.elapsed.tolist() == [0, 0]  # whole episodes
+        found = measure_speed(batch, 507, clock=lambda: float(next(ticks)))
+        assert batch.episode_step.tolist() == [0, 0]  # whole episodes
     assert "around the simulator" not in found.shares
     assert found.shares["simulator"] == pytest.approx(found.shares["actions"], rel=0.05)

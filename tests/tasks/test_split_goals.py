@@ -19,19 +19,24 @@ from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.split_folder_files import BuildSettings
 from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.tasks import env_specs, free_space, split_goals
+from morphgen.tasks import free_space, split_goals
 from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.goal_making import gathered, robot_goals
-from morphgen.tasks.goal_making import split_goals as make
 from morphgen.tasks.goal_sets import arrays_of, goals_from_npz, set_npz
 from morphgen.tasks.make import make_split_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach import goals as reach_goals
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.split_goals import read_goals, read_split_goals, write_goals
+from morphgen.tasks.split_goals import (
+    SplitGoals,
+    read_goals,
+    read_split_goals,
+    sample_robot_goals,
+    write_goals,
+)
+from morphgen.tasks.split_goals import sample_split_goals as make
 
-RECIPE = GoalConfig(0, (ReachConfig(goals=12), PushConfig(starts=4)))
+RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
 
 
 @pytest.fixture
@@ -81,7 +86,7 @@ def test_goals_follow_the_seed_that_the_cache_must_not_ignore(cache):
     for a, b in zip(first, second, strict=True):
         assert (a.goals.seed, b.goals.seed) == (0, 1)
         assert not np.isin(a.goals.q, b.goals.q).any()
-    assert env_specs.BENCHMARK.seed == 0
+    assert GoalConfig().seed == 0
 
 
 def test_every_member_has_its_own_set_train_first(cache):
@@ -93,9 +98,9 @@ def test_every_member_has_its_own_set_train_first(cache):
     ]
     assert [len(one.goals.q) for one in found] == [12, 4, 4]
     assert [len(one.goals.obstacles) for one in found] == [0, 3, 0]
-    assert [one.unproven for one in found] == [(), (), ()]
+    assert [one.certificate_errors for one in found] == [(), (), ()]
     assert [0 < one.acceptance <= 1 for one in found] == [True] * 3
-    assert [one.unproven for one in made(mixed(), cache)] == [None] * 3
+    assert [one.certificate_errors for one in made(mixed(), cache)] == [None] * 3
 
 
 def test_a_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
@@ -106,7 +111,7 @@ def test_a_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
     found = made(split([few, part], [fine]), cache)
     assert [one.goals is None for one in found] == [True, True, False]
     assert [one.acceptance for one in found] == [None, None, 1.0]
-    few, part, fine = (one.why for one in found)
+    few, part, fine = (one.error for one in found)
     assert re.search(r"only \d of 12 random configurations .* \(acceptance rate 0\.\d+\)", few)
     assert "unknown part 'cubw'" in part
     assert fine == ""
@@ -116,7 +121,9 @@ def test_a_set_that_cannot_be_certified_says_so(cache, monkeypatch):
     line = "goal 3: its configuration is in collision"
     monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
     found = made(reaching(), cache, certified=True)
-    assert {one.unproven for one in found} == {("goal 3: its configuration is in collision",)}
+    assert {one.certificate_errors for one in found} == {
+        ("goal 3: its configuration is in collision",)
+    }
 
 
 def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
@@ -142,17 +149,19 @@ def test_processes_make_the_same_sets(tmp_path):
     here, there = (made(which, tmp_path / str(jobs), jobs=jobs, certified=True) for jobs in (1, 2))
     assert [one.robot for one in here] == [one.robot for one in there]
     assert all(same(a.goals, b.goals) for a, b in zip(here, there, strict=True))
-    assert all(one.unproven == () for one in there)
+    assert all(one.certificate_errors == () for one in there)
 
 
 def test_one_robot_has_the_set_that_it_has_in_a_split(cache):
     body = robot("base=gantry ee=plane")
-    alone = robot_goals(body, "reach", RECIPE, obstacles=False, cache=cache)
+    alone = sample_robot_goals(body, "reach", RECIPE, obstacles=False, cache=cache)
     among = made(reaching(), cache)[0]
     assert (alone.side, alone.robot) == (None, body.name)
     assert alone.goals.key == among.goals.key
-    wrong = robot_goals(replace(body, frames=()), "push", RECIPE, obstacles=False, cache=cache)
-    assert "no frame 'tool'" in wrong.why
+    wrong = sample_robot_goals(
+        replace(body, frames=()), "push", RECIPE, obstacles=False, cache=cache
+    )
+    assert "no frame 'tool'" in wrong.error
 
 
 @pytest.fixture
@@ -169,18 +178,19 @@ def test_what_ships_is_read_back_as_it_was(home, cache):
     assert write_goals(home, found, RECIPE) == home / "goals"
     read = read_split_goals(home)
     assert read.config == RECIPE
-    assert read.sets.keys() == gathered(found, RECIPE).sets.keys()
+    assert read.sets.keys() == SplitGoals.from_results(found, RECIPE).sets.keys()
     for one in found:
         again = read.sets[one.side, one.robot]
         assert same(again.goals, one.goals)
         assert again.goals.obstacles == one.goals.obstacles
-        assert (again.body, again.task, again.obstacles) == (one.body, one.task, one.obstacles)
+        assert (again.robot_hash, again.task) == (one.robot_hash, one.task)
+        assert again.obstacles == one.obstacles
     assert read_goals(home, "train")["gantry-cylinder"].block == found[1].goals.block
     assert read_goals(home, "test").keys() == {"gantry-plane"}
     assert type(read_goals(home, "train")["gantry-plane"]) is reach_goals.ReachGoalSet
     for one in found:
         for each in fields(one.goals):
-            was, is_ = (getattr(x, each.name) for x in (one.goals, read.of(one.side, one.robot)))
+            was, is_ = (getattr(x, each.name) for x in (one.goals, read.get(one.side, one.robot)))
             assert type(was) is type(is_), each.name
 
 
@@ -218,7 +228,7 @@ def test_a_batch_takes_the_sets_that_are_shipped_and_refuses_others(home, cache,
                 assert same(own, shipped[setting.robot.name])
     for wrong, words in (
         ({"goal_seed": 1}, "seed"),
-        ({"configs": (ReachConfig(goals=3),)}, "constants"),
+        ({"configs": (ReachConfig(num_goals=3),)}, "constants"),
     ):
         with pytest.raises(MorphgenError, match=f"robot 'gantry-plane': the set .* {words}"):
             make_split_batch(which, "train", 2, **{**options, **wrong})
@@ -230,7 +240,11 @@ def test_the_index_says_what_the_sets_are(home, cache):
     index = json.loads((home / "goals" / "index.json").read_text())
     assert (index["format"], index["seed"], index["reach"]["goals"]) == (1, 0, 12)
     for record, one in zip(index["sets"], found, strict=True):
-        assert (record["robot"], record["side"], record["body"]) == (one.robot, one.side, one.body)
+        assert (record["robot"], record["side"], record["body"]) == (
+            one.robot,
+            one.side,
+            one.robot_hash,
+        )
         assert (record["key"], record["seed"]) == (one.goals.key, one.goals.seed)
         assert record["acceptance"] == record["accepted"] / record["tried"] == one.acceptance
         assert (home / "goals" / record["file"]).is_file()
@@ -268,7 +282,7 @@ def test_an_interruption_leaves_a_build_that_is_not_finished(home, cache, monkey
 def test_a_member_without_a_set_is_refused_and_nothing_is_written(home, cache):
     found = made(mixed(), cache)
     before = tree(home)
-    without = [replace(one, goals=None, why="too few") for one in found[:2]] + found[2:]
+    without = [replace(one, goals=None, error="too few") for one in found[:2]] + found[2:]
     with pytest.raises(BenchmarkError) as caught:
         write_goals(home, without, RECIPE)
     text = "train robot gantry-plane has no goal set: too few; nor has gantry-cylinder"
@@ -293,9 +307,9 @@ def test_a_build_without_goals_says_how_to_get_them(home):
     ("old", "new", "message"),
     [
         ('"format": 1', '"format": 2', "format 2; this version reads 1"),
-        ('"format": 1,', "", "no index of goal sets: KeyError"),
-        ('"goals": 12,', '"golas": 12,', "no index of goal sets: TypeError"),
-        ('"sets": [', '"sets": [3,', "no index of goal sets: TypeError"),
+        ('"format": 1,', "", "not an index of goal sets: KeyError"),
+        ('"goals": 12,', '"golas": 12,', "not an index of goal sets: TypeError"),
+        ('"sets": [', '"sets": [3,', "not an index of goal sets: TypeError"),
         ("{", "{{", "no valid JSON"),
         ('"task": "push"', '"task": "reach"', "gantry-cylinder.npz: no goal set for reach: 'poses"),
         ("train/gantry-cylinder", "train/gantry-cylinde", "gantry-cylinde.npz: no such file"),

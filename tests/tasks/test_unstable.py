@@ -9,18 +9,18 @@ import torch
 from helpers.goal_sets import draw_spec
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.rollouts import run_episodes
-from morphgen.tasks.make import batch_of
+from morphgen.tasks.env_specs import load_robot
+from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.robots import robot_of
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from helpers.pybullet_states import client_of
 
-REACH, PUSH = ReachConfig(goals=5), PushConfig(starts=5)
+REACH, PUSH = ReachConfig(num_goals=5), PushConfig(num_goals=5)
 CHANNELS = ObservationConfig(velocity=True, previous_action=True, tool=True)
 ENVS = 4
 
@@ -30,8 +30,8 @@ def settings(tmp_path_factory):
     """A robot that reaches and one that pushes."""
     cache = tmp_path_factory.mktemp("goals")
     chosen = {"obstacles": False, "seed": 0, "cache": cache}
-    reaching = draw_spec(robot_of("arm3-stick"), REACH, **chosen)
-    return [reaching, draw_spec(robot_of("prims"), PUSH, **chosen)]
+    reaching = draw_spec(load_robot("arm3-stick"), REACH, **chosen)
+    return [reaching, draw_spec(load_robot("prims"), PUSH, **chosen)]
 
 
 @pytest.fixture(params=["pybullet", "mujoco"])
@@ -41,8 +41,8 @@ def made(request, settings):
 
     def make():
         options = {"observe": CHANNELS, "seed": 1}
-        opened.append(batch_of(settings, ENVS, sim=request.param, **options))
-        assert opened[-1].does("push").tolist() == [False, True, False, True]
+        opened.append(batch_from_specs(settings, ENVS, sim=request.param, **options))
+        assert opened[-1].task_mask("push").tolist() == [False, True, False, True]
         return opened[-1]
 
     yield make
@@ -82,8 +82,8 @@ def test_it_is_put_back_its_episode_ends_and_the_others_go_on(made, lost):
     actions = chance.act(batch)
     found, other = batch.step(actions), whole.step(actions)
     kept = [env for env in range(ENVS) if env not in lost]
-    assert found.unstable.tolist() == [env in lost for env in range(ENVS)]
-    assert torch.equal(found.truncated, found.unstable)
+    assert found.diverged.tolist() == [env in lost for env in range(ENVS)]
+    assert torch.equal(found.truncated, found.diverged)
     assert not found.terminated.any()
     for name, each in numbers(found).items():
         assert each.isfinite().all(), name
@@ -91,10 +91,10 @@ def test_it_is_put_back_its_episode_ends_and_the_others_go_on(made, lost):
     assert torch.equal(found.q[lost], before.q[lost])
     torch.testing.assert_close(found.block_pose[lost], before.block_pose[lost])
     assert not found.final_observation["velocity"][lost].any()
-    assert not batch.elapsed[lost].any()
-    assert (batch.elapsed[kept] == 6).all()
+    assert not batch.episode_step[lost].any()
+    assert (batch.episode_step[kept] == 6).all()
     found, other = batch.step(actions), whole.step(actions)
-    assert not found.unstable.any()
+    assert not found.diverged.any()
     for name, each in numbers(found).items():
         assert each.isfinite().all(), name
         assert torch.equal(each[kept], numbers(other)[name][kept]), name
@@ -108,7 +108,7 @@ def test_the_episode_that_follows_is_the_one_that_would_have(made):
     break_physics(batch, 0)
     step = batch.step(Random(0).act(batch))
     whole.reset()
-    assert step.unstable.tolist() == [True, False, False, False]
+    assert step.diverged.tolist() == [True, False, False, False]
     assert torch.equal(batch.field("goal")[0], whole.field("goal")[0])
     assert torch.equal(batch.targets[0], whole.targets[0])
 
@@ -126,7 +126,7 @@ def test_episodes_say_so(made):
     batch = made()
     first, second, *others = run_episodes(batch, Breaks(0), 2)
     assert (first.env, first.unstable, first.steps) == (0, True, 10)
-    assert (second.env, second.unstable, second.steps) == (0, False, REACH.steps)
+    assert (second.env, second.unstable, second.steps) == (0, False, REACH.max_episode_steps)
     assert not any(each.unstable for each in others)
     assert len(others) == 2 * ENVS - 2
 
@@ -147,7 +147,7 @@ def test_an_episode_that_diverges_is_never_a_success(made):
 
     batch.reset()
     put_at_goals()
-    good = batch.step(torch.zeros(batch.mask.shape))
+    good = batch.step(torch.zeros(batch.action_mask.shape))
     assert good.success.tolist() == [True, True, False, False]
     assert good.terminated.tolist() == [False, True, False, False]
 
@@ -155,24 +155,24 @@ def test_an_episode_that_diverges_is_never_a_success(made):
     put_at_goals()
     break_physics(batch, 0)
     break_physics(batch, 1)
-    step = batch.step(torch.zeros(batch.mask.shape))
+    step = batch.step(torch.zeros(batch.action_mask.shape))
     assert step.distance[:2].max() < REACH.near
-    assert step.unstable.tolist() == step.truncated.tolist() == [True, True, False, False]
+    assert step.diverged.tolist() == step.truncated.tolist() == [True, True, False, False]
     assert not step.success.any()
     assert not step.terminated.any()
     assert step.score[1] == step.terms["success"][1] == 0
 
     class Breaks:
         def act(self, task):
-            if not task.elapsed[0]:
+            if not task.episode_step[0]:
                 put_at_goals()
                 break_physics(task, 0)
                 break_physics(task, 1)
-            return torch.zeros(task.mask.shape)
+            return torch.zeros(task.action_mask.shape)
 
     reached, pushed, *_ = run_episodes(batch, Breaks(), 1)
-    assert reached.unstable
-    assert pushed.unstable
+    assert reached.diverged
+    assert pushed.diverged
     assert not reached.success
     assert not pushed.success
     assert pushed.score == 0
@@ -188,7 +188,7 @@ def test_contacts_that_do_not_fit_end_one_episode(made, warning):
     batch.simulation._data[1].warning[number].number = 1
     actions = Random(0).act(batch)
     step, other = batch.step(actions), whole.step(actions)
-    assert step.unstable.tolist() == step.truncated.tolist() == [False, True, False, False]
+    assert step.diverged.tolist() == step.truncated.tolist() == [False, True, False, False]
     for name, each in numbers(step).items():
         assert torch.equal(each[[0, 2, 3]], numbers(other)[name][[0, 2, 3]]), name
-    assert not batch.step(actions).unstable.any()
+    assert not batch.step(actions).diverged.any()

@@ -15,15 +15,18 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 from morphgen.errors import MissingDependencyError, TaskError
-from morphgen.tasks import make_batch, registration
-from morphgen.tasks.config import BINS
+from morphgen.tasks import make_batch
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sb3 import sb3_vector
 from morphgen.tasks.vector import TaskVector
 
 ROBOTS, TASKS = ["arm3-stick", "prims"], ["reach", "push"]
-REACH, PUSH = ReachConfig(steps=12, goals=5), PushConfig(steps=9, starts=5)
+REACH, PUSH = (
+    ReachConfig(max_episode_steps=12, num_goals=5),
+    PushConfig(max_episode_steps=9, num_goals=5),
+)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,7 @@ def cache(tmp_path_factory):
 
 
 @pytest.fixture
-def batch_of(cache):
+def batch_from_specs(cache):
     """Make batches of two bodies at two tasks, one of them with obstacles."""
     made = []
 
@@ -47,10 +50,10 @@ def batch_of(cache):
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_spaces_hold_what_is_seen_and_done(batch_of, kind):
-    batch = batch_of(kind=kind)
+def test_spaces_hold_what_is_seen_and_done(batch_from_specs, kind):
+    batch = batch_from_specs(kind=kind)
     envs = TaskVector(batch)
-    links = batch.bodies.max_links
+    links = batch.robot_tables.max_links
     if kind == "discrete":
         assert envs.single_action_space.nvec.tolist() == [len(BINS)] * links
     else:
@@ -72,15 +75,15 @@ def test_what_is_empty_is_not_observed(cache):
         assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
 
 
-def test_steps_are_those_of_the_batch(batch_of):
-    batch, envs = batch_of(seed=3), TaskVector(batch_of(seed=99))
+def test_steps_are_those_of_the_batch(batch_from_specs):
+    batch, envs = batch_from_specs(seed=3), TaskVector(batch_from_specs(seed=99))
     expected, (seen, _) = batch.reset(), envs.reset(seed=3)
     rng = np.random.default_rng(0)
-    for _ in range(2 * REACH.steps):
+    for _ in range(2 * REACH.max_episode_steps):
         for name, values in seen.items():
             wide = expected[name].reshape(values.shape).numpy()
             assert np.array_equal(values, wide), name
-        actions = rng.uniform(-1, 1, (4, batch.bodies.max_links)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (4, batch.robot_tables.max_links)).astype(np.float32)
         step = batch.step(torch.from_numpy(actions))
         seen, reward, terminated, truncated, infos = envs.step(actions)
         expected = step.observation
@@ -92,14 +95,14 @@ def test_steps_are_those_of_the_batch(batch_of):
             assert np.array_equal(infos["terms"][name], term.numpy())
 
 
-def test_where_an_episode_ends_the_next_begins_and_the_last_is_told(batch_of):
-    envs = TaskVector(batch_of())
+def test_where_an_episode_ends_the_next_begins_and_the_last_is_told(batch_from_specs):
+    envs = TaskVector(batch_from_specs())
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     envs.reset(seed=0)
     actions = np.full(envs.action_space.shape, 0.3, dtype=np.float32)
-    for k in range(1, REACH.steps + 1):
+    for k in range(1, REACH.max_episode_steps + 1):
         seen, _, terminated, truncated, infos = envs.step(actions)
-        over = np.array([k == REACH.steps, k == PUSH.steps] * 2)
+        over = np.array([k == REACH.max_episode_steps, k == PUSH.max_episode_steps] * 2)
         assert not terminated.any()
         assert np.array_equal(truncated, over)
         assert np.array_equal(infos["_success"], ~over)
@@ -116,11 +119,11 @@ def test_where_an_episode_ends_the_next_begins_and_the_last_is_told(batch_of):
                 assert not np.array_equal(final["tokens"], seen["tokens"][env])
 
 
-def test_nothing_that_is_returned_changes_later(batch_of):
-    envs = TaskVector(batch_of())
+def test_nothing_that_is_returned_changes_later(batch_from_specs):
+    envs = TaskVector(batch_from_specs())
     kept = []
     seen, _ = envs.reset(seed=0)
-    for _ in range(REACH.steps + 1):
+    for _ in range(REACH.max_episode_steps + 1):
         kept.append((seen, {name: values.copy() for name, values in seen.items()}))
         seen, *_ = envs.step(envs.action_space.sample())
     for later, then in kept:
@@ -129,9 +132,9 @@ def test_nothing_that_is_returned_changes_later(batch_of):
     assert not any(np.shares_memory(first[name], second[name]) for name in first)
 
 
-def test_a_loop_as_of_cleanrl_runs(batch_of):
+def test_a_loop_as_of_cleanrl_runs(batch_from_specs):
     """Statistics of episodes, values of final observations, everything in preallocated rows."""
-    envs = RecordEpisodeStatistics(TaskVector(batch_of()))
+    envs = RecordEpisodeStatistics(TaskVector(batch_from_specs()))
     envs.reset(seed=1)
     rewards, dones = np.zeros((50, 4)), np.zeros((50, 4), dtype=bool)
     returns, bootstrapped = [], 0
@@ -150,8 +153,8 @@ def test_a_loop_as_of_cleanrl_runs(batch_of):
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_ppo_of_stable_baselines3_learns(batch_of, kind):
-    envs = VecMonitor(sb3_vector(batch_of(kind=kind)))
+def test_ppo_of_stable_baselines3_learns(batch_from_specs, kind):
+    envs = VecMonitor(sb3_vector(batch_from_specs(kind=kind)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model = PPO("MultiInputPolicy", envs, n_steps=24, batch_size=48, n_epochs=1, seed=0)
@@ -161,16 +164,19 @@ def test_ppo_of_stable_baselines3_learns(batch_of, kind):
     assert not torch.equal(before, after)
     assert torch.isfinite(after).all()
     assert model.num_timesteps == 2 * 24 * 4
-    assert {episode["l"] for episode in model.ep_info_buffer} == {REACH.steps, PUSH.steps}
+    assert {episode["l"] for episode in model.ep_info_buffer} == {
+        REACH.max_episode_steps,
+        PUSH.max_episode_steps,
+    }
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer)
 
 
-def test_stable_baselines3_is_told_how_episodes_ended(batch_of):
-    envs = sb3_vector(batch_of())
+def test_stable_baselines3_is_told_how_episodes_ended(batch_from_specs):
+    envs = sb3_vector(batch_from_specs())
     envs.seed(3)
     first = envs.reset()["goal"]
-    assert np.array_equal(first, TaskVector(batch_of(seed=3)).reset()[0]["goal"])
-    for _ in range(PUSH.steps):
+    assert np.array_equal(first, TaskVector(batch_from_specs(seed=3)).reset()[0]["goal"])
+    for _ in range(PUSH.max_episode_steps):
         seen, _, dones, infos = envs.step(np.zeros((4, 23), dtype=np.float32))
     assert dones.tolist() == [False, True] * 2
     for env, info in enumerate(infos):
@@ -182,8 +188,8 @@ def test_stable_baselines3_is_told_how_episodes_ended(batch_of):
             assert set(info["terminal_observation"]) == set(seen)
 
 
-def test_stable_baselines3_asks_for_attributes(batch_of):
-    envs = sb3_vector(batch_of())
+def test_stable_baselines3_asks_for_attributes(batch_from_specs):
+    envs = sb3_vector(batch_from_specs())
     assert envs.get_attr("num_envs", [0, 2]) == [4, 4]
     assert envs.env_is_wrapped(gym.Wrapper) == [False] * 4
     envs.set_attr("label", "x")
@@ -194,7 +200,7 @@ def test_stable_baselines3_asks_for_attributes(batch_of):
         envs.set_attr("label", "y", indices=0)
 
 
-def test_without_stable_baselines3_the_error_says_what_to_install(batch_of, monkeypatch):
+def test_without_stable_baselines3_the_error_says_what_to_install(batch_from_specs, monkeypatch):
     monkeypatch.delitem(sys.modules, "morphgen.tasks.sb3", raising=False)
     for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:
         monkeypatch.delitem(sys.modules, name)
@@ -210,7 +216,6 @@ def test_without_stable_baselines3_the_error_says_what_to_install(batch_of, monk
 
 
 def test_gymnasium_makes_vectors_of_several_robots(cache):
-    registration.register()
     options = {
         "robots": ["prims", "arm3-stick"],
         "sim": "mujoco",

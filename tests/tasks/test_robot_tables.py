@@ -12,9 +12,9 @@ from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Box, Shape
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Frame, Joint, Link, Robot
-from morphgen.tasks.bodies import bodies_of
-from morphgen.tasks.config import CONTROL_PERIOD, STEP_SLIDE, STEP_TURN
 from morphgen.tasks.observation import LinkTokens
+from morphgen.tasks.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 FOLDERS = default_library(()).folders
 WORDS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain beads=2", "prims", "arm3")
@@ -26,23 +26,23 @@ def robots():
 
 
 @pytest.fixture(scope="module")
-def bodies(robots):
-    return bodies_of(robots, FOLDERS)
+def robot_tables(robots):
+    return build_robot_tables(robots, FOLDERS)
 
 
-def configurations(robots, bodies, n=20):
+def configurations(robots, robot_tables, n=20):
     """Which body and q of n configurations each, (n R,) and (n R, J)."""
     rng = np.random.default_rng(0)
     body = torch.arange(len(robots)).repeat_interleave(n)
-    q = torch.zeros(len(body), bodies.max_joints, dtype=torch.float64)
+    q = torch.zeros(len(body), robot_tables.max_joints, dtype=torch.float64)
     for i, robot in enumerate(robots):
         q[body == i, : robot.dof] = torch.from_numpy(random_configurations(robot, n, rng))
     return body, q
 
 
-def test_the_position_codes_are_those_of_the_tokens(robots, bodies):
-    body, q = configurations(robots, bodies, n=4)
-    found = LinkTokens(bodies, body)(q.float())
+def test_the_position_codes_are_those_of_the_tokens(robots, robot_tables):
+    body, q = configurations(robots, robot_tables, n=4)
+    found = LinkTokens(robot_tables, body)(q.float())
     for i, robot in enumerate(robots):
         shapes = token_shapes(robot, FOLDERS)
         expected = tokens(robot, shapes, q[body == i, : robot.dof].numpy())
@@ -53,25 +53,27 @@ def test_the_position_codes_are_those_of_the_tokens(robots, bodies):
         assert (together[:, n:] == 0).all()
 
 
-def test_masks_and_steps_follow_the_joints(robots, bodies):
+def test_masks_and_steps_follow_the_joints(robots, robot_tables):
     for i, robot in enumerate(robots):
         n = len(robot.links)
-        assert bodies.links[i].tolist() == [True] * n + [False] * (bodies.max_links - n)
+        assert robot_tables.link_mask[i].tolist() == [True] * n + [False] * (
+            robot_tables.max_links - n
+        )
         moved = [k + 1 for k in robot.independent_joints]
-        assert torch.nonzero(bodies.joint_of_link[i] >= 0)[:, 0].tolist() == moved
+        assert torch.nonzero(robot_tables.joint_of_link[i] >= 0)[:, 0].tolist() == moved
         for j, k in enumerate(robot.independent_joints):
             joint = robot.joints[k]
             most = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
             expected = min(most, (joint.velocity or np.inf) * CONTROL_PERIOD)
-            assert bodies.step[i, j] == pytest.approx(expected)
-            assert bodies.lower[i, j] == pytest.approx(joint.effective_limits[0])
-            assert bodies.upper[i, j] == pytest.approx(joint.effective_limits[1])
-        assert (bodies.step[i, robot.dof :] == 0).all()
+            assert robot_tables.max_step[i, j] == pytest.approx(expected)
+            assert robot_tables.lower[i, j] == pytest.approx(joint.effective_limits[0])
+            assert robot_tables.upper[i, j] == pytest.approx(joint.effective_limits[1])
+        assert (robot_tables.max_step[i, robot.dof :] == 0).all()
 
 
-def test_fingers_act_in_push_and_not_in_reach(robots, bodies):
+def test_fingers_act_in_push_and_not_in_reach(robots, robot_tables):
     panda = 1
-    reach, push = (bodies.action_mask(fingers=fingers)[panda] for fingers in (False, True))
+    reach, push = (robot_tables.action_mask(fingers=fingers)[panda] for fingers in (False, True))
     names = [link.name for link in robots[panda].links]
     fingers = [names[i] for i in torch.nonzero(push & ~reach)[:, 0].tolist()]
     assert reach.sum() == 7
@@ -94,8 +96,8 @@ def test_a_mimic_joint_follows_its_leader():
         ),
     )
     robot = Robot("r", links, joints, (Frame("tool", "c"),), (0.2,))
-    bodies = bodies_of([robot])
-    assert bodies.action_mask(fingers=True)[0].sum() == 1
+    robot_tables = build_robot_tables([robot])
+    assert robot_tables.action_mask(fingers=True)[0].sum() == 1
 
 
 @pytest.mark.parametrize(
@@ -107,9 +109,9 @@ def test_a_mimic_joint_follows_its_leader():
 )
 def test_what_cannot_act_is_refused(robot, error, words):
     with pytest.raises(error, match=words):
-        bodies_of([robot])
+        build_robot_tables([robot])
 
 
 def test_an_empty_batch_is_refused():
     with pytest.raises(BenchmarkError, match="no robots"):
-        bodies_of([])
+        build_robot_tables([])

@@ -10,7 +10,7 @@ from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import CompositionError, FormatError, PartError
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.geometry import Mesh
-from morphgen.tasks.robots import robot_of
+from morphgen.tasks.env_specs import load_robot
 
 
 @pytest.mark.parametrize(
@@ -27,14 +27,14 @@ from morphgen.tasks.robots import robot_of
 )
 def test_names_are_words_of_compose(given, words):
     expected = morphgen.compose(words, geometry="primitive")
-    assert robot_of(given).name == expected.name
-    assert robot_hash(robot_of(given)) == robot_hash(expected)
+    assert load_robot(given).name == expected.name
+    assert robot_hash(load_robot(given)) == robot_hash(expected)
 
 
 def test_a_robot_is_itself_but_for_its_collision_shapes():
     robot = morphgen.compose("arm=ur5 ee=plane")
-    assert robot_of(robot, geometry="mesh") is robot
-    assert robot_hash(robot_of(robot)) == robot_hash(robot_of("arm=ur5 ee=plane"))
+    assert load_robot(robot, geometry="mesh") is robot
+    assert robot_hash(load_robot(robot)) == robot_hash(load_robot("arm=ur5 ee=plane"))
 
 
 def test_collision_shapes_are_primitives_unless_meshes_are_asked_for():
@@ -42,8 +42,8 @@ def test_collision_shapes_are_primitives_unless_meshes_are_asked_for():
         shapes = (shape for link in robot.links for shape in link.collisions)
         return any(isinstance(shape.geometry, Mesh) for shape in shapes)
 
-    assert not has_meshes(robot_of("ur5-plane"))
-    assert has_meshes(robot_of("ur5-plane", geometry="mesh"))
+    assert not has_meshes(load_robot("ur5-plane"))
+    assert has_meshes(load_robot("ur5-plane", geometry="mesh"))
 
 
 def test_files_are_read(tmp_path, monkeypatch):
@@ -51,17 +51,17 @@ def test_files_are_read(tmp_path, monkeypatch):
     folder = morphgen.write(arm(), "bundles", picture=False)
     Path("own.urdf").write_text(urdf_text(arm(), str))
     for given in (folder, str(folder), "bundles/arm", "own.urdf", Path("own.urdf")):
-        assert robot_of(given).dof == arm().dof
-        assert robot_of(given).frame("tool")
+        assert load_robot(given).dof == arm().dof
+        assert load_robot(given).frame("tool")
     Path("lr=3").mkdir()
     Path("own.urdf").rename("lr=3/own.urdf")
-    assert robot_of("lr=3/own.urdf").dof == arm().dof
+    assert load_robot("lr=3/own.urdf").dof == arm().dof
 
 
 def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("prims").mkdir()
-    assert robot_of("prims").name == "prims"
+    assert load_robot("prims").name == "prims"
 
 
 @pytest.mark.parametrize(
@@ -81,5 +81,5 @@ def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatc
 )
 def test_a_wrong_name_says_what_is_near(given, error, says):
     with pytest.raises(error) as caught:
-        robot_of(given)
+        load_robot(given)
     assert says in str(caught.value)

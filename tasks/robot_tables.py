@@ -1,0 +1,162 @@
+"""Robots of a batch as padded tensors, which observations, actions and rewards index."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.benchmark.token_layout import POSITION
+from morphgen.benchmark.tokens import MAX_LINKS, pad_tokens, tokens
+from morphgen.errors import BenchmarkError, RobotError
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.model.kinematics import driving_joints, joint_limits
+from morphgen.model.kinematics_torch import FrameChain, compile_chain
+from morphgen.model.robot import TOOL, Robot
+from morphgen.tasks.sim.base import CONTROL_PERIOD
+
+STEP_TURN, STEP_SLIDE = 0.2, 0.02
+"""Largest change of a joint target per control step [rad, m], if the joint is fast enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotTables:
+    """Tensors of R robots with L links and J independent joints, padded; float32, one device."""
+
+    robots: tuple[Robot, ...]
+    tokens: torch.Tensor
+    """Link tokens, shape (R, L, 48); the codes of joint positions are zero."""
+    link_mask: torch.Tensor
+    """Existing links, shape (R, L), bool."""
+    joint_of_link: torch.Tensor
+    """Index of the independent joint that moves each link, shape (R, L), int64; -1 if none does."""
+    link_of_joint: torch.Tensor
+    """Index of the link that each independent joint moves, shape (R, J), int64; padding is 0."""
+    lower: torch.Tensor
+    """Lower limits of the independent joints, shape (R, J) [rad or m]; padding is 0."""
+    upper: torch.Tensor
+    """Upper limits of the independent joints, shape (R, J) [rad or m]; padding is 0."""
+    max_step: torch.Tensor
+    """Largest change of a target per control step, shape (R, J) [rad or m]; padding is 0."""
+    home: torch.Tensor
+    """Home configurations, shape (R, J) [rad or m]; padding is 0."""
+    moves_tool: torch.Tensor
+    """Independent joints that move the tool, shape (R, J), bool."""
+    position_gain: torch.Tensor
+    """Matrix G, shape (R, L, J): the joint of each link has the scaled position G q + offset."""
+    position_offset: torch.Tensor
+    """Offset of the scaled joint positions, shape (R, L)."""
+    wraps: torch.Tensor
+    """Links whose joint turns without limits, so that its position wraps, shape (R, L), bool."""
+    movable_links: torch.Tensor
+    """Links that a joint moves, mimic joints included, shape (R, L), bool."""
+    tool_chain: FrameChain
+    """Joints between root and tool of each robot."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the tensors."""
+        return self.tokens.device
+
+    @property
+    def max_links(self) -> int:
+        """Number of links with padding, L."""
+        return self.tokens.shape[1]
+
+    @property
+    def max_joints(self) -> int:
+        """Number of independent joints with padding, J."""
+        return self.home.shape[1]
+
+    def action_mask(self, *, fingers: bool) -> torch.Tensor:
+        """Return the links whose joint an action moves, shape (R, L), bool.
+
+        Args:
+            fingers: Whether joints beyond the tool count, as in push.
+        """
+        joint = self.joint_of_link.clamp(min=0)
+        mask = self.joint_of_link >= 0
+        return mask if fingers else mask & torch.gather(self.moves_tool, 1, joint)
+
+
+def build_robot_tables(
+    robots: Sequence[Robot],
+    folders: Sequence[Path] = (),
+    *,
+    max_links: int = MAX_LINKS,
+    device: torch.device | str = "cpu",
+) -> RobotTables:
+    """Build the tables of robots.
+
+    Args:
+        robots: Robots with a tool frame and at least one movable joint.
+        folders: Folders of parts, where stored fits are looked up.
+        max_links: Number of links with padding, L; no robot may have more.
+        device: Device of the tensors.
+
+    Raises:
+        BenchmarkError: If there are no robots, or one has too many links.
+        RobotError: If a robot has no tool frame or no movable joint.
+    """
+    if not robots:
+        raise BenchmarkError("there are no robots")
+    for robot in robots:
+        robot.frame(TOOL)
+        if robot.dof == 0:
+            raise RobotError(f"robot {robot.name!r}: no joint moves")
+    num_joints = max(robot.dof for robot in robots)
+    rows = [_table_rows(robot, folders, max_links, num_joints) for robot in robots]
+    tables = {}
+    for name in rows[0]:
+        table = torch.from_numpy(np.stack([row[name] for row in rows])).to(device)
+        tables[name] = table.float() if table.is_floating_point() else table
+    return RobotTables(tuple(robots), tool_chain=compile_chain(robots, device=device), **tables)
+
+
+def _table_rows(
+    robot: Robot, folders: Sequence[Path], max_links: int, num_joints: int
+) -> dict[str, NDArray[Any]]:
+    """Return one robot's row of each table."""
+    rows: dict[str, NDArray[Any]] = {
+        name: np.zeros(num_joints) for name in ("lower", "upper", "max_step", "home")
+    }
+    rows |= {name: np.zeros(max_links, dtype=bool) for name in ("wraps", "movable_links")}
+    rows["joint_of_link"] = np.full(max_links, -1)
+    rows["link_of_joint"] = np.zeros(num_joints, dtype=np.int64)
+    rows["position_gain"] = np.zeros((max_links, num_joints))
+    rows["position_offset"] = np.zeros(max_links)
+    rows["moves_tool"] = np.zeros(num_joints, dtype=bool)
+
+    link_tokens = tokens(robot, token_shapes(robot, folders), max_links=max_links)
+    rows["tokens"], rows["link_mask"] = pad_tokens(link_tokens, max_links)
+    rows["tokens"][:, POSITION.columns] = 0
+    dof = robot.dof
+    rows["lower"][:dof], rows["upper"][:dof] = joint_limits(robot).T
+    rows["home"][:dof] = robot.home
+    rows["moves_tool"][[*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))]] = True
+    for i, k in enumerate(robot.independent_joints):
+        joint = robot.joints[k]
+        rows["joint_of_link"][k + 1], rows["link_of_joint"][i] = i, k + 1
+        max_step = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
+        if joint.velocity:
+            max_step = min(max_step, joint.velocity * CONTROL_PERIOD)
+        rows["max_step"][i] = max_step
+
+    # Tokens code a joint position p scaled to [-1, 1]; p = mimic_matrix q + mimic_offset.
+    mimic_matrix, mimic_offset = robot.mimic_map
+    for row, k in enumerate(robot.movable_joints):
+        joint = robot.joints[k]
+        low, high = joint.effective_limits
+        half_range, centre = (high - low) / 2, (high + low) / 2
+        rows["position_gain"][k + 1, :dof] = mimic_matrix[row] / half_range
+        rows["position_offset"][k + 1] = (mimic_offset[row] - centre) / half_range
+        rows["movable_links"][k + 1] = True
+        rows["wraps"][k + 1] = joint.kind == "continuous" or (
+            joint.kind == "revolute" and joint.limits is None
+        )
+    return rows
