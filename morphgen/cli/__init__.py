@@ -43,7 +43,6 @@ EXTRAS = {
     "fast_simplification": "fit",
     "gymnasium": "tasks",
     "imageio": "tasks",
-    "msgspec": "viewer",
     "tensorboard": "rl",
     "torch": "rl",
     "viser": "viewer",

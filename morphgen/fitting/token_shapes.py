@@ -16,14 +16,15 @@ from morphgen.fitting.composite import composite
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import keep
 from morphgen.formats.fits import (
+    ShapeRecord,
     are_primitives,
     fit_of,
     read_stored,
     shape_data,
-    shape_of,
     shapes_key,
     shapes_scale,
 )
+from morphgen.formats.records import read_record
 from morphgen.formats.rounding import rounded_shapes
 from morphgen.model.geometry import Shape, scale_shape
 from morphgen.model.inertia import union_integrals
@@ -87,9 +88,10 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
     if path.is_file():
         try:
             data = read_json(path)
-            return None if data is None else scale_shape(shape_of(data), factor)
-        except (FormatError, KeyError, TypeError, ValueError) as error:
-            raise FormatError(f"{path}: no fitted primitive: {error!r}; delete it") from error
+            record = None if data is None else read_record(data, ShapeRecord, str(path))
+        except FormatError as error:
+            raise FormatError(f"{error}; delete the file") from error
+        return None if record is None else scale_shape(record.shape, factor)
     shape = _fitted(shapes)
     data = None if shape is None else shape_data(scale_shape(shape, 1 / factor))
     try:

@@ -15,14 +15,14 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
-from morphgen.formats.card import apply_card, card_frames, card_of, card_text
+from morphgen.formats.card import apply_card, card_of, card_text
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.fits import FITS, fit_of, read_fits, shapes_key, stored_text
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
 from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf import own_frames, read_urdf, with_frames
+from morphgen.formats.urdf import read_urdf
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, StoredFits
@@ -112,10 +112,8 @@ def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
             written for is no error here: ``file_findings`` tells.
     """
     card = _read_card(folder)
-    place = str(folder / CARD)
     robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
-    robot = with_frames(robot, card_frames(card, place))
-    return replace(apply_card(robot, card, place), fits=_read_fits(folder))
+    return replace(apply_card(robot, card, str(folder / CARD)), fits=_read_fits(folder))
 
 
 def _read_fits(folder: Path) -> StoredFits:
@@ -187,10 +185,8 @@ def read_robot(
         return read_bundle(path, root=root)
     if path.name == URDF and (path.parent / CARD).is_file():
         return read_bundle(path.parent, root=root)
-    robot = read_urdf(path, args, default_finder(root=root))
-    if path.suffix == XACRO:
-        return robot
-    return with_frames(robot, own_frames(path.read_bytes(), str(path)))
+    is_xacro = path.suffix == XACRO
+    return read_urdf(path, args, default_finder(root=root), written_frames=not is_xacro)
 
 
 def split_colours(robot: Robot) -> Robot:

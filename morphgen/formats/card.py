@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
+from msgspec import field
+
 from morphgen.errors import FormatError
+from morphgen.formats.records import FiniteNumber, Record, read_record
+from morphgen.formats.urdf import with_frames
 from morphgen.formats.urdf_text import number
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
@@ -16,16 +19,36 @@ from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 
 CARD_FORMAT = 1
-_PROVENANCE: Mapping[str, tuple[type, ...]] = {
-    "derivation": (str,),
-    "source": (str,),
-    "choices": (dict,),
-    "repairs": (list, str),
-    "parts": (list, dict),
-    "accepted": (dict, dict, str),
-    "primitives": (dict,),
-}
-"""Types of what a card keeps of a robot's provenance, and of what that holds."""
+
+_PROVENANCE = (
+    "derivation",
+    "source",
+    "choices",
+    "repairs",
+    "parts",
+    "accepted",
+    "primitives",
+)
+"""Keys of a card that become the robot's provenance."""
+
+
+class _CardRecord(Record, frozen=True):
+    """The keys of a card that a robot is read from; the others only describe the robot."""
+
+    home: dict[str, FiniteNumber]
+    ignore_pairs: tuple[tuple[str, str], ...]
+    frames: dict[str, Any] = field(default_factory=dict)
+    derivation: str = ""
+    source: str = ""
+    choices: dict[str, Any] = field(default_factory=dict)
+    repairs: list[str] = field(default_factory=list)
+    parts: list[dict[str, Any]] = field(default_factory=list)
+    accepted: dict[str, dict[str, str]] = field(default_factory=dict)
+    primitives: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if any(not {"label", "part"} <= part.keys() for part in self.parts):
+            raise ValueError("parts: expected objects with the keys 'label' and 'part'")
 
 
 def card_of(
@@ -84,74 +107,33 @@ def card_text(card: Mapping[str, object]) -> str:
     return json.dumps(card, indent=2, ensure_ascii=False) + "\n"
 
 
-def card_frames(card: object, origin: str) -> tuple[str, ...]:
-    """Names of a card's frames.
+def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
+    """Complete a robot that was read from a bundle's URDF by what only its card holds.
 
     Args:
-        card: What was read.
-        origin: What to call the card in errors, usually its path.
+        robot: The robot, whose frames are still links.
+        card: The content of the card.
+        origin: Name of the card in errors, usually its path.
 
     Raises:
-        FormatError: If it is no card, or of another format.
+        FormatError: If the card lacks a key, holds an invalid value or is of another format, or if
+            the robot lacks a link of a frame.
     """
-    if not isinstance(card, dict) or "format" not in card:
-        raise FormatError(f"{origin}: no card: expected an object with the key 'format'")
+    if "format" not in card:
+        raise FormatError(f"{origin}: not a card: missing key 'format'")
     if card["format"] != CARD_FORMAT:
         raise FormatError(
             f"{origin}: card format {card['format']!r}; this version reads {CARD_FORMAT}"
         )
-    frames = card.get("frames", {})
-    if not isinstance(frames, dict):
-        raise FormatError(f"{origin}: frames: expected an object, not {frames!r}")
-    return tuple(frames)
-
-
-def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
-    """Give a robot read from a bundle's URDF what only the card knows.
-
-    Args:
-        robot: The robot, with the card's frames.
-        card: The card.
-        origin: What to call the card in errors, usually its path.
-
-    Raises:
-        FormatError: If the card lacks a key, or a value is of the wrong type.
-    """
-    provenance = {key: card[key] for key in _PROVENANCE if key in card}
-    for key, value in provenance.items():
-        if not _is_of(_PROVENANCE[key], value):
-            raise FormatError(f"{origin}: {key}: not what a card holds there: {_shown(value)}")
-    for part in provenance.get("parts", []):
-        if not {"label", "part"} <= part.keys():
-            raise FormatError(f"{origin}: parts: expected objects with label and part")
+    known = {key: card[key] for key in _CardRecord.__struct_fields__ if key in card}
+    record = read_record(known, _CardRecord, origin)
+    robot = with_frames(robot, tuple(record.frames))
     try:
-        home = card["home"]
-        positions = tuple(float(home[robot.joints[k].name]) for k in robot.independent_joints)
-        if not all(map(math.isfinite, positions)):
-            raise ValueError("a position at home is not finite")
-        return replace(
-            robot,
-            home=positions,
-            ignore_pairs=tuple((str(a), str(b)) for a, b in card["ignore_pairs"]),
-            provenance=provenance,
-        )
+        home = tuple(record.home[robot.joints[k].name] for k in robot.independent_joints)
     except KeyError as error:
-        raise FormatError(f"{origin}: has no {error}") from error
-    except (OverflowError, TypeError, ValueError) as error:
-        raise FormatError(f"{origin}: home or ignore_pairs: {error}") from error
-
-
-def _is_of(kinds: tuple[type, ...], value: object) -> bool:
-    """Whether a value is of the first type, what it holds of the second, and so on."""
-    if not isinstance(value, kinds[0]):
-        return False
-    held = value.values() if isinstance(value, dict) else value
-    return len(kinds) == 1 or all(_is_of(kinds[1:], each) for each in held)  # type: ignore[attr-defined]
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+        raise FormatError(f"{origin}: home: missing joint {error}") from error
+    provenance = {key: card[key] for key in _PROVENANCE if key in card}
+    return replace(robot, home=home, ignore_pairs=record.ignore_pairs, provenance=provenance)
 
 
 def rounded(value: float | None) -> float | None:

@@ -14,10 +14,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from msgspec import Meta
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
+from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import number
 from morphgen.model.geometry import (
@@ -36,15 +39,71 @@ from morphgen.model.geometry import (
 from morphgen.model.robot import Link, Robot
 
 SUFFIX = ".primitives.json"
-"""Of the file beside a part's manifest."""
+"""Suffix of the file of fits beside a part's manifest."""
 FITS = "primitives.json"
-"""The file in a bundle."""
+"""Name of the file of fits in a bundle."""
 MOST_PRIMITIVES = 32
-"""The most primitives that a link may be given."""
+"""Largest number of primitives in a link's fit."""
 VERSION = 2
-"""Rises when the fitter gives other primitives for the same meshes."""
-_LONGEST = 200
-"""Letters of a malformed entry that an error shows."""
+"""Version of the fitter; it rises when the fitter gives other primitives for the same meshes."""
+
+_Iou = Annotated[float, Meta(ge=0, le=1)]
+
+
+class ShapeRecord(Record, frozen=True):
+    """A box, cylinder or sphere as a file holds it; exactly one of the three sizes is given."""
+
+    xyz: tuple[FiniteNumber, FiniteNumber, FiniteNumber]
+    """Position in the link frame [m]."""
+    quaternion: tuple[FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber]
+    """Orientation in the link frame (w, x, y, z)."""
+    box: tuple[PositiveNumber, PositiveNumber, PositiveNumber] | None = None
+    """Edge lengths [m]."""
+    cylinder: tuple[PositiveNumber, PositiveNumber] | None = None
+    """Radius and length [m]."""
+    sphere: tuple[PositiveNumber] | None = None
+    """Radius [m]."""
+
+    def __post_init__(self) -> None:
+        if sum(size is not None for size in (self.box, self.cylinder, self.sphere)) != 1:
+            raise ValueError("expected one of box, cylinder and sphere")
+        if not math.isclose(math.hypot(*self.quaternion), 1, rel_tol=1e-6):
+            raise ValueError(f"quaternion {list(self.quaternion)} is not of unit length")
+
+    @property
+    def shape(self) -> Shape:
+        """The shape that the record describes."""
+        geometry: Geometry
+        if self.box:
+            geometry = Box(self.box)
+        elif self.cylinder:
+            geometry = Cylinder(*self.cylinder)
+        else:
+            assert self.sphere
+            geometry = Sphere(*self.sphere)
+        return Shape(geometry, Pose(self.xyz, self.quaternion))
+
+
+class _LinkRecord(Record, frozen=True):
+    """The fit of one link."""
+
+    link: str
+    shapes: str
+    """The ``shapes_key`` of the fitted shapes."""
+    token: ShapeRecord
+    token_iou: _Iou
+    collision: Annotated[tuple[ShapeRecord, ...], Meta(min_length=1, max_length=MOST_PRIMITIVES)]
+    collision_iou: _Iou
+
+    @property
+    def fit(self) -> StoredFit:
+        collision = tuple(record.shape for record in self.collision)
+        return StoredFit(self.link, self.token.shape, collision, self.token_iou, self.collision_iou)
+
+
+class _FileRecord(Record, frozen=True):
+    fitter: int
+    links: list[_LinkRecord]
 
 
 def stored_fit(shapes: Sequence[Shape], stored: StoredFits) -> StoredFit | None:
@@ -141,9 +200,8 @@ def read_fits(path: Path) -> dict[str, StoredFit]:
     """
     try:
         return dict(_read(path.absolute(), file_stamp(path)))
-    except (KeyError, OSError, OverflowError, RecursionError, TypeError, ValueError) as error:
-        why = f"lacks {error}" if isinstance(error, KeyError) else str(error)[:_LONGEST]
-        raise FormatError(f"{path}: no file of fitted primitives: {why}") from error
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}") from error
 
 
 def stored_text(fits: Mapping[str, StoredFit]) -> str:
@@ -179,52 +237,14 @@ def shape_data(shape: Shape) -> dict[str, object]:
     return size | {"xyz": list(pose.position), "quaternion": list(pose.quaternion)}
 
 
-def shape_of(data: dict[str, Any]) -> Shape:
-    """The shape of plain data, see ``shape_data``.
-
-    Raises:
-        KeyError, TypeError, ValueError: If it is none.
-    """
-    geometry: Geometry
-    kinds = {"box", "cylinder", "sphere"} & {*data}
-    if len(kinds) != 1:
-        raise ValueError(f"{data} is no box, cylinder or sphere")
-    (kind,) = kinds
-    size = [float(value) for value in data[kind]]
-    x, y, z = (float(value) for value in data["xyz"])
-    w, a, b, c = (float(value) for value in data["quaternion"])
-    finite = all(math.isfinite(value) for value in (*size, x, y, z, w, a, b, c))
-    if not finite or min(size) <= 0 or not math.isclose(math.hypot(w, a, b, c), 1, rel_tol=1e-6):
-        raise ValueError(f"a size or pose is out of range: {data}")
-    if kind == "box":
-        length, width, height = size
-        geometry = Box((length, width, height))
-    elif kind == "cylinder":
-        geometry = Cylinder(*size)
-    else:
-        geometry = Sphere(*size)
-    return Shape(geometry, Pose((x, y, z), (w, a, b, c)))
-
-
 @lru_cache(maxsize=256)
 def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
     """The fits of a file as it is at its stamp."""
     del stamp
     data = read_json(path)
-    if data["fitter"] != VERSION:
+    if isinstance(data, dict) and data.get("fitter", VERSION) != VERSION:
         return {}
-    return {str(link["shapes"]): _fit_of(link) for link in data["links"]}
-
-
-def _fit_of(data: dict[str, Any]) -> StoredFit:
-    """The entry of a link."""
-    collision = tuple(shape_of(shape) for shape in data["collision"])
-    if not 1 <= len(collision) <= MOST_PRIMITIVES:
-        raise ValueError(f"{len(collision)} primitives: expected 1 to {MOST_PRIMITIVES}")
-    ious = float(data["token_iou"]), float(data["collision_iou"])
-    if not all(0 <= iou <= 1 for iou in ious):
-        raise ValueError(f"IoU {ious[0]:g} and {ious[1]:g}: expected 0 to 1")
-    return StoredFit(str(data["link"]), shape_of(data["token"]), collision, *ious)
+    return {link.shapes: link.fit for link in read_record(data, _FileRecord, str(path)).links}
 
 
 def _shape_text(shape: Shape) -> str:

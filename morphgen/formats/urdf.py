@@ -41,6 +41,7 @@ def read_urdf(
     finder: PackageFinder | None = None,
     *,
     keep_order: bool = False,
+    written_frames: bool = False,
 ) -> Robot:
     """Read a URDF, or a xacro (by its suffix), with every mesh reference resolved.
 
@@ -51,11 +52,12 @@ def read_urdf(
             environment and in the installed data packages.
         keep_order: Whether links stay in the order of the file's joints, if parents are first
             there; otherwise the tree is walked depth first.
+        written_frames: Whether links that ``urdf_text`` wrote for frames become frames again.
 
     Returns:
-        The robot, without frames; its home is that of a file of morphgen's own, else zero, or the
-        middle of a range without zero. What had to be mended or left out is in its
-        ``source_findings``.
+        The robot, without frames unless ``written_frames``. Its home is the one that
+        ``urdf_text`` wrote, else zero, or the middle of a range without zero. What was repaired or
+        left out is listed in ``source_findings``.
 
     Raises:
         UnsoundError: If the tree is broken or a mesh is not found.
@@ -73,7 +75,7 @@ def read_urdf(
         raise FormatError(f"{path}: xacro arguments {', '.join(args)} for a file that is no xacro")
     else:
         data = read_bytes(path, LARGEST_DESCRIPTION)
-    return robot_from_xml(data, path, finder, keep_order=keep_order)
+    return robot_from_xml(data, path, finder, keep_order=keep_order, written_frames=written_frames)
 
 
 def robot_from_xml(
@@ -83,6 +85,7 @@ def robot_from_xml(
     *,
     trusted: bool = False,
     keep_order: bool = False,
+    written_frames: bool = False,
 ) -> Robot:
     """Read URDF text.
 
@@ -92,6 +95,7 @@ def robot_from_xml(
         finder: Where ``package://`` is looked for.
         trusted: Whether a document of the same structure has been examined before.
         keep_order: See ``read_urdf``.
+        written_frames: See ``read_urdf``.
 
     Raises:
         UnsoundError: If the tree is broken or a mesh is not found.
@@ -122,7 +126,9 @@ def robot_from_xml(
         for finding in (*mended, *findings)
     )
     name = root.get("name", "")
-    return Robot(name, bodies, tuple(joints), home=home, source_findings=told)
+    robot = Robot(name, bodies, tuple(joints), home=home, source_findings=told)
+    frames = [frame.get("name", "") for frame in root.iterfind(f"{OWN}/frame")]
+    return with_frames(robot, frames) if written_frames else robot
 
 
 def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
@@ -141,16 +147,6 @@ def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
         joints=tuple(joint for joint in robot.joints if joint.child not in names),
         frames=tuple(Frame(n, joints[n].parent, joints[n].T_parent_joint) for n in names),
     )
-
-
-def own_frames(data: bytes, origin: str) -> tuple[str, ...]:
-    """Names of the links that ``urdf_text`` wrote for frames; none in a file of others.
-
-    Raises:
-        FormatError: If it is not XML.
-    """
-    root, _ = parse_description(data, origin)
-    return tuple(frame.get("name", "") for frame in root.iterfind(f"{OWN}/frame"))
 
 
 def _told_home(root: etree._Element, origin: str) -> dict[str, float]:

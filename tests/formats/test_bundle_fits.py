@@ -90,11 +90,20 @@ def foreign(folder, change):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda link: link["token"].update(cylinder=[0.1, -0.2]), "out of range"),
-        (lambda link: link["token"].update(xyz=[float("nan"), 0, 0]), "out of range"),
-        (lambda link: link.update(collision=[]), "0 primitives: expected 1 to 32"),
-        (lambda link: link.pop("shapes"), "lacks 'shapes'"),
-        (lambda link: link.update(token_iou=7), "expected 0 to 1"),
+        (
+            lambda link: link["token"].update(cylinder=[0.1, -0.2]),
+            "cylinder[1]: invalid value -0.2; expected",
+        ),
+        (lambda link: link["token"].update(xyz=[float("nan"), 0, 0]), "xyz[0]: invalid value nan"),
+        (
+            lambda link: link.update(collision=[]),
+            "[]; expected a list of length >= 1",
+        ),
+        (lambda link: link.pop("shapes"), "links[0]: missing key 'shapes'"),
+        (
+            lambda link: link.update(token_iou=7),
+            "invalid value 7; expected a number <= 1",
+        ),
     ],
 )
 def test_a_stranger_s_fits_are_refused_in_one_line(folder, capsys, change, why):
