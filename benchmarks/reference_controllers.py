@@ -34,7 +34,7 @@ from morphgen.benchmark.split import SIDES, Member
 from morphgen.benchmark.split_file import read_split, split_names
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
-from morphgen.processes import mapped
+from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.rollouts import run_episodes
@@ -96,7 +96,9 @@ def main() -> int:
     ]
     work = Measuring(sims, args.envs, args.episodes, args.obstacles)
     rows: list[Row] = []
-    for row in tqdm(mapped(work, members, args.jobs, chunk=1), total=len(members), unit="robot"):
+    for row in tqdm(
+        parallel_map(work, members, args.jobs, chunk=1), total=len(members), unit="robot"
+    ):
         rows.append(row)
         _write(args.json, rows)
     for task in TASKS:

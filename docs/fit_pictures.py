@@ -24,7 +24,7 @@ from morphgen.fitting.part_fits import COLLISION_OPTIONS
 from morphgen.fitting.replace_collision import stored_primitives, with_primitives
 from morphgen.fitting.robot_fit import fit_links
 from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
-from morphgen.formats.fits import are_primitives, read_stored, shapes_key
+from morphgen.formats.fits import are_primitives, read_stored_fits, shapes_key
 from morphgen.formats.picture import render
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.geometry import Mesh, Rgba, Shape
@@ -96,7 +96,7 @@ def _picture(name: str, library: Library) -> Image.Image:
 
 def _fitted(robot: Robot, library: Library) -> tuple[dict[str, tuple[Shape, ...]], list[float]]:
     """Primitives by link, and the intersection over union of links that have meshes."""
-    stored = read_stored(library.folders)
+    stored = read_stored_fits(library.folders)
     found, missing = stored_primitives(robot, stored)
     ious = [
         stored[shapes_key(link.collisions)].collision_iou

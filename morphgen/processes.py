@@ -27,7 +27,7 @@ R = TypeVar("R")
 Progress = Callable[[int, int], None]
 """Told how much is done, and of how much."""
 
-CHUNK = 8
+CHUNK_SIZE = 8
 """Things that a worker does before it reports, unless told otherwise."""
 POLL = 0.2
 """Seconds between a worker's looks at whether the parent has stopped."""
@@ -40,16 +40,16 @@ _stopped: c_byte | None = None
 _is_working = False
 
 
-def unseen(done: int, total: int) -> None:
+def no_progress(done: int, total: int) -> None:
     """A progress that is shown to nobody."""
 
 
-def mapped(
+def parallel_map(
     work: Callable[[T], R],
     things: Sequence[T],
     jobs: int,
-    progress: Progress = unseen,
-    chunk: int = CHUNK,
+    progress: Progress = no_progress,
+    chunk: int = CHUNK_SIZE,
 ) -> Iterator[R]:
     """Do work on every thing; results in the order of the things.
 
@@ -93,7 +93,7 @@ def _submitted(
     pool: ProcessPoolExecutor, chunks: Iterable[Sequence[Any]]
 ) -> list[Future[list[Any]]]:
     """Submit chunks, for which the pool may start processes."""
-    with ctrl_c_held():
+    with sigint_blocked():
         return [pool.submit(_do, chunk) for chunk in chunks]
 
 
@@ -108,7 +108,7 @@ def _result(future: Future[list[R]]) -> list[R]:
 
 
 @contextmanager
-def ctrl_c_held() -> Iterator[None]:
+def sigint_blocked() -> Iterator[None]:
     """Start processes in this block: Ctrl-C is not for them, from their first moment on.
 
     They inherit a mask that blocks it. For this process it counts at the end of the block; the mask
@@ -133,7 +133,7 @@ def ctrl_c_held() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-def prepare_worker() -> None:
+def init_worker() -> None:
     """Prepare a worker: Ctrl-C is for the parent, and without it the worker ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -142,7 +142,7 @@ def prepare_worker() -> None:
 def _start(work: Callable[[Any], object], stopped: c_byte) -> None:
     """Prepare a worker, whose work is interrupted when the parent stops."""
     global _work, _stopped
-    prepare_worker()
+    init_worker()
     _work, _stopped = work, stopped
     signal.signal(signal.SIGTERM, _interrupt)
     threading.Thread(target=_interrupt_when_stopped, daemon=True).start()

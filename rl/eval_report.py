@@ -14,7 +14,7 @@ import numpy as np
 from tabulate import tabulate
 
 from morphgen.errors import TaskError, nearest
-from morphgen.formats.files import save
+from morphgen.formats.files import write_file
 from morphgen.rl.scores import Score, scores_to_json
 
 SIDES = {"train": "MT", "test": "ZS"}
@@ -75,9 +75,9 @@ def write_scores(path: Path, found: Scores) -> None:
     require_table(path)
     data = {mode: scores_to_json(scores) for mode, scores in found.items()}
     if path.suffix == ".json":
-        save(path, json.dumps(data, indent=2) + "\n")
+        write_file(path, json.dumps(data, indent=2) + "\n")
     elif path.suffix == ".md":
-        save(path, score_table(found, "github") + "\n")
+        write_file(path, score_table(found, "github") + "\n")
     else:
         text = io.StringIO()
         names = ["mode", *(field.name for field in fields(Score))]
@@ -85,7 +85,7 @@ def write_scores(path: Path, found: Scores) -> None:
         writer.writeheader()
         for mode, rows in data.items():
             writer.writerows({"mode": mode, **row} for row in rows)
-        save(path, text.getvalue())
+        write_file(path, text.getvalue())
 
 
 def _row(mode: str, score: Score) -> tuple[str, ...]:

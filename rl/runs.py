@@ -12,7 +12,7 @@ from typing import Any
 from morphgen.benchmark.token_layout import MAX_LINKS
 from morphgen.errors import FormatError, TaskError, nearest
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, partial_of, write_atomic
+from morphgen.formats.files import LOCK, partial_path, write_atomic
 from morphgen.rl.aliases import current_learner, current_run
 from morphgen.rl.checkpoint_content import require_fields, require_learner, require_policy
 from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
@@ -140,7 +140,7 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
     elif path.is_file():
         read_config(folder)
     elif folder.is_dir():
-        own = (LOCK, partial_of(path).name)
+        own = (LOCK, partial_path(path).name)
         if any(each.name not in own for each in folder.iterdir()):
             raise TaskError(f"{folder} is there and is no run's folder: name another with --out")
     elif folder.exists():

@@ -15,7 +15,7 @@ import numpy as np
 from tabulate import tabulate
 
 from morphgen.benchmark.split import SIDES, Side
-from morphgen.formats.files import save
+from morphgen.formats.files import write_file
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.intervals import Interval, iqm_interval
@@ -129,11 +129,11 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
         FormatError: If one cannot be written.
     """
     made = rows(results)
-    save(folder / TABLE, table_text(made))
+    write_file(folder / TABLE, table_text(made))
     data = {"rows": [_finite(asdict(row)) for row in made], "cells": _cells(results)}
-    save(folder / DATA, json.dumps(data, indent=2) + "\n")
-    save(folder / ROBOTS, _csv(results))
-    save(folder / CURVES, curves(results))
+    write_file(folder / DATA, json.dumps(data, indent=2) + "\n")
+    write_file(folder / ROBOTS, _csv(results))
+    write_file(folder / CURVES, curves(results))
     return [folder / name for name in (TABLE, DATA, ROBOTS, CURVES)]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from morphgen.errors import TaskError
-from morphgen.formats.files import alone
+from morphgen.formats.files import locked_folder
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.learner_state import load_networks, state_of
 from morphgen.rl.learner_state import resume as resume_learner
@@ -106,7 +106,7 @@ def train(
     resume: bool = False,
     execution: ExecutionConfig | None = None,
     show: Callable[[Subrun], ShowMetrics] | None = None,
-    hold: Callable[[Path], AbstractContextManager[None]] = alone,
+    hold: Callable[[Path], AbstractContextManager[None]] = locked_folder,
 ) -> list[Subrun]:
     """Train a run to its end; see ``subruns_of``.
 

@@ -29,7 +29,7 @@ from morphgen.benchmark.split import Member, Side, Split, sided_members
 from morphgen.errors import MorphgenError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
-from morphgen.processes import Progress, mapped, unseen
+from morphgen.processes import Progress, no_progress, parallel_map
 from morphgen.tasks.env_specs import GoalConfig, env_spec, member_with_primitives
 from morphgen.tasks.goal_sets import arrays_of
 from morphgen.tasks.split_goals import GoalResult, SplitGoals, certify_goal_set
@@ -71,7 +71,7 @@ def audit_goals(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
 ) -> tuple[Finding, ...]:
     """Find goals that leak, and sets that do not match the split's robots.
 
@@ -95,7 +95,7 @@ def audit_goals(
     """
     members = sided_members(split)
     examiner = _MemberExaminer(library.folders, goals)
-    examined = list(mapped(examiner, members, jobs, progress))
+    examined = list(parallel_map(examiner, members, jobs, progress))
     return (
         *_set_findings(split, goals, members, examined),
         *(_finding("goals-shared", *reason) for reason in shared_goals(split, goals)),

@@ -21,7 +21,7 @@ from platformdirs import user_cache_path
 
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, TaskError
-from morphgen.formats.files import keep
+from morphgen.formats.files import write_cache_file
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
@@ -166,7 +166,7 @@ def _cached(kind: type[G], path: Path, robot: str, sample: Callable[[], G]) -> G
         return replace(found, robot=robot)
     made = sample()
     try:
-        keep(path, set_npz(made))
+        write_cache_file(path, set_npz(made))
     except OSError as error:
         warnings.warn(f"cannot keep a {kind.__name__} in {path}: {error.strerror}", stacklevel=3)
     return made

@@ -25,10 +25,10 @@ from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums
 from morphgen.benchmark.split_folder_files import sums_text
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import alone, replacing_folder, write_atomic
+from morphgen.formats.files import locked_folder, replacing_folder, write_atomic
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, mapped, unseen
+from morphgen.processes import Progress, no_progress, parallel_map
 from morphgen.tasks.env_specs import GoalConfig, env_spec, member_with_primitives, task_configs
 from morphgen.tasks.goal_sets import goals_from_npz, set_npz
 from morphgen.tasks.registry import TASKS
@@ -153,7 +153,7 @@ def sample_split_goals(
     jobs: int = 1,
     certified: bool = False,
     cache: Path | None = None,
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
 ) -> list[GoalResult]:
     """Sample the goal sets of all members, train first, or take them from the cache.
 
@@ -173,7 +173,7 @@ def sample_split_goals(
         MorphgenError: If ``jobs`` is below 1, or a process died.
     """
     sampler = _MemberSampler(library.folders, config or GoalConfig(), certified, cache)
-    return list(mapped(sampler, sided_members(split), jobs, progress, chunk=1))
+    return list(parallel_map(sampler, sided_members(split), jobs, progress, chunk=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +228,7 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
     files = dict(_files(results, config))
     read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
     try:
-        with alone(home):
+        with locked_folder(home):
             sums = read_sums(home / SUMS_FILE)
             (home / SUMS_FILE).unlink()
             for leftover in home.glob(f".{GOALS}.*"):

@@ -7,34 +7,36 @@ import pytest
 
 from helpers.worker_functions import die, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.processes import CHUNK, mapped
+from morphgen.processes import CHUNK_SIZE, parallel_map
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-@pytest.mark.parametrize("n", [0, 1, CHUNK, 5 * CHUNK + 3])
+@pytest.mark.parametrize("n", [0, 1, CHUNK_SIZE, 5 * CHUNK_SIZE + 3])
 def test_results_come_in_order(jobs, n):
     told = []
-    results = list(mapped(partial(power, 2), range(n), jobs, lambda *counts: told.append(counts)))
+    results = list(
+        parallel_map(partial(power, 2), range(n), jobs, lambda *counts: told.append(counts))
+    )
     assert [value for value, _ in results] == [i**2 for i in range(n)]
     assert told == [(i + 1, n) for i in range(n)]
     elsewhere = {process for _, process in results} - {os.getpid()}
-    assert bool(elsewhere) == (jobs > 1 and n > CHUNK)
+    assert bool(elsewhere) == (jobs > 1 and n > CHUNK_SIZE)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_the_work_is_raised(jobs):
-    results = mapped(fail, range(40), jobs)
-    assert [next(results) for _ in range(2 * CHUNK)] == list(range(2 * CHUNK))
+    results = parallel_map(fail, range(40), jobs)
+    assert [next(results) for _ in range(2 * CHUNK_SIZE)] == list(range(2 * CHUNK_SIZE))
     with pytest.raises(BenchmarkError, match="20 is wrong"):
         list(results)
 
 
 def test_a_process_that_dies_is_told():
     with pytest.raises(MorphgenError, match=r"a worker died.*what is done is kept: run again"):
-        list(mapped(die, range(20), 2))
+        list(parallel_map(die, range(20), 2))
 
 
 @pytest.mark.parametrize("jobs", [0, -1])
 def test_there_is_a_job_at_least(jobs):
     with pytest.raises(MorphgenError, match=f"{jobs} jobs: expected 1 or more"):
-        list(mapped(fail, [1], jobs))
+        list(parallel_map(fail, [1], jobs))

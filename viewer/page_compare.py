@@ -17,7 +17,7 @@ from morphgen.benchmark.tokens import MAX_LINKS, tokens
 from morphgen.errors import MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
-from morphgen.formats.fits import are_primitives, read_stored, stored_fit
+from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Robot
@@ -121,7 +121,7 @@ def fit_qualities(
     Links whose collision shapes are primitives stand for themselves, with 1; links of which nothing
     is stored are left out.
     """
-    stored = read_stored(folders)
+    stored = read_stored_fits(folders)
     found = {}
     for link in with_library_meshes(robot, Library(folders)).links:
         if link.collisions and are_primitives(link.collisions):

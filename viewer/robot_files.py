@@ -18,7 +18,7 @@ from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
-from morphgen.formats.files import keep, write_atomic
+from morphgen.formats.files import write_atomic, write_cache_file
 from morphgen.formats.picture import render
 from morphgen.viewer.robot_uri import FileAccess, content_hash, is_robot, read_robot_uri
 from morphgen.viewer.workers import Workers
@@ -58,7 +58,7 @@ def portrait(place: str, places: FileAccess) -> Portrait:
     except (MorphgenError, OSError) as error:
         return Portrait("", {"findings": ("broken",)}, places.told(error))
     with suppress(OSError):  # where nothing can be kept it is drawn again next time
-        keep(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
+        write_cache_file(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
     return made
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import viser
 
 from morphgen.fitting.replace_collision import as_primitives, stored_primitives
-from morphgen.formats.fits import read_stored
+from morphgen.formats.fits import read_stored_fits
 from morphgen.model.geometry import Pose
 from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.kinematics import frame_pose
@@ -105,7 +105,7 @@ def _show_primitives(page: RobotPage) -> None:
     """Draw the primitives that stand for the links; what is stored at once, the rest is fitted."""
     folders = page.session.places.folders
     robot = with_library_meshes(page.robot, page.session.places.library)
-    found, missing = stored_primitives(robot, read_stored(folders))
+    found, missing = stored_primitives(robot, read_stored_fits(folders))
     if missing:
         say(page.session, f"fitting primitives to {len(missing)} links; this takes a while")
         fitted = in_worker(page.session, as_primitives, robot, folders)

@@ -10,7 +10,7 @@ from multiprocessing import get_context
 from typing import TypeVar
 
 from morphgen.errors import MorphgenError
-from morphgen.processes import ctrl_c_held, prepare_worker
+from morphgen.processes import init_worker, sigint_blocked
 
 T = TypeVar("T")
 
@@ -31,7 +31,7 @@ class Workers:
 
     def submit(self, work: Callable[..., T], *arguments: object) -> Future[T]:
         """Have something done."""
-        with self._lock, ctrl_c_held():
+        with self._lock, sigint_blocked():
             try:
                 return self._pool.submit(work, *arguments)
             except BrokenProcessPool:
@@ -65,4 +65,4 @@ class Workers:
         self._pool = self._started()
 
     def _started(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(self._n, get_context("spawn"), prepare_worker)
+        return ProcessPoolExecutor(self._n, get_context("spawn"), init_worker)

@@ -16,7 +16,7 @@ from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, survey_
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
-from morphgen.processes import Progress, unseen
+from morphgen.processes import Progress, no_progress
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def audit(
     *,
     near: NearThresholds = NEAR_THRESHOLDS,
     jobs: int = 1,
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
 ) -> Audit:
     """Look for leaks between train and test, and for rules of the regime that are broken.
 

@@ -23,7 +23,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.robot import Robot
-from morphgen.processes import mapped
+from morphgen.processes import parallel_map
 
 Progress = Callable[[int], None]
 
@@ -131,7 +131,7 @@ def make_robots(
         progress: Told how many are done, again and again.
     """
     bodies = []
-    for body in mapped(maker, recipes, jobs):
+    for body in parallel_map(maker, recipes, jobs):
         bodies.append(body)
         progress(len(bodies))
     return bodies

@@ -40,9 +40,9 @@ from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.formats.bundle import bundle_folder
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import alone, partial_of, write_atomic
+from morphgen.formats.files import locked_folder, partial_path, write_atomic
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, mapped, unseen
+from morphgen.processes import Progress, no_progress, parallel_map
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def build_split(
     *,
     jobs: int = 1,
     settings: BuildSettings = BUNDLED,
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
 ) -> BuildReport:
     """Write a split with all its robots below ``folder``, in folders of the split's name.
 
@@ -87,11 +87,11 @@ def build_split(
     firsts = unique_robots(split)
     with _writing(home):
         _prepare(home, split, settings)
-        with alone(home):
+        with locked_folder(home):
             (home / SUMS_FILE).unlink(missing_ok=True)
             _sweep(home / ROBOTS_DIR)
             maker = _Maker(library.folders, home, settings, split.max_links)
-            results = mapped(maker, firsts, jobs, progress)
+            results = parallel_map(maker, firsts, jobs, progress)
             made = {member.robot_hash: one for member, one in zip(firsts, results, strict=True)}
             _finish(home, split, settings, made)
     written = sum(one.is_new for one in made.values())
@@ -148,7 +148,7 @@ def _prepare(home: Path, split: Split, settings: BuildSettings) -> None:
     """Make the folder, or see that it holds the same split, built in the same way."""
     wanted = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
     if not (home / BUILD_FILE).is_file():
-        leftover = {partial_of(home / BUILD_FILE)}
+        leftover = {partial_path(home / BUILD_FILE)}
         if home.exists() and not (home.is_dir() and leftover >= set(home.iterdir())):
             raise BenchmarkError(
                 f"{home} exists and is no built split (no {BUILD_FILE}); name another folder"

@@ -21,7 +21,7 @@ from morphgen.formats.bundle import (
     split_colours,
     write_bundle,
 )
-from morphgen.formats.card import card_of, card_text
+from morphgen.formats.card import card_text, robot_card
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.urdf_text import urdf_text
@@ -106,7 +106,7 @@ def _differences(folder: Path, robot: Robot) -> Iterator[str]:
     urdf = folder / URDF
     if urdf.is_file() and _MESH.sub(r'\1"', urdf.read_text("utf-8", "replace")) != _nameless(robot):
         yield f"file {URDF} is not the robot's"
-    expected = json.loads(card_text(card_of(robot, (), card["hashes"], {})))
+    expected = json.loads(card_text(robot_card(robot, (), card["hashes"], {})))
     for key in sorted(expected.keys() - _FREE):
         if not same(card.get(key), expected[key]):
             yield f"file {CARD}: its {key!r} is not the robot's"

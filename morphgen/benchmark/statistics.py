@@ -12,7 +12,7 @@ from morphgen.benchmark.split import Member, Split
 from morphgen.benchmark.survey import Fault, RobotStats, SplitSurvey, SurveyedRobot, survey_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, unseen
+from morphgen.processes import Progress, no_progress
 
 DIGITS = 4
 """Decimals of the figures."""
@@ -26,7 +26,7 @@ def statistics(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
 ) -> dict[str, object]:
     """Figures of a split, as its file holds them.
 

@@ -23,7 +23,7 @@ from morphgen.grammar.conditions import RobotProperties
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, mapped, unseen
+from morphgen.processes import Progress, no_progress, parallel_map
 from morphgen.typing import Array
 
 
@@ -124,7 +124,7 @@ def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> Meas
 
 
 def survey_split(
-    split: Split, library: Library, *, jobs: int = 1, progress: Progress = unseen
+    split: Split, library: Library, *, jobs: int = 1, progress: Progress = no_progress
 ) -> SplitSurvey:
     """Compose, measure and compare a split's robots; what is named twice is composed once a side.
 
@@ -140,9 +140,11 @@ def survey_split(
     trains, tests = _firsts(split.train), _firsts(split.test)
     total = len(trains) + len(tests)
     examination = _Examination(library.folders, split.max_links)
-    tested = list(mapped(examination, tests, jobs, lambda done, _: progress(done, total)))
+    tested = list(parallel_map(examination, tests, jobs, lambda done, _: progress(done, total)))
     look = _Comparison(examination, tuple(map(_features_of, tested)))
-    trained = list(mapped(look, trains, jobs, lambda done, _: progress(len(tests) + done, total)))
+    trained = list(
+        parallel_map(look, trains, jobs, lambda done, _: progress(len(tests) + done, total))
+    )
     rows, columns = _places(split.train, trains), _places(split.test, tests)
     shape = (len(trains), len(tests), len(MEASURES))
     likeness = np.array([values for _, values in trained]).reshape(shape)

@@ -35,7 +35,7 @@ from morphgen.benchmark.split_folder_robots import differences, hashes, same
 from morphgen.benchmark.token_layout import GEOMETRY, LAYOUT, SHAPE_POSE, TOLERANCE
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.library import Library
-from morphgen.processes import Progress, mapped, unseen
+from morphgen.processes import Progress, no_progress, parallel_map
 
 FITTED_TOLERANCE = 1e-3
 """How far the numbers of a link's primitive may be off: it may have been sought anew, here."""
@@ -65,7 +65,7 @@ def verify(
     library: Library,
     *,
     jobs: int = 1,
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
 ) -> Verified:
     """Compare a split with what its derivations give today.
 
@@ -142,7 +142,7 @@ def _seen(
     """What is found of the robots, by derivation and hash."""
     members = [member for _, member in reversed(sided_members(split))]
     firsts = {(member.derivation, member.robot_hash): member for member in members}
-    found = mapped(look, list(firsts.values()), jobs, progress)
+    found = parallel_map(look, list(firsts.values()), jobs, progress)
     return dict(zip(firsts, found, strict=True))
 
 

@@ -183,7 +183,7 @@ def _robot(
     from morphgen.fitting.agreement import agreement
     from morphgen.fitting.part_fits import fits_of
     from morphgen.fitting.replace_collision import with_fits, with_primitives
-    from morphgen.formats.fits import read_stored
+    from morphgen.formats.fits import read_stored_fits
 
     robot = target.robot
     report = _fit(target, options, args)
@@ -193,7 +193,7 @@ def _robot(
     if folder is None:
         return data
     primitives = {row.link: row.fit.primitives for row in report.links}
-    fits = fits_of(robot, report, read_stored(library_of(args).folders))
+    fits = fits_of(robot, report, read_stored_fits(library_of(args).folders))
     made = replace(
         with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
         name=folder.name,

@@ -208,7 +208,7 @@ def _statistics(measure: str, matrices: Matrices) -> str:
 
 def _write(args: argparse.Namespace, names: Sequence[str], matrices: Matrices) -> list[str]:
     """Write what was asked for; return where."""
-    from morphgen.formats.files import save
+    from morphgen.formats.files import write_file
 
     made = {
         path: content(names, matrices)
@@ -216,7 +216,7 @@ def _write(args: argparse.Namespace, names: Sequence[str], matrices: Matrices) -
         if path is not None
     }
     for path, data in made.items():
-        save(path, data)
+        write_file(path, data)
     return [str(path) for path in made]
 
 

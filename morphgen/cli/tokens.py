@@ -114,9 +114,9 @@ def _run_layout(args: argparse.Namespace) -> int:
 
 def _write(path: Path, tokens: Array, robot: Robot, max_links: int) -> None:
     from morphgen.benchmark.tokens import tokens_npz
-    from morphgen.formats.files import save
+    from morphgen.formats.files import write_file
 
-    save(path, tokens_npz(tokens, [link.name for link in robot.links], robot.name, max_links))
+    write_file(path, tokens_npz(tokens, [link.name for link in robot.links], robot.name, max_links))
 
 
 def _text(tokens: Array, robot: Robot, max_links: int) -> str:

@@ -10,7 +10,7 @@ from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.search import best_several, best_single, sampled
 from morphgen.fitting.solid import Solid, solid_of
-from morphgen.formats.fits import MOST_PRIMITIVES, are_primitives, shape_data
+from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
 from morphgen.model.geometry import Shape
 
 
@@ -27,8 +27,8 @@ class FitOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.max_primitives <= MOST_PRIMITIVES:
-            raise ValueError(f"{self.max_primitives} primitives: expected 1 to {MOST_PRIMITIVES}")
+        if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
+            raise ValueError(f"{self.max_primitives} primitives: expected 1 to {MAX_PRIMITIVES}")
         if not 0 < self.iou <= 1:
             raise ValueError(f"IoU {self.iou}: expected more than 0, at most 1")
         if self.seed < 0:
@@ -54,7 +54,7 @@ class LinkFit:
     def as_dict(self) -> dict[str, object]:
         """Plain data for JSON: metres, (x, y, z) and (w, x, y, z)."""
         return {
-            "primitives": [shape_data(shape) for shape in self.primitives],
+            "primitives": [shape_to_data(shape) for shape in self.primitives],
             "solid": self.solid,
             "decimated_from": self.decimated_from,
             "quality": {name: float(f"{v:.6g}") for name, v in asdict(self.quality).items()},

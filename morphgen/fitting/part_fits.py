@@ -10,23 +10,23 @@ from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import quality
 from morphgen.fitting.robot_fit import FitReport, fit_links
 from morphgen.fitting.solid import solid_of
-from morphgen.formats.files import save
+from morphgen.formats.files import write_file
 from morphgen.formats.fits import (
     SUFFIX,
-    fit_of,
+    find_fit,
+    fits_text,
     has_meshes,
-    read_stored,
+    read_stored_fits,
     shapes_key,
     shapes_scale,
     shapes_to_fit,
-    stored_text,
 )
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Robot
-from morphgen.processes import mapped
+from morphgen.processes import parallel_map
 
 TOKEN_OPTIONS = FitOptions(max_primitives=1)
 COLLISION_OPTIONS = FitOptions(max_primitives=4, iou=0.9)
@@ -39,7 +39,7 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
         library: Where they are.
         missing: Leave out those of which every link is stored.
     """
-    stored = read_stored(library.folders) if missing else {}
+    stored = read_stored_fits(library.folders) if missing else {}
     return [
         manifest
         for manifest in library.manifests()
@@ -59,7 +59,7 @@ def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Pat
         MeshError: If a mesh cannot be read.
         MorphgenError: If a process died.
     """
-    yield from mapped(store_part, manifests, jobs, chunk=1)
+    yield from parallel_map(store_part, manifests, jobs, chunk=1)
 
 
 def store_part(manifest: Manifest) -> Path:
@@ -77,7 +77,7 @@ def store_part(manifest: Manifest) -> Path:
             1 / shapes_scale(shapes)
         )
     path = manifest.path.with_name(manifest.path.stem + SUFFIX)
-    save(path, stored_text(fits))
+    write_file(path, fits_text(fits))
     return path
 
 
@@ -95,7 +95,7 @@ def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, St
     found = {}
     for row in report.links:
         shapes, worth = shapes_to_fit(robot.link(row.link)), row.fit.quality.iou
-        known = fit_of(shapes, robot, stored)
+        known = find_fit(shapes, robot, stored)
         found[row.link] = (
             replace(known, collision=row.fit.primitives, collision_iou=worth)
             if known

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import FitError
-from morphgen.formats.fits import VERSION, fit_of, has_meshes, read_stored, shapes_key
+from morphgen.formats.fits import FITTER_VERSION, find_fit, has_meshes, read_stored_fits, shapes_key
 from morphgen.formats.rounding import as_written
 from morphgen.model.geometry import Shape, StoredFit, StoredFits
 from morphgen.model.robot import Link, Robot
@@ -31,7 +31,7 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
         MeshError: If a mesh cannot be read.
         RobotError: If an axis is zero.
     """
-    fits = _known_fits(robot, read_stored(folders))
+    fits = _known_fits(robot, read_stored_fits(folders))
     missing = [
         link.name for link in robot.links if link.name not in fits and has_meshes(link.collisions)
     ]
@@ -50,7 +50,7 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
     made = with_primitives(robot, {link: fit.collision for link, fit in fits.items()})
     return replace(
         with_fits(made, fits),
-        provenance={**made.provenance, "primitives": {"fitter": VERSION}},
+        provenance={**made.provenance, "primitives": {"fitter": FITTER_VERSION}},
     )
 
 
@@ -109,7 +109,7 @@ def stored_primitives(
 
 def _known_fits(robot: Robot, stored: StoredFits) -> dict[str, StoredFit]:
     """Fits of links with collision shapes that the robot brings or that are stored."""
-    found = {link.name: fit_of(link.collisions, robot, stored) for link in robot.links}
+    found = {link.name: find_fit(link.collisions, robot, stored) for link in robot.links}
     return {name: fit for name, fit in found.items() if fit}
 
 

@@ -18,7 +18,7 @@ from morphgen.formats.fits import shapes_to_fit
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Shape
 from morphgen.model.robot import Link, Robot
-from morphgen.processes import mapped
+from morphgen.processes import parallel_map
 
 Progress = Callable[[str], object]
 """Told the name of every link that is done."""
@@ -144,7 +144,7 @@ def _fit_all(
     progress: Progress,
 ) -> dict[str, Attempt]:
     work = [(shapes_to_fit(link), _solid(solids[link.name])) for link in links]
-    attempts = mapped(partial(_try_fit, options), work, jobs, chunk=1)
+    attempts = parallel_map(partial(_try_fit, options), work, jobs, chunk=1)
     fits: dict[str, Attempt] = {}
     for link, fit in zip(links, attempts, strict=True):
         fits[link.name] = fit

@@ -14,13 +14,13 @@ from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import canonical
 from morphgen.fitting.composite import composite
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import keep
+from morphgen.formats.files import write_cache_file
 from morphgen.formats.fits import (
     ShapeRecord,
     are_primitives,
-    fit_of,
-    read_stored,
-    shape_data,
+    find_fit,
+    read_stored_fits,
+    shape_to_data,
     shapes_key,
     shapes_scale,
 )
@@ -57,13 +57,13 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
         FormatError: If a stored fit is malformed.
         MeshError: If a mesh cannot be read.
     """
-    stored = read_stored(folders)
+    stored = read_stored_fits(folders)
     found = {}
     for link in robot.links:
         if not link.collisions:
             continue
         shapes = rounded_shapes(link.collisions)
-        if fit := fit_of(link.collisions, robot, stored):
+        if fit := find_fit(link.collisions, robot, stored):
             found[link.name] = fit.token
         elif main := _main_primitive(shapes):
             found[link.name] = canonical(replace(main, rgba=None))
@@ -93,9 +93,9 @@ def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
             raise FormatError(f"{error}; delete the file") from error
         return None if record is None else scale_shape(record.shape, factor)
     shape = _fitted(shapes)
-    data = None if shape is None else shape_data(scale_shape(shape, 1 / factor))
+    data = None if shape is None else shape_to_data(scale_shape(shape, 1 / factor))
     try:
-        keep(path, json.dumps(data))
+        write_cache_file(path, json.dumps(data))
     except OSError as error:
         warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=3)
     return shape

@@ -15,10 +15,10 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
-from morphgen.formats.card import apply_card, card_of, card_text
+from morphgen.formats.card import apply_card, card_text, robot_card
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import replacing_folder
-from morphgen.formats.fits import FITS, fit_of, read_fits, shapes_key, stored_text
+from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
 from morphgen.formats.mjcf import mjcf_text
 from morphgen.formats.picture import render
 from morphgen.formats.resolve import default_finder
@@ -93,7 +93,7 @@ def write_bundle(
             for path in sorted(partial.rglob("*"))
             if path.is_file()
         }
-        card = card_of(robot, findings, hashes, {"morphgen": version("morphgen")})
+        card = robot_card(robot, findings, hashes, {"morphgen": version("morphgen")})
         (partial / CARD).write_text(card_text(card), encoding="utf-8")
         if picture:
             render(robot, partial / URDF, partial / MJCF).save(partial / PICTURE)
@@ -244,11 +244,11 @@ def _write_fits(robot: Robot, folder: Path) -> None:
     written = read_urdf(folder / URDF, keep_order=True)
     fits = {}
     for link in robot.links:
-        if fit := fit_of(link.collisions, robot, {}):
+        if fit := find_fit(link.collisions, robot, {}):
             shapes = written.link(link.name).collisions
             fits[shapes_key(shapes)] = replace(fit, link=link.name)
     if fits:
-        (folder / FITS).write_text(stored_text(fits), encoding="utf-8")
+        (folder / FITS).write_text(fits_text(fits), encoding="utf-8")
 
 
 def _mesh_bytes(mesh: trimesh.Trimesh) -> tuple[bytes, str]:

@@ -51,7 +51,7 @@ class _CardRecord(Record, frozen=True):
             raise ValueError("parts: expected objects with the keys 'label' and 'part'")
 
 
-def card_of(
+def robot_card(
     robot: Robot,
     findings: Iterable[Finding],
     hashes: Mapping[str, str],

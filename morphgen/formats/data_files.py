@@ -11,17 +11,17 @@ import yaml
 
 from morphgen.errors import FormatError
 
-LARGEST_FILE = 64 * 2**20
+MAX_FILE_BYTES = 64 * 2**20
 """Bytes of the largest data file that is read."""
-DEEPEST = 100
+MAX_DEPTH = 100
 """Levels of lists and objects in the deepest data that is read."""
-MOST_VALUES = 1_000_000
+MAX_YAML_VALUES = 1_000_000
 """Values in the largest YAML file that is read, those of repeated aliases included."""
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-def read_bytes(path: Path, most: int = LARGEST_FILE) -> bytes:
+def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
     """Return the content of a regular file.
 
     Args:
@@ -44,7 +44,7 @@ def read_bytes(path: Path, most: int = LARGEST_FILE) -> bytes:
     return data
 
 
-def read_text(path: Path, most: int = LARGEST_FILE) -> str:
+def read_text(path: Path, most: int = MAX_FILE_BYTES) -> str:
     """Return the text of a regular UTF-8 file of at most so many bytes, line ends made alike.
 
     Raises:
@@ -77,7 +77,7 @@ def parse_json(text: str, origin: str) -> Any:  # noqa: ANN401
         origin: Where it stands, for messages.
 
     Raises:
-        FormatError: If it is no JSON, or deeper than ``DEEPEST``.
+        FormatError: If it is no JSON, or deeper than ``MAX_DEPTH``.
     """
     try:
         data = json.loads(text)
@@ -86,7 +86,7 @@ def parse_json(text: str, origin: str) -> Any:  # noqa: ANN401
     except ValueError as error:
         raise FormatError(f"{origin}: no valid JSON: {error}") from error
     level = [data]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         level = [
             child
             for value in level
@@ -109,7 +109,7 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
         origin: Where it stands, for messages.
 
     Raises:
-        FormatError: If it is deeper than ``DEEPEST`` or holds more than ``MOST_VALUES``.
+        FormatError: If it is deeper than ``MAX_DEPTH`` or holds more than ``MAX_YAML_VALUES``.
         yaml.YAMLError: If it is no YAML.
     """
     sizes: dict[str, int] = {}
@@ -132,11 +132,11 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
                     why = "found unconstructable recursive node"
                     raise FormatError(f"{origin}:{line}: no valid YAML: {why}")
                 count += sizes.get(event.anchor or "", 1)
-        if len(opened) > DEEPEST:
+        if len(opened) > MAX_DEPTH:
             raise _too_deep(origin)
-        if count > MOST_VALUES:
-            raise FormatError(f"{origin}: holds more than {MOST_VALUES} values")
+        if count > MAX_YAML_VALUES:
+            raise FormatError(f"{origin}: holds more than {MAX_YAML_VALUES} values")
 
 
 def _too_deep(origin: str) -> FormatError:
-    return FormatError(f"{origin}: is nested deeper than {DEEPEST} levels")
+    return FormatError(f"{origin}: is nested deeper than {MAX_DEPTH} levels")

@@ -17,12 +17,12 @@ LOCK = ".lock"
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file by way of ``partial_of`` it, so that it is never half there.
+    """Write a file by way of ``partial_path`` it, so that it is never half there.
 
     Raises:
         OSError: If it cannot be written; then nothing is left behind.
     """
-    partial = partial_of(path)
+    partial = partial_path(path)
     try:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
         partial.replace(path)
@@ -32,7 +32,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         raise
 
 
-def save(path: Path, content: str | bytes) -> None:
+def write_file(path: Path, content: str | bytes) -> None:
     """Write a file that the user named; several processes may at once.
 
     Raises:
@@ -44,7 +44,7 @@ def save(path: Path, content: str | bytes) -> None:
         raise FormatError(f"cannot write {path}: {error.strerror}") from error
 
 
-def partial_of(path: Path) -> Path:
+def partial_path(path: Path) -> Path:
     """Where a file is written before it takes its place."""
     return path.with_name(f".{path.name}.partial")
 
@@ -65,7 +65,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
         partial.replace(path)
 
 
-def keep(path: Path, content: str | bytes) -> None:
+def write_cache_file(path: Path, content: str | bytes) -> None:
     """Write a file of a cache, which several processes may do at once; makes its folder.
 
     Raises:
@@ -81,7 +81,7 @@ def _replace(path: Path, content: str | bytes) -> None:
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Hold a folder against a second run; a killed one holds nothing.
 
     Raises:

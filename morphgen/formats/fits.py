@@ -42,9 +42,9 @@ SUFFIX = ".primitives.json"
 """Suffix of the file of fits beside a part's manifest."""
 FITS = "primitives.json"
 """Name of the file of fits in a bundle."""
-MOST_PRIMITIVES = 32
+MAX_PRIMITIVES = 32
 """Largest number of primitives in a link's fit."""
-VERSION = 2
+FITTER_VERSION = 2
 """Version of the fitter; it rises when the fitter gives other primitives for the same meshes."""
 
 _Iou = Annotated[float, Meta(ge=0, le=1)]
@@ -92,7 +92,7 @@ class _LinkRecord(Record, frozen=True):
     """The ``shapes_key`` of the fitted shapes."""
     token: ShapeRecord
     token_iou: _Iou
-    collision: Annotated[tuple[ShapeRecord, ...], Meta(min_length=1, max_length=MOST_PRIMITIVES)]
+    collision: Annotated[tuple[ShapeRecord, ...], Meta(min_length=1, max_length=MAX_PRIMITIVES)]
     collision_iou: _Iou
 
     @property
@@ -116,7 +116,7 @@ def stored_fit(shapes: Sequence[Shape], stored: StoredFits) -> StoredFit | None:
     return fit and fit.scaled(shapes_scale(shapes))
 
 
-def fit_of(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> StoredFit | None:
+def find_fit(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> StoredFit | None:
     """The fit of a link's collision shapes: what its robot brings, or for meshes what is stored.
 
     Raises:
@@ -165,7 +165,7 @@ def shapes_to_fit(link: Link) -> tuple[Shape, ...]:
     return link.collisions or link.visuals
 
 
-def read_stored(folders: Iterable[Path]) -> dict[str, StoredFit]:
+def read_stored_fits(folders: Iterable[Path]) -> dict[str, StoredFit]:
     """All fits in folders of parts, but for those of another version of the fitter.
 
     Raises:
@@ -187,7 +187,7 @@ def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
     meshed = [link.collisions for link in robot.links if has_meshes(link.collisions)]
     if not meshed:
         return robot
-    stored = read_stored(folders)
+    stored = read_stored_fits(folders)
     keys = map(shapes_key, meshed)
     return replace(robot, fits={key: stored[key] for key in keys if key in stored})
 
@@ -204,24 +204,24 @@ def read_fits(path: Path) -> dict[str, StoredFit]:
         raise FormatError(f"cannot read {path}: {error.strerror}") from error
 
 
-def stored_text(fits: Mapping[str, StoredFit]) -> str:
+def fits_text(fits: Mapping[str, StoredFit]) -> str:
     """The file of a part."""
     links = [
         {
             "link": fit.link,
             "shapes": key,
-            "token": shape_data(fit.token),
+            "token": shape_to_data(fit.token),
             "token_iou": round(fit.token_iou, 4),
-            "collision": [shape_data(shape) for shape in fit.collision],
+            "collision": [shape_to_data(shape) for shape in fit.collision],
             "collision_iou": round(fit.collision_iou, 4),
         }
         for key, fit in fits.items()
     ]
     lines = ",\n  ".join(json.dumps(link) for link in links)
-    return f'{{"fitter": {VERSION}, "links": [\n  {lines}\n]}}\n'
+    return f'{{"fitter": {FITTER_VERSION}, "links": [\n  {lines}\n]}}\n'
 
 
-def shape_data(shape: Shape) -> dict[str, object]:
+def shape_to_data(shape: Shape) -> dict[str, object]:
     """A box, cylinder or sphere as plain data: metres, (x, y, z) and (w, x, y, z)."""
     size: dict[str, object]
     match shape.geometry:
@@ -242,7 +242,7 @@ def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
     """The fits of a file as it is at its stamp."""
     del stamp
     data = read_json(path)
-    if isinstance(data, dict) and data.get("fitter", VERSION) != VERSION:
+    if isinstance(data, dict) and data.get("fitter", FITTER_VERSION) != FITTER_VERSION:
         return {}
     return {link.shapes: link.fit for link in read_record(data, _FileRecord, str(path)).links}
 

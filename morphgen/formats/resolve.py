@@ -185,7 +185,7 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
     raise FormatError(f"{base}: {uri!r} names no file: looked for {_listed(missing)}")
 
 
-def require_readable(path: Path, finder: PackageFinder, *files: Path) -> None:
+def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> None:
     """Require that a xacro may read a text file or list a folder, which it could copy into a robot.
 
     It may in the package (the nearest folder above with a ``package.xml``, else the nearest named

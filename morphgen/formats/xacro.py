@@ -12,7 +12,7 @@ from xml.dom import minidom
 from xml.parsers.expat import ExpatError
 
 from morphgen.errors import FormatError, nearest
-from morphgen.formats.resolve import PackageFinder, is_installed, require_readable
+from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro_child import MEMORY_LIMIT, run_in_child
 from morphgen.formats.xacro_engine import thread_engine
 from morphgen.formats.xacro_files import (
@@ -53,12 +53,13 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
     The result depends on the files and the arguments only: the working directory plays no part,
     ``$(optenv NAME default)`` is always its default, and ``$(env NAME)`` and ``$(cwd)`` are errors.
 
-    Expressions are evaluated by an allow-list, files are read from the folders of
-    ``require_readable`` only, and time, memory and size are bounded. A file that was installed with
-    morphgen or a data package is expanded in this process, because it was chosen by who installed
-    it, as long as it reads no others; its arguments may be a stranger's, which the bounds of the
-    expansion hold for, too. Every other file, also one of a user's own library, is expanded in a
-    process with limits.
+    Threat model: the file and everything it includes may come from a stranger, and the values of
+    arguments as well. Expressions are interpreted by an allow-list and never given to Python.
+    Files are read only where ``require_allowed_text`` permits. Time, memory and size are bounded.
+
+    A file that was installed with morphgen or a data package was chosen by whoever installed it, so
+    it is expanded in this process as long as it reads installed files only. Every other file,
+    including one of the user's own library, is expanded in a child process with resource limits.
 
     Args:
         path: The file.
@@ -213,7 +214,7 @@ class Expansion:
         return parse_yaml(data, Path(name), self.engine.ConstructUnits)
 
     def _read(self, filename: str, including: str) -> bytes:
-        require_readable(Path(filename), self.finder, self.origin, Path(including))
+        require_allowed_text(Path(filename), self.finder, self.origin, Path(including))
         if self.installed_only and not is_installed(Path(filename)):
             self.met_foreign = True
             raise RefusedError(f"{filename} was not installed")
@@ -222,7 +223,7 @@ class Expansion:
     def _list_files(self, pattern: str) -> list[str]:
         """Files of a pattern, which must begin in a folder that may be read."""
         folder = Path(re.split(r"[*?[]", pattern)[0] + "x").parent
-        require_readable(folder, self.finder, self.origin, Path(self.engine.filestack[-1]))
+        require_allowed_text(folder, self.finder, self.origin, Path(self.engine.filestack[-1]))
         return glob(pattern)  # noqa: PTH207 - an absolute pattern, as xacro takes it
 
     def _substitute(self, text: str) -> object:

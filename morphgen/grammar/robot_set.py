@@ -24,7 +24,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.card import rounded
 from morphgen.formats.data_files import read_json, read_text
-from morphgen.formats.files import alone, partial_of, replacing_folder, write_atomic
+from morphgen.formats.files import locked_folder, partial_path, replacing_folder, write_atomic
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.grammar_file import Grammar, grammar_from_text
@@ -101,7 +101,7 @@ def make_set(
         SamplingError: If a robot's conditions cannot be met.
     """
     _prepare(plan)
-    with alone(plan.folder):
+    with locked_folder(plan.folder):
         done = _finished(plan)
         missing = [i for i in range(n) if i not in done]
         progress(n - len(missing))
@@ -258,7 +258,7 @@ def _prepare(plan: SetConfig) -> None:
 def _is_barely_begun(plan: SetConfig) -> bool:
     """Whether a folder is empty, or what a run left that was interrupted before it made a set."""
     grammar = plan.folder / GRAMMAR
-    own = {partial_of(grammar), partial_of(plan.folder / SETTINGS)}
+    own = {partial_path(grammar), partial_path(plan.folder / SETTINGS)}
     if grammar.is_file() and grammar.read_bytes() == plan.grammar_text.encode():
         own.add(grammar)
     return plan.folder.is_dir() and own >= set(plan.folder.iterdir())
@@ -292,7 +292,7 @@ def _write_index(plan: SetConfig, made: int, kept: int) -> SetReport:
     rejected: Counter[str] = Counter()
     first: dict[str, str] = {}
     duplicates = []
-    partial = partial_of(plan.folder / INDEX)
+    partial = partial_path(plan.folder / INDEX)
     places = _finished(plan)
     with ExitStack() as stack:
         sources = {path for path, _ in places.values()}

@@ -11,14 +11,14 @@ from typing import Any
 
 from morphgen.errors import MorphgenError
 from morphgen.grammar.robot_set import Record, RobotMaker, SetConfig, SetWorker
-from morphgen.processes import CHUNK, mapped, ray_cluster, require_ray
+from morphgen.processes import CHUNK_SIZE, parallel_map, ray_cluster, require_ray
 
 
 def make_in_processes(jobs: int) -> SetWorker:
     """Work in ``jobs`` processes of this machine."""
 
     def work(plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-        return mapped(_Making(plan), indices, jobs)
+        return parallel_map(_Making(plan), indices, jobs)
 
     return work
 
@@ -65,7 +65,7 @@ def make_on_ray(address: str | None) -> SetWorker:
 
 def _spread(ray: ModuleType, plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
     """A maker on every CPU, each given a chunk whenever it is free."""
-    chunks = deque(indices[i : i + CHUNK] for i in range(0, len(indices), CHUNK))
+    chunks = deque(indices[i : i + CHUNK_SIZE] for i in range(0, len(indices), CHUNK_SIZE))
     cpus = max(int(ray.cluster_resources().get("CPU", 1)), 1)
     remote = ray.remote(num_cpus=1)(RobotMaker)
     free = deque(remote.remote(plan) for _ in range(min(cpus, len(chunks))))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
-from morphgen.processes import ctrl_c_held
+from morphgen.processes import sigint_blocked
 from morphgen.tasks.sim.base import Contacts, Scene
 from morphgen.tasks.sim.bullet_batch import BulletBatch, Exported, Float32, Rows
 
@@ -97,7 +97,7 @@ def start(number: int, share: Share, arrays: SharedArrays) -> Worker:
     process = _CONTEXT.Process(target=_serve, args=(theirs, arrays), name=str(number), daemon=True)
     worker = Worker(process, ours, np.array(share.envs))
     try:
-        with ctrl_c_held():
+        with sigint_blocked():
             process.start()
         theirs.close()
         send(worker, pickle.dumps(share))

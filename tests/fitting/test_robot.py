@@ -24,7 +24,7 @@ from morphgen.fitting.replace_collision import as_primitives, stored_primitives,
 from morphgen.fitting.robot_fit import fit_links
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.formats.fits import SUFFIX, read_stored, shapes_key, shapes_to_fit
+from morphgen.formats.fits import SUFFIX, read_stored_fits, shapes_key, shapes_to_fit
 from morphgen.formats.rounding import as_written
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.part import load_part
@@ -174,7 +174,7 @@ def test_visuals_are_replaced_on_request(tmp_path, wedge):
 
 def test_links_that_are_not_stored_are_fitted_now(tmp_path):
     robot = arm([mesh_shape(tmp_path, trimesh.creation.box((0.1, 0.2, 0.3)))])
-    assert stored_primitives(robot, read_stored(LIBRARY.folders)) == ({}, ["l0"])
+    assert stored_primitives(robot, read_stored_fits(LIBRARY.folders)) == ({}, ["l0"])
     made = as_primitives(robot, LIBRARY.folders)
     worth = quality(solid_of(robot.links[0].collisions), made.links[0].collisions)
     assert worth.iou > 0.95
@@ -188,7 +188,7 @@ def test_a_link_that_nothing_can_stand_for_stops_composing(tmp_path):
 
 def test_primitives_agree_better_with_meshes_than_hulls_do():
     meshes = load_part(LIBRARY.manifest("ur5")).fragment
-    found, _ = stored_primitives(meshes, read_stored(LIBRARY.folders))
+    found, _ = stored_primitives(meshes, read_stored_fits(LIBRARY.folders))
     primitives, hulls = agreement(meshes, with_primitives(meshes, found), 300)
     for counts in (primitives, hulls):
         assert counts.both + counts.neither + counts.only_meshes + counts.only_other == 300
@@ -284,7 +284,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
 def test_what_is_stored_reproduces(name, options):
     """To a hundredth: other processors round sums otherwise, and a search amplifies that."""
     body = load_part(LIBRARY.manifest(name)).fragment
-    stored = read_stored(LIBRARY.folders)
+    stored = read_stored_fits(LIBRARY.folders)
     for row in fit_links(body, options).links:
         shapes = shapes_to_fit(body.link(row.link))
         fit = stored[shapes_key(shapes)]

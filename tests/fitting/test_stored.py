@@ -13,14 +13,14 @@ import trimesh
 
 from morphgen.errors import FormatError
 from morphgen.formats.fits import (
+    FITTER_VERSION,
     SUFFIX,
-    VERSION,
     StoredFit,
-    read_stored,
-    shape_data,
+    fits_text,
+    read_stored_fits,
+    shape_to_data,
     shapes_key,
     stored_fit,
-    stored_text,
 )
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, scale_shape
 
@@ -45,76 +45,76 @@ def write(folder, text, name="robot"):
 
 def changed(**changes):
     """The file of the arm, keys of its link changed; those that become None are left out."""
-    data = json.loads(stored_text({"key": ARM}))
+    data = json.loads(fits_text({"key": ARM}))
     link = {k: v for k, v in (data["links"][0] | changes).items() if v is not None}
     return json.dumps(data | {"links": [link]})
 
 
 def shape(**changes):
     """Plain data of the can, keys changed; those that become None are left out."""
-    return {k: v for k, v in (shape_data(CAN) | changes).items() if v is not None}
+    return {k: v for k, v in (shape_to_data(CAN) | changes).items() if v is not None}
 
 
 def test_what_is_written_is_read_back(tmp_path):
     fits = {"one": ARM, "two": HAND}
-    write(tmp_path, stored_text(fits))
-    assert read_stored([tmp_path]) == fits
+    write(tmp_path, fits_text(fits))
+    assert read_stored_fits([tmp_path]) == fits
 
 
 def test_overlaps_are_kept_to_four_decimals(tmp_path):
-    write(tmp_path, stored_text({"key": replace(ARM, token_iou=2 / 3, collision_iou=1 / 3)}))
-    fit = read_stored([tmp_path])["key"]
+    write(tmp_path, fits_text({"key": replace(ARM, token_iou=2 / 3, collision_iou=1 / 3)}))
+    fit = read_stored_fits([tmp_path])["key"]
     assert (fit.token_iou, fit.collision_iou) == (0.6667, 0.3333)
 
 
 def test_no_fits_are_a_file_too(tmp_path):
-    write(tmp_path, stored_text({}))
-    assert read_stored([tmp_path]) == {}
+    write(tmp_path, fits_text({}))
+    assert read_stored_fits([tmp_path]) == {}
 
 
 def test_a_link_is_a_line_so_that_changes_show():
-    lines = stored_text({"one": ARM, "two": HAND}).splitlines()
+    lines = fits_text({"one": ARM, "two": HAND}).splitlines()
     assert len(lines) == 4
     assert [name in line for line, name in zip(lines[1:3], ("one", "two"), strict=True)] == [
         True
     ] * 2
-    assert stored_text({"one": ARM, "two": HAND}) == stored_text({"one": ARM, "two": HAND})
+    assert fits_text({"one": ARM, "two": HAND}) == fits_text({"one": ARM, "two": HAND})
 
 
 def test_plain_data_names_the_kind_and_where_it_is():
     pose = Pose((1.0, 2.0, 3.0))
-    assert shape_data(Shape(Box((0.1, 0.2, 0.3)), pose)) == {
+    assert shape_to_data(Shape(Box((0.1, 0.2, 0.3)), pose)) == {
         "box": [0.1, 0.2, 0.3],
         "xyz": [1.0, 2.0, 3.0],
         "quaternion": [1.0, 0.0, 0.0, 0.0],
     }
-    assert shape_data(CAN)["cylinder"] == [0.05, 0.3]
-    assert shape_data(Shape(Sphere(0.1)))["sphere"] == [0.1]
+    assert shape_to_data(CAN)["cylinder"] == [0.05, 0.3]
+    assert shape_to_data(Shape(Sphere(0.1)))["sphere"] == [0.1]
 
 
 @pytest.mark.parametrize("geometry", [Capsule(0.1, 0.2), Mesh(Path("m.stl"))])
 def test_only_boxes_cylinders_and_spheres_are_stored(geometry):
     with pytest.raises(ValueError, match=f"{type(geometry).__name__} is no box"):
-        shape_data(Shape(geometry))
+        shape_to_data(Shape(geometry))
 
 
 def test_all_files_of_all_folders_are_read_whatever_else_lies_there(tmp_path):
-    write(tmp_path / "a", stored_text({"one": ARM}))
-    write(tmp_path / "b" / "deep" / "deeper", stored_text({"two": HAND}))
+    write(tmp_path / "a", fits_text({"one": ARM}))
+    write(tmp_path / "b" / "deep" / "deeper", fits_text({"two": HAND}))
     (tmp_path / "a" / "robot.json").write_text("{")
     (tmp_path / "a" / "robot.yaml").write_text("name: robot")
-    assert read_stored([tmp_path / "a", tmp_path / "b"]) == {"one": ARM, "two": HAND}
-    assert read_stored([tmp_path / "b"]) == {"two": HAND}
-    assert read_stored([tmp_path / "nowhere"]) == {}
-    assert read_stored([]) == {}
+    assert read_stored_fits([tmp_path / "a", tmp_path / "b"]) == {"one": ARM, "two": HAND}
+    assert read_stored_fits([tmp_path / "b"]) == {"two": HAND}
+    assert read_stored_fits([tmp_path / "nowhere"]) == {}
+    assert read_stored_fits([]) == {}
 
 
-@pytest.mark.parametrize("version", [VERSION - 1, VERSION + 1, None, "1"])
+@pytest.mark.parametrize("version", [FITTER_VERSION - 1, FITTER_VERSION + 1, None, "1"])
 def test_another_version_of_the_fitter_is_ignored(tmp_path, version):
-    data = json.loads(stored_text({"key": ARM}))
+    data = json.loads(fits_text({"key": ARM}))
     write(tmp_path, json.dumps(data | {"fitter": version}))
     write(tmp_path, json.dumps({"fitter": version, "whatever": []}), "other")
-    assert read_stored([tmp_path]) == {}
+    assert read_stored_fits([tmp_path]) == {}
 
 
 MALFORMED = {
@@ -125,10 +125,10 @@ MALFORMED = {
     "null": "null",
     "nothing": "{}",
     "deep": "[" * 100_000,
-    "no links": json.dumps({"fitter": VERSION}),
-    "links a number": json.dumps({"fitter": VERSION, "links": 5}),
-    "link a number": json.dumps({"fitter": VERSION, "links": [5]}),
-    "link empty": json.dumps({"fitter": VERSION, "links": [{}]}),
+    "no links": json.dumps({"fitter": FITTER_VERSION}),
+    "links a number": json.dumps({"fitter": FITTER_VERSION, "links": 5}),
+    "link a number": json.dumps({"fitter": FITTER_VERSION, "links": [5]}),
+    "link empty": json.dumps({"fitter": FITTER_VERSION, "links": [{}]}),
     "no name": changed(link=None),
     "no key": changed(shapes=None),
     "no token": changed(token=None),
@@ -165,7 +165,7 @@ MALFORMED = {
 def test_a_malformed_file_is_named_in_one_line(tmp_path, fault):
     path = write(tmp_path, MALFORMED[fault])
     with pytest.raises(FormatError) as caught:
-        read_stored([tmp_path])
+        read_stored_fits([tmp_path])
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < len(str(path)) + 300
@@ -175,22 +175,22 @@ def test_a_file_that_is_no_text_is_named(tmp_path):
     path = tmp_path / f"robot{SUFFIX}"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FormatError, match="robot") as caught:
-        read_stored([tmp_path])
+        read_stored_fits([tmp_path])
     assert str(path) in str(caught.value)
 
 
 def test_a_file_is_read_again_when_it_changes(tmp_path):
-    path = write(tmp_path, stored_text({"one": ARM}))
-    assert read_stored([tmp_path]) == {"one": ARM}
-    path.write_text(stored_text({"one": HAND}), encoding="utf-8")
+    path = write(tmp_path, fits_text({"one": ARM}))
+    assert read_stored_fits([tmp_path]) == {"one": ARM}
+    path.write_text(fits_text({"one": HAND}), encoding="utf-8")
     os.utime(path, ns=(1, 1))
-    assert read_stored([tmp_path]) == {"one": HAND}
+    assert read_stored_fits([tmp_path]) == {"one": HAND}
 
 
 def test_what_is_read_can_be_changed_without_changing_what_is_read_next(tmp_path):
-    write(tmp_path, stored_text({"one": ARM}))
-    read_stored([tmp_path]).clear()
-    assert read_stored([tmp_path]) == {"one": ARM}
+    write(tmp_path, fits_text({"one": ARM}))
+    read_stored_fits([tmp_path]).clear()
+    assert read_stored_fits([tmp_path]) == {"one": ARM}
 
 
 @pytest.fixture
@@ -235,10 +235,10 @@ def test_a_key_follows_the_working_directory(tmp_path, monkeypatch):
 
 def test_fits_follow_the_working_directory(tmp_path, monkeypatch):
     for name, fit in (("a", ARM), ("b", replace(ARM, link="leg"))):
-        path = write(tmp_path / name / "parts", stored_text({"one": fit}))
+        path = write(tmp_path / name / "parts", fits_text({"one": fit}))
         os.utime(path, ns=(1, 1))
         monkeypatch.chdir(tmp_path / name)
-        assert read_stored([Path("parts")]) == {"one": fit}
+        assert read_stored_fits([Path("parts")]) == {"one": fit}
 
 
 def test_whatever_changes_the_solid_changes_the_key(mesh):

@@ -10,7 +10,7 @@ from morphgen.formats.resolve import (
     default_finder,
     distribution_file,
     is_installed,
-    require_readable,
+    require_allowed_text,
     resolve_uri,
 )
 from morphgen.formats.xacro_functions import RefusedError
@@ -255,7 +255,7 @@ def test_a_root_widens_the_tree(tmp_path: Path) -> None:
 
 def refused_text(path: Path, base: Path, finder: PackageFinder = NOWHERE) -> bool:
     try:
-        require_readable(path, finder, base, base)
+        require_allowed_text(path, finder, base, base)
     except RefusedError:
         return True
     return False

@@ -15,7 +15,7 @@ from helpers.line_batch import OnALine
 from helpers.runs import POLICY, PPO, QUIET, equal, small_config, small_source, weights
 from helpers.splits import member, split
 from morphgen.errors import BenchmarkError, FormatError, TaskError
-from morphgen.formats.files import alone
+from morphgen.formats.files import locked_folder
 from morphgen.rl import training
 from morphgen.rl.agents import mlp
 from morphgen.rl.ppo import Learner
@@ -266,7 +266,7 @@ def test_two_runs_do_not_write_to_one_folder(tmp_path):
     config = small_config(total_timesteps=64)
     with pytest.raises(StoppedError):
         train(tmp_path / "run", config, execution=QUIET, show=stop_after(1))
-    with alone(tmp_path / "run"), pytest.raises(FormatError, match="by another run"):
+    with locked_folder(tmp_path / "run"), pytest.raises(FormatError, match="by another run"):
         train(tmp_path / "run", config, resume=True, execution=QUIET)
     train(tmp_path / "run", config, resume=True, execution=QUIET)
 
