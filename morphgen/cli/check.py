@@ -1,74 +1,62 @@
-"""``morphgen check``: findings about robots."""
+"""``morphgen check`` and ``morphgen conform``: findings about robots, and agreement of loaders."""
 
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import (
-    Subparsers,
-    add_json,
-    add_library,
-    add_robots,
-    add_root,
-    library_of,
-    sources_named,
-)
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, option, path_option, whole_number
+from morphgen.cli.progress import track
 from morphgen.errors import one_line
 
 if TYPE_CHECKING:
+    from morphgen.checks.conformance import ConformanceReport
     from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.findings import Finding
 
-
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "check",
-        help="say what is wrong with robots, and how to mend it",
-        description="Say what is wrong with robots. Exit code 1 if there is an error "
-        "(with --strict: or a warning).",
-    )
-    add_robots(parser)
-    parser.add_argument("--strict", action="store_true", help="warnings fail, too")
-    parser.add_argument(
-        "--fix",
-        metavar="DIR",
-        type=Path,
-        help="write bundles with the safe repairs applied to this folder",
-    )
-    add_root(parser)
-    add_library(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
+SEVERITIES = ("error", "warning", "info")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Check every robot; print findings."""
-    failing = ("error", "warning") if args.strict else ("error",)
-    report: dict[str, dict[str, list[dict[str, object]]]] = {}
-    failed = False
-    library = library_of(args)
-    for source in sources_named(args):
-        findings, repaired = _checked(source, library, args)
-        report[source.label] = {
+@command(
+    "check",
+    "find faults of robots and say how to repair them",
+    opt.ROBOTS,
+    flag("--strict", "fail on warnings, too"),
+    path_option("--fix", "DIR", "make the safe repairs and write bundles to DIR"),
+    opt.ROOT,
+    opt.LIBRARY,
+    opt.JSON,
+    details="The exit code is 1 if there is an error, or a warning with --strict.",
+    examples=("check my_arm.urdf", "check robots/ --strict", "check my_arm.urdf --fix repaired"),
+)
+def check(args: argparse.Namespace) -> int:
+    """Check every robot and print the findings."""
+    library, sources = opt.library_of(args), opt.sources_of(args)
+    results = [
+        (source.label, *_findings(source, library, args))
+        for source in track(sources, args, "checking", "robot", len(sources))
+    ]
+    data = {
+        label: {
             "findings": [finding.as_dict() for finding in findings],
             "repaired": [finding.as_dict() | {"repair": finding.repair} for finding in repaired],
         }
-        failed |= any(finding.severity in failing for finding in findings)
-        if not args.json:
-            _print(source.label, findings, repaired)
-    if args.json:
-        print(json.dumps(report, indent=2))
-    return int(failed)
+        for label, findings, repaired in results
+    }
+    opt.print_result(args, data, lambda: "\n".join(_text(*result) for result in results))
+    failing = SEVERITIES[:2] if args.strict else SEVERITIES[:1]
+    return int(any(each.severity in failing for _, findings, _ in results for each in findings))
 
 
-def _checked(
+def _findings(
     source: RobotSource, library: Library, args: argparse.Namespace
-) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+) -> tuple[Sequence[Finding], Sequence[Finding]]:
     """Return a robot's findings, and those that its repair into ``--fix`` removed."""
     from morphgen.checks import check, fix
     from morphgen.formats.bundle import CARD, bundle_folder, file_findings, write_bundle
@@ -81,27 +69,82 @@ def _checked(
         return error.findings, ()
     folder = source.path if source.path is None or source.path.is_dir() else source.path.parent
     is_bundle = folder is not None and (folder / CARD).is_file()
-    files = file_findings(folder) if folder is not None and is_bundle else ()
     tool_required = is_bundle or source.path is None
     if args.fix is None:
-        return (*check(robot, tool_required=tool_required), *files), ()
+        in_files = file_findings(folder) if folder is not None and is_bundle else ()
+        return (*check(robot, tool_required=tool_required), *in_files), ()
     robot, repaired = fix(robot)
     findings = check(robot, tool_required=tool_required)
     write_bundle(robot, bundle_folder(args.fix, robot.name), findings)
     return findings, repaired
 
 
-def _print(label: str, findings: tuple[Finding, ...], repaired: tuple[Finding, ...]) -> None:
-    for finding in repaired:
-        print(one_line(f"{label}: repaired {finding.code} at {finding.where}: {finding.repair}"))
-    counts = {
-        severity: sum(finding.severity == severity for finding in findings)
-        for severity in ("error", "warning", "info")
-    }
-    print(one_line(f"{label}: " + ", ".join(f"{n} {what}" for what, n in counts.items())))
+def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) -> str:
+    lines = [
+        f"{label}: repaired {finding.code} at {finding.where}: {finding.repair}"
+        for finding in repaired
+    ]
+    counts = {name: sum(each.severity == name for each in findings) for name in SEVERITIES}
+    lines.append(f"{label}: {', '.join(f'{n} {name}' for name, n in counts.items())}")
+    lines = [one_line(line) for line in lines]
     for finding in findings:
-        print(
-            "  " + one_line(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")
-        )
+        where = one_line(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")
         hint = " (check --fix does it)" if finding.fixable else ""
-        print("    " + one_line(f"fix: {finding.fix}{hint}"))
+        lines += [f"  {where}", f"    {one_line(f'fix: {finding.fix}{hint}')}"]
+    return "\n".join(lines)
+
+
+@command(
+    "conform",
+    "load robots in every simulator and compare joints, mass and tool pose",
+    opt.ROBOTS,
+    option(
+        "--samples",
+        type=whole_number(1, 100_000),
+        default=100,
+        metavar="N",
+        help="number of random configurations",
+    ),
+    opt.SEED,
+    opt.ROOT,
+    opt.LIBRARY,
+    opt.JSON,
+    details="The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. The exit "
+    "code is 1 if one disagrees.",
+    examples=("conform ur5-plane", "conform robots/ --samples 1000"),
+)
+def conform(args: argparse.Namespace) -> int:
+    """Print a row per robot and loader."""
+    from tabulate import tabulate
+
+    library, sources = opt.library_of(args), opt.sources_of(args)
+    reports = {
+        source.label: _conformance(source, library, args)
+        for source in track(sources, args, "loading", "robot", len(sources))
+    }
+    rows = [
+        {"robot": Path(label).name, **asdict(row)}
+        for label, report in reports.items()
+        for row in report.rows
+    ]
+    data = [asdict(report) for report in reports.values()]
+    opt.print_result(args, data, lambda: tabulate(rows, headers="keys", floatfmt=".2g"))
+    return int(not all(report.passed for report in reports.values()))
+
+
+def _conformance(
+    source: RobotSource, library: Library, args: argparse.Namespace
+) -> ConformanceReport:
+    """Compare the loaders on a bundle; a robot without one is written to a temporary folder."""
+    from morphgen.checks import check
+    from morphgen.checks.conformance import conformance
+    from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
+    from morphgen.grammar.robot_source import read_source
+
+    if source.path is not None and (source.path / CARD).is_file():
+        return conformance(source.path, args.samples, args.seed)
+    robot = read_source(source, library, args.root)
+    with TemporaryDirectory() as folder:
+        bundle = bundle_folder(Path(folder), robot.name)
+        write_bundle(robot, bundle, check(robot), picture=False)
+        return conformance(bundle, args.samples, args.seed)

@@ -4,23 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import (
-    ROBOTS_HELP,
-    Subparsers,
-    add_jobs,
-    add_json,
-    add_library,
-    add_root,
-    library_of,
-    sources_named,
-    whole_number,
-)
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, number, option, path_option
+from morphgen.cli.progress import bar, status, track
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
@@ -29,92 +20,80 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot_fit import FitReport
     from morphgen.model.robot import Robot
 
-IOU, CONFIGURATIONS = 0.9, 1000
-"""Unless the user says otherwise."""
-HEADERS = (
-    "link",
-    "primitives",
-    "solid",
-    "IoU",
-    "coverage",
-    "volume ratio",
-    "protrusion mm",
-    "p95",
-    "gap mm",
-    "p95",
-    "Hausdorff mm",
-    "s",
-)
+DEFAULT_IOU, DEFAULT_CONFIGURATIONS = 0.9, 1000
+COLUMNS = {
+    "link": "",
+    "primitives": "",
+    "solid": "",
+    "IoU": ".3f",
+    "coverage": ".3f",
+    "volume ratio": ".2f",
+    "protrusion mm": ".1f",
+    "protrusion p95": ".1f",
+    "gap mm": ".1f",
+    "gap p95": ".1f",
+    "Hausdorff mm": ".1f",
+    "s": ".1f",
+}
+"""Headers of the table of fits, and how their numbers are written."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A robot or the body of a part, to which primitives are fitted."""
+    """A robot, or a part alone, to which primitives are fitted."""
 
     label: str
-    """How the user names it."""
+    """Name that the user gave."""
     robot: Robot
     path: Path | None
-    """Its file or folder, if it has one of its own."""
+    """File or folder of the robot; None if it is composed or a part."""
     is_part: bool
 
 
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "fit",
-        help="fit boxes, cylinders and spheres to meshes, and say how good they are",
-        description="Fit boxes, cylinders and spheres to the meshes of a part, a robot or a file, "
-        "and say how good they are. With --out, write the robot with primitives as its collision "
-        "shapes.",
-        epilog="examples: morphgen fit panda; morphgen fit robots/ur5-plane --max-primitives 4 "
-        "--out robots/ur5-plane-prims; morphgen fit link.stl --max-primitives 3",
-    )
-    parser.add_argument(
-        "words", nargs="*", metavar="ROBOT", help=f"a part, a mesh file, or {ROBOTS_HELP}"
-    )
-    parser.add_argument("--all", action="store_true", help="fit and store every part with meshes")
-    parser.add_argument(
-        "--missing", action="store_true", help="with --all: only what is not stored"
-    )
-    parser.add_argument(
-        "--max-primitives", type=int, metavar="K", help="the most of a link (default: 1)"
-    )
-    parser.add_argument(
+@command(
+    "fit",
+    "fit boxes, cylinders and spheres to meshes, and measure how good they are",
+    option("words", nargs="*", metavar="ROBOT", help=f"a part, a mesh file, or {opt.ROBOTS_HELP}"),
+    flag("--all", "fit every part with meshes, and store the fits in the library"),
+    flag("--missing", "with --all: only the parts without stored fits"),
+    option(
+        "--max-primitives",
+        type=int,
+        metavar="K",
+        help="largest number of primitives per link (default: 1)",
+    ),
+    option(
         "--iou",
         type=float,
-        default=IOU,
-        help=f"take the fewest primitives that reach it (default: {IOU})",
-    )
-    parser.add_argument(
-        "--enclose", action="store_true", help="hold every point of the link, for safe collisions"
-    )
-    parser.add_argument("--visual", action="store_true", help="replace the visuals, too")
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        help="write the robot's bundle here; of several robots, one bundle each",
-    )
-    parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
-    parser.add_argument(
+        default=DEFAULT_IOU,
+        help="use the fewest primitives that reach this intersection over union",
+    ),
+    flag("--enclose", "enclose every point of the link, for conservative collision checks"),
+    flag("--visual", "replace the visual shapes, too"),
+    path_option(
+        "--out", "DIR", "write the robot's bundle to DIR; several robots: a bundle each in DIR"
+    ),
+    opt.NO_PICTURE,
+    number(
         "--configurations",
-        type=whole_number(1),
-        default=CONFIGURATIONS,
-        metavar="N",
-        help=f"compare collisions in so many configurations (default: {CONFIGURATIONS}; "
-        "with --out)",
-    )
-    add_jobs(parser)
-    parser.add_argument("--seed", type=whole_number(0), default=0)
-    add_root(parser)
-    add_library(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Fit, print the table, write."""
+        "with --out: number of random configurations in which collisions are compared with "
+        "those of the meshes",
+        default=DEFAULT_CONFIGURATIONS,
+    ),
+    opt.JOBS,
+    opt.SEED,
+    opt.ROOT,
+    opt.LIBRARY,
+    opt.JSON,
+    details="With --out, the robot is written with the primitives as its collision shapes.",
+    examples=(
+        "fit panda",
+        "fit robots/ur5-plane --max-primitives 4 --out robots/ur5-plane-prims",
+        "fit link.stl --max-primitives 3",
+    ),
+)
+def fit(args: argparse.Namespace) -> int:
+    """Fit, print the table and write bundles."""
     from morphgen.errors import MorphgenError
     from morphgen.fitting.link_fit import FitOptions
     from morphgen.model.geometry import MESH_SUFFIXES
@@ -122,23 +101,32 @@ def run(args: argparse.Namespace) -> int:
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     try:
-        most = 1 if args.max_primitives is None else args.max_primitives
-        options = FitOptions(most, args.iou, args.enclose, args.seed)
+        max_primitives = 1 if args.max_primitives is None else args.max_primitives
+        options = FitOptions(max_primitives, args.iou, args.enclose, args.seed)
     except ValueError as error:
         raise MorphgenError(str(error)) from error
-    if args.missing and not args.all:
-        raise MorphgenError("--missing goes with --all")
     if args.all:
-        return _store_all(args)
-    given = {"--visual": args.visual, "--no-picture": args.no_picture}
-    if idle := [name for name, value in given.items() if value and not args.out]:
-        raise MorphgenError(f"{' '.join(idle)}: only with --out")
+        return _fit_all_parts(args)
+    opt.reject_idle({"--missing": args.missing}, "only with --all")
+    if not args.out:
+        opt.reject_idle(
+            {"--visual": args.visual, "--no-picture": args.no_picture}, "only with --out"
+        )
     if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
-        return _mesh(args, options)
-    return _robots(args, options)
+        return _fit_mesh(args, options)
+    targets = _targets(args)
+    results = []
+    for target in targets:
+        folder = _folder(args, target, several=len(targets) > 1) if args.out else None
+        if len(targets) > 1 and not args.json:
+            print(f"{target.robot.name}:")
+        results.append(_fit_robot(target, folder, options, args))
+    if args.json:
+        print(json.dumps(results if len(results) > 1 else results[0]))
+    return 0
 
 
-def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
+def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> int:
     from morphgen.errors import FitError, MorphgenError
     from morphgen.fitting.link_fit import fit_shapes
     from morphgen.model.geometry import Mesh, Shape
@@ -147,68 +135,45 @@ def _mesh(args: argparse.Namespace, options: FitOptions) -> int:
     if args.out:
         raise MorphgenError(f"--out writes a robot, and {path} is a mesh; use --json")
     try:
-        fit = fit_shapes([Shape(Mesh(path))], options)
+        with status(args, f"fitting {path}"):
+            fit = fit_shapes([Shape(Mesh(path))], options)
     except FitError as error:
         raise MorphgenError(f"{path}: {error}") from error
-    if args.json:
-        print(json.dumps({"mesh": str(path), **fit.as_dict()}))
-        return 0
-    _print_table([_row(path.name, fit)])
-    for shape in fit.primitives:
-        pose = shape.T_link_shape
-        print(f"{shape.geometry} at {pose.position}, quaternion {pose.quaternion}")
+
+    def text() -> str:
+        primitives = [
+            f"{shape.geometry} at {pose.position}, quaternion {pose.quaternion}"
+            for shape in fit.primitives
+            if (pose := shape.T_link_shape)
+        ]
+        return "\n".join([_table([_row(path.name, fit)]), *primitives])
+
+    opt.print_result(args, {"mesh": str(path), **fit.as_dict()}, text)
     return 0
 
 
-def _robots(args: argparse.Namespace, options: FitOptions) -> int:
-    targets = _targets(args)
-    several = len(targets) > 1
-    data = []
-    for target in targets:
-        folder = _folder(args, target, several) if args.out else None
-        if several and not args.json:
-            print(f"{target.robot.name}:")
-        data.append(_robot(target, folder, options, args))
-    if args.json:
-        print(json.dumps(data if several else data[0]))
-    return 0
+def _targets(args: argparse.Namespace) -> list[Target]:
+    """Return what the arguments name: a part, or robots."""
+    from morphgen.grammar.part import load_part
+    from morphgen.grammar.robot_source import is_robot_file
+
+    library = opt.library_of(args)
+    word = args.words[0]
+    if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
+        opt.reject_idle({f"--root {args.root}": args.root}, "only with a bundle, a URDF or a xacro")
+        return [Target(word, load_part(library.manifest(word)).fragment, None, is_part=True)]
+    return [
+        Target(source.label, robot, source.path, is_part=False)
+        for source, robot in opt.read_robots(args)
+    ]
 
 
-def _robot(
-    target: Target, folder: Path | None, options: FitOptions, args: argparse.Namespace
-) -> dict[str, object]:
-    """Fit one robot, write its bundle if a folder is given, and return what ``--json`` prints."""
-    from dataclasses import replace
+def _folder(args: argparse.Namespace, target: Target, *, several: bool) -> Path:
+    """Return the folder of the bundle.
 
-    from morphgen.fitting.agreement import agreement
-    from morphgen.fitting.part_fits import fits_of
-    from morphgen.fitting.replace_collision import with_fits, with_primitives
-    from morphgen.formats.fits import read_stored_fits
-
-    robot = target.robot
-    report = _fit(target, options, args)
-    data = report.as_dict()
-    if not args.json:
-        _print_report(report)
-    if folder is None:
-        return data
-    primitives = {row.link: row.fit.primitives for row in report.links}
-    fits = fits_of(robot, report, read_stored_fits(library_of(args).folders))
-    made = replace(
-        with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
-        name=folder.name,
-        provenance={**robot.provenance, "primitives": report.without_times()},
-    )
-    compared, hulls = agreement(robot, made, args.configurations, args.seed)
-    _write(made, folder, target.is_part, args)
-    if not args.json:
-        _print_agreement(compared, hulls, args.configurations)
-        print(folder)
-    return data | {"agreement": compared.as_dict(), "agreement_of_hulls": hulls.as_dict()}
-
-
-def _folder(args: argparse.Namespace, target: Target, several: bool) -> Path:
-    """Where the bundle goes; refused before the long work if it cannot go there."""
+    Raises:
+        FormatError: If the bundle cannot be written there; better now than after the fit.
+    """
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import bundle_folder, require_replaceable
 
@@ -216,59 +181,69 @@ def _folder(args: argparse.Namespace, target: Target, several: bool) -> Path:
     folder = bundle_folder(parent, name)
     if target.path is not None:
         source = target.path.resolve()
-        if folder.resolve() in (source, *source.parents[:1]):
+        if folder.resolve() in (source, source.parent):
             raise FormatError(f"--out {args.out} is the robot itself; name another folder")
     require_replaceable(folder)
     return folder
 
 
-def _write(robot: Robot, folder: Path, is_part: bool, args: argparse.Namespace) -> None:
+def _fit_robot(
+    target: Target, folder: Path | None, options: FitOptions, args: argparse.Namespace
+) -> dict[str, object]:
+    """Fit one robot, write its bundle if a folder is given, and return the data of ``--json``."""
     from morphgen.checks import check
+    from morphgen.fitting.agreement import agreement
+    from morphgen.fitting.part_fits import fits_of
+    from morphgen.fitting.replace_collision import with_fits, with_primitives
     from morphgen.formats.bundle import write_bundle
+    from morphgen.formats.fits import read_stored_fits
 
-    findings = check(robot, tool_required=not is_part)
-    write_bundle(robot, folder, findings, picture=not args.no_picture)
+    robot = target.robot
+    report = _fit_links(target, options, args)
+    if not args.json:
+        print(_report_text(report))
+    if folder is None:
+        return report.as_dict()
+    primitives = {row.link: row.fit.primitives for row in report.links}
+    fits = fits_of(robot, report, read_stored_fits(opt.library_of(args).folders))
+    fitted = replace(
+        with_fits(with_primitives(robot, primitives, visual=args.visual), fits),
+        name=folder.name,
+        provenance={**robot.provenance, "primitives": report.without_times()},
+    )
+    with status(args, f"comparing collisions in {args.configurations} configurations"):
+        of_primitives, of_hulls = agreement(robot, fitted, args.configurations, args.seed)
+    findings = check(fitted, tool_required=not target.is_part)
+    write_bundle(fitted, folder, findings, picture=not args.no_picture)
+    if not args.json:
+        print(_agreement_text(of_primitives, of_hulls, args.configurations))
+        print(folder)
+    return report.as_dict() | {
+        "agreement": of_primitives.as_dict(),
+        "agreement_of_hulls": of_hulls.as_dict(),
+    }
 
 
-def _targets(args: argparse.Namespace) -> list[Target]:
-    """Return what is to be fitted: a part by its name, or robots."""
-    from morphgen.errors import FormatError
-    from morphgen.grammar.part import load_part
-    from morphgen.grammar.robot_source import is_robot_file, read_source
-
-    library = library_of(args)
-    word = args.words[0]
-    if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
-        if args.root is not None:
-            raise FormatError(f"--root {args.root}: only with a bundle, a URDF or a xacro")
-        return [Target(word, load_part(library.manifest(word)).fragment, None, is_part=True)]
-    return [
-        Target(source.label, read_source(source, library, args.root), source.path, is_part=False)
-        for source in sources_named(args)
-    ]
-
-
-def _fit(target: Target, options: FitOptions, args: argparse.Namespace) -> FitReport:
-    from tqdm import tqdm
-
+def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) -> FitReport:
     from morphgen.errors import FitError
     from morphgen.fitting.robot_fit import fit_links
     from morphgen.formats.fits import shapes_to_fit
 
-    links = sum(1 for link in target.robot.links if shapes_to_fit(link))
-    if not links:
+    total = sum(1 for link in target.robot.links if shapes_to_fit(link))
+    if not total:
         raise FitError(f"{target.label}: no link has a shape")
-    quiet = args.json or None
-    with tqdm(total=links, unit="link", file=sys.stderr, disable=quiet, leave=False) as bar:
-        report = fit_links(
-            target.robot, options, jobs=args.jobs, progress=lambda link: bar.update()
-        )
-    return report
+    done = 0
+    with bar(args, f"fitting {target.label}", "link", total) as update:
+
+        def count(link: str) -> None:
+            nonlocal done
+            done += 1
+            update(done)
+
+        return fit_links(target.robot, options, jobs=args.jobs, progress=count)
 
 
-def _store_all(args: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
+def _fit_all_parts(args: argparse.Namespace) -> int:
     from morphgen.errors import MorphgenError
     from morphgen.fitting.part_fits import parts_with_meshes, store_parts
 
@@ -279,61 +254,60 @@ def _store_all(args: argparse.Namespace) -> int:
         "--visual": args.visual,
         "--no-picture": args.no_picture,
         "--max-primitives": args.max_primitives is not None,
-        "--iou": args.iou != IOU,
-        "--configurations": args.configurations != CONFIGURATIONS,
+        "--iou": args.iou != DEFAULT_IOU,
+        "--configurations": args.configurations != DEFAULT_CONFIGURATIONS,
         "--seed": args.seed,
         "--json": args.json,
     }
-    if idle := [name for name, value in given.items() if value]:
+    if idle := [name for name, is_given in given.items() if is_given]:
         raise MorphgenError(
             "--all stores one primitive and up to four for every part, always the same ones: it "
             f"takes no {' or '.join(idle)}"
         )
-    library = library_of(args)
-    parts = parts_with_meshes(library, missing=args.missing)
-    stored = store_parts(parts, jobs=args.jobs)
-    for path in tqdm(stored, total=len(parts), unit="part", file=sys.stderr):
-        tqdm.write(str(path))
+    parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
+    for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
+        print(path)
     return 0
 
 
-def _print_report(report: FitReport) -> None:
+def _report_text(report: FitReport) -> str:
     rows = [_row(each.link, each.fit, each.same_as) for each in report.links]
     if report.mean is not None:
         seconds = sum(each.fit.seconds for each in report.links)
-        rows.append(("mean", "", "", *_figures(report.mean), seconds))
-    _print_table(rows)
-    for finding in report.findings:
-        print(f"{finding.severity} {finding.code} at {finding.where}: {finding.why}")
+        rows.append(("mean", "", "", *_quality_cells(report.mean), seconds))
+    findings = [
+        f"{finding.severity} {finding.code} at {finding.where}: {finding.why}"
+        for finding in report.findings
+    ]
+    return "\n".join([_table(rows), *findings])
 
 
-def _print_agreement(primitives: Agreement, hulls: Agreement, n: int) -> None:
+def _agreement_text(primitives: Agreement, hulls: Agreement, n: int) -> str:
     from tabulate import tabulate
 
     rows = [
-        (name, found.accuracy, found.precision, found.recall)
-        for name, found in (("primitives", primitives), ("convex hulls of meshes", hulls))
+        (name, result.accuracy, result.precision, result.recall)
+        for name, result in (("primitives", primitives), ("convex hulls of meshes", hulls))
     ]
-    print(f"collisions in {n} random configurations, compared with the meshes' triangles:")
-    print(tabulate(rows, ("", "agree", "precision", "recall"), floatfmt=".3f"))
+    table = tabulate(rows, ("", "agree", "precision", "recall"), floatfmt=".3f")
+    return f"collisions in {n} random configurations, compared with the meshes' triangles:\n{table}"
 
 
-def _print_table(rows: list[tuple[object, ...]]) -> None:
+def _table(rows: list[tuple[object, ...]]) -> str:
     from tabulate import tabulate
 
-    formats = ("", "", "", ".3f", ".3f", ".2f", ".1f", ".1f", ".1f", ".1f", ".1f", ".1f")
-    print(tabulate(rows, HEADERS, floatfmt=formats))
+    return tabulate(rows, list(COLUMNS), floatfmt=tuple(COLUMNS.values()))
 
 
 def _row(link: str, fit: LinkFit, same_as: str | None = None) -> tuple[object, ...]:
     kinds = Counter(type(shape.geometry).__name__.lower() for shape in fit.primitives)
     named = ", ".join(f"{n} {kind}" if n > 1 else kind for kind, n in sorted(kinds.items()))
     solid = f"as {same_as}" if same_as else fit.solid
-    return (link, named, solid, *_figures(fit.quality), fit.seconds)
+    return (link, named, solid, *_quality_cells(fit.quality), fit.seconds)
 
 
-def _figures(quality: Quality) -> tuple[float, ...]:
-    """Figures of a row; distances in millimetres."""
+def _quality_cells(quality: Quality) -> tuple[float, ...]:
+    """Return the cells of a fit's quality; distances in millimetres."""
     distances = (
         quality.protrusion_mean,
         quality.protrusion_p95,

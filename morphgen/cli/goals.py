@@ -1,123 +1,99 @@
-"""``morphgen goals``: goals of robots and splits; also those of ``split build`` and ``audit``."""
+"""``morphgen goals``: goal sets of robots and splits."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_jobs, add_json, add_library, add_task, library_of
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, option
+from morphgen.cli.progress import bar, status
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
-    from morphgen.benchmark.audit import Audit
     from morphgen.benchmark.split import Split
-    from morphgen.processes import Progress
     from morphgen.tasks.env_specs import GoalConfig
-    from morphgen.tasks.split_goals import GoalResult, SplitGoals
+    from morphgen.tasks.split_goals import GoalResult
 
 HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
 
 
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "goals",
-        help="make the goal sets of a split's robots, and prove that each goal can be reached",
-        description="Make the goals of reach and the starts of push of every robot of a split, or "
-        "of one robot, and keep them in the cache; interrupted, it goes on where it was. Exit code "
-        "1 if a robot has too few, or (with --certify) a goal is not proven by its configuration.",
-        epilog="examples: morphgen goals extrapolation/arms/reach --certify; "
-        "morphgen goals arm=ur5 ee=plane --task reach",
-    )
-    parser.add_argument(
+@command(
+    "goals",
+    "sample the goal sets of robots, and certify that each goal can be reached",
+    option(
         "words",
         nargs="+",
         metavar="SPLIT",
-        help="a split's file, name or built folder; with --task: words of compose, a bundle's "
-        "folder or a URDF",
-    )
-    add_task(parser, "--task", "task of one robot: ")
-    parser.add_argument("--obstacles", action="store_true", help="with --task: among obstacles")
-    parser.add_argument("--seed", type=int, default=0, help="of all goals (default: 0)")
-    parser.add_argument(
-        "--certify", action="store_true", help="test every goal with the configuration it is from"
-    )
-    add_jobs(parser)
-    add_library(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Make, print the table and what failed."""
+        help=f"name of a split, its file or built folder; with --task, a robot: {opt.ROBOT_HELP}",
+    ),
+    option("--task", choices=TASKS, metavar="TASK", help=f"one robot: its task, {opt.TASK_NAMES}"),
+    opt.OBSTACLES,
+    opt.SEED,
+    flag("--certify", "verify every goal with the configuration that it was sampled from"),
+    opt.JOBS,
+    opt.LIBRARY,
+    opt.JSON,
+    details="Goals of reach and starts of push are kept in the cache. Run the command again to "
+    "continue an interrupted one. The exit code is 1 if a robot has too few goals, or if a goal "
+    "fails --certify.",
+    examples=("goals extrapolation/arms/reach --certify", "goals arm=ur5 ee=plane --task reach"),
+)
+def goals(args: argparse.Namespace) -> int:
+    """Sample goal sets and print a table with the failures."""
     from morphgen.errors import BenchmarkError
+    from morphgen.tasks.env_specs import GoalConfig
 
     if args.task is None:
         if args.obstacles:
-            raise BenchmarkError("--obstacles goes with --task; a split says which robots have any")
+            raise BenchmarkError(
+                "--obstacles goes with --task; a split says which robots have obstacles"
+            )
         if len(args.words) > 1:
             raise BenchmarkError(
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
-    config = goal_config(args.seed)
-    made = _of_robot(args, config) if args.task else _of_split(args, config)
-    failed = [one for one in made if one.goals is None or one.certificate_errors]
-    if args.json:
-        print(json.dumps(_data(made, config.seed) | {"passed": not failed}))
+        split, _ = read_split_or_folder(args.words[0])
+        made = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
     else:
-        print(_text(made, config.seed))
-    return int(bool(failed))
+        made = [_robot_goals(args, GoalConfig(args.seed))]
+    passed = all(result.goals is not None and not result.certificate_errors for result in made)
+    data = _data(made, args.seed) | {"passed": passed}
+    opt.print_result(args, data, lambda: _text(made, args.seed))
+    return int(not passed)
 
 
-def goal_config(seed: int) -> GoalConfig:
-    """Return how the goals of a benchmark are made, with a seed.
-
-    Raises:
-        BenchmarkError: If the seed is none.
-    """
-    from morphgen.errors import BenchmarkError
-    from morphgen.tasks.env_specs import GoalConfig
-
-    if seed < 0:
-        raise BenchmarkError(f"goal seed {seed}: expected 0 or more")
-    return GoalConfig(seed)
-
-
-def _of_robot(args: argparse.Namespace, config: GoalConfig) -> list[GoalResult]:
+def _robot_goals(args: argparse.Namespace, config: GoalConfig) -> GoalResult:
     from morphgen.tasks.env_specs import load_robot
     from morphgen.tasks.split_goals import sample_robot_goals
 
-    robot = load_robot(" ".join(args.words), library=args.library)
-    made = sample_robot_goals(
-        robot, args.task, config, obstacles=args.obstacles, certified=args.certify
-    )
-    return [made]
-
-
-def _of_split(args: argparse.Namespace, config: GoalConfig) -> list[GoalResult]:
-    from morphgen.tasks.split_goals import sample_split_goals
-
-    split, _ = read_split_or_built(args.words[0])
-    with bar(args) as progress:
-        return sample_split_goals(
-            split,
-            library_of(args),
-            config,
-            jobs=args.jobs,
-            certified=args.certify,
-            progress=progress,
+    words = " ".join(args.words)
+    with status(args, f"sampling goals of {args.task} for {words}"):
+        robot = load_robot(words, library=args.library)
+        return sample_robot_goals(
+            robot, args.task, config, obstacles=args.obstacles, certified=args.certify
         )
 
 
-def read_split_or_built(name: str) -> tuple[Split, Path | None]:
-    """A split, by its name, file, or the folder where it is built; and that folder.
+def make_goals(
+    args: argparse.Namespace, split: Split, config: GoalConfig, *, certify: bool = False
+) -> list[GoalResult]:
+    """Sample the goal sets of a split's robots, or read them from the cache."""
+    from morphgen.tasks.split_goals import sample_split_goals
+
+    with bar(args, "sampling goals") as update:
+        return sample_split_goals(
+            split, opt.library_of(args), config, jobs=args.jobs, certified=certify, progress=update
+        )
+
+
+def read_split_or_folder(name: str) -> tuple[Split, Path | None]:
+    """Return a split by its name, its file or its built folder; and that folder.
 
     Raises:
-        BenchmarkError: If there is none.
+        BenchmarkError: If there is no such split.
     """
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder import SPLIT_FILE, require_split_folder
@@ -129,151 +105,56 @@ def read_split_or_built(name: str) -> tuple[Split, Path | None]:
     return read_split(folder / SPLIT_FILE), folder
 
 
-def require_room_for(home: Path, wanted: bool) -> None:
-    """Require that a build without goals does not leave those of another one in its folder.
-
-    Raises:
-        BenchmarkError: If it would.
-    """
-    from morphgen.errors import BenchmarkError
-
-    if wanted or not home.is_dir():
-        return
-    from morphgen.tasks.split_goals import GOALS, has_goals
-
-    if has_goals(home):
-        raise BenchmarkError(
-            f"{home} was built with goals: say --goals, delete {home / GOALS}, or name another "
-            "folder"
-        )
-
-
-def ready_goals(args: argparse.Namespace, split: Split) -> list[GoalResult]:
-    """The goal sets of a split that is to be built.
-
-    Raises:
-        BenchmarkError: If a robot has none.
-    """
-    from morphgen.tasks.split_goals import require_goal_sets, sample_split_goals
-
-    config = goal_config(args.goal_seed or 0)
-    with bar(args, "goals") as progress:
-        made = sample_split_goals(
-            split, library_of(args), config, jobs=args.jobs, progress=progress
-        )
-    require_goal_sets(made)
-    return made
-
-
-def ship_goals(args: argparse.Namespace, home: Path, made: Sequence[GoalResult]) -> None:
-    """Write the goal sets of a split into the folder where it is built."""
-    from morphgen.tasks.split_goals import write_goals
-
-    write_goals(home, made, goal_config(args.goal_seed or 0))
-
-
-def audit_with_goals(
-    args: argparse.Namespace, done: Audit, split: Split, folder: Path | None
-) -> tuple[Audit, SplitGoals | None]:
-    """An audit with what is found of goal sets, and these, if there are any to look at."""
-    accepts = any(code.startswith("goals-") for code in split.accepted)
-    if folder is None and not args.goals and not accepts:
-        return done, None
-    from morphgen.tasks.goal_audit import audit_goals, with_goal_findings
-
-    goals = _goals_to_audit(args, split, folder)
-    if goals is None:
-        return with_goal_findings(done, split, None), None
-    with bar(args, "goals") as progress:
-        findings = audit_goals(split, goals, library_of(args), jobs=args.jobs, progress=progress)
-    return with_goal_findings(done, split, findings), goals
-
-
-def _goals_to_audit(
-    args: argparse.Namespace, split: Split, folder: Path | None
-) -> SplitGoals | None:
-    """Those that are shipped, else, if asked for, those that tasks would have."""
-    from dataclasses import replace
-
-    from morphgen.tasks.split_goals import (
-        SplitGoals,
-        has_goals,
-        read_split_goals,
-        sample_split_goals,
-    )
-
-    if folder is not None and has_goals(folder):
-        found = read_split_goals(folder)
-        seed = found.config.seed if args.goal_seed is None else goal_config(args.goal_seed).seed
-        return replace(found, config=replace(found.config, seed=seed))
-    if not args.goals:
-        return None
-    config = goal_config(args.goal_seed or 0)
-    with bar(args, "goals") as progress:
-        made = sample_split_goals(
-            split, library_of(args), config, jobs=args.jobs, progress=progress
-        )
-    return SplitGoals.from_results(made, config)
-
-
-@contextmanager
-def bar(args: argparse.Namespace, title: str | None = None) -> Iterator[Progress]:
-    """A bar on stderr, gone when done."""
-    from tqdm import tqdm
-
-    hidden = args.json or None
-    with tqdm(desc=title, unit="robot", file=sys.stderr, disable=hidden, leave=False) as shown:
-
-        def show(done: int, total: int) -> None:
-            shown.total = total
-            shown.update(done - shown.n)
-
-        yield show
-
-
 def _text(made: Sequence[GoalResult], seed: int) -> str:
     from tabulate import tabulate
 
-    lines = [tabulate([_row(one) for one in made], HEADERS, disable_numparse=True)]
-    for one in made:
-        who = f"{one.side} robot {one.robot}" if one.side else f"robot {one.robot}"
-        if one.goals is None:
-            lines.append(f"{who}: {one.error}")
-        elif one.certificate_errors:
+    lines = [tabulate([_row(result) for result in made], HEADERS, disable_numparse=True)]
+    for result in made:
+        robot = f"{result.side} robot {result.robot}" if result.side else f"robot {result.robot}"
+        if result.goals is None:
+            lines.append(f"{robot}: {result.error}")
+        elif result.certificate_errors:
             more = (
-                f" (and {len(one.certificate_errors) - 1} more)"
-                if one.certificate_errors[1:]
+                f" (and {len(result.certificate_errors) - 1} more)"
+                if result.certificate_errors[1:]
                 else ""
             )
-            lines.append(f"{who}: {one.certificate_errors[0]}{more}")
-    ready = sum(one.goals is not None for one in made)
-    lines.append(f"{ready} of {len(made)} goal sets are there, seed {seed}")
-    return "\n".join(lines)
+            lines.append(f"{robot}: {result.certificate_errors[0]}{more}")
+    complete = sum(result.goals is not None for result in made)
+    return "\n".join([*lines, f"{complete} of {len(made)} goal sets are complete, seed {seed}"])
 
 
-def _row(one: GoalResult) -> tuple[str, ...]:
-    certified = "" if one.certificate_errors is None else "NO" if one.certificate_errors else "yes"
-    rate = "" if one.acceptance is None else f"{one.acceptance:.3g}"
-    count = "none" if one.goals is None else str(len(one.goals.q))
-    boxes = str(len(one.goals.obstacles)) if one.goals else "yes" if one.obstacles else "0"
-    return (one.robot, one.side or "", one.task, count, rate, boxes, certified)
+def _row(result: GoalResult) -> tuple[str, ...]:
+    goals, certificate_errors = result.goals, result.certificate_errors
+    certified = "" if certificate_errors is None else "NO" if certificate_errors else "yes"
+    rate = "" if result.acceptance is None else f"{result.acceptance:.3g}"
+    count = "none" if goals is None else str(len(goals.q))
+    boxes = str(len(goals.obstacles)) if goals else "yes" if result.obstacles else "0"
+    return (result.robot, result.side or "", result.task, count, rate, boxes, certified)
 
 
 def _data(made: Sequence[GoalResult], seed: int) -> dict[str, object]:
     from morphgen.tasks.split_goals import goal_record
 
     sets = [
-        goal_record(one)
+        goal_record(result)
         | {
-            "certified": None if one.certificate_errors is None else not one.certificate_errors,
-            "unproven": list(one.certificate_errors or ()),
+            "certified": None
+            if result.certificate_errors is None
+            else not result.certificate_errors,
+            "unproven": list(result.certificate_errors or ()),
         }
-        for one in made
-        if one.goals
+        for result in made
+        if result.goals
     ]
     failures = [
-        {"robot": one.robot, "side": one.side, "task": one.task, "why": one.error}
-        for one in made
-        if one.goals is None
+        {
+            "robot": result.robot,
+            "side": result.side,
+            "task": result.task,
+            "why": result.error,
+        }
+        for result in made
+        if result.goals is None
     ]
     return {"seed": seed, "sets": sets, "failures": failures}

@@ -1,4 +1,4 @@
-"""``morphgen grammar``: check, count and enumerate grammars."""
+"""``morphgen grammar``: list, check, count, enumerate and print grammars."""
 
 from __future__ import annotations
 
@@ -6,94 +6,95 @@ import argparse
 import itertools
 import json
 import math
-from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_json, add_library, library_of, whole_number
+from morphgen.cli import options as opt
+from morphgen.cli.command import Command, command, number, option
 
-if TYPE_CHECKING:
-    from morphgen.grammar.grammar_file import Grammar
-
-
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command and its own."""
-    parser = commands.add_parser("grammar", help="list, check, count, enumerate or print grammars")
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="name the grammars that come with morphgen")
-    add_json(listing)
-    listing.set_defaults(run=run_list)
-    for name, run, summary in (
-        ("check", run_check, "say what is wrong; exit code 1 if anything is"),
-        ("count", run_count, "how many structures; which parameters are drawn"),
-        ("enumerate", run_enumerate, "every structure, with typical values"),
-        ("print", run_print, "the grammar with its includes as one text"),
-    ):
-        action = actions.add_parser(name, help=summary, description=summary)
-        action.add_argument("grammar", help="a grammar's name or file")
-        if name == "enumerate":
-            action.add_argument(
-                "--limit", type=whole_number(0), default=50, metavar="N", help="default: 50"
-            )
-        add_library(action)
-        add_json(action)
-        action.set_defaults(run=run)
+GRAMMAR = option("grammar", help="name of a grammar (see: morphgen grammar list), or its file")
 
 
-def run_list(args: argparse.Namespace) -> int:
-    """Print the names and what their robots are."""
+@command("list", "list the grammars that come with morphgen", opt.JSON)
+def list_grammars(args: argparse.Namespace) -> int:
+    """Print the names and summaries."""
     from tabulate import tabulate
 
     from morphgen.grammar.grammar_file import grammar_names, grammar_summary
 
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
-    print(json.dumps(rows) if args.json else tabulate(rows, headers="keys"))
+    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
     return 0
 
 
-def run_check(args: argparse.Namespace) -> int:
+@command(
+    "check",
+    "check a grammar for faults",
+    GRAMMAR,
+    opt.LIBRARY,
+    opt.JSON,
+    details="The exit code is 1 if it has any.",
+)
+def check(args: argparse.Namespace) -> int:
     """Print every fault."""
     from morphgen.grammar.analysis import check_grammar
 
-    grammar = _load(args)
-    found = check_grammar(grammar, library_of(args))
-    if args.json:
-        print(json.dumps(found))
-    else:
-        print("\n".join(found) or f"{grammar.name}: sound")
+    library = opt.library_of(args)
+    grammar = opt.load_grammar_named(args.grammar, library)
+    found = check_grammar(grammar, library)
+    opt.print_result(args, found, lambda: "\n".join(found) or f"{grammar.name}: sound")
     return int(bool(found))
 
 
-def run_count(args: argparse.Namespace) -> int:
-    """Print the number of structures and what is drawn."""
+@command(
+    "count",
+    "count the structures of a grammar, and list the values that are sampled",
+    GRAMMAR,
+    opt.LIBRARY,
+    opt.JSON,
+)
+def count(args: argparse.Namespace) -> int:
+    """Print the number of structures and the sampled values."""
     from morphgen.grammar.analysis import variables
     from morphgen.grammar.limits import COUNT_DIGITS, MAX_COUNT
     from morphgen.grammar.structures import count_structures
 
-    grammar = _load(args)
-    structures = count_structures(grammar)
-    finite = structures != math.inf
-    drawn = variables(grammar)
-    if args.json:
-        number = int(structures) if structures <= MAX_COUNT else None
-        names = [
+    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args))
+    structures, sampled = count_structures(grammar), variables(grammar)
+    data = {
+        "structures": int(structures) if structures <= MAX_COUNT else None,
+        "finite": structures != math.inf,
+        "variables": [
             {"where": v.location, "draw": v.text, "continuous": v.distribution.is_continuous}
-            for v in drawn
-        ]
-        print(json.dumps({"structures": number, "finite": finite, "variables": names}))
-        return 0
-    text = f"{structures}" if structures <= MAX_COUNT else f"more than 10^{COUNT_DIGITS}"
-    text = text if finite else "infinitely many"
-    print(f"{grammar.name}: {text} structures, {len(drawn)} values drawn")
-    for variable in drawn:
-        kind = "continuous" if variable.distribution.is_continuous else "discrete"
-        print(f"  {kind:10}  {variable.location} = {variable.text}")
+            for v in sampled
+        ],
+    }
+
+    def text() -> str:
+        number = f"{structures}" if structures <= MAX_COUNT else f"more than 10^{COUNT_DIGITS}"
+        number = "infinitely many" if structures == math.inf else number
+        lines = [f"{grammar.name}: {number} structures, {len(sampled)} values drawn"]
+        for variable in sampled:
+            kind = "continuous" if variable.distribution.is_continuous else "discrete"
+            lines.append(f"  {kind:10}  {variable.location} = {variable.text}")
+        return "\n".join(lines)
+
+    opt.print_result(args, data, text)
     return 0
 
 
-def run_enumerate(args: argparse.Namespace) -> int:
-    """Print a derivation a line."""
+@command(
+    "enumerate",
+    "print every structure of a grammar, with typical values",
+    GRAMMAR,
+    number("--limit", "largest number of structures", default=50, least=0),
+    opt.LIBRARY,
+    opt.JSON,
+)
+def enumerate_structures(args: argparse.Namespace) -> int:
+    """Print a derivation per line."""
     from morphgen.grammar.structures import enumerate_structures
 
-    structures = enumerate_structures(_load(args), library_of(args))
+    library = opt.library_of(args)
+    structures = enumerate_structures(opt.load_grammar_named(args.grammar, library), library)
     texts = map(str, itertools.islice(structures, args.limit))
     if args.json:
         print(json.dumps(list(texts)))
@@ -103,17 +104,18 @@ def run_enumerate(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_print(args: argparse.Namespace) -> int:
-    """Print the grammar."""
+@command("print", "print a grammar and its includes as one text", GRAMMAR, opt.LIBRARY, opt.JSON)
+def print_grammar(args: argparse.Namespace) -> int:
+    """Print the text of the grammar."""
     from morphgen.grammar.grammar_file import grammar_text
 
-    text = grammar_text(_load(args))
-    print(json.dumps(text) if args.json else text, end="" if not args.json else "\n")
+    text = grammar_text(opt.load_grammar_named(args.grammar, opt.library_of(args)))
+    opt.print_result(args, text, lambda: text.removesuffix("\n"))
     return 0
 
 
-def _load(args: argparse.Namespace) -> Grammar:
-    from morphgen.grammar.grammar_file import find_grammar, load_grammar
-
-    folders = library_of(args).folders
-    return load_grammar(find_grammar(args.grammar, folders), folders)
+grammar = Command(
+    "grammar",
+    "list, check, count, enumerate or print grammars",
+    commands=(list_grammars, check, count, enumerate_structures, print_grammar),
+)

@@ -1,49 +1,22 @@
-"""``morphgen play``: run episodes of a robot, print results, and render a video."""
+"""``morphgen play`` and ``morphgen speed``: run one robot at a task, and measure how fast it is."""
 
 from __future__ import annotations
 
 import argparse
+from collections import deque
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library, add_robot, add_sim, add_task
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, number, option, path_option, positive
+from morphgen.cli.progress import status
 from morphgen.rl.baselines import BASELINES
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Episode
 
-
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "play",
-        help="run a controller on one robot, and render a video",
-        description="Run episodes of one robot; print a line for each, and render a video.",
-        epilog="examples: morphgen play reach arm=ur5 ee=stick --policy ik --out ik.mp4; "
-        "morphgen play push prims --policy scripted --episodes 3 --sim mujoco",
-    )
-    add_task(parser, "task")
-    add_robot(parser)
-    parser.add_argument(
-        "--policy",
-        type=_policy,
-        default="random",
-        metavar="POLICY",
-        help="the controller: zero (no action), random, ik (inverse kinematics, for reach), "
-        "scripted (for push), or a checkpoint or a run's folder (default: random)",
-    )
-    parser.add_argument("--out", metavar="FILE", type=Path, help="the video: .mp4 or .gif")
-    add_sim(parser)
-    parser.add_argument("--episodes", type=int, default=1, help="default: 1")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: 0)")
-    parser.add_argument("--obstacles", action="store_true", help="among obstacles")
-    parser.add_argument(
-        "--kind",
-        choices=["continuous", "discrete"],
-        help="kind of actions (default: that of the checkpoint, else continuous)",
-    )
-    add_library(parser)
-    parser.set_defaults(run=run)
+OBSTACLES = flag("--obstacles", "place the robot among obstacles")
 
 
 def _policy(text: str) -> str:
@@ -54,59 +27,151 @@ def _policy(text: str) -> str:
     return text
 
 
-def run(args: argparse.Namespace) -> int:
+@command(
+    "play",
+    "run a controller on one robot, and render a video",
+    opt.TASK,
+    opt.ROBOT,
+    option(
+        "--policy",
+        type=_policy,
+        default="random",
+        metavar="POLICY",
+        help="the controller: zero (no action), random, ik (inverse kinematics, for reach), "
+        "scripted (for push), or a checkpoint or run folder",
+    ),
+    path_option("--out", "FILE", "the video: .mp4 or .gif"),
+    opt.sim_option(),
+    number("--episodes", "number of episodes", default=1),
+    opt.SEED,
+    OBSTACLES,
+    option(
+        "--kind",
+        choices=["continuous", "discrete"],
+        help="kind of actions (default: that of the checkpoint, else continuous)",
+    ),
+    opt.LIBRARY,
+    details="The result of each episode is printed.",
+    examples=(
+        "play reach arm=ur5 ee=stick --policy ik --out ik.mp4",
+        "play push prims --policy scripted --episodes 3 --sim mujoco",
+    ),
+)
+def play(args: argparse.Namespace) -> int:
     """Run the episodes, print a line for each, and write the video."""
-    from collections import deque
-
-    from morphgen.errors import TaskError
     from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
     from morphgen.tasks.gym_env import TaskEnv
     from morphgen.tasks.registry import TASKS
     from morphgen.tasks.renderer import require_video_path, write_video
 
-    if args.episodes < 1 or args.seed < 0:
-        raise TaskError(
-            f"--episodes {args.episodes} --seed {args.seed}: at least one, and no negative seed"
-        )
     require_policy(args.policy, args.task)
     if args.out is not None:
         require_video_path(args.out)
     interface = interface_of(args.policy)
-    env = TaskEnv(
-        args.task,
-        " ".join(args.words),
-        sim=args.sim,
-        obstacles=args.obstacles,
-        kind=args.kind or interface.kind,
-        observe=interface.channels,
-        max_links=interface.max_links,
-        library=args.library,
-        render_mode=None if args.out is None else "rgb_array",
-    )
+    robot = " ".join(args.words)
+    with status(args, f"preparing {robot} and its goals"):
+        env = TaskEnv(
+            args.task,
+            robot,
+            sim=args.sim,
+            obstacles=args.obstacles,
+            kind=args.kind or interface.kind,
+            observe=interface.channels,
+            max_links=interface.max_links,
+            library=args.library,
+            render_mode=None if args.out is None else "rgb_array",
+        )
+    number, target = 0, TASKS[args.task].target
+
+    def report(episode: Episode) -> None:
+        nonlocal number
+        number += 1
+        print(
+            f"episode {number}: {'success' if episode.success else 'failure'}, "
+            f"{episode.distance:.3f} m from the {target}, score {episode.score:.2f}, "
+            f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}",
+            flush=True,
+        )
+
     try:
-        acting = make_controller(args.policy, env, args.seed)
-        frames = play(env, acting, args.episodes, args.seed, _Report(TASKS[args.task].target))
-        if args.out is None:
-            deque(frames, maxlen=0)
-        else:
-            write_video(frames, args.out, FPS)
+        controller = make_controller(args.policy, env, args.seed)
+        frames = play(env, controller, args.episodes, args.seed, report)
+        with status(args, f"running {args.episodes} episodes"):
+            if args.out is None:
+                deque(frames, maxlen=0)
+            else:
+                write_video(frames, args.out, FPS)
+        if args.out is not None:
             print(args.out)
     finally:
         env.close()
     return 0
 
 
-class _Report:
-    """Prints a line per episode."""
+@command(
+    "speed",
+    "measure how fast a task runs on this machine, and where the time goes",
+    opt.TASK,
+    opt.ROBOT,
+    number("--envs", "number of environments", default=64),
+    opt.sim_option(),
+    opt.WORKERS,
+    OBSTACLES,
+    option(
+        "--seconds",
+        type=positive,
+        default=5.0,
+        metavar="S",
+        help="least duration of the measurement",
+    ),
+    opt.LIBRARY,
+    opt.JSON,
+    details="Environments of one robot are stepped with random actions. Environment steps are at "
+    "50 Hz, physics steps at 200 Hz. The share of the simulator is its own step alone, if it runs "
+    "in one process or thread.",
+    examples=(
+        "speed reach arm=ur5 ee=plane --envs 128 --sim mujoco",
+        "speed push arm=panda ee=panda_hand --workers 2",
+    ),
+)
+def speed(args: argparse.Namespace) -> int:
+    """Measure the speed and print it."""
+    from tabulate import tabulate
 
-    def __init__(self, target: str) -> None:
-        self._number, self._target = 0, target
+    from morphgen.tasks.make import make_batch
+    from morphgen.tasks.registry import SIMULATORS
+    from morphgen.tasks.speed import measure_speed
 
-    def __call__(self, episode: Episode) -> None:
-        self._number += 1
-        print(
-            f"episode {self._number}: {'success' if episode.success else 'failure'}, "
-            f"{episode.distance:.3f} m from the {self._target}, score {episode.score:.2f}, "
-            f"{episode.seconds:.2f} s{', the simulation became unstable' * episode.unstable}",
-            flush=True,
+    robot = " ".join(args.words)
+    with status(args, f"preparing {robot} and its goals"):
+        batch = make_batch(
+            args.task,
+            [robot],
+            args.envs,
+            sim=args.sim,
+            workers=args.workers,
+            obstacles=args.obstacles,
+            max_links=None,
+            library=args.library,
         )
+    try:
+        module, step = SIMULATORS[args.sim].native_step
+        own = [(import_module(module), step)] if args.workers == 1 else []
+        with status(args, "measuring"):
+            result = measure_speed(batch, args.seconds, own=own)
+    finally:
+        batch.close()
+
+    def text() -> str:
+        shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
+        return (
+            f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {args.sim}, "
+            f"{args.workers} worker(s)\n"
+            f"environment steps per second: {result.steps_per_second:,.0f}\n"
+            f"physics steps per second:     {result.substeps_per_second:,.0f}\n"
+            f"{tabulate(shares)}"
+        )
+
+    data = {"steps_per_second": result.steps_per_second, "shares": result.shares}
+    opt.print_result(args, data, text)
+    return 0

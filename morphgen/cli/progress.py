@@ -1,12 +1,14 @@
-"""How runs that train, and evaluations, are going, as they go."""
+"""Progress of commands on stderr: bars on a terminal, a few lines elsewhere."""
 
 from __future__ import annotations
 
+import argparse
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -15,60 +17,149 @@ if TYPE_CHECKING:
     from morphgen.rl.metrics import UpdateMetrics
     from morphgen.rl.training import ShowMetrics, Subrun
 
-MINUTE = 60.0
-"""Seconds between lines of an evaluation."""
+T = TypeVar("T")
+
+LINE_INTERVAL = 60.0
+"""Time between two lines about an evaluation where there is no terminal [s]."""
+REDRAW_INTERVAL = 1.0
+"""Time after which a bar appears, and between its updates if nothing else happens [s]."""
+TRAINING_LINES = 20
+"""Number of lines about a training where there is no terminal."""
+
+
+class Update(Protocol):
+    """Sets a bar to the number of finished items, and their number if it was unknown."""
+
+    def __call__(self, done: float, total: int | None = None) -> None:
+        """Redraw the bar."""
 
 
 @contextmanager
-def shown(again: str = "with --resume") -> Iterator[Shower]:
-    """Bars on stderr while there is one to look at, else some lines.
+def bar(
+    args: argparse.Namespace,
+    title: str,
+    unit: str = "robot",
+    total: int | None = None,
+    layout: str | None = None,
+) -> Iterator[Update]:
+    """Yield a function that updates a bar, which disappears at the end.
+
+    Nothing is shown without a terminal or with ``--json``.
 
     Args:
-        again: What to say after Ctrl-C.
+        args: Arguments of the command.
+        title: What the command does, such as ``reading``.
+        unit: Name of an item.
+        total: Number of items; None if the updates tell it.
+        layout: Format of the bar, as for tqdm.
     """
-    shower = Shower()
+    from tqdm import tqdm
+
+    hidden = getattr(args, "json", False) or None  # None: shown on a terminal only
+    with tqdm(
+        desc=title,
+        unit=unit,
+        total=total,
+        bar_format=layout,
+        file=sys.stderr,
+        disable=hidden,
+        delay=REDRAW_INTERVAL,
+        leave=False,
+    ) as shown:
+
+        def update(done: float, total: int | None = None) -> None:
+            if total is not None:
+                shown.total = total
+            shown.update(done - shown.n)
+
+        with _redrawn(shown):
+            yield update
+
+
+@contextmanager
+def _redrawn(shown: tqdm[NoReturn]) -> Iterator[None]:
+    """Redraw a bar at regular intervals, so that its clock runs while one item takes long."""
+    if shown.disable:
+        yield
+        return
+    finished = threading.Event()
+
+    def redraw() -> None:
+        while not finished.wait(REDRAW_INTERVAL):
+            shown.refresh()
+
+    thread = threading.Thread(target=redraw, daemon=True)
+    thread.start()
     try:
-        yield shower
+        yield
+    finally:
+        finished.set()
+        thread.join()
+
+
+def track(
+    items: Iterable[T], args: argparse.Namespace, title: str, unit: str, total: int
+) -> Iterator[T]:
+    """Yield the items, and show in a bar how many of them are finished."""
+    with bar(args, title, unit, total) as update:
+        for done, item in enumerate(items):
+            update(done)
+            yield item
+
+
+@contextmanager
+def status(args: argparse.Namespace, text: str) -> Iterator[None]:
+    """Show on a terminal what the command does and for how long, until the work is done."""
+    with bar(args, text, layout="{desc} [{elapsed}]"):
+        yield
+
+
+@contextmanager
+def training_progress(how_to_resume: str = "with --resume") -> Iterator[TrainingProgress]:
+    """Yield a display of trainings and evaluations; Ctrl-C says how to resume them."""
+    display = TrainingProgress()
+    try:
+        yield display
     except KeyboardInterrupt as interrupt:
-        text = f"it goes on from its last checkpoint, if it has one, {again}"
+        text = f"it continues from its last checkpoint, if there is one, {how_to_resume}"
         raise KeyboardInterrupt(text) from interrupt
     finally:
-        shower.close()
+        display.close()
 
 
-class Shower:
-    """Shows how a run or an evaluation goes."""
+class TrainingProgress:
+    """Shows the progress of trainings and evaluations, one after the other."""
 
     def __init__(self) -> None:
         self._bar: tqdm[NoReturn] | None = None
 
-    def __call__(self, part: Subrun) -> ShowMetrics:
-        """Begin with a part."""
-        self.close()
-        name = part.config.source.member or part.config.source.name
-        if not sys.stderr.isatty():
-            return lambda report, updates: _print(name, report, updates)
+    def __call__(self, subrun: Subrun) -> ShowMetrics:
+        """Begin with a subrun; return the function that shows its metrics."""
         from tqdm import tqdm
 
-        total = part.config.num_updates * part.config.ppo.num_steps * part.config.num_envs
-        self._bar = tqdm(
-            total=total,
+        self.close()
+        name = subrun.config.source.member or subrun.config.source.name
+        if not sys.stderr.isatty():
+            return lambda report, num_updates: _print_update(name, report, num_updates)
+        total = subrun.config.num_updates * subrun.config.ppo.num_steps * subrun.config.num_envs
+        shown = self._bar = tqdm(
             desc=name,
+            total=total,
             unit="step",
             unit_scale=True,
             file=sys.stderr,
             dynamic_ncols=True,
         )
-        return self._show
+        return lambda report, num_updates: _draw_update(shown, report)
 
-    def counting(self, name: str) -> Progress:
-        """Begin with an evaluation; on no terminal it is a line a minute."""
-        self.close()
-        if not sys.stderr.isatty():
-            return _Minutes(name)
+    def evaluation(self, name: str) -> Progress:
+        """Begin with an evaluation; return the function that shows how many episodes ended."""
         from tqdm import tqdm
 
-        bar = self._bar = tqdm(
+        self.close()
+        if not sys.stderr.isatty():
+            return _print_each_minute(name)
+        shown = self._bar = tqdm(
             desc=name,
             unit="episode",
             file=sys.stderr,
@@ -77,61 +168,61 @@ class Shower:
             bar_format="{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]",
         )
 
-        def told(done: float, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
+        def update(done: float, total: int) -> None:
+            shown.total = total
+            shown.update(done - shown.n)
 
-        return told
+        return update
 
     def close(self) -> None:
-        """Leave the bar as it is."""
+        """Finish the bar, if there is one."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
 
-    def _show(self, report: UpdateMetrics, updates: int) -> None:
-        assert self._bar is not None
-        if self._bar.n == 0:
-            self._bar.initial = report.transitions - report.transitions // report.update
-            self._bar.n = self._bar.initial
-        self._bar.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
-        self._bar.update(report.transitions - self._bar.n)
-        if report.unstable:
-            self._bar.write(_unstable(self._bar.desc, report), file=sys.stderr)
 
-
-class _Minutes:
-    """Says how far an evaluation is, once a minute."""
-
-    def __init__(self, name: str) -> None:
-        self._name, self._last = name, time.monotonic()
-
-    def __call__(self, done: float, total: int) -> None:
-        """Be told how many episodes are over."""
-        if time.monotonic() - self._last > MINUTE:
-            self._last = time.monotonic()
-            print(f"{self._name}: {done:.0f} of {total} episodes", file=sys.stderr, flush=True)
-
-
-def _print(name: str, report: UpdateMetrics, updates: int) -> None:
+def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics) -> None:
+    if shown.n == 0:  # a resumed run: the bar begins where the run was interrupted
+        shown.initial = report.transitions - report.transitions // report.update
+        shown.n = shown.initial
+    shown.set_postfix(score=f"{report.score:.2f}", success=_success(report), refresh=False)
+    shown.update(report.transitions - shown.n)
     if report.unstable:
-        print(_unstable(name, report), file=sys.stderr, flush=True)
-    if report.update % max(updates // 20, 1) and report.update < updates:
+        shown.write(_divergence(shown.desc, report), file=sys.stderr)
+
+
+def _print_update(name: str, report: UpdateMetrics, num_updates: int) -> None:
+    if report.unstable:
+        print(_divergence(name, report), file=sys.stderr, flush=True)
+    if report.update % max(num_updates // TRAINING_LINES, 1) and report.update < num_updates:
         return
-    left = (updates - report.update) * report.transitions / report.update / report.steps_per_second
+    updates_left = num_updates - report.update
+    seconds_left = updates_left * report.transitions / report.update / report.steps_per_second
     print(
-        f"{name}: update {report.update} of {updates}, {report.transitions:,} steps, "
+        f"{name}: update {report.update} of {num_updates}, {report.transitions:,} steps, "
         f"score {report.score:.2f}, success {_success(report)}, "
-        f"{report.steps_per_second:,.0f} steps/s, {left / 60:.1f} min left",
+        f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left",
         file=sys.stderr,
         flush=True,
     )
 
 
-def _unstable(name: str, report: UpdateMetrics) -> str:
+def _print_each_minute(name: str) -> Progress:
+    last = time.monotonic()
+
+    def update(done: float, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > LINE_INTERVAL:
+            last = time.monotonic()
+            print(f"{name}: {done:.0f} of {total} episodes", file=sys.stderr, flush=True)
+
+    return update
+
+
+def _divergence(name: str, report: UpdateMetrics) -> str:
     return (
         f"{name}: update {report.update}: {report.unstable} of {report.episodes} episodes ended "
-        "because their simulation became unstable"
+        "because their simulation diverged"
     )
 
 

@@ -1,81 +1,56 @@
-"""``morphgen sample``: robots from a grammar."""
+"""``morphgen sample``, ``derive`` and ``mutate``: robots from grammars, and their derivations."""
 
 from __future__ import annotations
 
 import argparse
-import sys
+import tempfile
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from morphgen.cli.options import (
-    Subparsers,
-    add_jobs,
-    add_json,
-    add_library,
-    library_of,
-    whole_number,
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, number, option, path_option, repeated
+from morphgen.cli.grammar import GRAMMAR
+from morphgen.cli.progress import bar, track
+
+if TYPE_CHECKING:
+    from morphgen.grammar.derivation import Derivation
+    from morphgen.grammar.library import Library
+
+NUMBER = number("-n", "number of robots", default=10)
+
+
+@command(
+    "sample",
+    "sample robots from a grammar",
+    GRAMMAR,
+    NUMBER,
+    opt.SEED,
+    path_option("--out", "DIR", "output folder (default: robots/GRAMMAR)"),
+    repeated("--where", "keep only robots such as 'reach > 0.4 and dof >= 5'", metavar="CONDITION"),
+    flag("--light", "write the URDF and the derivation only"),
+    opt.NO_PICTURE,
+    opt.JOBS,
+    opt.RAY,
+    opt.LIBRARY,
+    opt.JSON,
+    details="The same seed gives the same robots, with any number of jobs. Run the command again "
+    "to continue an interrupted one.",
+    examples=("sample chain -n 100 --jobs 4", "sample arm5 --where 'reach > 0.4'"),
 )
-
-
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "sample",
-        help="draw robots from a grammar",
-        description="Draw robots from a grammar into a folder. Interrupted, it goes on where it "
-        "was when run again; the same seed gives the same robots, with any --jobs.",
-    )
-    parser.add_argument("grammar", help="a grammar's name or file (see: morphgen grammar list)")
-    parser.add_argument(
-        "-n", type=whole_number(1), default=10, help="how many robots (default: 10)"
-    )
-    parser.add_argument("--seed", type=whole_number(0), default=0)
-    parser.add_argument("--out", metavar="DIR", type=Path, help="default: robots/<grammar>")
-    parser.add_argument(
-        "--where",
-        metavar="CONDITION",
-        action="append",
-        default=[],
-        help="keep only robots such as 'reach > 0.4 and dof >= 5'; may be repeated",
-    )
-    parser.add_argument("--light", action="store_true", help="URDF and derivation only")
-    parser.add_argument("--no-picture", action="store_true", help="do not draw preview.png")
-    add_jobs(parser)
-    parser.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        nargs="?",
-        const="",
-        help="work on the Ray cluster at this address (without one: on a local Ray)",
-    )
-    add_library(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Make the set and report."""
-    import json
-    from dataclasses import asdict
-
-    from tqdm import tqdm
-
-    from morphgen.errors import GrammarError
-    from morphgen.grammar.analysis import check_grammar
+def sample(args: argparse.Namespace) -> int:
+    """Sample a set of robots and print how many were written and rejected."""
     from morphgen.grammar.conditions import require_condition
-    from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
+    from morphgen.grammar.grammar_file import grammar_text
     from morphgen.grammar.robot_set import SetConfig, SetWorker, make_serially, make_set
     from morphgen.grammar.syntax import parse_condition
     from morphgen.grammar.workers import make_in_processes, make_on_ray
 
-    library = library_of(args)
-    grammar = load_grammar(find_grammar(args.grammar, library.folders), library.folders)
-    wrong = check_grammar(grammar, library)
-    if wrong:
-        raise GrammarError(wrong[0] + (f" (and {len(wrong) - 1} more)" if wrong[1:] else ""))
+    grammar = opt.load_grammar_named(args.grammar, opt.library_of(args), sound=True)
     for text in args.where:
         require_condition(parse_condition(text))
     folder = args.out or Path("robots") / grammar.name
-    plan = SetConfig(
+    config = SetConfig(
         folder,
         grammar.name,
         grammar_text(grammar),
@@ -90,19 +65,168 @@ def run(args: argparse.Namespace) -> int:
         work = make_on_ray(args.ray or None)
     elif args.jobs > 1:
         work = make_in_processes(args.jobs)
-    with tqdm(total=args.n, unit="robot", file=sys.stderr, disable=args.json or None) as bar:
+    with bar(args, "sampling", total=args.n) as update:
+        report = make_set(config, args.n, work, lambda done: update(min(done, args.n)))
 
-        def show(done: int) -> None:
-            bar.n = min(done, args.n)
-            bar.refresh() if done >= args.n else bar.update(0)
+    def summary() -> str:
+        lines = [f"{folder}: {report.made} made, {report.kept} were there"]
+        rejected = sorted(report.rejected.items(), key=lambda entry: -entry[1])
+        lines += [f"  {times} draws rejected: {reason}" for reason, times in rejected]
+        lines += [f"  {name} has the same body as {same}" for name, same in report.duplicates]
+        return "\n".join(lines)
 
-        report = make_set(plan, args.n, work, show)
-    if args.json:
-        print(json.dumps({"folder": str(folder), **asdict(report)}))
-        return 0
-    print(f"{folder}: {report.made} made, {report.kept} were there")
-    for reason, times in sorted(report.rejected.items(), key=lambda entry: -entry[1]):
-        print(f"  {times} draws rejected: {reason}")
-    for name, earlier in report.duplicates:
-        print(f"  {name} has the same body as {earlier}")
+    opt.print_result(args, {"folder": str(folder), **asdict(report)}, summary)
     return 0
+
+
+@command(
+    "derive",
+    "print, replay or compare the derivation of a robot",
+    option("robot", type=Path, metavar="ROBOT", help="folder of a bundle or of a light set"),
+    flag("--replay", "build the URDF anew; the exit code is 1 unless every byte is the same"),
+    path_option(
+        "--diff", "OTHER", "compare with another robot's; the exit code is 1 if they differ"
+    ),
+    opt.LIBRARY,
+    opt.JSON,
+    details="The derivation lists the parts of a robot, its grammar's choices and all parameters.",
+    examples=("derive robots/chain/chain-000001 --replay",),
+)
+def derive(args: argparse.Namespace) -> int:
+    """Print, replay or compare a derivation."""
+    from morphgen.formats.bundle import URDF
+    from morphgen.grammar.derivation import difference, outline
+
+    derivation = _derivation(args.robot)
+    if args.diff is not None:
+        lines = difference(derivation, _derivation(args.diff))
+        opt.print_result(args, lines, lambda: "\n".join(lines) or "the same")
+        return int(bool(lines))
+    if not args.replay:
+        opt.print_result(args, str(derivation), lambda: outline(derivation))
+        return 0
+    path = args.robot / URDF
+    text = _replayed_urdf(args.robot, derivation, opt.library_of(args))
+    same = text == path.read_text(encoding="utf-8")
+    opt.print_result(
+        args, {"same": same}, lambda: f"{path}: {'the same bytes' if same else 'other bytes'}"
+    )
+    return int(not same)
+
+
+@command(
+    "mutate",
+    "sample neighbours of a robot: one choice or parameter of its grammar changed",
+    option(
+        "robot", type=Path, metavar="ROBOT", help="a robot's folder in a set of morphgen sample"
+    ),
+    NUMBER,
+    opt.SEED,
+    path_option("--out", "DIR", "output folder (default: SET-mutants)"),
+    opt.NO_PICTURE,
+    opt.LIBRARY,
+    opt.JSON,
+    examples=("mutate robots/chain/chain-000001 -n 20",),
+)
+def mutate(args: argparse.Namespace) -> int:
+    """Write neighbours as bundles and print what differs."""
+    from morphgen.errors import FormatError
+    from morphgen.formats.bundle import write_bundle
+    from morphgen.formats.data_files import read_text
+    from morphgen.grammar.derivation import difference
+    from morphgen.grammar.grammar_file import grammar_from_text
+    from morphgen.grammar.limits import MAX_TEXT
+    from morphgen.grammar.robot_set import GRAMMAR, read_index, read_settings
+    from morphgen.grammar.sampling import mutate
+
+    name, folder = args.robot.name, args.robot.resolve().parent
+    if not (folder / GRAMMAR).is_file():
+        _require_folder(args.robot)
+        raise FormatError(
+            f"{args.robot} is not in a set made by morphgen sample (no {folder / GRAMMAR})"
+        )
+    records = {record["name"]: record for record in read_index(folder)}
+    if name not in records:
+        raise FormatError(f"{name!r} is not in the index of {folder}")
+    grammar = grammar_from_text(
+        read_text(folder / GRAMMAR, MAX_TEXT), read_settings(folder)["grammar"]
+    )
+    origin, out = _derivation(args.robot), args.out or folder.parent / f"{folder.name}-mutants"
+    neighbours = mutate(
+        grammar, opt.library_of(args), records[name]["choices"], args.n, seed=args.seed, name=name
+    )
+    changes: dict[str, Any] = {}
+    for neighbour in track(neighbours, args, "sampling", "robot", args.n):
+        robot = neighbour.robot
+        path = write_bundle(
+            robot, out / robot.name, neighbour.findings, picture=not args.no_picture
+        )
+        changes[str(path)] = difference(origin, neighbour.derivation)
+    opt.print_result(
+        args,
+        changes,
+        lambda: "\n".join(f"{path}: {'; '.join(lines)}" for path, lines in changes.items()),
+    )
+    return 0
+
+
+def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:
+    """Return the URDF that a derivation gives, as in a bundle or in a light set."""
+    from morphgen.errors import FormatError
+    from morphgen.fitting.replace_collision import as_primitives
+    from morphgen.formats.bundle import CARD, URDF, write_bundle
+    from morphgen.grammar.compose import compose
+    from morphgen.grammar.robot_set import light_urdf
+
+    robot = compose(derivation, library, folder.resolve().name)
+    if not (folder / CARD).is_file():
+        return light_urdf(robot)
+    primitives = _card(folder).get("primitives")
+    if primitives is not None:
+        if "links" in primitives:
+            raise FormatError(
+                f"{folder} has primitives of morphgen fit, which its derivation does not include: "
+                "replay the robot that was fitted"
+            )
+        robot = as_primitives(robot, library.folders)
+    with tempfile.TemporaryDirectory() as scratch:
+        bundle = write_bundle(robot, Path(scratch) / robot.name, picture=False)
+        return (bundle / URDF).read_text(encoding="utf-8")
+
+
+def _derivation(folder: Path) -> Derivation:
+    from morphgen.errors import FormatError
+    from morphgen.formats.bundle import CARD
+    from morphgen.formats.data_files import read_text
+    from morphgen.grammar.derivation import parse_derivation
+    from morphgen.grammar.limits import MAX_DERIVATION_TEXT
+    from morphgen.grammar.robot_set import DERIVATION
+
+    _require_folder(folder)
+    light, card = folder / DERIVATION, folder / CARD
+    if light.is_file():
+        return parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
+    if not card.is_file():
+        raise FormatError(f"{folder} is not a robot: it has neither {CARD} nor {DERIVATION}")
+    content = _card(folder)
+    if not isinstance(content.get("derivation"), str):
+        raise FormatError(f"{card} has no derivation: the robot was imported, not composed")
+    return parse_derivation(content["derivation"], str(card))
+
+
+def _card(folder: Path) -> dict[str, Any]:
+    from morphgen.errors import FormatError
+    from morphgen.formats.bundle import CARD
+    from morphgen.formats.data_files import read_json
+
+    content = read_json(folder / CARD)
+    if not isinstance(content, dict):
+        raise FormatError(f"{folder / CARD}: expected an object, not {type(content).__name__}")
+    return content
+
+
+def _require_folder(folder: Path) -> None:
+    from morphgen.errors import FormatError
+
+    if not folder.exists():
+        raise FormatError(f"{folder}: no such file or folder")

@@ -1,57 +1,51 @@
-"""``morphgen split``: which robots to train on and which to test on."""
+"""``morphgen split``: list, print and release splits of train and test robots."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from collections import Counter
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
-from morphgen.cli import split_checks, split_new
-from morphgen.cli.options import Subparsers, add_json
+from morphgen.cli import options as opt
+from morphgen.cli.command import Command, command, flag, option
+from morphgen.cli.progress import bar
+from morphgen.cli.split_checks import audit, build, verify
+from morphgen.cli.split_new import new
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Member, Split
+    from morphgen.benchmark.statistics import PaperRow
 
-SHOWN = 60
-"""Letters of a derivation that ``show`` prints without --full."""
-
-
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command and its own."""
-    parser = commands.add_parser(
-        "split",
-        help="list, make, audit, build and verify splits of train and test robots",
-        description="Splits of robots to train on and robots to test on, as files of YAML.",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    listing = verbs.add_parser("list", help="name the splits that come with morphgen")
-    add_json(listing)
-    listing.set_defaults(run=run_list)
-    show = verbs.add_parser("show", help="print the robots of a split")
-    show.add_argument("split", metavar="SPLIT", help="a split's file or name")
-    show.add_argument(
-        "--full",
-        action="store_true",
-        help="print derivations whole, and how the robots were chosen",
-    )
-    add_json(show)
-    show.set_defaults(run=run_show)
-    split_new.add(verbs)
-    split_checks.add(verbs)
+SHORT_DERIVATION = 60
+"""Number of characters of a derivation that ``show`` prints without ``--full``."""
 
 
-def run_list(args: argparse.Namespace) -> int:
-    """Print a row a split."""
+@command("list", "list the splits that come with morphgen", opt.JSON)
+def list_splits(args: argparse.Namespace) -> int:
+    """Print a row per split."""
     from tabulate import tabulate
 
     from morphgen.benchmark.split_file import read_split, split_names
 
     splits = [read_split(name) for name in split_names()]
-    if args.json:
-        print(json.dumps([_facts(split) for split in splits], indent=2))
-        return 0
+    data = [
+        {
+            "name": split.name,
+            "regime": split.regime,
+            "tasks": _tasks(split),
+            "train": len(split.train),
+            "test": len(split.test),
+            "train_categories": _categories(split.train),
+            "test_categories": _categories(split.test),
+            "summary": split.summary,
+            "reference": split.reference,
+        }
+        for split in splits
+    ]
     headers = ("name", "regime", "task", "train", "test", "categories", "summary")
     rows = [
         (
@@ -65,73 +59,161 @@ def run_list(args: argparse.Namespace) -> int:
         )
         for split in splits
     ]
-    print(tabulate(rows, headers))
+    opt.print_result(args, data, lambda: tabulate(rows, headers))
     return 0
 
 
-def run_show(args: argparse.Namespace) -> int:
+@command(
+    "show",
+    "print the robots of a split",
+    option("split", metavar="SPLIT", help="name of a split, or its file"),
+    flag("--full", "print whole derivations, and how the robots were chosen"),
+    opt.JSON,
+    examples=("split show interpolation/panda/reach",),
+)
+def show(args: argparse.Namespace) -> int:
     """Print a split."""
-    from tabulate import tabulate
-
-    from morphgen.benchmark.split import SIDES, split_id
+    from morphgen.benchmark.split import split_id
     from morphgen.benchmark.split_file import read_split
 
     split = read_split(args.split)
-    if args.json:
-        print(json.dumps({"id": split_id(split), **split.as_dict()}, indent=2))
-        return 0
-    print(f"{split.name} ({split.regime}): {split.summary}")
-    print(f"  id: {split_id(split)}")
+    data = {"id": split_id(split), **split.as_dict()}
+    opt.print_result(args, data, lambda: _split_text(split, full=args.full))
+    return 0
+
+
+def _split_text(split: Split, *, full: bool) -> str:
+    from tabulate import tabulate
+
+    from morphgen.benchmark.split import SIDES, split_id
+
+    lines = [f"{split.name} ({split.regime}): {split.summary}", f"  id: {split_id(split)}"]
     if split.reference:
-        print(f"  reference: {split.reference}")
+        lines.append(f"  reference: {split.reference}")
     for key, value in split.provenance.items():
-        if args.full or isinstance(value, int | str):
-            print(f"  {key}: {_plain(value)}")
-    for code, reason in split.accepted.items():
-        print(f"  accepted {code}: {reason}")
+        if full or isinstance(value, int | str):
+            text = value if isinstance(value, str) else json.dumps(value).replace('"', "")
+            lines.append(f"  {key}: {text}")
+    lines += [f"  accepted {code}: {reason}" for code, reason in split.accepted.items()]
+    headers = ("name", "task", "category", "body", "derivation")
     for side in SIDES:
         members = split.side(side)
         counts = ", ".join(f"{n} {name}" for name, n in _categories(members).items())
-        print(f"\n{side}, {len(members)}: {counts}")
-        headers = ("name", "task", "category", "body", "derivation")
-        rows = [_row(member, args.full) for member in members]
-        print(tabulate(rows, headers, disable_numparse=True))
-    return 0
+        rows = [_row(member, full=full) for member in members]
+        lines.append(f"\n{side}, {len(members)}: {counts}")
+        lines.append(tabulate(rows, headers, disable_numparse=True))
+    return "\n".join(lines)
+
+
+def _row(member: Member, *, full: bool) -> tuple[str, ...]:
+    text = member.derivation
+    if not full and len(text) > SHORT_DERIVATION:
+        text = f"{text[: SHORT_DERIVATION - 3]}..."
+    return (member.name, _task(member), member.category, member.robot_hash[:8], text)
+
+
+def _task(member: Member) -> str:
+    return member.task + (" (obstacles)" if member.obstacles else "")
+
+
+def _tasks(split: Split) -> list[str]:
+    return sorted({_task(member) for member in (*split.train, *split.test)})
 
 
 def _categories(members: Sequence[Member]) -> Counter[str]:
     return Counter(member.category for member in members)
 
 
-def _tasks(split: Split) -> list[str]:
-    """Its tasks, with obstacles where they are."""
-    members = (*split.train, *split.test)
-    found = {member.task + (" (obstacles)" if member.obstacles else "") for member in members}
-    return sorted(found)
+@command(
+    "stats",
+    "print statistics of splits next to those of the paper",
+    option(
+        "splits", nargs="*", metavar="SPLIT", help="names or files (default: all shipped splits)"
+    ),
+    flag("--markdown", "print the table as Markdown"),
+    opt.JOBS,
+    opt.LIBRARY,
+    opt.JSON,
+    details="The columns are the mean numbers of links, of movable joints and of movable joints "
+    "between base and tool of the train robots, and the cosine similarity of test and train "
+    "robots; the paper's numbers are in parentheses. Splits with the same robots share a row.",
+)
+def stats(args: argparse.Namespace) -> int:
+    """Print a table with a row per set of robots."""
+    from tabulate import tabulate
+
+    from morphgen.benchmark.split_file import read_split, split_names
+    from morphgen.benchmark.statistics import PAPER_TABLE, paper_row, statistics
+
+    library = opt.library_of(args)
+    groups = _by_robots([read_split(name) for name in args.splits or split_names()])
+    figures: dict[str, dict[str, Any]] = {}
+    for title, splits in groups.items():
+        with bar(args, title) as update:
+            figures[title] = statistics(splits[0], library, jobs=args.jobs, progress=update)
+    data = [
+        {
+            "robots": title,
+            "splits": [split.name for split in splits],
+            "ours": figures[title],
+            "paper": asdict(theirs) if (theirs := paper_row(title)) else None,
+        }
+        for title, splits in groups.items()
+    ]
+
+    def text() -> str:
+        rows = [_stats_row(title, ours, paper_row(title)) for title, ours in figures.items()]
+        style = "github" if args.markdown else "simple"
+        return (
+            f"{tabulate(rows, 'keys', tablefmt=style, disable_numparse=True)}\n"
+            "\nlinks, joints, mass: mean over the train robots; cosine: of test and train robots"
+            f"\nin parentheses: {PAPER_TABLE}"
+        )
+
+    opt.print_result(args, {"rows": data, "paper": PAPER_TABLE}, text)
+    return 0
 
 
-def _facts(split: Split) -> dict[str, object]:
-    return {
-        "name": split.name,
-        "regime": split.regime,
-        "tasks": _tasks(split),
-        "train": len(split.train),
-        "test": len(split.test),
-        "train_categories": _categories(split.train),
-        "test_categories": _categories(split.test),
-        "summary": split.summary,
-        "reference": split.reference,
-    }
+def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
+    """Return splits with the same robots together, by what their names have in common."""
+    from morphgen.benchmark.split import SIDES
+
+    groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
+    for split in splits:
+        hashes = tuple(tuple(m.robot_hash for m in split.side(side)) for side in SIDES)
+        groups.setdefault(hashes, []).append(split)
+    return {_common_prefix([split.name for split in group]): group for group in groups.values()}
 
 
-def _row(member: Member, full: bool) -> tuple[str, ...]:
-    text = member.derivation
-    if not full and len(text) > SHOWN:
-        text = f"{text[: SHOWN - 3]}..."
-    task = member.task + (" (obstacles)" if member.obstacles else "")
-    return (member.name, task, member.category, member.robot_hash[:8], text)
+def _common_prefix(names: Sequence[str]) -> str:
+    """Return the path segments that all names begin with, or the first name if there are none."""
+    columns = zip(*(name.split("/") for name in names), strict=False)
+    same = list(itertools.takewhile(lambda column: len(set(column)) == 1, columns))
+    return "/".join(column[0] for column in same) or names[0]
 
 
-def _plain(value: object) -> str:
-    """A value of a file as text."""
-    return value if isinstance(value, str) else json.dumps(value).replace('"', "")
+def _stats_row(title: str, ours: Mapping[str, Any], theirs: PaperRow | None) -> dict[str, str]:
+    train, cosine = ours["train"], ours["cosine"]
+
+    def with_paper(value: str, key: str) -> str:
+        if theirs is None:
+            return value
+        paper = getattr(theirs, key)
+        return f"{value} ({'-' if paper is None else f'{paper:g}'})"
+
+    row = {"robots": title, "train": train["robots"], "test": ours["test"]["robots"]}
+    for key in ("links", "movable", "movable_to_tool"):
+        row[key.replace("_", " ")] = with_paper(f"{train[key]:.4g}", key)
+    row["cosine"] = with_paper(f"{cosine['mean']:.2f}", "cosine")
+    row["least to largest"] = f"{cosine['min']:.2f} to {cosine['max']:.2f}"
+    row["mass (kg)"] = f"{train['mass']['mean']:.3g}"
+    row["reach (m)"] = f"{train['reach']['min']:.2f} to {train['reach']['max']:.2f}"
+    return row
+
+
+split = Command(
+    "split",
+    "list, make, audit, build and verify splits of train and test robots",
+    commands=(list_splits, show, new, audit, build, verify, stats),
+    details="A split is a YAML file with the robots to train on and those to test on.",
+)

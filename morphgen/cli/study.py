@@ -4,90 +4,75 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library
-from morphgen.cli.progress import shown
-from morphgen.cli.train import add_training, count, execution_of
+from morphgen.cli.command import command, flag, number, option, path_option
+from morphgen.cli.options import LIBRARY, RAY
+from morphgen.cli.progress import training_progress
+from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
 from morphgen.rl.agents import AGENTS
 
 if TYPE_CHECKING:
     from morphgen.rl.study import Cell
 
 
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "study",
-        help="train and score a matrix of agents, seeds and splits",
-        description="Train and evaluate every agent with every seed on every split, and the "
-        "baselines, and write tables and curves. Finished cells are not repeated; "
-        "several processes started on one folder share the work. Exit code 1 "
-        "if a cell failed.",
-        epilog="examples: morphgen study interpolation/arm3/reach --agents se,me-mlp,me-tf "
-        "--seeds 0..2 --out study; morphgen study interpolation/arm3/reach --agents ablation",
-    )
-    parser.add_argument(
-        "words", nargs="+", metavar="SPLIT", help="a split's name, file or built folder"
-    )
-    parser.add_argument(
+@command(
+    "study",
+    "train and score a matrix of agents, seeds and splits",
+    option("words", nargs="+", metavar="SPLIT", help="name of a split, its file or built folder"),
+    option(
         "--agents",
         default=",".join(AGENTS),
-        help="separated by commas; each may have switches, such as me-tf-symlog+task-reweighting, "
-        "and se@test is trained on the test robots; ablation: the paper's (default: all)",
-    )
-    parser.add_argument("--seeds", default="0..2", help="such as 0..2 or 0,3 (default: 0..2)")
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("study"))
-    parser.add_argument(
-        "--eval-steps", type=count, default=10_000, help="of each robot (default: 10,000)"
-    )
-    parser.add_argument(
-        "--report", action="store_true", help="only write tables and curves of the finished cells"
-    )
-    parser.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        nargs="?",
-        const="",
-        help="run on the Ray cluster at this address (without one: on a local Ray)",
-    )
-    parser.add_argument(
+        help="agents, separated by commas, with or without switches such as "
+        "me-tf-symlog+task-reweighting; se@test is trained on the test robots; ablation: those of "
+        "the paper (default: all agents)",
+    ),
+    option("--seeds", default="0..2", help="such as 0..2 or 0,3"),
+    path_option("--out", "DIR", "output folder", default=Path("study")),
+    number("--eval-steps", "number of control steps of each robot's evaluation", default=10_000),
+    flag("--report", "only write tables and curves of the finished cells"),
+    RAY,
+    option(
         "--gpus",
         type=float,
+        metavar="N",
         help="with --ray: GPUs per cell (default: 1 with --device cuda, else 0)",
-    )
-    add_training(parser, steps=2e6, envs=128)
-    add_library(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
+    ),
+    *TRAINING_OPTIONS,
+    LIBRARY,
+    details="A cell is an agent with a seed on a split, or a baseline on a split. The command "
+    "trains and evaluates each cell, and writes tables and curves. Finished cells are skipped; "
+    "several processes with one folder share the work. The exit code is 1 if a cell failed.",
+    examples=(
+        "study interpolation/arm3/reach --agents se,me-mlp,me-tf --seeds 0..2 --out study",
+        "study interpolation/arm3/reach --agents ablation",
+    ),
+)
+def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
     from morphgen.rl.study import read_scores, require_cells
     from morphgen.rl.study_report import TABLE, write_tables
 
-    execution_of(args)
-    cells = cells_of(args)
+    execution_config(args)  # refuses invalid options before the work
+    cells = _cells(args)
     require_cells(cells)
     args.out.mkdir(parents=True, exist_ok=True)
-    failed = 0 if args.report else _work(args, cells)
+    failures = 0 if args.report else _run_cells(args, cells)
     written = write_tables(args.out, {cell: read_scores(cell) for cell in cells})
     print((args.out / TABLE).read_text(encoding="utf-8"))
     for path in written:
         print(path)
-    return int(failed > 0)
+    return int(failures > 0)
 
 
-def cells_of(args: argparse.Namespace) -> list[Cell]:
+def _cells(args: argparse.Namespace) -> list[Cell]:
     """Return the cells of the study, baselines first.
 
     Raises:
         MorphgenError: If a split, agent or seed is invalid, or a run could not begin.
     """
-    from dataclasses import replace
-
-    from morphgen.cli.train import config_of, source_of
     from morphgen.errors import TaskError
     from morphgen.rl.agent_spec import parse_agents
     from morphgen.rl.evaluation import EvalConfig, episodes_for
@@ -100,65 +85,61 @@ def cells_of(args: argparse.Namespace) -> list[Cell]:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     if args.ray is None and not args.report:
         require_device(args.device)
-    longest = max(config.max_episode_steps for config in default_configs())
-    eval_config = EvalConfig(episodes_for(args.eval_steps, longest), args.sim)
-    args.on, args.obstacles = "train", False
-    agents, seeds = parse_agents(args.agents), seeds_of(args.seeds)
-    made: list[Cell] = []
+    episode_steps = max(config.max_episode_steps for config in default_configs())
+    eval_config = EvalConfig(episodes_for(args.eval_steps, episode_steps), args.sim)
+    args.on, args.obstacles, args.seed = "train", False, 0
+    agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
+    cells: list[Cell] = []
     for name in dict.fromkeys(args.words):
-        source = source_of([name], args)
-        made += baseline_cells(args.out, source, eval_config)
+        source = robots_to_train([name], args)
+        cells += baseline_cells(args.out, source, eval_config)
         for label, spec, side in agents:
+            config = run_config(other_side(source, side), spec, args)
             for seed in seeds:
-                config = config_of(other_side(source, side), spec, _with(args, seed))
-                config = matched_budget(replace(config, seed=seed))
-                for part in () if args.report else subruns_of(args.out, config):
-                    require_runnable(part.config)
-                made.append(agent_cell(args.out, label, config, eval_config))
-    return made
+                seeded = matched_budget(replace(config, seed=seed))
+                for subrun in () if args.report else subruns_of(args.out, seeded):
+                    require_runnable(subrun.config)
+                cells.append(agent_cell(args.out, label, seeded, eval_config))
+    return cells
 
 
-def seeds_of(text: str) -> list[int]:
+def _seeds(text: str) -> list[int]:
     """Read ``0..2`` or ``0,3``.
 
     Raises:
-        TaskError: If it is neither.
+        TaskError: If the text is something else.
     """
     from morphgen.errors import TaskError
 
-    found: list[int] = []
+    seeds: list[int] = []
     for part in text.split(","):
         first, dots, last = part.partition("..")
         if not first.isdecimal() or (dots and not last.isdecimal()):
             raise TaskError(f"--seeds {text}: expected such as 0..2 or 0,3")
-        found += range(int(first), int(last or first) + 1)
-    if not found or len(set(found)) < len(found):
+        seeds += range(int(first), int(last or first) + 1)
+    if not seeds or len(set(seeds)) < len(seeds):
         raise TaskError(f"--seeds {text}: expected at least one seed, and none twice")
-    return found
+    return seeds
 
 
-def _with(args: argparse.Namespace, seed: int) -> argparse.Namespace:
-    return argparse.Namespace(**{**vars(args), "seed": seed})
-
-
-def _work(args: argparse.Namespace, cells: list[Cell]) -> int:
-    """Do the cells and return how many failed."""
+def _run_cells(args: argparse.Namespace, cells: list[Cell]) -> int:
+    """Run the cells and return how many failed."""
     from morphgen.rl.study import run_cells, run_cells_on_ray
 
-    failed = 0
-    with shown("if the same command is given again") as show:
+    failures = 0
+    execution = execution_config(args)
+    with training_progress("if the same command is given again") as show:
         if args.ray is None:
-            outcomes = run_cells(cells, execution_of(args), show, show.counting)
+            outcomes = run_cells(cells, execution, show, show.evaluation)
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
-            outcomes = run_cells_on_ray(args.ray or None, gpus=gpus)(cells, execution_of(args))
+            outcomes = run_cells_on_ray(args.ray or None, gpus=gpus)(cells, execution)
         for done, outcome in enumerate(outcomes, 1):
             show.close()
             cell = outcome.cell
-            what = f"{cell.split} {cell.agent}" + (
-                "" if cell.seed is None else f" seed {cell.seed}"
-            )
+            seed = "" if cell.seed is None else f" seed {cell.seed}"
             state = f"failed: {outcome.error}" if outcome.error else "done"
-            print(f"{done} of {len(cells)}: {what} {state}", file=sys.stderr, flush=True)
-            failed += bool(outcome.error)
-    return failed
+            line = f"{done} of {len(cells)}: {cell.split} {cell.agent}{seed} {state}"
+            print(line, file=sys.stderr, flush=True)
+            failures += bool(outcome.error)
+    return failures

@@ -1,173 +1,198 @@
-"""``morphgen train``: train an agent on the robots of a split, or on one robot."""
+"""``morphgen train`` and ``morphgen finetune``: train an agent on the robots of a split, or one."""
 
 from __future__ import annotations
 
 import argparse
-import math
+import re
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from morphgen.cli.options import Subparsers, add_library, add_max_links, add_sim
-from morphgen.cli.progress import shown
+from morphgen.cli import options as opt
+from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
+from morphgen.cli.progress import training_progress
 from morphgen.rl.agents import AGENTS
 
 if TYPE_CHECKING:
     from morphgen.rl.agent_spec import AgentSpec
     from morphgen.rl.robot_source import RobotSource
     from morphgen.rl.runs import RunConfig
-    from morphgen.rl.training import ExecutionConfig, Subrun
+    from morphgen.rl.training import ExecutionConfig
     from morphgen.tasks.task import TaskConfig
 
 SWITCHES = {
     "symlog": "the critic predicts the symlog of returns (default: on)",
     "slow-critic": "compute returns with a moving average of the critic (default: on)",
-    "discrete": "discrete actions (default: on if all robots reach)",
+    "discrete": "discrete actions (default: on if the task of all robots is reach)",
     "task-reweighting": "weight the robots randomly (default: off)",
     "curriculum": "push: move the line from near to far during training (default: on)",
     "fixed-deviation": "keep the initial standard deviation of continuous actions (default: off)",
     "mask-morphology": "hide the robot's morphology from the agent (default: off)",
-    "tool-position": "show the tool's position to the agent (default: off)",
+    "tool-position": "add the tool's position to the observations (default: off)",
 }
-OF_NETWORKS = {
+NETWORK_SWITCHES = {
     "bf16": "run the networks in bfloat16",
-    "compile": "run networks and losses by torch.compile",
+    "compile": "run networks and losses with torch.compile",
 }
-"""Switches of how the networks are computed."""
 
 
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "train",
-        help="train an agent on the robots of a split, or on one robot",
-        description="Train a policy by PPO and write it to a run's folder. --resume continues an "
-        "interrupted run, which ends with the same weights.",
-        epilog="examples: morphgen train interpolation/arm3/reach --agent me-tf --sim mujoco; "
-        "morphgen train arm=ur5 ee=stick task=reach --agent se",
+def on_off(name: str, help: str, default: bool | None = None) -> Option:
+    """Return an option ``--name`` with its opposite ``--no-name``."""
+    return Option(
+        (f"--{name}",), {"action": argparse.BooleanOptionalAction, "default": default, "help": help}
     )
-    parser.add_argument(
-        "words",
-        nargs="+",
-        metavar="SPLIT",
-        help="a split's name, file or built folder; or words of compose, parts such as ur5-plane, "
-        "a bundle's folder or a URDF, and its task such as task=reach",
-    )
-    parser.add_argument(
-        "--agent", default="me-tf", help=f"one of {', '.join(AGENTS)} (default: me-tf)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="default: 0")
-    parser.add_argument(
-        "--on",
-        choices=["train", "test"],
-        default="train",
-        help="side of the split (default: train)",
-    )
-    parser.add_argument("--obstacles", action="store_true", help="one robot: among obstacles")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/SPLIT/AGENT/seedN")
-    parser.add_argument("--resume", action="store_true", help="continue the run in the folder")
-    for name, text in SWITCHES.items():
-        parser.add_argument(
-            f"--{name}", action=argparse.BooleanOptionalAction, default=None, help=text
-        )
-    add_training(parser, steps=2e6, envs=128)
-    add_library(parser)
-    parser.set_defaults(run=run)
 
 
-def add_training(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:
-    """Add the options of commands that train from random weights."""
-    add_learning(parser, steps=steps, envs=envs)
-    add_sim(parser)
-    parser.add_argument(
-        "--goal-seed",
-        type=int,
-        help="seed of all goals (default: as shipped with the split, else 0)",
+def learning_options(num_steps: int, num_envs: int) -> tuple[Option, ...]:
+    """Return the options of all commands that train."""
+    return (
+        number(
+            "--steps", "number of control steps of all environments together", default=num_steps
+        ),
+        number("--envs", "number of environments, which the robots share", default=num_envs),
+        opt.WORKERS,
+        opt.DEVICE,
+        repeated(
+            "--set",
+            "set a hyperparameter, such as learning_rate=1e-4 or num_steps=32",
+            metavar="NAME=VALUE",
+        ),
+        flag("--no-tensorboard", "write no TensorBoard events"),
+        flag("--wandb", "also log metrics to Weights & Biases"),
     )
-    parser.add_argument(
+
+
+TRAINING_OPTIONS = (
+    *learning_options(2_000_000, 128),
+    opt.sim_option(),
+    number(
+        "--goal-seed", "seed of all goals (default: as shipped with the split, else 0)", least=0
+    ),
+    number(
         "--train-goals",
-        type=count,
-        metavar="N",
-        help="goals of reach, and starts of push, per robot in training; evaluations have 100 "
-        "(default: 100, as in the paper)",
-    )
-    parser.add_argument(
+        "number of goals of reach, or starts of push, per robot in training; evaluations "
+        "have 100 (default: 100, as in the paper)",
+        least=2,
+    ),
+    flag(
         "--whole",
-        action="store_true",
-        help="se on a split: give each robot all steps and environments, instead of a share",
-    )
-    add_max_links(parser)
-    for name, meaning in OF_NETWORKS.items():
-        parser.add_argument(f"--{name}", action="store_true", help=meaning)
+        "agent se on a split: give each robot all steps and environments instead of a share",
+    ),
+    opt.MAX_LINKS,
+    *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
+)
+"""Options of the commands that train from random weights."""
+SPLIT_HELP = (
+    "name of a split, its file or built folder; or a robot and its task, such as arm=ur5 ee=stick "
+    "task=reach"
+)
+RESUME = flag("--resume", "continue the run in the output folder")
+SIDES = ["train", "test"]
 
 
-def add_learning(parser: argparse.ArgumentParser, *, steps: float, envs: int) -> None:
-    """Add the options of all commands that train."""
-    parser.add_argument(
-        "--steps",
-        type=count,
-        default=int(steps),
-        help=f"control steps of all environments together (default: {steps:,.0f})",
-    )
-    parser.add_argument(
-        "--envs",
-        type=int,
-        default=envs,
-        help=f"number of environments, which the robots share (default: {envs})",
-    )
-    parser.add_argument(
-        "--workers", type=int, default=1, help="processes of PyBullet, or threads of MuJoCo"
-    )
-    parser.add_argument("--device", default="cpu", help="device of the networks: cpu or cuda")
-    parser.add_argument(
-        "--set",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="change a constant, such as learning_rate=1e-4 or num_steps=32; may be repeated",
-    )
-    parser.add_argument("--no-tensorboard", action="store_true", help="write no TensorBoard events")
-    parser.add_argument(
-        "--wandb", action="store_true", help="also send metrics to Weights & Biases"
-    )
-
-
-def count(text: str) -> int:
-    """Read a whole number, also as 2e6."""
-    value = float(text)
-    if not (math.isfinite(value) and value.is_integer()):
-        raise ValueError(text)
-    return int(value)
-
-
-def run(args: argparse.Namespace) -> int:
+@command(
+    "train",
+    "train an agent on the robots of a split, or on one robot",
+    option(
+        "words", nargs="+", metavar="SPLIT", help=f"{SPLIT_HELP}. The robot is {opt.ROBOT_HELP}"
+    ),
+    option("--agent", default="me-tf", help=f"one of {', '.join(AGENTS)} (default: me-tf)"),
+    opt.SEED,
+    option("--on", choices=SIDES, default="train", help="side of the split"),
+    opt.OBSTACLES,
+    path_option("--out", "DIR", "run folder (default: runs/SPLIT/AGENT/seedN)"),
+    RESUME,
+    *(on_off(name, help) for name, help in SWITCHES.items()),
+    *TRAINING_OPTIONS,
+    opt.LIBRARY,
+    details="The algorithm is PPO. The policy is written to the run folder. With --resume, an "
+    "interrupted run continues and ends with the same weights.",
+    examples=(
+        "train interpolation/arm3/reach --agent me-tf --sim mujoco",
+        "train arm=ur5 ee=stick task=reach --agent se",
+    ),
+)
+def train(args: argparse.Namespace) -> int:
     """Train and print the paths of the checkpoints."""
     from morphgen.rl.robot_source import other_side
-    from morphgen.rl.runs import CHECKPOINT
 
-    source = other_side(source_of(args.words, args), args.on)
-    spec = spec_of(args)
-    config = config_of(source, spec, args)
-    _require_meant(config, args)
-    folder = args.out or Path("runs") / folder_of(source) / str(spec) / f"seed{args.seed}"
-    parts = trained(folder, config, args)
-    for part in parts:
-        print(part.folder / CHECKPOINT)
+    source = other_side(robots_to_train(args.words, args), args.on)
+    spec = agent_spec(args)
+    config = run_config(source, spec, args)
+    _require_used(config, args)
+    folder = args.out or Path("runs") / _folder_name(source) / str(spec) / f"seed{args.seed}"
+    _train(folder, config, args)
     return 0
 
 
-def trained(folder: Path, config: RunConfig, args: argparse.Namespace) -> list[Subrun]:
-    """Train a run to its end, with a progress bar."""
+@command(
+    "finetune",
+    "train a policy further, by default on the test robots of its split",
+    option("checkpoint", type=Path, help="a checkpoint, or a run folder"),
+    option(
+        "--split",
+        dest="words",
+        nargs="+",
+        metavar="SPLIT",
+        default=[],
+        help=f"other robots than those of the checkpoint's split: {SPLIT_HELP}",
+    ),
+    option("--on", choices=SIDES, default="test", help="side of the split"),
+    opt.OBSTACLES,
+    opt.SEED,
+    opt.sim_option(None),
+    number("--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0),
+    path_option(
+        "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
+    ),
+    RESUME,
+    *(
+        on_off(name, f"{help} (default: as the checkpoint's run)")
+        for name, help in NETWORK_SWITCHES.items()
+    ),
+    on_off(
+        "curriculum",
+        "push: move the line from near to far again (default: it stays at its final place)",
+        default=False,
+    ),
+    *learning_options(30_000, 16),
+    opt.LIBRARY,
+    details="The run begins with the networks of the checkpoint, and with a new optimiser and "
+    "schedule. Agent and hyperparameters are the checkpoint's unless given.",
+    examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 30000",),
+)
+def finetune(args: argparse.Namespace) -> int:
+    """Train and print the path of the checkpoint."""
+    from morphgen.errors import TaskError
+    from morphgen.rl.training import checkpoint_files
+
+    require_split_for_options(args)
+    files = list(checkpoint_files(args.checkpoint))
+    if len(files) > 1:
+        raise TaskError(
+            f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"
+        )
+    folder = args.out or files[0].parent / "finetuned" / f"{args.on}-seed{args.seed}"
+    _train(folder, _finetuning_config(files[0], args), args)
+    return 0
+
+
+def _train(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
+    from morphgen.rl.runs import CHECKPOINT
     from morphgen.rl.training import train
 
-    with shown() as show:
-        return train(folder, config, resume=args.resume, execution=execution_of(args), show=show)
+    with training_progress() as show:
+        execution = execution_config(args)
+        subruns = train(folder, config, resume=args.resume, execution=execution, show=show)
+    for subrun in subruns:
+        print(subrun.folder / CHECKPOINT)
 
 
-def require_words(args: argparse.Namespace) -> None:
-    """Require that options which describe other robots come with ``--split``.
+def require_split_for_options(args: argparse.Namespace) -> None:
+    """Require ``--split`` with options that describe other robots than the checkpoint's.
 
     Raises:
-        TaskError: If they do not.
+        TaskError: If it is missing.
     """
     from morphgen.errors import TaskError
 
@@ -176,74 +201,66 @@ def require_words(args: argparse.Namespace) -> None:
             raise TaskError(f"--{name.replace('_', '-')} goes with --split")
 
 
-def source_of(words: list[str], args: argparse.Namespace) -> RobotSource:
-    """Return the robots that the words of a command describe.
+def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
+    """Return the robots that a split, or a robot and ``task=NAME``, describe.
 
     Raises:
-        TaskError: If a robot has no task, or the seed of the goals is invalid, or not the seed of
-            the goals that a built split ships.
-        MorphgenError: If there is no such split.
+        TaskError: If a robot has no task, or the seed of the goals differs from that of the goals
+            that a built split ships.
+        MorphgenError: If the split or the robot is unknown.
     """
-    from morphgen.cli.goals import read_split_or_built
+    from morphgen.cli.goals import read_split_or_folder
     from morphgen.errors import BenchmarkError, TaskError
     from morphgen.rl.robot_source import robot_source, split_source
     from morphgen.tasks.registry import TASKS
     from morphgen.tasks.split_goals import has_goals, read_split_goals
 
-    seed = args.goal_seed or 0
-    if seed < 0:
-        raise TaskError(f"--goal-seed {seed}: expected 0 or more")
-    library = tuple(args.library)
+    seed, library = args.goal_seed or 0, tuple(args.library)
     choices = " or ".join(f"task={name}" for name in TASKS)
-    given = [word for word in words if word.startswith("task=")]
-    robot = [word for word in words if not word.startswith("task=")]
-    if given:
-        task = given[-1].partition("=")[2]
-        if len(given) > 1 or not robot:
+    tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    robot = " ".join(word for word in words if not word.startswith("task="))
+    if tasks:
+        if len(tasks) > 1 or not robot:
             raise TaskError(f"{' '.join(words)}: name a robot and one task, {choices}")
-        TASKS[task]  # refuses one that is unknown
+        TASKS[tasks[0]]  # raises if the task is unknown
         return robot_source(
-            " ".join(robot),
-            task,
-            obstacles=args.obstacles,
-            goal_seed=seed,
-            library=library,
+            robot, tasks[0], obstacles=args.obstacles, goal_seed=seed, library=library
         )
     if len(words) > 1 or "=" in words[0]:
         raise TaskError(f"{' '.join(words)}: a robot needs its task, {choices}")
     if args.obstacles:
-        raise TaskError("--obstacles is for one robot; a split says which robots have any")
+        raise TaskError("--obstacles is for one robot; a split says which robots have obstacles")
     try:
-        split, home = read_split_or_built(words[0])
+        split, folder = read_split_or_folder(words[0])
     except BenchmarkError as error:
         raise BenchmarkError(f"{error}; a robot needs {choices}") from error
-    shipped = home if home is not None and has_goals(home) else None
-    if shipped is not None:
-        made_with = read_split_goals(shipped).config.seed
-        if args.goal_seed not in (None, made_with):
-            raise TaskError(f"--goal-seed {seed}: the goals in {shipped} are of seed {made_with}")
-        seed = made_with
-    return split_source(split, side=args.on, goal_seed=seed, goals=shipped, library=library)
+    goal_folder = folder if folder is not None and has_goals(folder) else None
+    if goal_folder is not None:
+        shipped_seed = read_split_goals(goal_folder).config.seed
+        if args.goal_seed not in (None, shipped_seed):
+            raise TaskError(
+                f"--goal-seed {seed}: the goals in {goal_folder} are of seed {shipped_seed}"
+            )
+        seed = shipped_seed
+    return split_source(split, side=args.on, goal_seed=seed, goals=goal_folder, library=library)
 
 
-def spec_of(args: argparse.Namespace) -> AgentSpec:
+def agent_spec(args: argparse.Namespace) -> AgentSpec:
     """Return the agent with the switches that were given.
 
     Raises:
-        TaskError: If it is unknown.
+        TaskError: If the agent is unknown.
     """
-    from dataclasses import replace
-
     from morphgen.rl.agent_spec import parse_agent
 
     given = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
     spec = parse_agent(args.agent)
-    switches = {name: on for name, on in given.items() if on is not None}
+    switches = {name: value for name, value in given.items() if value is not None}
     return replace(spec, switches={**spec.switches, **switches})
 
 
-def config_of(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
-    """Return the config of the run that the options ask for.
+def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
+    """Return the configuration of a run from the options.
 
     Raises:
         TaskError: If a number is out of its range.
@@ -265,18 +282,16 @@ def config_of(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) ->
         device=args.device,
         full_budget=args.whole and AGENTS[spec.agent].per_robot,
         max_links=MAX_LINKS if args.max_links is None else args.max_links,
-        tasks=_tasks(source, args.train_goals),
+        tasks=_task_configs(source, args.train_goals),
     )
 
 
-def _tasks(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]:
-    """Return constants with so many goals per robot; by default as many as in evaluations.
+def _task_configs(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]:
+    """Return the configurations of the tasks; with the goals of evaluations if None is given.
 
     Raises:
-        TaskError: If they are too few, or the split ships its own goals.
+        TaskError: If the split ships its own goals.
     """
-    from dataclasses import replace
-
     from morphgen.errors import TaskError
     from morphgen.rl.robot_source import tasks_of
     from morphgen.tasks.registry import TASKS
@@ -285,8 +300,6 @@ def _tasks(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]
     configs: list[TaskConfig] = [TASKS[name].config_type() for name in names]
     if num_goals is None:
         return tuple(configs)
-    if num_goals < 2:
-        raise TaskError(f"--train-goals {num_goals}: expected 2 or more")
     if source.goal_dir:
         raise TaskError(
             f"--train-goals {num_goals}: {source.goal_dir} ships the goals to train on; name the "
@@ -295,11 +308,13 @@ def _tasks(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]
     return tuple(replace(config, num_goals=num_goals) for config in configs)
 
 
-def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:
-    """Require that no option is for another agent; a study may have options for some of its agents.
+def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
+    """Require that the agent uses all options that were given.
+
+    A study does not require it: its options may be for some of its agents.
 
     Raises:
-        TaskError: If one is.
+        TaskError: If an option has no effect.
     """
     from morphgen.errors import TaskError
     from morphgen.rl.agent_spec import owners_of, parse_constants
@@ -319,22 +334,48 @@ def _require_meant(config: RunConfig, args: argparse.Namespace) -> None:
         )
 
 
-def execution_of(args: argparse.Namespace) -> ExecutionConfig:
+def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
+    from morphgen.errors import TaskError
+    from morphgen.rl.agent_spec import parse_constants
+    from morphgen.rl.config import PPOConfig
+    from morphgen.rl.robot_source import other_side
+    from morphgen.rl.runs import read_checkpoint
+
+    initial, _ = read_checkpoint(file)
+    if args.words:
+        source = robots_to_train(args.words, args)
+    else:
+        source = other_side(initial.source, args.on)
+    changes: dict[str, Any] = parse_constants(args.set)
+    if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
+        raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
+    switches = {name: getattr(args, name) for name in NETWORK_SWITCHES}
+    changes |= {name: value for name, value in switches.items() if value is not None}
+    changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
+    return replace(
+        initial,
+        source=source,
+        ppo=replace(initial.ppo, **changes),
+        seed=args.seed,
+        sim=args.sim or initial.sim,
+        num_envs=args.envs,
+        device=args.device,
+        initial_checkpoint=str(file.resolve()),
+    )
+
+
+def execution_config(args: argparse.Namespace) -> ExecutionConfig:
     """Return how runs are executed.
 
     Raises:
-        TaskError: If the number of workers is below 1.
-        MissingDependencyError: If Weights & Biases is asked for and not installed.
+        MissingDependencyError: If ``--wandb`` is given and Weights & Biases is not installed.
     """
     from morphgen.rl.training import ExecutionConfig
 
     return ExecutionConfig(args.workers, not args.no_tensorboard, args.wandb)
 
 
-def folder_of(source: RobotSource) -> str:
-    """Return the name of a run's folder for robots."""
-    import re
-
+def _folder_name(source: RobotSource) -> str:
     name = source.name if source.split else f"{Path(source.name).name}-{source.task}"
     if source.obstacles:
         name += "-obstacles"

@@ -9,72 +9,69 @@ import time
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from morphgen.cli.options import Subparsers, add_library, whole_number
+from morphgen.cli.command import command, option, repeated, whole_number
+from morphgen.cli.options import LIBRARY
 
 if TYPE_CHECKING:
     from morphgen.viewer.app import Viewer
 
-_ENDS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
-"""Signals that end it as Ctrl-C does: of a service manager, of a terminal that is closed."""
-_NAP = 0.5
-"""Seconds after which a signal is seen for certain."""
-LOCAL = ("127.0.0.1", "localhost", "::1")
+STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+"""Signals that stop the server as Ctrl-C does: of a service manager, of a closed terminal."""
+SIGNAL_POLL = 0.5
+"""Longest delay before a signal is handled [s]."""
+LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
-def add_parser(commands: Subparsers) -> None:
-    """Declare the command."""
-    parser = commands.add_parser(
-        "view",
-        help="look at robots in the browser: browse, compose, compare, see them at work",
-        description="Look at robots in the browser, until interrupted. Without a target: the "
-        "library, the splits and the robots of this folder.",
-        epilog="examples: morphgen view; morphgen view robots/arm3; "
-        "morphgen view extrapolation/arms/reach; morphgen view arm=ur5 ee=plane; "
-        "morphgen view some.urdf; morphgen view runs/reach/checkpoint.pt; "
-        "morphgen view episode.npz",
-    )
-    parser.add_argument(
+@command(
+    "view",
+    "show robots in the browser: browse, compose, compare and run them",
+    option(
         "words",
         nargs="*",
         metavar="TARGET",
         help="a folder of robots, a bundle, a URDF or xacro, a split's name or file, a grammar, "
-        "words as for morphgen compose, a checkpoint or a run's folder whose policy is to be seen "
-        "at work, or an episode that the page has saved",
-    )
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to bind (default: this machine)"
-    )
-    parser.add_argument("--port", type=whole_number(1, 65535), default=8080)
-    parser.add_argument(
+        "words of morphgen compose, a checkpoint or a run's folder (its policy is run), or an "
+        "episode that was saved from the page",
+    ),
+    option("--host", default="127.0.0.1", help="address to listen on"),
+    option("--port", type=whole_number(1, 65535), default=8080, help="default: 8080"),
+    repeated(
         "--allow-origin",
-        action="append",
-        default=[],
+        "a website whose pages may use this one, such as https://hub.example.com if a proxy shows "
+        "it there, or http://box:8080 for the name of this machine",
         metavar="ORIGIN",
-        help="a site whose pages may use this one, such as https://hub.example.com where a proxy "
-        "shows it, or the name of this machine, http://box:8080; may be repeated",
-    )
-    add_library(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
+    ),
+    LIBRARY,
+    details="The server runs until it is interrupted. Without a target, it shows the library, the "
+    "splits and the robots of this folder.",
+    examples=(
+        "view",
+        "view robots/arm3",
+        "view extrapolation/arms/reach",
+        "view arm=ur5 ee=plane",
+        "view some.urdf",
+        "view runs/reach/checkpoint.pt",
+        "view episode.npz",
+    ),
+)
+def view(args: argparse.Namespace) -> int:
     """Serve until interrupted."""
     from morphgen.viewer.app import serve
 
-    for name in _ENDS:
+    for name in STOP_SIGNALS:
         signal.signal(name, _interrupt)
     try:
         viewer = serve(args.words, args.host, args.port, args.library, args.allow_origin)
-        _sleep(args.host, viewer)
+        _wait(args.host, viewer)
     except KeyboardInterrupt:
         pass
     return 0
 
 
-def _sleep(host: str, viewer: Viewer) -> None:
-    """Say where it serves, and wait until it is interrupted."""
+def _wait(host: str, viewer: Viewer) -> None:
+    """Print the address, and wait until the server is interrupted."""
     try:
-        if host not in LOCAL:
+        if host not in LOCAL_HOSTS:
             print(
                 f"morphgen: warning: --host {host}: whoever can reach this machine can use this "
                 "page, see the robots of this folder and write into it; there is no password",
@@ -82,14 +79,14 @@ def _sleep(host: str, viewer: Viewer) -> None:
             )
         name = f"[{host}]" if ":" in host else host
         print(f"http://{name}:{viewer.port}  (stop with Ctrl-C)", flush=True)
-        while True:  # a signal that another thread takes does not end a sleep
-            time.sleep(_NAP)
+        while True:  # a signal that another thread receives does not end a sleep
+            time.sleep(SIGNAL_POLL)
     finally:
-        for signal_name in (signal.SIGINT, *_ENDS):
+        for signal_name in (signal.SIGINT, *STOP_SIGNALS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind
         viewer.stop()
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """End as Ctrl-C does."""
+    """Stop as Ctrl-C does."""
     raise KeyboardInterrupt

@@ -360,7 +360,7 @@ def test_a_binary_stl_of_nans_is_refused_by_name(refused, tmp_path):
         ("lost.stl", "lost.stl: no such file"),
         ("lost.urdf", "lost.urdf"),
         (".", ". holds no robot; expected a bundle"),
-        ("plane --missing", "--missing goes with --all"),
+        ("plane --missing", "--missing: only with --all"),
         ("plane --max-primitives 0", "0 primitives: expected 1 to 32"),
         ("plane --max-primitives -1", "-1 primitives: expected 1 to 32"),
         ("plane --max-primitives 33", "33 primitives: expected 1 to 32"),

@@ -56,7 +56,7 @@ def test_a_row_a_robot_says_what_its_goals_are(run, path, cache):
         ["planar-plane", "test", "reach", "100"],
     ]
     assert [row.split()[5] for row in rows] == ["0", "0", "3"]
-    assert last == "3 of 3 goal sets are there, seed 0"
+    assert last == "3 of 3 goal sets are complete, seed 0"
     assert len(list((cache / "goals-4").iterdir())) == 3
 
 
@@ -92,7 +92,7 @@ def test_a_robot_that_fails_does_not_stop_the_others(run, tmp_path, monkeypatch)
     assert [line.split()[3] for line in lines[2:5]] == ["100", "none", "100"]
     assert lines[5].startswith("train robot arm3-claw: robot 'arm3-claw': only ")
     assert "(acceptance rate 0." in lines[5]
-    assert lines[6:] == ["2 of 3 goal sets are there, seed 0"]
+    assert lines[6:] == ["2 of 3 goal sets are complete, seed 0"]
     data = json.loads(run("goals", path, "--json")[1])
     assert (data["passed"], len(data["sets"])) == (False, 2)
     assert [(one["robot"], one["side"]) for one in data["failures"]] == [("arm3-claw", "train")]
@@ -139,7 +139,7 @@ def test_a_built_split_is_a_split(run, tmp_path):
     folder = build_split(
         some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True)
     ).folder
-    assert run("goals", folder)[1].endswith("3 of 3 goal sets are there, seed 0\n")
+    assert run("goals", folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")
 
 
 def test_an_interruption_is_said_in_a_line_and_keeps_what_is_made(tmp_path):
@@ -168,7 +168,7 @@ def files(folder):
         ("extrapolation/arms/raech", "no split of this name; did you mean"),
         ("arm=ur5 ee=plane", "arm=ur5 ee=plane: name one split, or say --task for a robot"),
         ("arm=ur5", "arm=ur5: no such file, and no split of this name"),
-        ("some.yaml --seed -1", "goal seed -1: expected 0 or more"),
+        ("some.yaml --seed -1", "argument --seed: -1: expected a whole number, 0 or more"),
         ("some.yaml --jobs 0", "argument --jobs: 0: expected a whole number"),
         ("some.yaml --obstacles", "--obstacles goes with --task"),
         ("arm=ur6 --task reach", "unknown arm 'ur6'; did you mean"),

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.runs import small_config
 from morphgen.cli import progress
-from morphgen.cli.progress import Shower
+from morphgen.cli.progress import TrainingProgress
 from morphgen.rl.metrics import UpdateMetrics
 
 FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
@@ -27,24 +27,24 @@ REPORT = UpdateMetrics(
 @pytest.fixture(params=[True, False], ids=["terminal", "file"])
 def show(request, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: request.param)
-    shower = Shower()
-    yield shower(SimpleNamespace(config=small_config()))
-    shower.close()
+    display = TrainingProgress()
+    yield display(SimpleNamespace(config=small_config()))
+    display.close()
 
 
 def test_episodes_cut_short_are_told_at_once_and_only_then(show, capsys):
     show(replace(REPORT, update=99, transitions=99 * 32), 100)
-    assert "unstable" not in capsys.readouterr().err
+    assert "diverged" not in capsys.readouterr().err
     show(replace(REPORT, update=99, transitions=99 * 32, unstable=2), 100)
-    told = "update 99: 2 of 7 episodes ended because their simulation became unstable\n"
+    told = "update 99: 2 of 7 episodes ended because their simulation diverged\n"
     assert told in capsys.readouterr().err
 
 
 def test_what_takes_minutes_says_how_far_it_is_once_in_each(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    with closing(Shower()) as shower:
-        tell = shower.counting("stochastic on test")
+    with closing(TrainingProgress()) as display:
+        tell = display.evaluation("stochastic on test")
         for i in range(1, 13):
             now[0] += 11
             tell(i / 2, 6)
@@ -57,11 +57,11 @@ def test_what_takes_minutes_says_how_far_it_is_once_in_each(capsys, monkeypatch)
 
 def test_on_a_terminal_it_is_a_bar_that_goes_away(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with closing(Shower()) as shower:
-        tell = shower.counting("train")
+    with closing(TrainingProgress()) as display:
+        tell = display.evaluation("train")
         tell(0.5, 2)
         tell(2, 2)
-        shower.counting("test")(1, 2)
+        display.evaluation("test")(1, 2)
     err = capsys.readouterr().err
     assert "train" in err
     assert "test" in err

@@ -23,7 +23,7 @@ def test_it_prints_rates_and_shares(sim, capsys):
     assert main(words) == 0
     text = capsys.readouterr().out
     assert f"reach, arm3, 2 environments, {sim}, 1 worker(s)" in text
-    assert "physics steps a second" in text
+    assert "physics steps per second" in text
 
 
 def test_bodies_of_many_links_are_measured_too(capsys):
@@ -35,9 +35,15 @@ def test_bodies_of_many_links_are_measured_too(capsys):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["reach", "arm3", "--seconds", "0"], "--seconds 0: expected more than 0"),
-        (["reach", "arm3", "--envs", "0"], "0 environments"),
-        (["reach", "arm3", "--workers", "0"], "0 workers"),
+        (["reach", "arm3", "--seconds", "0"], "argument --seconds: 0: expected a number above 0"),
+        (
+            ["reach", "arm3", "--envs", "0"],
+            "argument --envs: 0: expected a whole number, 1 or more",
+        ),
+        (
+            ["reach", "arm3", "--workers", "0"],
+            "argument --workers: 0: expected a whole number, 1 or more",
+        ),
         (["reach", "ur55-plane"], "'ur55' is no part"),
     ],
 )

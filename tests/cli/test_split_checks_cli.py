@@ -116,7 +116,7 @@ def test_a_build_says_where_it_is_and_verifies(run, write):
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "data/mine/some: 4 robots made, 0 were there",
-        "test it anywhere: morphgen split verify data/mine/some",
+        "verify it anywhere: morphgen split verify data/mine/some",
     ]
     first = tree(Path("data"))
     code, out, _ = run("split", "build", path, "--light", "--json")
@@ -255,7 +255,7 @@ def test_a_build_ships_goals_that_verify_and_pass_the_audit(run, write, tmp_path
     assert build_with_goals(run, path) == [
         "data/mine/some: 4 robots made, 0 were there",
         "4 goal sets, seed 0",
-        "test it anywhere: morphgen split verify data/mine/some",
+        "verify it anywhere: morphgen split verify data/mine/some",
     ]
     first = tree(Path("data"))
     assert "mine/some/goals/test/planar-plane.npz" in first
@@ -267,7 +267,7 @@ def test_a_build_ships_goals_that_verify_and_pass_the_audit(run, write, tmp_path
     code, out, err = run("split", "audit", "data/mine/some", "--strict")
     assert (code, err) == (0, "")
     assert out.splitlines()[-2:] == [
-        "4 goal sets were looked at, seed 0",
+        "4 goal sets were audited, seed 0",
         "mine/some: passed: 0 error, 0 warning, 0 accepted",
     ]
     data = json.loads(run("split", "audit", "data/mine/some", "--json")[1])
@@ -300,7 +300,7 @@ def test_goals_are_audited_only_if_they_are_there_or_asked_for(run, write):
         assert out.splitlines()[i + 1] == (
             "  test robot twin: train robot gantry-plane has 100 of its 100 goals"
         )
-        assert "5 goal sets were looked at, seed 0" in out
+        assert "5 goal sets were audited, seed 0" in out
 
 
 @pytest.mark.usefixtures("own_cache")
@@ -339,9 +339,15 @@ def test_a_build_without_goals_does_not_leave_those_of_another(run, write):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ("build some.yaml --goal-seed 1", "--goal-seed goes with --goals"),
-        ("build some.yaml --goals --goal-seed -1", "goal seed -1: expected 0 or more"),
-        ("audit some.yaml --goals --goal-seed -1", "goal seed -1: expected 0 or more"),
+        ("build some.yaml --goal-seed 1", "--goal-seed: only with --goals"),
+        (
+            "build some.yaml --goals --goal-seed -1",
+            "argument --goal-seed: -1: expected a whole number, 0 or more",
+        ),
+        (
+            "audit some.yaml --goals --goal-seed -1",
+            "argument --goal-seed: -1: expected a whole number, 0 or more",
+        ),
         ("audit folder", "folder is no built split: it has no build.json"),
     ],
 )

@@ -168,7 +168,7 @@ def test_parts_and_grammars_of_the_users_library_are_found(run, monkeypatch):
 def test_another_split_is_never_replaced(run, refused):
     assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
     message = refused(*INTERPOLATION, "--out", "a.yaml", "--seed", 1)
-    assert "a.yaml exists and says otherwise; choose another --name or --out" in message
+    assert "a.yaml exists with another content; choose another --name or --out" in message
     Path("b-train2.yaml").write_text("thesis")
     assert "b-train2.yaml exists" in refused(*INTERPOLATION[:-1], "1,2", "--out", "b.yaml")
 
@@ -189,14 +189,17 @@ def test_an_interrupted_run_leaves_nothing(run, tmp_path, monkeypatch):
         ((*EXTRAPOLATION[:4], "stick,", *EXTRAPOLATION[5:]), "unknown grammar ''"),
         ((*EXTRAPOLATION[:4], "chain", *EXTRAPOLATION[5:]), "chain: the category is on both sides"),
         ((*EXTRAPOLATION, "--similarity", "0.6"), "--similarity '0.6': expected '<' or '>' and a"),
-        ((*INTERPOLATION, "--task", "pusch"), "'pusch' is no task; did you mean 'push'?"),
+        ((*INTERPOLATION, "--task", "pusch"), "unknown task 'pusch'; did you mean 'push'?"),
         ((*INTERPOLATION, "--task", "push,push"), "'push' is named twice"),
         ((*INTERPOLATION, "--train", "3,x"), "--train 3,x: expected a whole number, or several"),
         ((*INTERPOLATION, "--train", "30,10"), "--train 30,10: expected sizes that grow"),
         ((*INTERPOLATION, "--train", ""), "--train: say how many robots to train on"),
         ((*EXTRAPOLATION, "--train", ""), "--train: say how many robots to train on"),
         ((*INTERPOLATION, "--test", "0"), "--train and --test start at 1"),
-        ((*INTERPOLATION, "--seed", "-1"), "--seed at 0"),
+        (
+            (*INTERPOLATION, "--seed", "-1"),
+            "argument --seed: -1: expected a whole number, 0 or more",
+        ),
         ((*INTERPOLATION, "--jobs", "0"), "argument --jobs: 0: expected a whole number, 1 or more"),
         ((*INTERPOLATION, "--name", "../x"), "name '../x': use letters, digits"),
         ((*INTERPOLATION, "--out", "file/x.yaml"), "cannot write file/x.yaml: "),

@@ -115,7 +115,10 @@ def test_it_writes_a_file_the_same_bytes_each_time(run, bundle, tmp_path):
         ("base=gantry ee=plane --out no/x.npz", "cannot write no/x.npz: No such file"),
         ("base=gantry ee=plane --out folder.npz", "cannot write folder.npz: Is a directory"),
         ("base=gantry ee=plane --max-links 6", "has 7 links, more than max_links 6"),
-        ("base=gantry ee=plane --max-links 1", "max_links 1: expected 2 or more"),
+        (
+            "base=gantry ee=plane --max-links 1",
+            "argument --max-links: 1: expected a whole number, 2 or more",
+        ),
         ("base=gantry ee=plnae", "unknown ee 'plnae'; did you mean 'plane'?"),
         ("robots/nowhere", "robots/nowhere: no such file or folder"),
         ("nowhere.urdf", "nowhere.urdf: no such file or folder"),

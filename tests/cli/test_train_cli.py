@@ -177,7 +177,10 @@ def test_training_may_have_more_goals_than_evaluations(run):
     ]
     assert randoms[0] == randoms[1]
     code, _, err = run(*RUN, "--train-goals", "1", "--out", "c")
-    assert (code, "--train-goals 1: expected 2 or more" in err) == (2, True)
+    assert (code, "argument --train-goals: 1: expected a whole number, 2 or more" in err) == (
+        2,
+        True,
+    )
     assert not Path("c").exists()
 
 
@@ -231,7 +234,7 @@ def test_ctrl_c_leaves_a_run_that_goes_on(run, tmp_path, cache):
     finally:
         process.kill()
     assert process.returncode == 130
-    assert "goes on from its last checkpoint, if it has one, with --resume" in err
+    assert "continues from its last checkpoint, if there is one, with --resume" in err
     assert "Traceback" not in err
     assert sorted(tree(tmp_path / "cut")) == [CHECKPOINT, "config.json", METRICS]
 
@@ -316,13 +319,16 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         ((*RUN, "--set", "gama=1"), "did you mean 'gamma'?"),
         ((*RUN, "--set", "gamma=much"), "expected a number"),
         ((*RUN, "--set", "gamma=2"), "gamma 2: expected 0 to 1"),
-        ((*RUN, "--workers", "0"), "--workers 0"),
-        ((*RUN, "--seed", "-1"), "--seed -1"),
-        ((*RUN, "--goal-seed", "-1"), "--goal-seed -1"),
+        ((*RUN, "--workers", "0"), "argument --workers: 0: expected a whole number, 1 or more"),
+        ((*RUN, "--seed", "-1"), "argument --seed: -1: expected a whole number, 0 or more"),
+        (
+            (*RUN, "--goal-seed", "-1"),
+            "argument --goal-seed: -1: expected a whole number, 0 or more",
+        ),
         (("eval", "nothing"), "no checkpoint, and no folder of a run"),
         ((*RUN, "--on", "test"), "is one robot, no split: there is nothing to test on"),
         ((*RUN, "--whole"), "--whole is for --agent se, not for me-mlp"),
-        ((*RUN, "--max-links", "1"), "--max-links 1: expected 2 or more"),
+        ((*RUN, "--max-links", "1"), "argument --max-links: 1: expected a whole number, 2 or more"),
         (
             ("train", "planar-cube", "task=reach", "--no-discrete", "--set", "logit_scale=8"),
             "--set logit_scale: continuous actions have no logits; it is for --discrete",

@@ -1,0 +1,198 @@
+"""Commands and their options as data, and the parser that is made of them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, TypeAlias
+
+from morphgen.errors import MorphgenError, nearest
+
+Run: TypeAlias = Callable[[argparse.Namespace], int]
+
+
+class UsageError(MorphgenError):
+    """The arguments of the command line are invalid."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option or a positional argument; several commands may share one."""
+
+    names: tuple[str, ...]
+    """Flags such as ``--seed``, or the name of a positional argument."""
+    settings: Mapping[str, Any]
+    """Keyword arguments of ``ArgumentParser.add_argument``."""
+
+
+def option(*names: str, help: str = "", **settings: object) -> Option:
+    """Return an option; its help ends with the default, if there is one to show."""
+    default = settings.get("default")
+    if default not in (None, [], "") and "default" not in help:
+        shown = f"{default:,}" if isinstance(default, int) else f"{default}"
+        help += f" (default: {shown})" if help else f"default: {shown}"
+    return Option(names, {**settings, "help": help})
+
+
+def flag(name: str, help: str) -> Option:
+    """Return an option that is on if it is given."""
+    return Option((name,), {"action": "store_true", "help": help})
+
+
+def number(name: str, help: str, *, default: int | None = None, least: int = 1) -> Option:
+    """Return an option whose value is a whole number."""
+    return option(name, type=whole_number(least), default=default, metavar="N", help=help)
+
+
+def path_option(name: str, metavar: str, help: str, *, default: Path | None = None) -> Option:
+    """Return an option whose value is a path."""
+    return option(name, type=Path, default=default, metavar=metavar, help=help)
+
+
+def repeated(name: str, help: str, **settings: object) -> Option:
+    """Return an option that may be given several times; its value is a list."""
+    settings = {"action": "append", "default": [], **settings}
+    return Option((name,), {**settings, "help": f"{help}; may be repeated"})
+
+
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Return a type for argparse: a whole number, also as ``2e6``.
+
+    Args:
+        least: The smallest valid number.
+        most: The largest valid number; None for no limit.
+    """
+    valid = f"{least} or more" if most is None else f"{least} to {most}"
+
+    def parse(text: str) -> int:
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not (number.is_integer() and least <= number <= (math.inf if most is None else most)):
+            raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
+        return int(number)
+
+    return parse
+
+
+def positive(text: str) -> float:
+    """Read a number above 0; a type for argparse."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: expected a number above 0")
+    return number
+
+
+Options: TypeAlias = "Sequence[Option | tuple[Option, ...]]"
+"""Options of a command; those of a nested tuple exclude each other."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, or a group of commands such as ``morphgen split``."""
+
+    name: str
+    """Word of the command line."""
+    summary: str
+    """What the command does: a verb and its object, without a full stop."""
+    options: Options = ()
+    """Options and positional arguments."""
+    run: Run | None = None
+    """Function that runs the command and returns the exit code; None for a group."""
+    details: str = ""
+    """Sentences that follow the summary in the command's own help."""
+    examples: Sequence[str] = ()
+    """Command lines that the help shows."""
+    commands: Sequence[Command] = ()
+    """Commands of the group."""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    """Further attributes of the parsed arguments."""
+
+    def add_to(self, parsers: argparse._SubParsersAction[Parser]) -> None:
+        """Add the command's parser to those of its group."""
+        parser = parsers.add_parser(self.name, help=self.summary, **self._texts())
+        if self.commands:
+            add_commands(parser, self.commands, required=True)
+            return
+        for each in self.options:
+            alternatives = each if isinstance(each, tuple) else (each,)
+            group = parser.add_mutually_exclusive_group() if isinstance(each, tuple) else parser
+            for one in alternatives:
+                group.add_argument(*one.names, **one.settings)
+        parser.set_defaults(run=self.run, parser=parser, **self.defaults)
+
+    def _texts(self) -> dict[str, Any]:
+        width = shutil.get_terminal_size().columns - 2
+        summary = f"{self.summary[0].upper()}{self.summary[1:]}."
+        lines = [f"  morphgen {example}" for example in self.examples]
+        return {
+            "description": textwrap.fill(f"{summary} {self.details}".strip(), width),
+            "epilog": "\n".join(["examples:", *lines]) if lines else None,
+            "formatter_class": argparse.RawDescriptionHelpFormatter,
+        }
+
+
+def command(
+    name: str,
+    summary: str,
+    *options: Option | tuple[Option, ...],
+    details: str = "",
+    examples: Sequence[str] = (),
+) -> Callable[[Run], Command]:
+    """Return a decorator that makes a command of the function that runs it."""
+    return lambda run: Command(name, summary, options, run, details, examples)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line and name the nearest valid choice."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a ``UsageError`` that says what is wrong and where the usage is explained."""
+        raise UsageError(f"{message}; see {self.prog} --help")
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        """Refuse an invalid choice as the rest of morphgen does."""
+        if action.choices is not None and value not in action.choices:
+            names = map(str, action.choices)
+            raise argparse.ArgumentError(
+                action, f"invalid choice: {value!r}{nearest(str(value), names)}"
+            )
+
+
+def add_commands(
+    parser: argparse.ArgumentParser, commands: Sequence[Command], *, required: bool = False
+) -> None:
+    """Add commands to a parser; the chosen one sets ``run`` and ``parser``."""
+    parsers = parser.add_subparsers(
+        metavar="COMMAND", dest="command", required=required, parser_class=Parser
+    )
+    for each in commands:
+        each.add_to(parsers)
+
+
+def parse(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:
+    """Return the arguments; words of a request may stand before and after options.
+
+    Raises:
+        UsageError: If the command line is invalid.
+    """
+    args, rest = parser.parse_known_args(argv)
+    used = getattr(args, "parser", parser)
+    unknown = next((word for word in rest if word.startswith("-")), None)
+    if unknown is not None:
+        valid = (name for name in used._option_string_actions if name.startswith("--"))
+        used.error(f"unknown option {unknown!r}{nearest(unknown, valid)}")
+    if rest and not hasattr(args, "words"):
+        used.error(f"unknown arguments: {' '.join(rest)}")
+    if rest:
+        args.words += rest
+    return args

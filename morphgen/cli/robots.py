@@ -1,0 +1,244 @@
+"""``morphgen compose``, ``import``, ``list`` and ``show``: make robots and print their facts."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from morphgen.cli import options as opt
+from morphgen.cli.command import command, flag, option, repeated
+
+if TYPE_CHECKING:
+    from morphgen.model.robot import Joint, Robot
+
+PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment", "bodies": "body"}
+
+
+@command(
+    "compose",
+    "join a base, arms and end-effectors into a robot",
+    option(
+        "words",
+        nargs="+",
+        metavar="[GRAMMAR] KEY=VALUE",
+        help="arm=ur5, ee=plane, ee.size=0.1, left.arm=panda, ee.mount_yaw=45deg ...",
+    ),
+    option(
+        "--geometry",
+        choices=["mesh", "primitive"],
+        default="mesh",
+        help="collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres",
+    ),
+    *opt.BUNDLE_OUT,
+    opt.LIBRARY,
+    opt.JSON,
+    details="The bundle is a folder with the robot as URDF and MJCF. If the first word is a "
+    "grammar (see: morphgen grammar list), the robot follows its first alternatives and typical "
+    "values, except for those that KEY=VALUE sets.",
+    examples=("compose arm=ur5 ee=plane ee.size=80mm --out robots/", "compose chain beads=5"),
+)
+def compose(args: argparse.Namespace) -> int:
+    """Compose a robot, check it and write its bundle."""
+    from morphgen.grammar.compose import compose
+    from morphgen.grammar.request import parse_words
+
+    library = opt.library_of(args)
+    derivation, name = parse_words(args.words, library)
+    robot = compose(derivation, library, name if args.name is None else args.name)
+    if args.geometry == "primitive":
+        from morphgen.fitting.replace_collision import as_primitives
+
+        robot = as_primitives(robot, library.folders)
+    return _write_and_report(robot, args)
+
+
+@command(
+    "import",
+    "turn a URDF or xacro into a bundle",
+    option("file", type=Path, help="a URDF, or a xacro if its suffix is .xacro"),
+    option(
+        "--root-link",
+        metavar="LINK",
+        help="link where the robot begins (default: the root of the file)",
+    ),
+    option("--tool", metavar="LINK", help="link whose frame is the tool"),
+    repeated("--arg", "a xacro argument", metavar="NAME=VALUE"),
+    flag(
+        "--as-is",
+        "do not make the safe repairs (see morphgen check), without which some loaders refuse the "
+        "robot",
+    ),
+    opt.ROOT,
+    *opt.BUNDLE_OUT,
+    opt.JSON,
+    details="Meshes are converted to metres and z up. The exit code is 1 if an error remains that "
+    "no safe repair removes (see morphgen check); the bundle is written all the same.",
+    examples=("import my_arm.urdf --tool flange", "import my_arm.xacro --arg length=0.4"),
+)
+def import_robot(args: argparse.Namespace) -> int:
+    """Import a description, check it and write its bundle."""
+    from morphgen.errors import FormatError
+    from morphgen.formats.bundle import bundle_folder
+    from morphgen.grammar.robot_source import import_robot
+
+    if args.name is not None:
+        bundle_folder(args.out, args.name)  # refuses an invalid name before the work
+    pairs = [entry.partition("=") for entry in args.arg]
+    for name, equals, value in pairs:
+        if not name or not equals:
+            raise FormatError(f"--arg {name}{equals}{value}: expected NAME=VALUE")
+    if args.root is not None and not args.root.is_dir():
+        raise FormatError(
+            f"--root {args.root}: no such folder; the link where the robot begins is named by "
+            "--root-link"
+        )
+    robot = import_robot(
+        args.file,
+        {name: value for name, _, value in pairs},
+        root=args.root,
+        root_link=args.root_link,
+        tool=args.tool,
+        name=args.name,
+        repair=not args.as_is,
+    )
+    return _write_and_report(robot, args)
+
+
+def _write_and_report(robot: Robot, args: argparse.Namespace) -> int:
+    """Write ``args.out / robot.name`` and print a summary.
+
+    Returns:
+        1 if the checks find an error in the robot, as ``morphgen check`` does, else 0.
+    """
+    from morphgen.checks import check
+    from morphgen.formats.bundle import CARD, bundle_folder, write_bundle
+    from morphgen.formats.data_files import read_json
+
+    folder = bundle_folder(args.out, robot.name)
+    findings = check(robot)
+    write_bundle(robot, folder, findings, picture=not args.no_picture)
+
+    def text() -> str:
+        lines = [
+            f"{folder}: {len(robot.links)} links, {robot.dof} DoF, {robot.mass:.3g} kg, "
+            f"{len(robot.ignore_pairs)} pairs ignored for self-collision"
+        ]
+        repairs = robot.provenance.get("repairs", ())
+        lines += [f"  repaired {repair}" for repair in repairs]  # type: ignore[attr-defined]
+        lines += [
+            f"  {finding.severity} {finding.code} at {finding.where}: {finding.why}"
+            for finding in findings
+            if finding.severity != "info"
+        ]
+        files = sorted(folder.iterdir())
+        lines += [f"  {path.name}{'/' if path.is_dir() else ''}" for path in files]
+        return "\n".join(lines)
+
+    opt.print_result(args, {"folder": str(folder), "card": read_json(folder / CARD)}, text)
+    return int(any(finding.severity == "error" for finding in findings))
+
+
+@command(
+    "list",
+    "list the parts that morphgen compose joins",
+    option("kind", nargs="?", choices=list(PART_KINDS), help="list only this kind"),
+    opt.LIBRARY,
+    opt.JSON,
+    details="The columns are degrees of freedom, reach (m), mass (kg), source and licence.",
+    examples=("list arms",),
+)
+def list_parts(args: argparse.Namespace) -> int:
+    """Print a table with a row per part."""
+    from tabulate import tabulate
+
+    from morphgen.grammar.catalogue import catalogue
+
+    rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
+    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
+    return 0
+
+
+@command(
+    "show",
+    "print the link tree of a robot with joints, limits, masses and frames",
+    opt.ROBOT,
+    opt.ROOT,
+    opt.LIBRARY,
+    opt.JSON,
+    examples=("show ur5-plane", "show my_arm.urdf"),
+)
+def show(args: argparse.Namespace) -> int:
+    """Print the link tree of one robot."""
+    from morphgen.errors import CompositionError
+    from morphgen.grammar.robot_source import read_source
+
+    sources = opt.sources_of(args)
+    if len(sources) > 1:
+        raise CompositionError(
+            f"{' '.join(args.words)}: {len(sources)} robots; name one, such as {sources[0].label}"
+        )
+    robot = read_source(sources[0], opt.library_of(args), args.root)
+    opt.print_result(args, _facts(robot), lambda: _tree(robot))
+    return 0
+
+
+def _tree(robot: Robot) -> str:
+    lines = [f"{robot.name}: {len(robot.links)} links, {robot.dof} DoF, {robot.mass:.4g} kg"]
+    depth = [0] * len(robot.links)
+    for i, link in enumerate(robot.links):
+        words = [link.name]
+        if i:
+            depth[i] = depth[robot.parents[i]] + 1
+            words.append(_joint_text(robot.joints[i - 1]))
+        if link.inertial is not None and link.inertial.mass:
+            words.append(f"{link.inertial.mass:.4g} kg")
+        words += [f"<{frame.name}>" for frame in robot.frames if frame.link == link.name]
+        lines.append("  " * depth[i] + "  ".join(words))
+    return "\n".join(lines)
+
+
+def _joint_text(joint: Joint) -> str:
+    if joint.kind == "fixed":
+        return "fixed"
+    axis = " ".join(f"{value:g}" for value in joint.axis)
+    text = f"{joint.name}: {joint.kind} ({axis})"
+    if joint.limits is not None:
+        unit, factor = ("m", 1.0) if joint.kind == "prismatic" else ("deg", math.degrees(1))
+        low, high = (factor * limit for limit in joint.limits)
+        text += f" [{low:.4g}, {high:.4g}] {unit}"
+    if joint.mimic is not None:
+        text += f" = {joint.mimic.multiplier:g} * {joint.mimic.joint} + {joint.mimic.offset:g}"
+    return text
+
+
+def _facts(robot: Robot) -> dict[str, object]:
+    parents = ["", *(joint.parent for joint in robot.joints)]
+    columns = ("name", "kind", "parent", "child", "axis", "limits", "effort", "velocity")
+    return {
+        "name": robot.name,
+        "mass": robot.mass,
+        "dof": robot.dof,
+        "links": [
+            {
+                "name": link.name,
+                "parent": parent,
+                "mass": link.inertial.mass if link.inertial else 0.0,
+            }
+            for link, parent in zip(robot.links, parents, strict=True)
+        ],
+        "joints": [
+            {name: getattr(joint, name) for name in columns}
+            | {"mimic": joint.mimic.joint if joint.mimic else None}
+            for joint in robot.joints
+        ],
+        "frames": {
+            frame.name: {
+                "link": frame.link,
+                "position": frame.T_link_frame.position,
+                "quaternion": frame.T_link_frame.quaternion,
+            }
+            for frame in robot.frames
+        },
+    }
