@@ -19,7 +19,7 @@ from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
 from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from
 from morphgen.rl.robot_source import RobotSource, most_obstacles
 from morphgen.tasks.actions import ActionKind
-from morphgen.tasks.env_specs import GoalConfig, default_configs, task_configs
+from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.task import TaskConfig
@@ -189,7 +189,7 @@ def config_from(data: object) -> RunConfig:
         if name not in constants:
             raise TaskError(f"run: no {name}")
     for name, values in constants.items():
-        require_fields(TASKS[name].config_type, values, name)
+        require_fields(TASKS[name].config_type, config_fields(name, values), name)
     made = {"source": RobotSource, "policy": PolicyConfig, "ppo": PPOConfig}
     for name, kind in made.items():
         if name not in own:

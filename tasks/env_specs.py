@@ -66,6 +66,12 @@ class GoalConfig:
         return data
 
 
+def config_fields(task: str, constants: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a task's constants from a file by the names of the fields of its config."""
+    fields = {key: field for field, key in _FILE_KEYS.get(task, {}).items()}
+    return {fields.get(key, key): value for key, value in constants.items()}
+
+
 def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...]:
     """Read the JSON data of ``GoalConfig.as_data``.
 
@@ -75,10 +81,9 @@ def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...
     """
     configs = []
     for name, constants in data.items():
-        fields = {key: field for field, key in _FILE_KEYS.get(name, {}).items()}
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in constants.items()}
-        config_type = TASKS[name].config_type
-        configs.append(config_type(**{fields.get(key, key): v for key, v in values.items()}))
+        values = config_fields(name, constants)
+        values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        configs.append(TASKS[name].config_type(**values))
     return tuple(configs)
 
 
