@@ -181,16 +181,16 @@ def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
     from morphgen.viewer import page_robot
     from morphgen.viewer.app import serve
-    from morphgen.viewer.robot_state import RobotPage, show_moved
+    from morphgen.viewer.page_robot_show import RobotPage, update_scene
 
     times: list[float] = []
 
     def timed(moved: RobotPage) -> None:
         begun = time.perf_counter()
-        show_moved(moved)
+        update_scene(moved)
         times.append(1e3 * (time.perf_counter() - begun))
 
-    with patch.object(page_robot, "show_moved", timed):
+    with patch.object(page_robot, "update_scene", timed):
         viewer = serve()
         print(f"http://127.0.0.1:{viewer.port}", flush=True)
         with suppress(KeyboardInterrupt):

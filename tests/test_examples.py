@@ -12,7 +12,7 @@ from morphgen.grammar.library import default_library
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer.address import Address
 from morphgen.viewer.episode import episode_bytes, read_episode
-from morphgen.viewer.episode_export import recording
+from morphgen.viewer.episode_export import record_scene
 from morphgen.viewer.page_play_controls import parse_rollout
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Rollout, RolloutConfig
@@ -58,4 +58,4 @@ def test_a_task_outside_of_the_package_trains_plays_and_is_shown(follow, tmp_pat
     (tmp_path / "episode.npz").write_bytes(episode_bytes(rollout.episode))
     read = read_episode(tmp_path / "episode.npz", places).tracks[0]
     assert np.array_equal(read.marker_poses["goal"], goals)
-    assert recording(rollout.episode)
+    assert record_scene(rollout.episode)

@@ -1,8 +1,10 @@
-"""Who may use the page: requests are judged by the names in their ``Host`` and ``Origin``.
+"""Which requests the viewer answers, decided by their ``Host`` and ``Origin`` headers.
 
-A page of any other site that a user has open can send requests to this machine, too, and a foreign
-name can be made to lead here (DNS rebinding). Browsers say in ``Host`` by which name a server was
-asked, and in ``Origin`` which site asks; a page cannot change either.
+Threat: the viewer has no password and listens on this machine, but any web page that the user has
+open in the same browser can send requests to ``localhost`` too, and can point a host name of its
+own to this machine (DNS rebinding). Browsers send the name by which a server was addressed as
+``Host``, and the site that sends a request as ``Origin``; a page cannot forge either. So a request
+is answered only if it was addressed to a name of this viewer, by a page of this viewer.
 """
 
 from __future__ import annotations
@@ -18,143 +20,145 @@ from websockets.datastructures import Headers
 from morphgen.errors import MorphgenError
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-"""Names of this machine that nobody else can take."""
+"""Names of this machine that nobody else can claim."""
 _PORTS = {"http": 80, "https": 443}
 _FOREIGN_SERVER, _FOREIGN_FILE = "websocket", "playbackPath"
-"""Keys of an address by which viser's page lets another server, or a file, take its place."""
+"""Query keys that make viser's page show another server, or a file, under this viewer's name."""
 
 
 @dataclass(frozen=True)
 class AccessPolicy:
-    """Which names a viewer may be asked by, and which sites may ask."""
+    """Names by which a viewer may be addressed, and sites that may use it."""
 
     names: frozenset[str] = frozenset(LOCAL_NAMES)
     """Host names and IP addresses, in lower case."""
     any_address: bool = False
-    """Whether every IP address is a name of this machine: it listens at all of them."""
+    """Whether every IP address is accepted as a name, because the viewer listens on all of them."""
     origins: frozenset[str] = frozenset()
-    """Other sites that may ask, such as ``https://hub.example.com``."""
+    """Other sites that may use the viewer, such as ``https://hub.example.com``."""
 
 
 def access_policy(host: str, origins: Sequence[str] = ()) -> AccessPolicy:
-    """The gate of a viewer.
+    """Return the access policy of a viewer.
 
     Args:
-        host: The address that it binds.
-        origins: Other sites that are allowed, as ``--allow-origin`` has them.
+        host: Address that the viewer binds.
+        origins: Other sites that may use it, from ``--allow-origin``.
 
     Raises:
         MorphgenError: If an origin is malformed.
     """
     names = {*LOCAL_NAMES, host.strip("[]").lower()}
-    everywhere = _is_unspecified(host)
-    if everywhere:
+    any_address = _is_unspecified(host)
+    if any_address:
         names |= {name.lower() for name in (socket.gethostname(), socket.getfqdn()) if name}
-    return AccessPolicy(frozenset(names), everywhere, frozenset(map(_parsed_origin, origins)))
+    return AccessPolicy(frozenset(names), any_address, frozenset(map(_parse_origin, origins)))
 
 
-def refusal_reason(gate: AccessPolicy, path: str, headers: Headers) -> str:
-    """Why a request is refused, in one sentence; empty if it is not.
+def refusal_reason(policy: AccessPolicy, path: str, headers: Headers) -> str:
+    """Return in one sentence why a request is refused; empty if it is answered.
 
-    A request without ``Origin`` is no script's of another site: browsers send it with every
-    websocket. So programs of this machine may connect without one.
+    A request without ``Origin`` does not come from a page of another site, because browsers send
+    ``Origin`` with every websocket. So programs on this machine may connect without one.
 
     Args:
-        gate: Who may ask.
-        path: With the query.
-        headers: Of the request.
+        policy: The viewer's names and allowed sites.
+        path: Path and query of the request.
+        headers: Headers of the request.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:
         return "expected one Host and at most one Origin in the request."
     host = hosts[0].lower()
-    if not _is_own(gate, host):
+    if not _is_viewer_name(policy, host):
         return (
-            f"{hosts[0][:100]!a} is no name of this viewer; open it as localhost, or start it with "
-            "--host NAME or --allow-origin http://NAME."
+            f"{hosts[0][:100]!a} is not a name of this viewer; open it as localhost, or start it "
+            "with --host NAME or --allow-origin http://NAME."
         )
-    if origins and not _may_ask(gate, origins[0], host):
+    if origins and not _is_allowed_origin(policy, origins[0], host):
         return (
             f"a page of {origins[0][:100]!a} may not use this viewer; if it is yours, start the "
             "viewer with --allow-origin and its origin."
         )
     query = dict(parse_qsl(urlsplit(path).query))
-    server = _split(query.get(_FOREIGN_SERVER, f"ws://{host}"))
-    if _FOREIGN_FILE in query or server is None or not _is_own(gate, server.netloc.lower()):
+    server = _split_url(query.get(_FOREIGN_SERVER, f"ws://{host}"))
+    foreign = server is None or not _is_viewer_name(policy, server.netloc.lower())
+    if _FOREIGN_FILE in query or foreign:
         return f"an address with {_FOREIGN_SERVER}= or {_FOREIGN_FILE}= would show another server."
     return ""
 
 
-def policy(gate: AccessPolicy, host: str) -> str:
-    """The Content-Security-Policy of the page: what it may connect to, and who may frame it.
+def content_security_policy(policy: AccessPolicy, host: str) -> str:
+    """Return the Content-Security-Policy of the page: its connections, and who may embed it.
 
-    viser's page would connect to any server that its address names and run what that sends.
+    Second defence: without it, viser's page would connect to any server that its address names, and
+    run what that server sends.
 
     Args:
-        gate: Who may ask.
+        policy: The viewer's names and allowed sites.
         host: ``Host`` of a request that was not refused.
     """
-    sites = " ".join(sorted(gate.origins))
-    sockets = " ".join(f"ws{each[4:]}" for each in sorted(gate.origins))
+    sites = " ".join(sorted(policy.origins))
+    sockets = " ".join(f"ws{origin[4:]}" for origin in sorted(policy.origins))
     return (
         f"connect-src 'self' ws://{host} wss://{host} {sockets} data: blob:; "
         f"frame-ancestors 'self' {sites}; object-src 'none'; base-uri 'none'; form-action 'none'"
     )
 
 
-def _is_own(gate: AccessPolicy, netloc: str) -> bool:
-    """Whether a host with its port is this viewer's name.
+def _is_viewer_name(policy: AccessPolicy, netloc: str) -> bool:
+    """Return whether a host with its port names this viewer.
 
-    The port is not compared, because a tunnel (``ssh -L``) may have another.
+    The port is not compared, because a tunnel (``ssh -L``) may use another one.
     """
-    url = _split(f"http://{netloc}")
+    url = _split_url(f"http://{netloc}")
     if url is None or url.username is not None or url.netloc != netloc or not url.hostname:
         return False
-    allowed = (urlsplit(origin) for origin in gate.origins)
     return (
-        url.hostname in gate.names
-        or (gate.any_address and _is_address(url.hostname))
-        or any(url.netloc == each.netloc for each in allowed)
+        url.hostname in policy.names
+        or (policy.any_address and _is_ip_address(url.hostname))
+        or any(url.netloc == urlsplit(origin).netloc for origin in policy.origins)
     )
 
 
-def _may_ask(gate: AccessPolicy, origin: str, host: str) -> bool:
-    """Whether a site is the viewer's own, by the name that it was asked by, or an allowed one."""
-    site = _split(origin)
+def _is_allowed_origin(policy: AccessPolicy, origin: str, host: str) -> bool:
+    """Return whether a site is allowed, or the viewer itself under the name it was addressed by."""
+    site = _split_url(origin)
     if site is None or site.scheme not in _PORTS:
         return False
-    own = _split(f"{site.scheme}://{host}")
-    return own is not None and (_site(site) == _site(own) or _site(site) in gate.origins)
+    viewer = _split_url(f"{site.scheme}://{host}")
+    return viewer is not None and _normalized(site) in {_normalized(viewer), *policy.origins}
 
 
-def _site(url: SplitResult) -> str:
-    """An origin in one spelling: lower case, without the scheme's own port."""
+def _normalized(url: SplitResult) -> str:
+    """Return an origin in one spelling: lower case, without the default port of its scheme."""
     name = f"[{url.hostname}]" if ":" in (url.hostname or "") else url.hostname
     port = "" if url.port in (None, _PORTS[url.scheme]) else f":{url.port}"
     return f"{url.scheme}://{name}{port}"
 
 
-def _parsed_origin(text: str) -> str:
-    url = _split(text.strip())
+def _parse_origin(text: str) -> str:
+    url = _split_url(text.strip())
     plain = url is not None and not (url.path.strip("/") or url.query or url.fragment)
     if url is None or not plain or url.scheme not in _PORTS or not url.hostname or "@" in text:
         raise MorphgenError(
             f"--allow-origin {text!r}: expected a site such as https://hub.example.com or "
             "http://box:8080, without a path"
         )
-    return _site(url)
+    return _normalized(url)
 
 
-def _split(url: str) -> SplitResult | None:
+def _split_url(url: str) -> SplitResult | None:
+    """Split a URL; None if it is malformed."""
     try:
         parts = urlsplit(url)
-        parts.port  # noqa: B018  (a port that is no number raises here)
+        parts.port  # noqa: B018  (raises ValueError for a port that is not a number)
     except ValueError:
         return None
     return parts
 
 
-def _is_address(name: str) -> bool:
+def _is_ip_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:
@@ -163,6 +167,6 @@ def _is_address(name: str) -> bool:
 
 
 def _is_unspecified(host: str) -> bool:
-    if not host:
-        return True
-    return _is_address(host.strip("[]")) and ipaddress.ip_address(host.strip("[]")).is_unspecified
+    """Return whether binding a host means to listen on all addresses (``0.0.0.0``, ``::``)."""
+    address = host.strip("[]")
+    return not host or (_is_ip_address(address) and ipaddress.ip_address(address).is_unspecified)

@@ -2,87 +2,130 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
 from urllib.parse import parse_qsl, quote, urlencode
 
 from morphgen.errors import MorphgenError, nearest
+from morphgen.viewer.pages import PAGES
 
-Page = Literal["library", "gallery", "robot", "compose", "compare", "split", "play"]
-PAGES: tuple[Page, ...] = get_args(Page)
-LONGEST = 8000
-"""Characters of a query."""
-MOST_DIGITS = 15
-"""Of a number in an address; browsers have no larger whole numbers."""
-ROBOT: Page = "robot"
-"""Key of a page, and on the page ``play`` of the robots that play."""
+MAX_QUERY = 8000
+"""Longest query [characters]."""
+MAX_DIGITS = 15
+"""Longest number in an address [digits]; larger integers are not exact in a browser."""
+MAX_PACKED = 4000
+"""Longest packed text [characters]; some browsers and mail programs cut longer addresses."""
+MAX_UNPACKED = 200_000
+"""Longest text that is unpacked [bytes], so that a short address cannot fill the memory."""
+ROBOT = "robot"
+"""Key of the page of a robot, and on the page ``play`` the key of each robot of the rollout."""
 
 
 class AddressError(MorphgenError):
-    """An address that leads to no page."""
+    """An address does not lead to a page."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """A page, what it shows, and how."""
+    """A page with its subjects and its state."""
 
-    page: Page
-    of: tuple[str, ...] = ("",)
-    """What is shown: a folder, a robot, a split's name, words; several to compare."""
+    page: str
+    """Key of the page in ``PAGES``."""
+    subjects: tuple[str, ...] = ("",)
+    """What the page shows: a folder, a robot, a split's name, ...; several on page ``compare``."""
     state: Mapping[str, str] = field(default_factory=dict)
-    """Sort order, filter, joint positions ...; what is at its default is left out."""
+    """Sort order, filter, joint positions, ... by key; default values are left out."""
     robots: tuple[str, ...] = ()
-    """Those that play; no other page has any."""
+    """URIs of the robots of a rollout (page ``play`` only)."""
 
     @property
     def subject(self) -> str:
-        """The first thing that is shown."""
-        return self.of[0]
+        """The first subject."""
+        return self.subjects[0]
 
     @property
     def query(self) -> str:
-        """The text after the host, from the question mark on."""
+        """The query of the URL, with its question mark."""
         robots = ((ROBOT, robot) for robot in self.robots)
-        pairs = [*((self.page, of) for of in self.of), *robots, *self.state.items()]
+        subjects = ((self.page, subject) for subject in self.subjects)
+        pairs = [*subjects, *robots, *self.state.items()]
         return "?" + urlencode(pairs, quote_via=quote, safe="/=:,@+")
 
     def with_state(self, **changes: str) -> Address:
-        """The same page with other state; an empty value removes a key."""
+        """Return the same page with other state; an empty value removes a key."""
         state = {key: value for key, value in {**self.state, **changes}.items() if value}
         return replace(self, state=state)
 
 
-def whole_number(text: str, default: int) -> int:
-    """A number of an address, 0 or more; the default if it is none that a page can hold."""
-    is_number = text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS
-    return int(text) if is_number else default
-
-
 def parse_address(query: str) -> Address | None:
-    """Read the query of a URL.
-
-    Args:
-        query: With or without its question mark.
+    """Parse the query of a URL, with or without its question mark.
 
     Returns:
-        None if the query is empty: the page that the viewer was started for.
+        The address; None if the query is empty, which stands for the viewer's start page.
 
     Raises:
-        AddressError: If it names no page, or two different ones.
+        AddressError: If the query names no page, or two different ones.
     """
-    if len(query) > LONGEST:
-        raise AddressError(f"the address has {len(query)} characters; at most {LONGEST} are read")
+    if len(query) > MAX_QUERY:
+        raise AddressError(f"the address has {len(query)} characters; at most {MAX_QUERY} are read")
+    # "+" stays a plus sign: addresses write spaces as %20.
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
     if not pairs:
         return None
-    named = {key for key, _ in pairs}
-    robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in named else ()
-    pages = [page for page in PAGES if page in named and not (page == ROBOT and robots)]
+    keys = {key for key, _ in pairs}
+    robots = tuple(value for key, value in pairs if key == ROBOT) if "play" in keys else ()
+    pages = [page for page in PAGES if page in keys and not (page == ROBOT and robots)]
     if not pages:
         raise AddressError(f"address {query!r:.100} names no page{nearest(pairs[0][0], PAGES)}")
     if len(pages) > 1:
         raise AddressError(f"address {query!r:.100} names two pages: {' and '.join(pages)}")
-    of = tuple(value for key, value in pairs if key == pages[0])
+    subjects = tuple(value for key, value in pairs if key == pages[0])
     state = {key: value for key, value in pairs if key not in PAGES}
-    return Address(pages[0], of, state, robots)
+    return Address(pages[0], subjects, state, robots)
+
+
+def parse_count(text: str, default: int) -> int:
+    """Return a nonnegative integer of an address; the default if it is invalid or too long."""
+    is_number = text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS
+    return int(text) if is_number else default
+
+
+def pack_text(text: str) -> str:
+    """Compress a text into characters that an address keeps unescaped (base64url).
+
+    Raises:
+        AddressError: If the packed text is too long for an address.
+    """
+    content = base64.urlsafe_b64encode(zlib.compress(text.encode(), 9)).decode().rstrip("=")
+    if len(content) > MAX_PACKED:
+        raise AddressError(
+            f"the text is too long for the page's address ({len(content)} characters packed, at "
+            f"most {MAX_PACKED}): keep it in a file"
+        )
+    return content
+
+
+def unpack_text(content: str) -> str:
+    """Return the text that ``pack_text`` has packed.
+
+    Raises:
+        AddressError: If the content is invalid or too long.
+    """
+    if len(content) > MAX_PACKED:
+        raise AddressError(
+            f"the address has a text of {len(content)} characters; at most {MAX_PACKED} are read"
+        )
+    try:
+        data = base64.b64decode(content + "=" * (-len(content) % 4), altchars=b"-_", validate=True)
+        decompressor = zlib.decompressobj()
+        text = decompressor.decompress(data, MAX_UNPACKED)
+        if not decompressor.eof:
+            raise AddressError(
+                f"the address has an incomplete text, or one of more than {MAX_UNPACKED} bytes"
+            )
+        return text.decode()
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise AddressError(f"the address has no readable text: {error}") from error

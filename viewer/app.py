@@ -1,13 +1,10 @@
-"""The viewer: a server of pages, a session for every browser."""
+"""The viewer: a server, and a session for every browser."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import io
 import socket
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -15,50 +12,34 @@ from tempfile import TemporaryDirectory
 
 import viser
 
-from morphgen.errors import MorphgenError
+from morphgen.benchmark.split_file import split_names
+from morphgen.benchmark.split_folder import SPLIT_FILE
+from morphgen.errors import MorphgenError, nearest
 from morphgen.formats.urdf import UnsoundError
+from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import default_library
-from morphgen.viewer import (
-    browser,
-    markup,
-    page_compare,
-    page_compose,
-    page_gallery,
-    page_library,
-    page_robot,
-    page_split,
-)
+from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.viewer import markup
 from morphgen.viewer.access import access_policy
-from morphgen.viewer.address import Address, Page, parse_address
-from morphgen.viewer.messages import check_values
-from morphgen.viewer.robot_uri import FileAccess
-from morphgen.viewer.server import start_server
-from morphgen.viewer.session import BUG, Session, close, post, refuse
-from morphgen.viewer.targets import target_address
+from morphgen.viewer.address import Address, parse_address
+from morphgen.viewer.messages import filter_messages
+from morphgen.viewer.pages import load_page
+from morphgen.viewer.robot_uri import (
+    CHECKPOINT,
+    EPISODE_SUFFIX,
+    WORDS,
+    FileAccess,
+    UriError,
+    resolve_words,
+)
+from morphgen.viewer.server import start_server, stop_server
+from morphgen.viewer.session import BUG, Session, read_query
 from morphgen.viewer.workers import Workers
 
 NOTHING = "There is nothing to see here"
-WORKERS = 2
+"""Title of the page for an address that cannot be shown."""
+NUM_WORKERS = 2
 """Processes that draw thumbnails and compare robots."""
-
-
-def _show_play(session: Session) -> None:
-    # What simulates takes seconds and much memory to load, which other pages need not.
-    from morphgen.viewer import page_play
-
-    page_play.show(session)
-
-
-SHOW: Mapping[Page, Callable[[Session], None]] = {
-    "library": page_library.show,
-    "gallery": page_gallery.show,
-    "robot": page_robot.show,
-    "compose": page_compose.show,
-    "compare": page_compare.show,
-    "split": page_split.show,
-    "play": _show_play,
-}
-"""How each page is built."""
 
 
 @dataclass(eq=False)
@@ -67,26 +48,26 @@ class Viewer:
 
     server: viser.ViserServer
     start: Address
-    """The page that is shown to those who name none."""
-    places: FileAccess
+    """Page for browsers whose URL names none."""
+    files: FileAccess
     workers: Workers
     uploads: TemporaryDirectory[str]
-    """Where uploads are kept; it goes with the viewer, or with its process."""
+    """Folder of uploads; deleted with the viewer, at the latest when its process ends."""
     sessions: dict[int, Session] = field(default_factory=dict)
-    shared: dict[str, object] = field(default_factory=dict)
-    """What took long to find."""
+    """Sessions of the connected browsers, by viser's client number."""
+    cache: dict[str, object] = field(default_factory=dict)
+    """Results of slow work that all sessions share."""
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port on which the viewer listens."""
         return self.server.get_port()
 
     def stop(self) -> None:
-        """End all sessions, the server and its workers."""
+        """End all sessions, the server and its workers, and delete the uploads."""
         for session in list(self.sessions.values()):
-            close(session)
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+            session.close()
+        stop_server(self.server)
         self.workers.close()
         self.uploads.cleanup()
 
@@ -101,89 +82,133 @@ def serve(
     """Start a viewer.
 
     Args:
-        words: What its first page shows: nothing for the library; a folder, a file or a split's
-            name; or words of ``morphgen compose``.
+        words: Target of the start page, see ``start_address``.
         host: Address to bind.
         port: Port; if it is taken, the next free one.
-        library: Folders of the user's own parts.
-        origins: Sites, besides its own, whose pages may use it.
+        library: Folders with further parts.
+        origins: Other sites whose pages may use the viewer.
 
     Raises:
-        MorphgenError: If there is no such thing, or the address is none of this machine's.
+        MorphgenError: If the target does not exist, or the address does not belong to this machine.
     """
-    places = FileAccess(default_library(library).folders, _roots(words), Path("/nowhere"))
-    places.library.names()  # a folder that is missing, or a part that is broken, is told now
-    start = target_address(words, places)
-    gate = access_policy(host, origins)
-    _require_address(host)
+    files = FileAccess(default_library(library).folders, _roots(words), Path("/nowhere"))
+    files.library.names()  # reports a missing folder or a broken part before the server starts
+    start = start_address(words, files)
+    policy = access_policy(host, origins)
+    _require_local_address(host)
     uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
-    places = FileAccess(places.folders, places.roots, Path(uploads.name).resolve())
-    server = start_server(host, port, gate)
-    # What a browser misses that has just gone is no news.
+    files = FileAccess(files.library_folders, files.roots, Path(uploads.name).resolve())
+    server = start_server(host, port, policy)
+    # Work that ends after its browser has disconnected still writes to the page; that is harmless.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    viewer = Viewer(server, start, places, Workers(WORKERS), uploads)
+    viewer = Viewer(server, start, files, Workers(NUM_WORKERS), uploads)
 
     async def connect(client: viser.ClientHandle) -> None:
-        session = Session(client, places, viewer.workers, start, viewer.shared)
+        session = Session(client, files, viewer.workers, start, viewer.cache)
         viewer.sessions[client.client_id] = session
-        check_values(client, functools.partial(refuse, session))
-        post(session, lambda: open_page(session))
+        filter_messages(client, session.report_error)
+        session.enqueue(lambda: open_page(session))
 
     async def disconnect(client: viser.ClientHandle) -> None:
         session = viewer.sessions.pop(client.client_id, None)
         if session is not None:
-            close(session)
+            session.close()
 
     server.on_client_disconnect(disconnect)
     server.on_client_connect(connect)
     return viewer
 
 
-def _require_address(host: str) -> None:
-    """Require that a host is an address of this machine."""
-    try:
-        kind, _, _, _, address = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(kind) as probe:
-            probe.bind(address)
-    except OSError as error:
-        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
+def start_address(words: Sequence[str], files: FileAccess) -> Address:
+    """Return the page that ``morphgen view`` opens.
+
+    Args:
+        words: Nothing for the library; a folder, a file, or the name of a split or grammar; or
+            words of ``morphgen compose``.
+        files: Files that may be read.
+
+    Raises:
+        MorphgenError: If the target does not exist.
+    """
+    if not words:
+        return Address("library")
+    if len(words) > 1 or "=" in words[0]:
+        resolve_words(" ".join(words), files)
+        return Address("robot", (WORDS + " ".join(words),))
+    word = words[0]
+    if Path(word).exists():
+        return _path_address(word, files)
+    if word in split_names():
+        return Address("split", (word,))
+    if word in grammar_names():
+        return Address("compose", (word,))
+    valid = (*split_names(), *grammar_names())
+    raise UriError(f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}")
+
+
+def _path_address(text: str, files: FileAccess) -> Address:
+    """Return the page of a file or folder."""
+    path = files.path(text)
+    if path.suffix == EPISODE_SUFFIX:
+        from morphgen.viewer.episode import read_episode
+
+        read_episode(path, files)
+        return Address("play", (text,))
+    if path.suffix == ".pt" or (path / CHECKPOINT).is_file():
+        from morphgen.rl.runs import read_checkpoint
+
+        read_checkpoint(path)
+        return Address("play", state={"policy": text})
+    if path.is_file():
+        return Address({".yaml": "split", SUFFIX: "compose"}.get(path.suffix, "robot"), (text,))
+    if (path / SPLIT_FILE).is_file():
+        return Address("split", (text,))
+    return Address("robot" if is_robot_folder(path) else "gallery", (text,))
 
 
 def open_page(session: Session) -> None:
-    """Build the page that a browser's URL names."""
+    """Build the page that a browser's URL names, or a page that says why it cannot be shown."""
     client = session.client
     client.gui.configure_theme(show_logo=False, show_share_button=False)
+    redact = session.files.redact
     try:
-        session.address = parse_address(browser.read_query(client)) or session.address
-        SHOW[session.address.page](session)
+        session.address = parse_address(read_query(client)) or session.address
+        load_page(session.address.page)(session)
     except UnsoundError as error:
-        findings = markup.findings_table(error.findings, session.places.told)
-        _show_fault(session, session.places.told(error.origin), findings)
+        _show_fault(session, redact(error.origin), markup.findings_table(error.findings, redact))
     except (MorphgenError, TimeoutError) as error:
-        _show_fault(session, NOTHING, escape(session.places.told(error)))
+        _show_fault(session, NOTHING, escape(redact(error)))
     except RecursionError:
-        _show_fault(session, NOTHING, "what the address names is nested too deeply")
+        _show_fault(session, NOTHING, "the address is nested too deeply")
     except Exception:
         if not session.closed.is_set():
             _show_fault(session, NOTHING, BUG)
             raise
 
 
-def _show_fault(session: Session, title: str, text: str) -> None:
-    """A page that says why there is no other."""
+def _show_fault(session: Session, title: str, html: str) -> None:
     gui, session.status = session.client.gui, None
     gui.reset()
     session.client.scene.reset()
     gui.set_panel_label("morphgen")
     gui.main_panel.dock_left()
     gui.main_panel.set_width(760)
-    gui.add_html(markup.STYLE + markup.crumbs((session.address.page, None)))
-    gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{text}"))
+    gui.add_html(markup.STYLE + markup.breadcrumbs((session.address.page, None)))
+    gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{html}"))
 
 
 def _roots(words: Sequence[str]) -> tuple[Path, ...]:
-    """Where robots may be read from: here, and what the user named."""
-    here = Path.cwd().resolve()
-    named = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
-    beside = [path.parent if path.is_file() else path for path in named]
-    return tuple(dict.fromkeys((here, *beside)))
+    """Return the folders below which files may be read: the current one, and the target's."""
+    targets = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
+    folders = [path.parent if path.is_file() else path for path in targets]
+    return tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
+
+
+def _require_local_address(host: str) -> None:
+    """Require that an address to bind belongs to this machine."""
+    try:
+        kind, _, _, _, address = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error

@@ -1,62 +1,165 @@
-"""Joints of different robots that do the same: by their place on the way to the tool."""
+"""Comparison of robots: joints with the same role, similarity, and quality of their primitives."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
+from morphgen.benchmark.similarity import MEASURES, features
+from morphgen.benchmark.tokens import MAX_LINKS, tokens
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
+from morphgen.grammar.library import Library
+from morphgen.model.geometry import Shape
 from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
+from morphgen.viewer import markup
+from morphgen.viewer.figures import blend
+from morphgen.viewer.robot_tables import has_tool
+from morphgen.viewer.robot_uri import with_library_meshes
+
+FitQuality = dict[str, tuple[float, tuple[Shape, ...]]]
+"""IoU of a link's primitives with the shapes they replace, and the primitives, by link."""
+_RED_TO_GREEN = ((224, 49, 49), (250, 200, 30), (47, 158, 68))
 
 
-def roles(robot: Robot) -> list[str]:
-    """The role of every independent joint, in the order of q.
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Tokens and similarity of robots."""
 
-    ``joint 1`` is the first on the way from the root to the tool; ``finger 1`` the first of those
-    that do not move the tool. A joint that moves the tool through a mimic is on the way, too.
+    tables: tuple[Array, ...]
+    """Tokens at home by robot, shape (n_links, 48) each."""
+    values: dict[str, Array]
+    """Similarity of every pair by measure, shape (n, n)."""
+
+
+def joint_roles(robot: Robot) -> list[str]:
+    """Return the role of every independent joint, in the order of q.
+
+    ``joint 1`` is the first joint on the path from the root to the tool; ``finger 1`` the first
+    that does not move the tool. A joint that moves the tool only through a mimic joint counts as
+    on the path.
     """
-    on_way: list[int] = []
-    if any(frame.name == TOOL for frame in robot.frames):
+    on_path: list[int] = []
+    if has_tool(robot):
         row = {k: i for i, k in enumerate(robot.movable_joints)}
         gains, _ = robot.mimic_map
         path = [k for k in robot.joint_chain(robot.frame(TOOL).link) if k in row]
-        on_way = [int(column) for k in path for column in gains[row[k]].nonzero()[0]]
-    on_way = list(dict.fromkeys(on_way))
-    others = [i for i in range(robot.dof) if i not in on_way]
-    named = {i: f"joint {n}" for n, i in enumerate(on_way, 1)}
-    named |= {i: f"finger {n}" for n, i in enumerate(others, 1)}
-    return [named[i] for i in range(robot.dof)]
+        on_path = [int(column) for k in path for column in gains[row[k]].nonzero()[0]]
+    on_path = list(dict.fromkeys(on_path))
+    others = [i for i in range(robot.dof) if i not in on_path]
+    roles = {i: f"joint {n}" for n, i in enumerate(on_path, 1)}
+    roles |= {i: f"finger {n}" for n, i in enumerate(others, 1)}
+    return [roles[i] for i in range(robot.dof)]
 
 
 def all_roles(robots: Sequence[Robot]) -> list[str]:
-    """Every role that one of the robots has, joints before fingers, by number."""
-    found = {role for robot in robots for role in roles(robot)}
-    return sorted(found, key=lambda role: (role[0] != "j", int(role.split()[1])))
+    """Return every role of any of the robots, joints before fingers, by number."""
+    roles = {role for robot in robots for role in joint_roles(robot)}
+    return sorted(roles, key=lambda role: (role[0] != "j", int(role.split()[1])))
 
 
-def scaled(robot: Robot, q: Array) -> Array:
-    """Positions as shares of the ranges: -1 at the lower bound, 1 at the upper, shape (dof,)."""
+def normalized_positions(robot: Robot, q: Array) -> Array:
+    """Map joint positions to -1 at the lower limit and 1 at the upper, shape (dof,)."""
     low, high = joint_limits(robot).T
-    half = np.where(high > low, (high - low) / 2, 1.0)
-    return np.asarray((q - (low + high) / 2) / half)
+    half_range = np.where(high > low, (high - low) / 2, 1.0)
+    return np.asarray((q - (low + high) / 2) / half_range)
 
 
 def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
-    """A configuration with the joints of some roles moved.
+    """Return a configuration with the joints of some roles moved.
 
     Args:
-        robot: The body.
-        q: Independent joint positions, shape (dof,), rad or m.
-        values: Share of the range by role, in [-1, 1].
+        robot: The robot.
+        q: Independent joint positions, shape (dof,) [rad or m].
+        values: Normalized position in [-1, 1] by role.
 
     Returns:
-        Shape (dof,), within the bounds.
+        The configuration clipped to the limits, shape (dof,).
     """
     low, high = joint_limits(robot).T
-    found = np.array(q, dtype=np.float64)
-    for i, role in enumerate(roles(robot)):
+    moved = np.array(q, dtype=np.float64)
+    for i, role in enumerate(joint_roles(robot)):
         if role in values:
-            found[i] = (low[i] + high[i]) / 2 + values[role] * (high[i] - low[i]) / 2
-    return np.asarray(np.clip(found, low, high))
+            moved[i] = (low[i] + high[i]) / 2 + values[role] * (high[i] - low[i]) / 2
+    return np.asarray(np.clip(moved, low, high))
+
+
+def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> Comparison:
+    """Compute tokens and similarity of robots; takes seconds if primitives have to be fitted.
+
+    Raises:
+        BenchmarkError: If a robot has no tool, or no joint that moves it.
+        MorphgenError: If a mesh cannot be read.
+    """
+    library = Library(folders)
+    shapes = [token_shapes(with_library_meshes(robot, library), folders) for robot in robots]
+    # Splits fix the number of links; here the largest robot does.
+    max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
+    pairs = list(zip(robots, shapes, strict=True))
+    known = [features(robot, shape, max_links=max_links) for robot, shape in pairs]
+    return Comparison(
+        tuple(tokens(robot, shape, max_links=max_links) for robot, shape in pairs),
+        {
+            name: np.array([[measure.function(a, b) for b in known] for a in known])
+            for name, measure in MEASURES.items()
+        },
+    )
+
+
+def similarity_table(names: Sequence[str], comparison: Comparison) -> str:
+    """Return a table with a row for each pair of robots and a column for each measure."""
+    header = [""]
+    for name, measure in MEASURES.items():
+        direction = "larger" if measure.larger_is_more_alike else "smaller"
+        header.append(f"{name} ({direction} is more similar)")
+    rows = [
+        (
+            f"{escape(names[i])} and {escape(names[j])}",
+            *(f"{comparison.values[name][i, j]:.3f}" for name in MEASURES),
+        )
+        for i, j in combinations(range(len(names)), 2)
+    ]
+    return markup.table(header, rows, range(1, len(header)))
+
+
+def fit_quality(robot: Robot, folders: Sequence[Path]) -> FitQuality:
+    """Return how well stored primitives replace the collision shapes of links.
+
+    A link whose collision shapes are primitives already has IoU 1; a link without stored fit is
+    left out.
+    """
+    stored = read_stored_fits(folders)
+    quality: FitQuality = {}
+    for link in with_library_meshes(robot, Library(folders)).links:
+        if link.collisions and are_primitives(link.collisions):
+            quality[link.name] = (1.0, link.collisions)
+        elif link.collisions and (fit := stored_fit(link.collisions, stored)):
+            quality[link.name] = (fit.collision_iou, fit.collision)
+    return quality
+
+
+def iou_colour(iou: float) -> tuple[int, int, int]:
+    """Return red for an IoU of 0.5 or less, yellow for 0.75, green for 1."""
+    return blend(_RED_TO_GREEN, min(max((iou - 0.5) / 0.5, 0.0), 1.0))
+
+
+def fit_table(robot: Robot, quality: FitQuality) -> str:
+    """Return a table of links with the number of their primitives and their IoU."""
+    rows = []
+    for link in robot.links:
+        if not link.collisions:
+            continue
+        if link.name not in quality:
+            rows.append((escape(link.name), "", '<span class="dim">not fitted yet</span>'))
+            continue
+        iou, shapes = quality[link.name]
+        square = f'<span style="color:rgb{iou_colour(iou)}">■</span>'
+        rows.append((escape(link.name), str(len(shapes)), f"{square} {iou:.2f}"))
+    return markup.table(("link", "primitives", "IoU"), rows, (1, 2))

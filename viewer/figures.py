@@ -1,89 +1,191 @@
-"""Token matrices of robots as pictures, with what differs between them."""
+"""Figures of pages: maps and heatmaps of robots as SVG, token matrices as PNG."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from html import escape
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from morphgen.benchmark.token_layout import LAYOUT
 from morphgen.typing import Array
+from morphgen.viewer.address import Address
 
-SAME = 1e-6
-"""Difference up to which two numbers are the same."""
-_ROW, _WIDTH, _DPI = 0.14, 5.4, 200
+TOKEN_TOLERANCE = 1e-6
+"""Difference up to which two numbers of tokens count as equal."""
+_SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
+_WIDTH = 480
+"""Width of an SVG in its own units."""
+_BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))
+"""White to dark blue."""
+_ROW_HEIGHT, _PNG_WIDTH, _DPI = 0.14, 5.4, 200
+"""Height of a link's row and width of the picture of tokens [inches], and its resolution."""
 
 
-def differences(tables: Sequence[Array]) -> list[NDArray[np.bool_]]:
-    """Where each robot's tokens are not those of the first one.
+def blend(stops: ArrayLike, share: float) -> tuple[int, int, int]:
+    """Return the colour at a share in [0, 1] of a scale of three colours."""
+    colours = np.asarray(stops, dtype=float)
+    channels = [np.interp(share, (0.0, 0.5, 1.0), colours[:, k]) for k in range(3)]
+    red, green, blue = (int(channel) for channel in channels)
+    return red, green, blue
+
+
+def map_svg(points: Array, names: Sequence[str], sides: Sequence[str], uris: Sequence[str]) -> str:
+    """Return a map of robots in the plane; a click on a point opens the robot.
+
+    Args:
+        points: Shape (n, 2).
+        names: Names of the robots.
+        sides: ``train`` or ``test`` for each robot, shown by colour.
+        uris: URIs of the robots.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    scale = (_WIDTH - 130) / max(float((high - low).max()), 1e-9)
+    height = float((high - low)[1]) * scale + 60
+    marks = []
+    labels: list[tuple[float, float, float]] = []
+    for (x, y), name, side, uri in zip(points.tolist(), names, sides, uris, strict=True):
+        px, py = 20 + (x - low[0]) * scale, 30 + (high[1] - y) * scale
+        query = escape(Address("robot", (uri,)).query)
+        marks.append(
+            f'<a href="{query}"><g><title>{escape(name)} ({side})</title>'
+            f'<circle cx="{px:.1f}" cy="{py:.1f}" r="6" fill="{_SIDE_COLOURS[side]}" '
+            f'fill-opacity="0.8" stroke="#fff"/>'
+            f"{_map_label(px, py, name, labels)}</g></a>"
+        )
+    return _svg(height, "".join(marks))
+
+
+def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:
+    """Return a square for each pair of robots, dark if they are similar; titles have the values.
+
+    Args:
+        values: Shape (n, n).
+        names: Names of the robots.
+        sides: ``train`` or ``test`` for each robot, shown by the colour of its name.
+        larger: Whether larger values mean more similar robots.
+    """
+    n = len(names)
+    left, cell = 120.0, (_WIDTH - 120.0) / max(n, 1)
+    # Robots compared with themselves would stretch the scale.
+    pairs = values[~np.eye(n, dtype=bool)] if n > 1 else values.ravel()
+    low, high = float(pairs.min()), float(pairs.max())
+    parts = []
+    for i, (name, side) in enumerate(zip(names, sides, strict=True)):
+        parts.append(
+            f'<text x="{left - 4}" y="{(i + 0.65) * cell:.1f}" font-size="{min(10.0, cell):.1f}" '
+            f'text-anchor="end" fill="{_SIDE_COLOURS[side]}">{escape(name[:22])}</text>'
+        )
+        for j, other in enumerate(names):
+            share = (values[i, j] - low) / (high - low) if high > low else 1.0
+            share = min(max(share if larger else 1 - share, 0.0), 1.0)
+            parts.append(
+                f'<rect x="{left + j * cell:.1f}" y="{i * cell:.1f}" width="{cell:.2f}" '
+                f'height="{cell:.2f}" fill="rgb{blend(_BLUES, share)}">'
+                f"<title>{escape(name)} and {escape(other)}: {values[i, j]:.3f}</title></rect>"
+            )
+    return _svg(n * cell + 4, "".join(parts))
+
+
+def token_differences(tables: Sequence[Array]) -> list[NDArray[np.bool_]]:
+    """Return which tokens of each robot differ from those of the first robot.
 
     Args:
         tables: Tokens by robot, shape (n_links, 48) each.
 
     Returns:
-        By robot, shape (n_links, 48); rows that the first robot does not have are all different.
+        By robot, shape (n_links, 48); links that the first robot does not have differ throughout.
     """
     first = tables[0]
-    found = []
+    differences = []
     for table in tables:
-        apart = np.ones(table.shape, dtype=bool)
+        different = np.ones(table.shape, dtype=bool)
         n = min(len(table), len(first))
-        apart[:n] = np.abs(table[:n] - first[:n]) > SAME
-        found.append(apart)
-    return found
+        different[:n] = np.abs(table[:n] - first[:n]) > TOKEN_TOLERANCE
+        differences.append(different)
+    return differences
 
 
 def tokens_png(
     names: Sequence[str], links: Sequence[Sequence[str]], tables: Sequence[Array]
 ) -> bytes:
-    """Draw the tokens of robots below each other; a PNG.
+    """Draw the tokens of robots below each other; return a PNG.
 
-    Blue is negative, red positive, up to 1 in size. A black dot marks what differs from the first
-    robot. Lines part the fields of a token.
+    Blue is negative, red positive, saturated at -1 and 1. A black dot marks a difference from the
+    first robot. Vertical lines separate the fields of a token.
 
     Args:
-        names: Of the robots.
+        names: Names of the robots.
         links: Names of their links.
         tables: Their tokens, shape (n_links, 48) each.
     """
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()
+        matplotlib.rcdefaults()  # the same bytes whatever the user has configured
         heights = [max(len(table), 3) for table in tables]
-        size = (_WIDTH, _ROW * sum(heights) + 0.45 * len(tables) + 1.0)
+        size = (_PNG_WIDTH, _ROW_HEIGHT * sum(heights) + 0.45 * len(tables) + 1.0)
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
         axes = figure.subplots(len(tables), 1, squeeze=False, height_ratios=heights)[:, 0]
-        apart = differences(tables)
+        differences = token_differences(tables)
         for i, ax in enumerate(axes):
-            _draw(ax, names[i], links[i], tables[i], apart[i] if i else None)
-        _name_fields(axes[0])
+            _draw_tokens(ax, names[i], links[i], tables[i], differences[i] if i else None)
+        top = axes[0].secondary_xaxis("top")
+        centres = [field.start + (field.size - 1) / 2 for field in LAYOUT]
+        labels = [field.name for field in LAYOUT]
+        top.set_xticks(centres, labels, fontsize=6.5, rotation=55, ha="left")
+        top.tick_params(length=2)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
 
 
-def _draw(
-    ax: Axes, name: str, links: Sequence[str], table: Array, apart: NDArray[np.bool_] | None
+def _draw_tokens(
+    ax: Axes,
+    name: str,
+    links: Sequence[str],
+    table: Array,
+    different: NDArray[np.bool_] | None,
 ) -> None:
     ax.imshow(table, "RdBu_r", vmin=-1, vmax=1, aspect="auto", interpolation="nearest")
     for field in LAYOUT[1:]:
         ax.axvline(field.start - 0.5, color="0.45", linewidth=0.6)
-    if apart is not None:
-        rows, columns = np.nonzero(apart)
+    if different is not None:
+        rows, columns = np.nonzero(different)
         ax.scatter(columns, rows, s=1.2, color="black", linewidths=0)
-        name = f"{name}: {apart.sum()} of {apart.size} numbers differ"
+        name = f"{name}: {different.sum()} of {different.size} numbers differ"
     ax.set_yticks(range(len(links)), links, fontsize=6, parse_math=False)
     ax.set_xticks([])
     ax.tick_params(length=0)
     ax.set_xlabel(name, fontsize=7.5, loc="left", labelpad=2, parse_math=False)
 
 
-def _name_fields(ax: Axes) -> None:
-    top = ax.secondary_xaxis("top")
-    centres = [field.start + (field.size - 1) / 2 for field in LAYOUT]
-    top.set_xticks(centres, [field.name for field in LAYOUT], fontsize=6.5, rotation=55, ha="left")
-    top.tick_params(length=2)
+def _map_label(x: float, y: float, name: str, labels: list[tuple[float, float, float]]) -> str:
+    """Return a name beside its point, at the first of a few heights where it covers no other name.
+
+    Args:
+        x: Position of the point.
+        y: Position of the point.
+        name: The name.
+        labels: Left end, right end and height of the earlier labels; this one is appended.
+    """
+    width = 5.6 * len(name)
+    for shift in (3.5, 14.5, -7.5, 25.5, -18.5):
+        row = y + shift
+        if all(abs(row - r) > 10 or x > right or x + width < left for left, right, r in labels):
+            labels.append((x, x + width, row))
+            return (
+                f'<text x="{x + 9:.1f}" y="{row:.1f}" font-size="10" fill="currentColor">'
+                f"{escape(name)}</text>"
+            )
+    return ""
+
+
+def _svg(height: float, content: str) -> str:
+    return (
+        f'<svg viewBox="0 0 {_WIDTH} {height:.0f}" width="100%" '
+        f'style="font-family:inherit">{content}</svg>'
+    )

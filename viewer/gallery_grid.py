@@ -1,50 +1,56 @@
-"""Galleries: thumbnails of robots to filter, sort and open."""
+"""A grid of thumbnails that is searched, filtered, sorted and paged by controls beside it."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
+from concurrent.futures import FIRST_COMPLETED, wait
+from dataclasses import dataclass, field, replace
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import viser
 
 from morphgen.formats.bundle import PICTURE
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address, whole_number
-from morphgen.viewer.entries import (
+from morphgen.viewer.address import Address, parse_count
+from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
+from morphgen.viewer.robot_rows import (
     NUMBERS,
     PAGE_SIZES,
     SORTS,
-    Entry,
     Filter,
-    choices,
-    extent,
+    Row,
+    fact_choices,
+    fact_range,
     facts_line,
-    filtered,
-    ordered,
-    paged,
-    with_facts,
+    select_page,
+    sort_rows,
 )
-from morphgen.viewer.robot_files import Portrait, ask, thumbnail_of_picture
-from morphgen.viewer.session import Session, later, notify, say, show_state, when
-from morphgen.viewer.workers import WorkerDied, Workers
+from morphgen.viewer.session import Session
+from morphgen.viewer.workers import WorkerDied
 
-REFRESH = 0.6
-"""How often a gallery shows the portraits that were made since, seconds."""
-SIDE = 330.0
-"""Width of the controls, pixels."""
-CANVAS = 120.0
-"""Width that viser keeps for its scene, pixels."""
+REFRESH_INTERVAL = 0.6
+"""Time after which a gallery shows the thumbnails that were drawn meanwhile [s]."""
+CONTROLS_WIDTH = 330.0
+"""Width of the controls [pixels]."""
+CANVAS_WIDTH = 120.0
+"""Width that viser keeps free for its scene between the panels [pixels]."""
 _ALL = "all"
-_STEPS: Mapping[str, Callable[[int], int]] = {
-    "first": lambda n: 1,
-    "prev": lambda n: n - 1,
-    "next": lambda n: n + 1,
-    "last": lambda n: 10**9,
+_PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
+    "first": lambda number: 1,
+    "prev": lambda number: number - 1,
+    "next": lambda number: number + 1,
+    "last": lambda number: 10**9,  # clipped to the last page
 }
-_UNITS = {"dof": "DoF", "reach": "Reach (m)", "mass": "Mass (kg)"}
+_RANGE_LABELS = {"dof": "DoF", "reach": "Reach (m)", "mass": "Mass (kg)"}
+_SORT_KEYS = {
+    label: key
+    for name in SORTS
+    for label, key in ((name, name), (f"{name}, largest first", f"-{name}"))
+}
+"""Keys of ``sort_rows`` by their label in the dropdown."""
 
 
 @dataclass(eq=False)
@@ -53,117 +59,147 @@ class Gallery:
 
     session: Session
     title: str
-    entries: list[Entry]
-    portraits: dict[str, str] = field(default_factory=dict)
-    """Thumbnails that are known, by place."""
-    faults: dict[str, str] = field(default_factory=dict)
-    """Why there is no robot, by place."""
-    controls: dict[str, Any] = field(default_factory=dict)
-    grid: viser.GuiHtmlHandle | None = None
-    about: str = ""
-    """How many robots pass the filter, and which of them are shown."""
-    shown: list[Entry] = field(default_factory=list)
-    number: int = 1
+    rows: list[Row]
+    """All robots, shown or not."""
     columns: tuple[str, ...] = ()
-    """Roles that are shown beside each other; by default all robots are in one grid."""
+    """Roles that are shown in a column each; without any, all robots are in one grid."""
+    thumbnails: dict[str, str] = field(default_factory=dict)
+    """Thumbnails drawn so far, by URI."""
+    faults: dict[str, str] = field(default_factory=dict)
+    """Errors of robots that cannot be read, by URI."""
+    controls: dict[str, Any] = field(default_factory=dict)
+    """Controls by their key in the address."""
+    grid: viser.GuiHtmlHandle | None = None
+    summary: str = ""
+    """Number of robots that pass the filter, and of the page."""
+    page_rows: list[Row] = field(default_factory=list)
+    """Robots on the current page."""
+    page_number: int = 1
 
 
-def open_panels(gallery: Gallery, crumbs: str, about: str, side: float = SIDE) -> None:
-    """The thumbnails at the left, the controls at the right.
+def open_panels(
+    gallery: Gallery, breadcrumbs: str, header: str, width: float = CONTROLS_WIDTH
+) -> None:
+    """Open the panel of thumbnails at the left and the panel of controls at the right.
 
     Args:
-        gallery: What is shown.
-        crumbs: The way to the page.
-        about: HTML that stands above the controls.
-        side: Width of the controls, pixels.
+        gallery: The gallery.
+        breadcrumbs: HTML of the path to the page.
+        header: HTML above the controls.
+        width: Width of the controls [pixels].
     """
     client = gallery.session.client
     gui = client.gui
     gui.set_panel_label("morphgen")
     gui.main_panel.dock_right()
-    gui.main_panel.set_width(side)
-    gui.add_html(markup.STYLE + crumbs + (markup.framed(about) if about else ""))
+    gui.main_panel.set_width(width)
+    gui.add_html(markup.STYLE + breadcrumbs + (markup.framed(header) if header else ""))
     gallery.session.status = gui.add_html("")
     panel = gui.add_panel()
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
     panel.dock_left()
-    panel.set_width(max(client.camera.image_width - side - CANVAS, 400.0))
+    panel.set_width(max(client.camera.image_width - width - CANVAS_WIDTH, 400.0))
 
 
-def build(gallery: Gallery) -> None:
-    """Add a gallery's controls and thumbnails to the panel."""
+def add_controls(gallery: Gallery) -> None:
+    """Add the controls, in the state that the address gives, and show the first robots."""
     gui, state = gallery.session.client.gui, gallery.session.address.state
     controls = gallery.controls
+
+    def add_dropdown(key: str, label: str, options: Sequence[str], value: str) -> None:
+        initial = value if value in options else options[0]
+        controls[key] = gui.add_dropdown(label, tuple(options), initial_value=initial)
+
     controls["search"] = gui.add_text("Search", state.get("search", ""))
-    first = _sort_label(state.get("sort", "order"))
-    controls["sort"] = _dropdown(gui, "Sort by", list(_SORT_KEYS), first)
-    with gui.add_folder("Filter", expand_by_default=_is_filtered(state)):
+    labels = {key: label for label, key in _SORT_KEYS.items()}
+    add_dropdown("sort", "Sort by", list(_SORT_KEYS), labels.get(state.get("sort", ""), ""))
+    is_filtered = not state.keys().isdisjoint({"category", "role", "findings", "size", *NUMBERS})
+    with gui.add_folder("Filter", expand_by_default=is_filtered):
         for key, label in (("category", "Category"), ("role", "Role")):
-            options = choices(gallery.entries, key)
-            if len(options) > 1:
-                options = [_ALL, *options]
-                controls[key] = _dropdown(gui, label, options, state.get(key, _ALL))
-        options = [_ALL, "with", "without"]
-        controls["findings"] = _dropdown(gui, "Findings", options, state.get("findings", _ALL))
+            if len(options := fact_choices(gallery.rows, key)) > 1:
+                add_dropdown(key, label, [_ALL, *options], state.get(key, _ALL))
+        findings = [_ALL, "with", "without"]
+        add_dropdown("findings", "Findings", findings, state.get("findings", _ALL))
         for fact in NUMBERS:
             _add_range(gallery, fact)
-        sizes = [str(size) for size in PAGE_SIZES]
-        controls["size"] = _dropdown(gui, "On a page", sizes, state.get("size", sizes[0]))
-    gallery.number = whole_number(state.get("n", ""), 1)
-    turn = gui.add_button_group("Page", tuple(_STEPS))
+        add_dropdown("size", "On a page", list(map(str, PAGE_SIZES)), state.get("size", ""))
+    gallery.page_number = parse_count(state.get("n", ""), 1)
+    buttons = gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
+
+    def turn_page() -> None:
+        _show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
+
     for control in controls.values():
-        when(control, gallery.session, lambda: _refilter(gallery), "filter")
-    when(turn, gallery.session, lambda: _turn(gallery, turn.value))
-    refresh(gallery)
+        gallery.session.on_change(control, lambda: _show_page(gallery, 1), "filter")
+    gallery.session.on_change(buttons, turn_page)
+    _show_page(gallery, gallery.page_number)
 
 
-def refresh(gallery: Gallery) -> None:
-    """Show the rows that the controls ask for, and have missing portraits made."""
+def passing_rows(gallery: Gallery) -> list[Row]:
+    """Return the robots that pass the filter, on all pages, in the order of the set."""
+    return sort_rows(filter(_current_filter(gallery).passes, gallery.rows), "order")
+
+
+def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
+    """Show that a split was written, and the command that audits it."""
+    name = str(path.relative_to(session.files.roots[0]))
+    text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(name)}"))
+    session.notify("Saved", name)
+
+
+def card(row: Row, thumbnail: str, fault: str) -> str:
+    """Return a robot's card in the grid, a link to its page."""
+    image = f'<img alt="" src="{thumbnail}">'
+    if not thumbnail:
+        image = f'<div class="empty">{"broken" if fault else "…"}</div>'
+    tags = markup.tag(row.role, row.role) if row.role else ""
+    if row.task:
+        tags += markup.tag(row.task)
+    if row.findings:
+        tags += markup.tag(", ".join(row.findings[:2]), "error" if fault else "warning")
+    facts = facts_line(row) or escape(row.category)
+    query = escape(Address("robot", (row.uri,)).query)
+    return (
+        f'<a class="card" href="{query}" title="{escape(fault or row.uri)}">'
+        f'{image}<div class="text"><div class="name">{escape(row.name)}</div>'
+        f"{markup.dim(facts)}{tags}</div></a>"
+    )
+
+
+def _show_page(gallery: Gallery, number: int) -> None:
+    """Show a page of the robots that pass the filter, and request missing thumbnails."""
     session, controls = gallery.session, gallery.controls
     sort = _SORT_KEYS[controls["sort"].value]
-    rows = ordered(filtered(gallery.entries, wanted(gallery)), sort)
+    rows = sort_rows(filter(_current_filter(gallery).passes, gallery.rows), sort)
     size = int(controls["size"].value)
-    gallery.shown, gallery.number, count = paged(rows, gallery.number, size)
-    state = {
-        key: "" if str(control.value) == _ALL else str(control.value)
-        for key, control in controls.items()
-        if key not in NUMBERS
-    }
-    state |= {"sort": "" if sort == "order" else sort, "n": str(gallery.number)}
+    gallery.page_rows, gallery.page_number, count = select_page(rows, number, size)
+    state = {key: str(control.value) for key, control in controls.items()}
     state |= {fact: _range_text(gallery, fact) for fact in NUMBERS if fact in controls}
-    if state["n"] == "1":
-        state["n"] = ""
-    if state["size"] == str(PAGE_SIZES[0]):
-        state["size"] = ""
-    show_state(session, gallery.title, **state)
-    all_of = "" if len(rows) == len(gallery.entries) else f" of {len(gallery.entries)}"
-    gallery.about = f"{len(rows)}{all_of} robots · page {gallery.number} of {count}"
-    _take_pictures(gallery)
-    _draw(gallery)
-    later(session, lambda: _have_portraits_made(gallery), "portraits")
+    state |= {"sort": sort, "n": str(gallery.page_number)}
+    defaults = {"sort": "order", "n": "1", "size": str(PAGE_SIZES[0])}
+    for key, value in state.items():
+        if value == defaults.get(key, _ALL) and key != "search":
+            state[key] = ""
+    session.update_address(gallery.title, **state)
+    total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
+    gallery.summary = f"{len(rows)}{total} robots · page {gallery.page_number} of {count}"
+    _load_bundle_pictures(gallery)
+    _draw_grid(gallery)
+    session.run_in_background(lambda: _draw_missing(gallery), "thumbnails")
 
 
-def passing(gallery: Gallery) -> list[Entry]:
-    """The rows that pass the filter, on all pages."""
-    return ordered(filtered(gallery.entries, wanted(gallery)), "order")
-
-
-def wanted(gallery: Gallery) -> Filter:
-    """The filter that the controls ask for."""
+def _current_filter(gallery: Gallery) -> Filter:
     values = {
-        key: "" if control.value == _ALL else control.value
+        key: "" if control.value == _ALL and key != "search" else control.value
         for key, control in gallery.controls.items()
         if key not in NUMBERS
     }
-    ranges: dict[str, tuple[float, float]] = {}
+    ranges = {}
     for fact in NUMBERS:
-        whole = extent(gallery.entries, fact)
-        if whole is None or fact not in gallery.controls:
-            continue
-        low, high = gallery.controls[fact].value
-        if not _is_whole((low, high), whole):
-            ranges[fact] = (low - 1e-9, high + 1e-9)
+        if fact in gallery.controls and _range_text(gallery, fact):
+            low, high = gallery.controls[fact].value
+            ranges[fact] = (low - 1e-9, high + 1e-9)  # browsers round
     return Filter(
         values["search"],
         values.get("category", ""),
@@ -173,163 +209,102 @@ def wanted(gallery: Gallery) -> Filter:
     )
 
 
-def card(entry: Entry, thumbnail: str, fault: str) -> str:
-    """A robot in the grid, a link to its page."""
-    picture = f'<img alt="" src="{thumbnail}">'
-    if not thumbnail:
-        picture = f'<div class="empty">{"broken" if fault else "…"}</div>'
-    tags = markup.tag(entry.role, entry.role) if entry.role else ""
-    if entry.task:
-        tags += markup.tag(entry.task)
-    if entry.findings:
-        kind = "error" if fault else "warning"
-        tags += markup.tag(", ".join(entry.findings[:2]), kind)
-    about = facts_line(entry) or escape(entry.category)
-    address = Address("robot", (entry.place,))
-    return (
-        f'<a class="card" href="{escape(address.query)}" title="{escape(fault or entry.place)}">'
-        f'{picture}<div class="text"><div class="name">{escape(entry.name)}</div>'
-        f'<div class="dim">{about}</div>{tags}</div></a>'
-    )
-
-
-def _draw(gallery: Gallery) -> None:
+def _draw_grid(gallery: Gallery) -> None:
     if gallery.grid is None:
         return
-    cards = [
-        card(entry, gallery.portraits.get(entry.place, ""), gallery.faults.get(entry.place, ""))
-        for entry in gallery.shown
+    columns: dict[str, list[str]] = {role: [] for role in gallery.columns}
+    for row in gallery.page_rows:
+        thumbnail, fault = gallery.thumbnails.get(row.uri, ""), gallery.faults.get(row.uri, "")
+        role = row.role if gallery.columns else ""
+        columns.setdefault(role, []).append(card(row, thumbnail, fault))
+    html = [
+        f"<div>{f'<h3>{role} ({len(cards)})</h3>' if role else ''}"
+        f'<div class="grid">{"".join(cards)}</div></div>'
+        for role, cards in columns.items()
     ]
-    about = f'<div class="dim" style="padding:.6em 0">{gallery.about}</div>'
-    groups: dict[str, list[str]] = {role: [] for role in gallery.columns}
-    for entry, text in zip(gallery.shown, cards, strict=True):
-        groups.setdefault(entry.role if gallery.columns else "", []).append(text)
-    columns = [
-        f"<div>{f'<h3>{role} ({len(grid)})</h3>' if role else ''}"
-        f'<div class="grid">{"".join(grid)}</div></div>'
-        for role, grid in groups.items()
-    ]
-    gallery.grid.content = markup.framed(about, f'<div class="columns">{"".join(columns)}</div>')
+    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}</div>'
+    gallery.grid.content = markup.framed(summary, f'<div class="columns">{"".join(html)}</div>')
 
 
-def _take_pictures(gallery: Gallery) -> None:
-    """Thumbnails of bundles that have a picture."""
-    for entry in gallery.shown:
-        if entry.place in gallery.portraits or ":" in entry.place:
+def _load_bundle_pictures(gallery: Gallery) -> None:
+    """Load the pictures that bundles have, for robots whose facts are known."""
+    for row in gallery.page_rows:
+        if row.uri in gallery.thumbnails or ":" in row.uri:
             continue
-        path = gallery.session.places.path(entry.place) / PICTURE
+        path = gallery.session.files.path(row.uri) / PICTURE
         thumbnail = thumbnail_of_picture(path) if path.is_file() else ""
-        if thumbnail and entry.dof is not None:
-            gallery.portraits[entry.place] = thumbnail
+        if thumbnail and row.dof is not None:
+            gallery.thumbnails[row.uri] = thumbnail
 
 
-def _have_portraits_made(gallery: Gallery) -> None:
-    """Let the workers draw what is missing of the rows shown; once more if one of them dies."""
+def _draw_missing(gallery: Gallery) -> None:
+    """Let the workers draw the page's missing thumbnails; retry once if a worker dies."""
     try:
-        _ask_for_missing(gallery)
+        _request_missing(gallery)
     except WorkerDied:
-        notify(gallery.session, "A worker died", "another one goes on with the thumbnails")
-        _ask_for_missing(gallery)
+        gallery.session.notify("A worker died", "another one continues with the thumbnails")
+        _request_missing(gallery)
 
 
-def _ask_for_missing(gallery: Gallery) -> None:
-    """Have thumbnails drawn; what is done is shown meanwhile."""
-    session = gallery.session
-    rows = gallery.shown
-    known = gallery.portraits.keys() | gallery.faults.keys()
-    missing = [entry for entry in rows if entry.place not in known]
-    waiting = {entry.place: ask(session.workers, entry.place, session.places) for entry in missing}
-    total = len(waiting)
-    while waiting and not session.closed.is_set() and gallery.shown is rows:
-        say(session, f"drawing {total} robots", (total - len(waiting)) / total)
-        for place, found in _collected(session.workers, waiting).items():
-            _keep(gallery, place, found)
-        _draw(gallery)
-    for future in waiting.values():
+def _request_missing(gallery: Gallery) -> None:
+    session, rows, workers = gallery.session, gallery.page_rows, gallery.session.workers
+    known = gallery.thumbnails.keys() | gallery.faults.keys()
+    pending = {
+        row.uri: workers.submit(make_thumbnail, row.uri, session.files)
+        for row in rows
+        if row.uri not in known
+    }
+    total = len(pending)
+    # Another page of the gallery replaces ``page_rows``; then these thumbnails can wait.
+    while pending and not session.closed.is_set() and gallery.page_rows is rows:
+        session.set_status(f"drawing {total} robots", (total - len(pending)) / total)
+        wait(pending.values(), timeout=REFRESH_INTERVAL, return_when=FIRST_COMPLETED)
+        for uri in [uri for uri, future in pending.items() if future.done()]:
+            _store_thumbnail(gallery, uri, workers.result(pending.pop(uri)))
+        _draw_grid(gallery)
+    for future in pending.values():
         future.cancel()
-    say(session, "")
+    session.set_status("")
 
 
-def _collected(workers: Workers, waiting: dict[str, Future[Portrait]]) -> dict[str, Portrait]:
-    """Wait a while for portraits; those that are done are taken out."""
-    wait(waiting.values(), timeout=REFRESH, return_when=FIRST_COMPLETED)
-    done = [place for place, future in waiting.items() if future.done()]
-    return {place: workers.result(waiting.pop(place)) for place in done}
-
-
-def _keep(gallery: Gallery, place: str, found: Portrait) -> None:
-    if found.error:
-        gallery.faults[place] = found.error
+def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
+    if thumbnail.error:
+        gallery.faults[uri] = thumbnail.error
     else:
-        gallery.portraits[place] = found.thumbnail
-
-    def updated(entry: Entry) -> Entry:
-        return with_facts(entry, found.facts) if entry.place == place else entry
-
-    gallery.entries[:] = map(updated, gallery.entries)
-    gallery.shown[:] = map(updated, gallery.shown)
-
-
-def _refilter(gallery: Gallery) -> None:
-    gallery.number = 1
-    refresh(gallery)
-
-
-def _turn(gallery: Gallery, where: str) -> None:
-    gallery.number = _STEPS[where](gallery.number)
-    refresh(gallery)
-
-
-def _sort_label(key: str) -> str:
-    name = key.removeprefix("-")
-    return f"{name}, largest first" if key != name else name
-
-
-_SORT_KEYS = {_sort_label(key): key for name in SORTS for key in (name, f"-{name}")}
-
-
-def _dropdown(
-    gui: viser.GuiApi, label: str, options: Sequence[str], value: str
-) -> viser.GuiDropdownHandle[str]:
-    chosen = value if value in options else options[0]
-    return gui.add_dropdown(label, tuple(options), initial_value=chosen)
+        gallery.thumbnails[uri] = thumbnail.image
+    facts: dict[str, Any] = thumbnail.facts
+    for rows in (gallery.rows, gallery.page_rows):
+        rows[:] = [replace(row, **facts) if row.uri == uri else row for row in rows]
 
 
 def _add_range(gallery: Gallery, fact: str) -> None:
-    """A slider with two ends, where there is a range at all."""
-    whole = extent(gallery.entries, fact)
-    if whole is None:
+    """Add a slider with two ends for a fact that varies."""
+    limits = fact_range(gallery.rows, fact)
+    if limits is None:
         return
     step = 1.0 if fact == "dof" else 0.001
-    low, high = whole[0] - whole[0] % step, whole[1] + (-whole[1]) % step
-    chosen = _parse_range(gallery.session.address.state.get(fact, ""), (low, high))
+    low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
+    text = gallery.session.address.state.get(fact, "")
     gallery.controls[fact] = gallery.session.client.gui.add_multi_slider(
-        _UNITS[fact], low, high, step, chosen
+        _RANGE_LABELS[fact], low, high, step, _parse_range(text, low, high)
     )
 
 
-def _parse_range(text: str, whole: tuple[float, float]) -> tuple[float, float]:
-    low, dots, high = text.partition("..")
+def _parse_range(text: str, low: float, high: float) -> tuple[float, float]:
+    """Parse ``LOW..HIGH``, clipped to limits; invalid text gives the limits."""
+    first, dots, last = text.partition("..")
     try:
-        found = (float(low), float(high)) if dots else whole
+        ends = (float(first), float(last)) if dots else (low, high)
     except ValueError:
-        return whole
-    low_value, high_value = (min(max(value, whole[0]), whole[1]) for value in found)
-    return (low_value, max(low_value, high_value))
+        ends = (low, high)
+    start, end = (min(max(value, low), high) for value in ends)
+    return (start, max(start, end))
 
 
 def _range_text(gallery: Gallery, fact: str) -> str:
+    """Return a range slider's value for the address; empty if it lets every known value pass."""
     low, high = gallery.controls[fact].value
-    whole = extent(gallery.entries, fact)
-    if whole is None or _is_whole((low, high), whole):
+    limits = fact_range(gallery.rows, fact)
+    if limits is None or (low <= limits[0] and high >= limits[1]):
         return ""
     return f"{low:g}..{high:g}"
-
-
-def _is_whole(chosen: tuple[float, ...], whole: tuple[float, float]) -> bool:
-    return chosen[0] <= whole[0] and chosen[1] >= whole[1]
-
-
-def _is_filtered(state: object) -> bool:
-    keys = {"category", "role", "findings", "size", *NUMBERS}
-    return isinstance(state, dict) and bool(keys & state.keys())

@@ -1,4 +1,4 @@
-"""Pieces of HTML that several pages share; every text that comes from outside is escaped."""
+"""HTML that several pages share; every text that comes from outside is escaped."""
 
 from __future__ import annotations
 
@@ -43,76 +43,87 @@ font-size:11px}
 
 
 def framed(*content: str) -> str:
-    """HTML in the style of the pages."""
+    """Return HTML in the style of the pages."""
     return f'<div class="mg">{"".join(content)}</div>'
 
 
+def dim(html: str) -> str:
+    """Return HTML as a block of small grey text."""
+    return f'<div class="dim">{html}</div>'
+
+
 def link(address: Address, text: str) -> str:
-    """A link to another page."""
+    """Return a link to a page."""
     return f'<a href="{escape(address.query)}">{escape(text)}</a>'
 
 
-def crumbs(*steps: tuple[str, Address | None]) -> str:
-    """The way from the library to a page; steps without address are no links."""
-    home = ("Library", Address("library"))
-    parts = [link(where, text) if where else escape(text) for text, where in (home, *steps)]
+def breadcrumbs(*steps: tuple[str, Address | None]) -> str:
+    """Return the path from the library to a page; steps without address are plain text."""
+    library = ("Library", Address("library"))
+    parts = [
+        link(address, text) if address else escape(text) for text, address in (library, *steps)
+    ]
     return framed(f'<div class="crumbs">{" / ".join(parts)}</div>')
 
 
-def tag(text: str, kind: str = "") -> str:
-    """A word in a coloured box."""
-    return f'<span class="tag {escape(kind)}">{escape(text)}</span>'
+def tag(text: str, style: str = "") -> str:
+    """Return a word in a coloured box; the style is a class of ``STYLE``, such as ``error``."""
+    return f'<span class="tag {escape(style)}">{escape(text)}</span>'
+
+
+def error(text: str) -> str:
+    """Return an error as a framed line."""
+    return framed(tag("error", "error"), f" {escape(text)}")
 
 
 def code(text: str) -> str:
-    """Text to copy: a click marks all of it."""
+    """Return text to copy: a click selects all of it."""
     return f"<pre>{escape(text)}</pre>"
 
 
+def command(text: str) -> str:
+    """Return the block with the command that repeats a page's robot on the command line."""
+    return f"<h3>The same on the command line</h3>{code(text)}"
+
+
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """A table of cells that are HTML already.
+    """Return a table.
 
     Args:
         header: Texts of the first row.
-        rows: Cells.
+        rows: Cells as HTML.
         numbers: Columns that are aligned to the right.
     """
     right = ['class="n"' if i in numbers else "" for i in range(len(header))]
-    head = "".join(f"<th {r}>{escape(text)}</th>" for r, text in zip(right, header, strict=True))
-    body = "".join(
-        "<tr>"
-        + "".join(f"<td {r}>{cell}</td>" for r, cell in zip(right, row, strict=True))
-        + "</tr>"
-        for row in rows
-    )
-    return f"<table><tr>{head}</tr>{body}</table>"
+
+    def row(kind: str, cells: Iterable[str]) -> str:
+        line = "".join(f"<{kind} {r}>{c}</{kind}>" for r, c in zip(right, cells, strict=True))
+        return f"<tr>{line}</tr>"
+
+    body = "".join(row("td", cells) for cells in rows)
+    return f"<table>{row('th', map(escape, header))}{body}</table>"
 
 
-def findings_table(findings: Sequence[Finding], told: Callable[[str], str] = str) -> str:
-    """Findings with what to do about them, or that there are none.
-
-    Args:
-        findings: What was found.
-        told: How a text of them may be shown, see ``FileAccess.told``.
-    """
+def findings_table(findings: Sequence[Finding], redact: Callable[[str], str] = str) -> str:
+    """Return a table of findings and their repairs; ``redact`` as in ``FileAccess``."""
     if not findings:
-        return '<div class="dim">no findings</div>'
+        return dim("no findings")
     rows = [
         (
             tag(finding.severity, finding.severity) + f"<br><code>{escape(finding.code)}</code>",
-            f"<b>{escape(told(finding.where))}</b>: {escape(told(finding.why))}<br>"
-            f'<span class="dim">{escape(told(finding.fix))}</span>',
+            f"<b>{escape(redact(finding.where))}</b>: {escape(redact(finding.why))}<br>"
+            f'<span class="dim">{escape(redact(finding.fix))}</span>',
         )
         for finding in findings
     ]
-    return table(("", "what"), rows)
+    return table(("", "finding"), rows)
 
 
-def status(text: str, share: float | None = None) -> str:
-    """A line that says what is being done, with a bar; nothing if there is no text."""
+def status(text: str, fraction: float | None = None) -> str:
+    """Return the line of the current activity with a progress bar; empty without a text."""
     if not text:
         return ""
     bar = ""
-    if share is not None:
-        bar = f'<div class="bar"><div style="width:{100 * share:.0f}%"></div></div>'
-    return framed(f'<div class="dim">{escape(text)}</div>{bar}')
+    if fraction is not None:
+        bar = f'<div class="bar"><div style="width:{100 * fraction:.0f}%"></div></div>'
+    return framed(dim(escape(text)) + bar)

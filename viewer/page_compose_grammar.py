@@ -1,8 +1,9 @@
-"""The tab of the compose page on which a grammar is written, and robots are drawn from it."""
+"""The tab of the compose page on which a grammar is edited and robots are sampled from it."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -22,184 +23,192 @@ from morphgen.grammar.grammar_file import (
     grammar_text,
 )
 from morphgen.grammar.sampling import sample_robot
+from morphgen.model.robot import Robot
 from morphgen.viewer import markup
-from morphgen.viewer.address import Address, AddressError, whole_number
-from morphgen.viewer.choice import first_parts
-from morphgen.viewer.composed import Composed, fault, show_robot
-from morphgen.viewer.packed_text import packed, unpacked
-from morphgen.viewer.robot_uri import DERIVED, resolve_grammar
-from morphgen.viewer.session import say, set_value, show_state, when
+from morphgen.viewer.address import Address, AddressError, pack_text, parse_count, unpack_text
+from morphgen.viewer.part_choice import first_parts
+from morphgen.viewer.robot_uri import DERIVATION, resolve_grammar
+from morphgen.viewer.session import Session, set_value
+
+ShowRobot = Callable[[Robot, Derivation, str, str], None]
+"""Shows a robot, given its derivation, the command that makes it, and its URI."""
 
 
 @dataclass(eq=False)
 class GrammarTab:
     """The tab in one browser."""
 
-    composed: Composed
-    grammar: str
-    """The grammar in the text field, by its name or file."""
+    session: Session
+    show_robot: ShowRobot
+    source: str
+    """Name or file of the grammar."""
     original: str
-    """Its text before it was edited."""
+    """Text of the grammar before it was edited."""
     text: viser.GuiTextHandle
     fault: viser.GuiHtmlHandle
     too_long: viser.GuiHtmlHandle
+    """Says if the edited text does not fit into the address."""
     seed: viser.GuiNumberHandle[int]
     number: viser.GuiNumberHandle[int]
-    step: viser.GuiSliderHandle[int]
+    num_parts: viser.GuiSliderHandle[int]
     tree: viser.GuiHtmlHandle
     derivation: Derivation | None = None
-    """Of the whole robot; the one that is shown may have fewer parts."""
+    """Derivation of the whole robot; fewer of its parts may be shown."""
 
     @property
     def name(self) -> str:
-        """Of the grammar, which robots get."""
-        return Path(self.grammar).stem if self.grammar.endswith(SUFFIX) else self.grammar
+        """Name of the grammar, from which its robots get theirs."""
+        return Path(self.source).stem if self.source.endswith(SUFFIX) else self.source
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether the text differs from the grammar's own."""
+        return self.text.value != self.original
 
 
 def add_grammar_tab(
-    composed: Composed, tabs: viser.GuiTabGroupHandle, grammar: Grammar, source: str
+    session: Session,
+    tabs: viser.GuiTabGroupHandle,
+    grammar: Grammar,
+    source: str,
+    show_robot: ShowRobot,
 ) -> GrammarTab:
-    """Add the tab with a grammar, edited as the page's address has it; ``show_derived`` shows it.
+    """Add the tab, with the text, seed and number that the page's address gives.
 
     Args:
-        composed: Where.
-        tabs: Where the tab is added.
-        grammar: What is written.
-        source: The grammar's name or file, as the address has it.
+        session: The browser.
+        tabs: Group to which the tab is added.
+        grammar: The grammar.
+        source: Name or file of the grammar.
+        show_robot: Shows a robot on the page.
 
     Raises:
-        AddressError: If the address has no text.
+        AddressError: If the text in the address is invalid.
     """
-    session = composed.session
     gui, state = session.client.gui, session.address.state
     original = grammar_text(grammar)
     names = tuple(dict.fromkeys((source, *grammar_names())))
+
+    def count(key: str) -> int:
+        return parse_count(state.get(key, ""), 0)
+
     with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
-        chosen = gui.add_dropdown("start from", names, initial_value=source)
-        text = unpacked(state["text"]) if "text" in state else original
-        written = gui.add_text("text", text, multiline=True)
-        why_not, too_long = gui.add_html(""), gui.add_html("")
-        seed = gui.add_number("seed", _count(state.get("seed", "")), min=0, step=1)
-        number = gui.add_number("robot number", _count(state.get("number", "")), min=0, step=1)
-        action = gui.add_button_group("draw", ("typical", "this", "next"))
-        step = gui.add_slider("parts shown", 1, 2, 1, 1, hint="how far the derivation is shown")
+        dropdown = gui.add_dropdown("start from", names, initial_value=source)
+        text = unpack_text(state["text"]) if "text" in state else original
+        text_field = gui.add_text("text", text, multiline=True)
+        fault, too_long = gui.add_html(""), gui.add_html("")
+        seed = gui.add_number("seed", count("seed"), min=0, step=1)
+        number = gui.add_number("robot number", count("number"), min=0, step=1)
+        buttons = gui.add_button_group("draw", ("typical", "this", "next"))
+        num_parts = gui.add_slider(
+            "parts shown", 1, 2, 1, 1, hint="how much of the derivation is shown"
+        )
         tree = gui.add_html("")
     tab = GrammarTab(
-        composed,
+        session,
+        show_robot,
         source,
         original,
-        text=written,
-        fault=why_not,
-        too_long=too_long,
-        seed=seed,
-        number=number,
-        step=step,
-        tree=tree,
+        text_field,
+        fault,
+        too_long,
+        seed,
+        number,
+        num_parts,
+        tree,
     )
-    when(chosen, session, lambda: _load(tab, chosen.value))
-    when(written, session, lambda: _edited(tab), "grammar")
-    when(action, session, lambda: _draw(tab, action.value))
-    when(step, session, lambda: _show_step(tab), "step")
+    session.on_change(dropdown, lambda: _load(tab, dropdown.value))
+    session.on_change(text_field, lambda: _check_edited(tab), "grammar")
+    session.on_change(buttons, lambda: _draw(tab, buttons.value))
+    session.on_change(num_parts, lambda: _show_parts(tab), "parts")
     return tab
 
 
-def show_derived(tab: GrammarTab, *, drawn: bool) -> None:
-    """Show a robot of the grammar in the text field: a drawn one, or the typical one."""
-    session, library = tab.composed.session, tab.composed.session.places.library
-    if not _read_grammar(tab):
+def show_grammar(tab: GrammarTab, *, drawn: bool) -> None:
+    """Show a robot of the edited grammar: sampled by seed and number, or the typical one."""
+    session, library = tab.session, tab.session.files.library
+    if not _check_grammar(tab):
         return
     grammar = grammar_from_text(tab.text.value, tab.name)
-    name = shlex.quote(f"{tab.name}{SUFFIX}" if _is_edited(tab) else tab.grammar)
-    note = f"# with the text of the tab Grammar in {name}\n" if _is_edited(tab) else ""
+    name = shlex.quote(f"{tab.name}{SUFFIX}" if tab.is_edited else tab.source)
+    note = f"# with the text of the tab Grammar in {name}\n" if tab.is_edited else ""
     command = f"{note}morphgen compose {name}"
+    state = {}
     if drawn:
         seed, number = tab.seed.value, tab.number.value
-        say(session, f"drawing robot {number} of seed {seed}")
+        session.set_status(f"drawing robot {number} of seed {seed}")
         sample = sample_robot(grammar, library, number, seed=seed)
-        say(session, "")
+        session.set_status("")
         robot, tab.derivation = sample.robot, sample.derivation
         command = f"{note}morphgen sample {name} -n {number + 1} --seed {seed}"
+        state = {"seed": str(seed), "number": str(number)}
     else:
         tab.derivation = derive(grammar, library, FirstChooser())
         robot = compose(tab.derivation, library, tab.name)
     n = sum(1 for _ in tab.derivation.walk())
-    tab.step.max = max(n, 2)
-    set_value(tab.step, n)
-    state = {"seed": str(tab.seed.value), "number": str(tab.number.value)} if drawn else {}
-    _show_address(tab, state)
+    tab.num_parts.max = max(n, 2)  # a slider needs a range
+    set_value(tab.num_parts, n)
+    _update_address(tab, state)
     _show_tree(tab, tab.derivation, n)
-    show_robot(tab.composed, robot, tab.derivation, command, f"{DERIVED}{tab.derivation}")
+    tab.show_robot(robot, tab.derivation, command, f"{DERIVATION}{tab.derivation}")
 
 
-def _load(tab: GrammarTab, name: str) -> None:
-    tab.grammar = name
-    tab.original = grammar_text(resolve_grammar(name, tab.composed.session.places))
+def _load(tab: GrammarTab, source: str) -> None:
+    tab.source = source
+    tab.original = grammar_text(resolve_grammar(source, tab.session.files))
     set_value(tab.text, tab.original)
-    show_derived(tab, drawn=False)
+    show_grammar(tab, drawn=False)
 
 
-def _edited(tab: GrammarTab) -> None:
-    """Check the text, and keep it in the address."""
-    _show_address(tab, {})
-    _read_grammar(tab)
+def _check_edited(tab: GrammarTab) -> None:
+    """Check the edited text, and keep it in the address."""
+    _update_address(tab, {})
+    _check_grammar(tab)
 
 
-def _show_address(tab: GrammarTab, state: dict[str, str]) -> None:
-    session = tab.composed.session
-    session.address = Address("compose", (tab.grammar,), state | _text_state(tab))
-    show_state(session, f"compose {tab.grammar}")
-
-
-def _text_state(tab: GrammarTab) -> dict[str, str]:
-    """The text as the address keeps it, if it was edited and is not too long; else it is said."""
+def _update_address(tab: GrammarTab, state: dict[str, str]) -> None:
+    """Show grammar, state and edited text in the address; say if the text is too long for it."""
     tab.too_long.content = ""
-    if not _is_edited(tab):
-        return {}
-    try:
-        return {"text": packed(tab.text.value)}
-    except AddressError as error:
-        tab.too_long.content = markup.framed(f'<div class="dim">{error}</div>')
-        return {}
+    if tab.is_edited:
+        try:
+            state = state | {"text": pack_text(tab.text.value)}
+        except AddressError as error:
+            tab.too_long.content = markup.framed(markup.dim(str(error)))
+    tab.session.address = Address("compose", (tab.source,), state)
+    tab.session.show_address(f"compose {tab.source}")
 
 
-def _is_edited(tab: GrammarTab) -> bool:
-    return tab.text.value != tab.original
-
-
-def _read_grammar(tab: GrammarTab) -> bool:
-    """Say whether the text is a grammar that can be derived; if not, where it fails."""
+def _check_grammar(tab: GrammarTab) -> bool:
+    """Return whether the text is a grammar that derives a robot; show the error if not."""
     try:
         grammar = grammar_from_text(tab.text.value, tab.name)
-        derive(grammar, tab.composed.session.places.library, FirstChooser())
+        derive(grammar, tab.session.files.library, FirstChooser())
     except GrammarError as error:
-        tab.fault.content = fault(error, tab.composed.session.places)
+        tab.fault.content = markup.error(tab.session.files.redact(error))
         return False
     tab.fault.content = ""
     return True
 
 
-def _draw(tab: GrammarTab, what: str) -> None:
-    if what == "next":
+def _draw(tab: GrammarTab, action: str) -> None:
+    if action == "next":
         set_value(tab.number, tab.number.value + 1)
-    show_derived(tab, drawn=what != "typical")
+    show_grammar(tab, drawn=action != "typical")
 
 
-def _show_step(tab: GrammarTab) -> None:
-    """Show the robot as it was after some of its parts."""
+def _show_parts(tab: GrammarTab) -> None:
+    """Show the robot with as many of its parts as the slider says."""
     if tab.derivation is None:
         return
-    n = tab.step.value
+    n = tab.num_parts.value
     partial = first_parts(tab.derivation, n)
     _show_tree(tab, tab.derivation, n)
-    robot = compose(partial, tab.composed.session.places.library, tab.name)
-    show_robot(tab.composed, robot, partial, f"# {partial}", f"{DERIVED}{partial}")
+    robot = compose(partial, tab.session.files.library, tab.name)
+    tab.show_robot(robot, partial, f"# {partial}", f"{DERIVATION}{partial}")
 
 
 def _show_tree(tab: GrammarTab, derivation: Derivation, n: int) -> None:
+    """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
     lines = [escape(line) for line in outline(derivation).splitlines()]
     shown = [line if i < n else f'<span class="dim">{line}</span>' for i, line in enumerate(lines)]
     tab.tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(shown)}</pre>")
-
-
-def _count(text: str) -> int:
-    return whole_number(text, 0)

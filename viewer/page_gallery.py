@@ -1,8 +1,7 @@
-"""The page of a folder of robots, and a split made of them."""
+"""The page of a folder of robots, from which a new split can be made."""
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 
 import viser
@@ -10,67 +9,72 @@ import viser
 from morphgen.benchmark.split import REGIMES, Member
 from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer import gallery_grid, markup
+from morphgen.viewer import markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.entries import Entry
-from morphgen.viewer.gallery_grid import Gallery
-from morphgen.viewer.new_split import member_of, save_split
-from morphgen.viewer.robot_rows import folder_entries, subfolders
-from morphgen.viewer.session import Session, later, notify, say, when
-
-
-def show(session: Session) -> None:
-    """The page of a folder of robots.
-
-    Raises:
-        UriError: If there is none.
-    """
-    place = session.address.subject
-    entries = folder_entries(place, session.places)
-    rows = Gallery(session, place, entries)
-    below = [f"{place.rstrip('/')}/{name}" for name in subfolders(session.places.path(place))]
-    links = " · ".join(markup.link(Address("gallery", (name,)), name) for name in below)
-    gallery_grid.open_panels(rows, markup.crumbs((place, None)), links)
-    gallery_grid.build(rows)
-    _add_new_split(rows)
+from morphgen.viewer.gallery_grid import (
+    Gallery,
+    add_controls,
+    open_panels,
+    passing_rows,
+    show_saved,
+)
+from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
+from morphgen.viewer.session import Session
+from morphgen.viewer.splits import make_member, save_split
 
 
 @dataclass(frozen=True, eq=False)
-class _Wanted:
+class _SplitForm:
     """Controls of a new split."""
 
     name: viser.GuiTextHandle
     regime: viser.GuiDropdownHandle[str]
     task: viser.GuiDropdownHandle[str]
     obstacles: viser.GuiCheckboxHandle
-    train: viser.GuiNumberHandle[int]
-    test: viser.GuiNumberHandle[int]
-    told: viser.GuiHtmlHandle
+    num_train: viser.GuiNumberHandle[int]
+    num_test: viser.GuiNumberHandle[int]
+    text: viser.GuiHtmlHandle
 
 
-def sides_of(
-    entries: list[Entry], passing: list[Entry], train: int, test: int
-) -> tuple[list[Entry], list[Entry]]:
-    """The first robots that pass the filter, to train on, and of those that do not, to test on.
+def show(session: Session) -> None:
+    """Build the page.
 
     Raises:
-        BenchmarkError: If there are not as many.
+        UriError: If the folder does not exist or holds no robot.
     """
-    inside = {entry.place for entry in passing}
-    outside = [entry for entry in entries if entry.place not in inside]
-    if len(passing) < train or len(outside) < test:
+    folder = session.address.subject
+    gallery = Gallery(session, folder, folder_rows(folder, session.files))
+    names = robot_subfolders(session.files.path(folder))
+    below = [f"{folder.rstrip('/')}/{name}" for name in names]
+    links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
+    open_panels(gallery, markup.breadcrumbs((folder, None)), links)
+    add_controls(gallery)
+    _add_split_form(gallery)
+
+
+def choose_sides(
+    rows: list[Row], passing: list[Row], num_train: int, num_test: int
+) -> tuple[list[Row], list[Row]]:
+    """Return the first rows that pass the filter (train) and the first that do not (test).
+
+    Raises:
+        BenchmarkError: If there are too few of either.
+    """
+    uris = {row.uri for row in passing}
+    others = [row for row in rows if row.uri not in uris]
+    if len(passing) < num_train or len(others) < num_test:
         raise BenchmarkError(
-            f"{len(passing)} robots pass the filter and {len(outside)} do not: too few for "
-            f"{train} to train on and {test} to test on"
+            f"{len(passing)} robots pass the filter and {len(others)} do not: too few for "
+            f"{num_train} to train on and {num_test} to test on"
         )
-    return passing[:train], outside[:test]
+    return passing[:num_train], others[:num_test]
 
 
-def _add_new_split(rows: Gallery) -> None:
-    gui, session = rows.session.client.gui, rows.session
+def _add_split_form(gallery: Gallery) -> None:
+    gui, session = gallery.session.client.gui, gallery.session
     with gui.add_folder("New split", expand_by_default=False):
-        gui.add_html(markup.framed('<div class="dim">train: pass the filter; test: do not</div>'))
-        wanted = _Wanted(
+        gui.add_html(markup.framed(markup.dim("train: pass the filter; test: do not")))
+        form = _SplitForm(
             gui.add_text("split name", ""),
             gui.add_dropdown("regime", REGIMES),
             gui.add_dropdown("task", tuple(TASKS)),
@@ -80,35 +84,30 @@ def _add_new_split(rows: Gallery) -> None:
             gui.add_html(""),
         )
         button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-    when(button, session, lambda: later(session, lambda: _save(rows, wanted)))
+    session.on_change(button, lambda: session.run_in_background(lambda: _save(gallery, form)))
 
 
-def _save(rows: Gallery, wanted: _Wanted) -> None:
-    """Compose the robots in the workers, and write the split."""
-    session = rows.session
-    passing = gallery_grid.passing(rows)
-    sides = sides_of(rows.entries, passing, wanted.train.value, wanted.test.value)
-    train, test = (_members(session, side, wanted) for side in sides)
-    say(session, "")
-    regime = next(each for each in REGIMES if each == wanted.regime.value)
-    path = save_split(wanted.name.value, regime, train, test, session.places)
-    shown = path.relative_to(session.places.roots[0])
-    wanted.told.content = markup.framed(
-        markup.code(f"morphgen split audit {shlex.quote(str(shown))}")
+def _save(gallery: Gallery, form: _SplitForm) -> None:
+    """Compose the robots in the worker processes, and write the split."""
+    session = gallery.session
+    sides = choose_sides(
+        gallery.rows, passing_rows(gallery), form.num_train.value, form.num_test.value
     )
-    notify(session, "Saved", str(shown))
+    train, test = (_make_members(session, rows, form) for rows in sides)
+    session.set_status("")
+    regime = next(regime for regime in REGIMES if regime == form.regime.value)
+    path = save_split(form.name.value, regime, train, test, session.files)
+    show_saved(session, path, form.text)
 
 
-def _members(session: Session, entries: list[Entry], wanted: _Wanted) -> list[Member]:
-    task = wanted.task.value
-    waiting = [
-        session.workers.submit(
-            member_of, entry.place, entry.category, task, wanted.obstacles.value, session.places
-        )
-        for entry in entries
+def _make_members(session: Session, rows: list[Row], form: _SplitForm) -> list[Member]:
+    task, obstacles = form.task.value, form.obstacles.value
+    futures = [
+        session.workers.submit(make_member, row.uri, row.category, task, obstacles, session.files)
+        for row in rows
     ]
     members = []
-    for i, future in enumerate(waiting):
-        say(session, f"composing {len(waiting)} robots", i / len(waiting))
+    for i, future in enumerate(futures):
+        session.set_status(f"composing {len(futures)} robots", i / len(futures))
         members.append(session.workers.result(future))
     return members

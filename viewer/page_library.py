@@ -1,4 +1,4 @@
-"""The first page: all parts, and links to robots, splits and grammars."""
+"""The first page: all parts, with links to robots, splits and grammars, and the upload button."""
 
 from __future__ import annotations
 
@@ -6,48 +6,50 @@ import viser
 
 from morphgen.benchmark.split_file import split_names
 from morphgen.grammar.grammar_file import grammar_names
-from morphgen.viewer import browser, gallery_grid, markup
+from morphgen.viewer import markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.gallery_grid import Gallery
-from morphgen.viewer.robot_rows import part_entries, subfolders
+from morphgen.viewer.gallery_grid import Gallery, add_controls, open_panels
+from morphgen.viewer.robot_rows import part_rows, robot_subfolders
 from morphgen.viewer.robot_uri import FileAccess
-from morphgen.viewer.session import Session, post
-from morphgen.viewer.uploads import keep
+from morphgen.viewer.session import Session
+from morphgen.viewer.uploads import store_upload
 
 
 def show(session: Session) -> None:
-    """The first page: sets and splits, grammars, and the parts as a gallery."""
-    rows = Gallery(session, "Parts", part_entries(session.places.library))
-    gallery_grid.open_panels(rows, markup.crumbs(), library_links(session.places))
-    gui = session.client.gui
-    upload = gui.add_upload_button("Look at a URDF or a zipped bundle", icon=viser.Icon.UPLOAD)
+    """Build the page."""
+    gallery = Gallery(session, "Parts", part_rows(session.files.library))
+    open_panels(gallery, markup.breadcrumbs(), library_links(session.files))
+    upload = session.client.gui.add_upload_button(
+        "Look at a URDF or a zipped bundle", icon=viser.Icon.UPLOAD
+    )
 
     async def uploaded(event: viser.GuiEvent[viser.GuiUploadButtonHandle]) -> None:
-        sent = event.target.value
-        post(session, lambda: _open_upload(session, sent.name, sent.content))
+        file = event.target.value
+        session.enqueue(lambda: _open_upload(session, file.name, file.content))
 
     upload.on_upload(uploaded)
-    gallery_grid.build(rows)
+    add_controls(gallery)
 
 
 def _open_upload(session: Session, name: str, content: bytes) -> None:
-    place = keep(name, content, session.places)
-    browser.go_to(session.client, Address("robot", (place,)).query)
+    uri = store_upload(name, content, session.files)
+    session.open_address(Address("robot", (uri,)))
 
 
-def library_links(places: FileAccess) -> str:
-    """Links to all that is no part: robots of this folder, splits, grammars."""
-    here = places.roots[0]
-    robots = ["robots", *(f"robots/{name}" for name in subfolders(here / "robots"))]
-    folders = [*subfolders(here), *(name for name in robots if (here / name).is_dir())]
+def library_links(files: FileAccess) -> str:
+    """Return links to the robots of the current folder, the splits and the grammars."""
+    root = files.roots[0]
+    folders = [*robot_subfolders(root), "robots"]
+    folders += [f"robots/{name}" for name in robot_subfolders(root / "robots")]
+    folders = [name for name in dict.fromkeys(folders) if (root / name).is_dir()]
     sections = [
-        ("Robots", [(name, Address("gallery", (name,))) for name in dict.fromkeys(folders)]),
+        ("Robots", [(name, Address("gallery", (name,))) for name in folders]),
         ("Splits", [(name, Address("split", (name,))) for name in split_names()]),
         ("Categories", [(name, Address("compose", (name,))) for name in grammar_names()]),
         ("New", [("compose a robot", Address("compose", ("arm=ur5 ee=plane",)))]),
     ]
     return "".join(
-        f"<h3>{title}</h3>" + " · ".join(markup.link(where, text) for text, where in links)
+        f"<h3>{title}</h3>" + " · ".join(markup.link(address, text) for text, address in links)
         for title, links in sections
         if links
     )

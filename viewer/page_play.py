@@ -1,124 +1,214 @@
-"""The page on which bodies do their tasks: simulated now, or as they were recorded."""
+"""The page of a rollout: robots at a task, simulated now or played back from a file."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from html import escape
 
 import viser
 
 from morphgen.errors import MorphgenError
-from morphgen.viewer import browser, episode_export, markup
+from morphgen.tasks.registry import TASKS
+from morphgen.viewer import markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.episode import Episode, episode_bytes, read_episode, still
-from morphgen.viewer.page_play_controls import add_choices, begin, parse_rollout, trained_bodies
-from morphgen.viewer.play_screen import PlayPage, playing
+from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
+from morphgen.viewer.episode_export import record_scene, render_video
+from morphgen.viewer.page_play_controls import (
+    RolloutControls,
+    add_rollout_controls,
+    complete_address,
+    parse_rollout,
+    rollout_address,
+)
+from morphgen.viewer.page_robot import open_panel
 from morphgen.viewer.player import SPEEDS, Player
-from morphgen.viewer.robot_uri import EPISODE_SUFFIX, name_of
-from morphgen.viewer.rollout import Recorded
-from morphgen.viewer.session import Session, at_end, in_worker, later, say, when
+from morphgen.viewer.robot_uri import EPISODE_SUFFIX, uri_name
+from morphgen.viewer.rollout import EpisodeSource, RecordedEpisode, Rollout, RolloutConfig
+from morphgen.viewer.scene_robot import look_at
+from morphgen.viewer.scene_rollout import RolloutScene, add_episode, show_step
+from morphgen.viewer.session import Session, set_value
 
-SIDE = 400.0
-"""Width of the panel, pixels."""
+PANEL_WIDTH = 400.0
+"""Width of the panel [pixels]."""
+PLANNERS = ("ik", "scripted")
+"""Policies whose first step takes seconds, because they plan a path."""
+
+
+@dataclass(eq=False)
+class PlayPage:
+    """Playback in one browser; the display of its player."""
+
+    session: Session
+    time: viser.GuiSliderHandle[float]
+    fault: viser.GuiHtmlHandle
+    score: viser.GuiHtmlHandle
+    source: EpisodeSource | None = None
+    scene: RolloutScene | None = None
+    framed: tuple[str, ...] = ()
+    """URIs of the robots that the camera was pointed at."""
+    is_planning: bool = False
+    """Whether the policy is still planning its first step."""
+
+    def show_start(self, source: EpisodeSource) -> None:
+        """Show a new episode at its start."""
+        client, self.source = self.session.client, source
+        with client.atomic():
+            if self.scene is not None:
+                self.scene.root.remove()
+            self.scene = add_episode(client.scene, source.episode)
+        uris = tuple(track.uri for track in source.episode.tracks)
+        if uris != self.framed:  # the next episode of the same robots keeps the user's camera
+            self.framed = uris
+            look_at(client, self.scene.low, self.scene.high)
+        self.time.max = max(source.max_steps, 1) * source.episode.period
+        self._show_faults(source.faults.values())
+        self.is_planning = isinstance(source, Rollout) and source.episode.policy in PLANNERS
+        self.session.set_status("the policy plans its path" if self.is_planning else "")
+
+    def show_step(self, step: int) -> None:
+        """Show the episode after a number of control steps."""
+        if self.scene is None or self.source is None:
+            return
+        episode = self.source.episode
+        with self.session.client.atomic():
+            show_step(self.scene, step)
+        if step > 0 and self.is_planning:
+            self.is_planning = False
+            self.session.set_status("")
+        set_value(self.time, step * episode.period)
+        self.score.content = markup.framed(score_table(episode, step))
+
+    def show_stopped(self) -> None:
+        """Show errors that ended robots' episodes early."""
+        tracks = self.source.episode.tracks if self.source else []
+        if faults := [track.fault for track in tracks if track.fault]:
+            self._show_faults(faults)
+
+    def show_failure(self, reason: str) -> None:
+        """Show why there is no episode."""
+        self.session.set_status("")
+        self._show_faults([reason])
+        self.score.content = ""
+        if self.scene is not None:
+            self.scene.root.remove()
+            self.scene = None
+        self.source = None
+
+    def _show_faults(self, texts: Iterable[str]) -> None:
+        redact = self.session.files.redact
+        self.fault.content = "".join(markup.error(redact(text)) for text in texts)
 
 
 def show(session: Session) -> None:
     """Build the page.
 
     Raises:
-        MorphgenError: If its address names no task, nothing that plays, or a broken episode.
+        MorphgenError: If the address names an unknown task, policy or robot, or an invalid episode.
     """
-    page = PlayPage(session)
     gui, subject = session.client.gui, session.address.subject
-    gui.set_panel_label("morphgen")
-    gui.main_panel.dock_right()
-    gui.main_panel.set_width(SIDE)
-    gui.add_html(markup.STYLE + markup.crumbs((name_of(subject) or "play", None)))
-    session.status = gui.add_html(markup.status("reading"))
-    episode = None
+    header = markup.breadcrumbs((uri_name(subject) or "play", None))
+    open_panel(session, PANEL_WIDTH, header, "reading")
     if subject.endswith(EPISODE_SUFFIX):
-        episode = read_episode(session.places.path(subject), session.places)
+        episode = read_episode(session.files.path(subject), session.files)
+        page, player = _add_player(session)
+        gui.add_html(markup.framed(_description(episode)))
+        player.load(lambda: RecordedEpisode(episode))
+        session.show_address(f"play {uri_name(subject)}")
     else:
-        page.trained = trained_bodies(page)
-        page.wanted = parse_rollout(session.address, page.trained)
-    page.texts["fault"] = gui.add_html("")
-    _add_time(page)
-    page.texts["score"] = gui.add_html("")
-    if page.wanted is not None:
-        add_choices(page, page.wanted)
-    elif episode is not None:
-        gui.add_html(markup.framed(_about(episode)))
+        trained_on = complete_address(session)
+        config = parse_rollout(session.address, trained_on)
+        page, player = _add_player(session)
+        start = functools.partial(_start_rollout, session, player)
+        add_rollout_controls(RolloutControls(session, config, trained_on, start))
+        start(config)
     with gui.add_folder("Get"):
         _add_downloads(page)
-    player = page.player = Player(page)
-    at_end(session, player.stop)
-    if episode is not None:
-        recorded = Recorded(episode)
-        player.prepare(lambda: recorded)
-        browser.show_query(session.client, session.address.query, f"play {name_of(subject)}")
-    else:
-        begin(page)
 
 
-def _add_time(page: PlayPage) -> None:
-    gui, session = page.session.client.gui, page.session
+def score_table(episode: Episode, step: int) -> str:
+    """Return a table of the robots' scores after a number of control steps."""
+    rows = []
+    for track in episode.tracks:
+        i = min(step, track.num_steps)
+        score = score_until(track, episode.task, i)
+        if score is None:
+            rows.append((escape(track.robot.name), "", "", ""))
+            continue
+        tag = markup.tag("success", "train") if track.success[i - 1] else markup.tag("not yet")
+        distance = f"{track.distance[i - 1]:.3f}"
+        rows.append((escape(track.robot.name), f"{score:.2f}", distance, tag))
+    seconds, simulated = step * episode.period, episode.num_steps * episode.period
+    header = ("", "score so far", f"m from {TASKS[episode.task].target}", "now")
+    head = markup.dim(f"{seconds:.2f} s; simulated: {simulated:.2f} s")
+    return head + markup.table(header, rows, (1, 2))
+
+
+def _start_rollout(session: Session, player: Player, config: RolloutConfig) -> None:
+    """Show a rollout's address, and let the player simulate it."""
+    session.address = rollout_address(config)
+    session.show_address(f"{config.task} {uri_name(config.robots[0])}")
+    progress = session.set_status
+    player.load(lambda: Rollout(config, session.files, progress))
+
+
+def _add_player(session: Session) -> tuple[PlayPage, Player]:
+    """Add the controls of the playback; return the page and its player."""
+    gui = session.client.gui
+    fault = gui.add_html("")
     buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
-    speed = gui.add_dropdown("speed", tuple(f"{each:g}x" for each in SPEEDS), initial_value="1x")
+    speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
+    speed = gui.add_dropdown("speed", speeds, initial_value="1x")
     time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint="as far as it was simulated")
-    page.controls |= {"buttons": buttons, "speed": speed, "time": time}
+    page = PlayPage(session, time, fault, gui.add_html(""))
+    player = Player(page)
+    session.on_close(player.stop)
+    commands: dict[str, Callable[[], None]] = {
+        "play": player.play,
+        "pause": player.pause,
+        "back": lambda: player.go_by(-1),
+        "step": lambda: player.go_by(1),
+    }
 
-    def pressed() -> None:
-        player = playing(page)
-        match buttons.value:
-            case "play":
-                player.play()
-            case "pause":
-                player.pause()
-            case "back":
-                player.go_by(-1)
-            case _:
-                player.go_by(1)
+    def go_to_time() -> None:
+        if page.source is not None:
+            player.go_to(round(time.value / page.source.episode.period))
 
-    when(buttons, session, pressed)
-    when(speed, session, lambda: playing(page).at_speed(float(speed.value.removesuffix("x"))))
-    when(time, session, lambda: _scrub(page), "time")
-
-
-def _scrub(page: PlayPage) -> None:
-    if page.source is not None:
-        playing(page).go_to(round(page.controls["time"].value / page.source.episode.period))
+    session.on_change(buttons, lambda: commands[buttons.value]())
+    session.on_change(speed, lambda: player.set_speed(float(speed.value.removesuffix("x"))))
+    session.on_change(time, go_to_time, "time")
+    return page, player
 
 
 def _add_downloads(page: PlayPage) -> None:
     gui, session = page.session.client.gui, page.session
-    film = functools.partial(in_worker, session, episode_export.film)
-    scene = functools.partial(in_worker, session, episode_export.recording)
-    files: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
+    downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
         (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
-        ("Film (.mp4)", ".mp4", film),
-        ("Scene (.viser)", ".viser", scene),
+        ("Film (.mp4)", ".mp4", functools.partial(session.run_in_worker, render_video)),
+        ("Scene (.viser)", ".viser", functools.partial(session.run_in_worker, record_scene)),
     )
-    for label, suffix, work in files:
+    for label, suffix, make in downloads:
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
-        send = functools.partial(_send, page, suffix, work)
-        when(button, session, functools.partial(later, session, send))
+        send = functools.partial(_send, page, suffix, make)
+        session.on_change(button, functools.partial(session.run_in_background, send))
 
 
-def _send(page: PlayPage, suffix: str, work: Callable[[Episode], bytes]) -> None:
-    """Send the episode as far as it has been simulated."""
+def _send(page: PlayPage, suffix: str, make: Callable[[Episode], bytes]) -> None:
+    """Send a file of the episode as far as it has been simulated."""
     if page.source is None:
         raise MorphgenError("there is no episode yet")
-    episode = still(page.source.episode)
-    say(page.session, f"making the {suffix} of {episode.steps * episode.period:.2f} s")
-    content = work(episode)
+    episode = snapshot(page.source.episode)
+    seconds = episode.num_steps * episode.period
+    page.session.set_status(f"making the {suffix} of {seconds:.2f} s")
+    content = make(episode)
     name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}{suffix}"
     page.session.client.send_file_download(name, content, save_immediately=True)
-    say(page.session, "")
+    page.session.set_status("")
 
 
-def _about(episode: Episode) -> str:
-    """What a recorded episode is, with links to its robots and to playing it anew."""
+def _description(episode: Episode) -> str:
+    """Return a table about a recorded episode, with links to its robots."""
     rows = [
         ("task", escape(episode.task) + (" with obstacles" if episode.obstacles else "")),
         ("policy", escape(episode.policy)),
@@ -126,6 +216,5 @@ def _about(episode: Episode) -> str:
         ("simulator", escape(episode.simulator)),
     ]
     for track in episode.tracks:
-        robot = Address("robot", (track.place,))
-        rows.append(("robot", markup.link(robot, track.robot.name)))
+        rows.append(("robot", markup.link(Address("robot", (track.uri,)), track.robot.name)))
     return markup.table(("recorded", ""), rows)

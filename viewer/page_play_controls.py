@@ -1,187 +1,245 @@
-"""What is to be played: from a page's address, and by the controls that change it."""
+"""Controls of a rollout: task, policy, seed and robots; and their state in the address."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import viser
 
+from morphgen.benchmark.split_file import split_names
 from morphgen.errors import MorphgenError, nearest
+from morphgen.grammar.robot_source import is_set_folder
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.tasks.registry import TASKS
-from morphgen.viewer import browser, play_bodies
-from morphgen.viewer.address import Address, whole_number
-from morphgen.viewer.play_bodies import Bodies
-from morphgen.viewer.play_screen import PlayPage, asked, playing
-from morphgen.viewer.robot_uri import WORDS, name_of
-from morphgen.viewer.rollout import (
-    MOST,
-    Rollout,
-    RolloutConfig,
-    checkpoints,
-    simulators,
-    trained_with,
+from morphgen.viewer.address import Address, parse_count
+from morphgen.viewer.robot_rows import folder_rows, split_rows
+from morphgen.viewer.robot_uri import (
+    WORDS,
+    FileAccess,
+    member_split,
+    parent_folder,
+    resolve_split,
 )
-from morphgen.viewer.session import say, set_value, when
+from morphgen.viewer.rollout import (
+    MAX_ROBOTS,
+    RolloutConfig,
+    list_checkpoints,
+    simulators,
+    training_robots,
+)
+from morphgen.viewer.session import Session
 
-BODY = "words:arm=ur5 ee=plane"
-"""What plays if an address names nobody."""
+DEFAULT_ROBOT = "words:arm=ur5 ee=plane"
+"""Robot of an address that names none."""
+ARMS = "arms with a plate"
+MAX_CHOICES = 500
+"""Robots that a dropdown offers; others can be named by words."""
+ACTIONS = ("replace", "add", "only")
+"""What to do with the chosen robot: replace the first, add it, or remove all others."""
+
+Robots = list[tuple[str, str]]
+"""Names and URIs."""
 
 
-def parse_rollout(address: Address, trained: Bodies) -> RolloutConfig:
-    """What an address asks to play.
+@dataclass(eq=False)
+class RolloutControls:
+    """The controls in one browser."""
+
+    session: Session
+    config: RolloutConfig
+    """The current rollout."""
+    trained_on: Robots
+    """Robots that the policy was trained on."""
+    start: Callable[[RolloutConfig], object]
+    """Starts a rollout."""
+    handles: dict[str, Any] = field(default_factory=dict)
+    choices: dict[str, str] = field(default_factory=dict)
+    """URIs of the robots in the dropdown, by label."""
+
+
+def parse_rollout(address: Address, trained_on: Robots) -> RolloutConfig:
+    """Return the rollout that an address describes.
 
     Args:
-        address: Of the page.
-        trained: Bodies that its policy was trained on; the first plays if it names none.
+        address: Address of the page.
+        trained_on: Robots that the policy was trained on; the first is the default robot.
 
     Raises:
-        MorphgenError: If there is no such task or simulator, or the seed is no number.
+        MorphgenError: If the task, simulator or seed is invalid.
     """
     state, installed = address.state, simulators()
     task = address.subject
     if task not in TASKS:
-        raise MorphgenError(f"no task {address.subject!r} to play{nearest(address.subject, TASKS)}")
-    simulator = next((each for each in installed if each == state.get("sim", installed[0])), None)
-    if simulator is None:
-        name = state["sim"]
-        raise MorphgenError(f"simulator {name!r} is not here{nearest(name, installed)}")
-    seed = state.get("seed", "0")
-    if (number := whole_number(seed, -1)) < 0:
-        raise MorphgenError(f"seed {seed!r:.80}: expected a whole number, 0 or more")
-    default = trained[0][1] if trained else BODY
+        raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
+    simulator = state.get("sim", installed[0])
+    if simulator not in installed:
+        raise MorphgenError(
+            f"simulator {simulator!r} is not installed{nearest(simulator, installed)}"
+        )
+    seed_text = state.get("seed", "0")
+    if (seed := parse_count(seed_text, -1)) < 0:
+        raise MorphgenError(f"seed {seed_text!r:.80}: expected a whole number, 0 or more")
+    robot = trained_on[0][1] if trained_on else DEFAULT_ROBOT
     return RolloutConfig(
         task,
-        (address.robots or (default,))[:MOST],
+        (address.robots or (robot,))[:MAX_ROBOTS],
         state.get("policy") or baselines_for(task)[0],
-        number,
+        seed,
         bool(state.get("obstacles")),
         simulator,
     )
 
 
-def address_of(wanted: RolloutConfig) -> Address:
-    """The address of what is played; what is at its default is left out."""
-    state = {
-        "policy": wanted.policy,
-        "seed": str(wanted.seed),
-        "obstacles": "yes" if wanted.obstacles else "",
-        "sim": "" if wanted.simulator == simulators()[0] else wanted.simulator,
-    }
-    return Address("play", (wanted.task,), robots=wanted.places).with_state(**state)
+def rollout_address(config: RolloutConfig) -> Address:
+    """Return the address of a rollout; default values are left out."""
+    return Address("play", (config.task,), robots=config.robots).with_state(
+        policy=config.policy,
+        seed=str(config.seed),
+        obstacles="yes" if config.obstacles else "",
+        sim="" if config.simulator == simulators()[0] else config.simulator,
+    )
 
 
-def trained_bodies(page: PlayPage) -> Bodies:
-    """The bodies of the address's checkpoint; where it names no task or body, it gets them."""
-    address, places = page.session.address, page.session.places
-    policy = address.state.get("policy", "")
+def complete_address(session: Session) -> Robots:
+    """Return the robots that the address's checkpoint was trained on.
+
+    An address without a task gets the task and the obstacles of the training.
+    """
+    policy = session.address.state.get("policy", "")
     if not policy or policy in BASELINES:
         return []
-    task, obstacles, bodies = trained_with(policy, places)
-    if not address.subject:
-        address = replace(address, of=(task,))
-        page.session.address = address.with_state(obstacles="yes" if obstacles else "")
-    return bodies
+    task, obstacles, robots = training_robots(policy, session.files)
+    if not session.address.subject:
+        address = replace(session.address, subjects=(task,))
+        session.address = address.with_state(obstacles="yes" if obstacles else "")
+    return robots
 
 
-def add_choices(page: PlayPage, wanted: RolloutConfig) -> None:
-    """Controls of what is played."""
-    gui, session, controls = page.session.client.gui, page.session, page.controls
-    again = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
+def add_rollout_controls(controls: RolloutControls) -> None:
+    """Add the controls to the page."""
+    gui, session, handles = controls.session.client.gui, controls.session, controls.handles
+    config = controls.config
+    restart = gui.add_button("New episode", icon=viser.Icon.REFRESH, hint="with the next seed")
     with gui.add_folder("Task"):
-        controls["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=wanted.task)
-        names = _policies(page, wanted)
-        controls["policy"] = gui.add_dropdown("policy", names, initial_value=wanted.policy)
-        controls["obstacles"] = gui.add_checkbox("obstacles", wanted.obstacles)
-        controls["seed"] = gui.add_number("seed", wanted.seed, min=0, step=1)
-        installed = tuple(simulators())
-        controls["sim"] = gui.add_dropdown("simulator", installed, initial_value=wanted.simulator)
-    with gui.add_folder("Bodies"):
-        listed = tuple(play_bodies.sources(wanted.places[0], page.trained, session.places))
-        controls["from"] = gui.add_dropdown("from", listed)
-        controls["body"] = gui.add_dropdown("body", ("",))
-        controls["words"] = gui.add_text(
+        handles["task"] = gui.add_dropdown("task", tuple(TASKS), initial_value=config.task)
+        policies = _policies(session.files, config)
+        handles["policy"] = gui.add_dropdown("policy", policies, initial_value=config.policy)
+        handles["obstacles"] = gui.add_checkbox("obstacles", config.obstacles)
+        handles["seed"] = gui.add_number("seed", config.seed, min=0, step=1)
+        names = tuple(simulators())
+        handles["simulator"] = gui.add_dropdown("simulator", names, initial_value=config.simulator)
+    with gui.add_folder("Robots"):
+        handles["from"] = gui.add_dropdown("from", tuple(_robot_lists(controls)))
+        handles["robot"] = gui.add_dropdown("robot", ("",))
+        handles["words"] = gui.add_text(
             "or words", "", hint="such as arm=ur5 ee=plane, or a bundle's folder; then Enter"
         )
-        group = gui.add_button_group("this body", ("instead", "beside", "alone"))
-    when(again, session, lambda: _change(page, seed=asked(page).seed + 1))
-    when(controls["task"], session, lambda: _change_task(page))
-    when(controls["policy"], session, lambda: _change(page, policy=controls["policy"].value))
-    when(controls["obstacles"], session, lambda: _change(page, obstacles=_value(page, "obstacles")))
-    when(controls["seed"], session, lambda: _change(page, seed=_value(page, "seed")), "seed")
-    when(controls["sim"], session, lambda: _change(page, simulator=_value(page, "sim")))
-    when(controls["from"], session, lambda: _list_bodies(page))
-    when(controls["body"], session, lambda: _put_body(page, "instead"))
-    when(group, session, lambda: _put_body(page, group.value))
-    _list_bodies(page)
+        action = gui.add_button_group("this robot", ACTIONS)
+    session.on_change(restart, lambda: _change(controls, seed=controls.config.seed + 1))
+    session.on_change(handles["task"], lambda: _change_task(controls))
+    for name in ("policy", "obstacles", "seed", "simulator"):
+        session.on_change(handles[name], functools.partial(_apply, controls, name), name)
+    session.on_change(handles["from"], lambda: _list_robots(controls))
+    session.on_change(handles["robot"], lambda: _use_robot(controls, "replace"))
+    session.on_change(action, lambda: _use_robot(controls, action.value))
+    _list_robots(controls)
 
 
-def _policies(page: PlayPage, wanted: RolloutConfig) -> tuple[str, ...]:
-    """Those of the task, checkpoints of this folder, and the one that is wanted."""
-    found = (*baselines_for(wanted.task), *checkpoints(page.session.places), wanted.policy)
-    return tuple(dict.fromkeys(found))
+def label_robots(robots: Robots, current: Sequence[str]) -> dict[str, str]:
+    """Return URIs by distinct labels, in the order of the robots.
+
+    Args:
+        robots: Names and URIs.
+        current: URIs of the rollout; those that are not among the robots come first.
+    """
+    known = {uri for _, uri in robots}
+    labels: dict[str, str] = {}
+    for name, uri in [*((uri, uri) for uri in current if uri not in known), *robots]:
+        label = name
+        while label in labels:
+            label += "'"
+        labels[label] = uri
+    return labels
 
 
-def _list_bodies(page: PlayPage) -> None:
-    """Fill the dropdown of bodies from where they are to come."""
-    wanted, box = asked(page), page.controls["body"]
-    listed = play_bodies.sources(wanted.places[0], page.trained, page.session.places)
-    found = listed.get(page.controls["from"].value, list)()
-    page.bodies = play_bodies.labels(found, wanted.places[:1])
-    box.options = tuple(page.bodies)
-    labels = [label for label, place in page.bodies.items() if place == wanted.places[0]]
-    set_value(box, labels[0])
+def _robot_lists(controls: RolloutControls) -> Mapping[str, Callable[[], Robots]]:
+    """Return functions that list robots to choose from, by the name of their source.
+
+    The robots that the policy was trained on come first, then the split or set of the first robot.
+    """
+    uri, files = controls.config.robots[0], controls.session.files
+    lists: dict[str, Callable[[], Robots]] = {}
+    if controls.trained_on:
+        lists["trained on"] = lambda: controls.trained_on
+    if split := member_split(uri):
+        lists[split] = functools.partial(_split_robots, split, files)
+    folder = parent_folder(uri)
+    if folder and is_set_folder(files.path(folder)):
+        lists[folder] = lambda: [(row.name, row.uri) for row in folder_rows(folder, files)]
+    lists[ARMS] = lambda: [
+        *((arm, f"{WORDS}arm={arm} ee=plane") for arm in files.library.names("arm")),
+        ("planar-cube", f"{WORDS}base=planar ee=cube"),
+    ]
+    for split in split_names():
+        lists.setdefault(split, functools.partial(_split_robots, split, files))
+    return lists
 
 
-def _put_body(page: PlayPage, how: str) -> None:
-    """Have the chosen body play: instead of the first, beside all, or alone."""
-    wanted, text = asked(page), page.controls["words"].value.strip()
-    place = page.bodies[page.controls["body"].value]
+def _split_robots(split: str, files: FileAccess) -> Robots:
+    rows = split_rows(split, resolve_split(split, files))
+    return [(f"{row.role}: {row.name}", row.uri) for row in rows]
+
+
+def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
+    """Return the baselines of the task, the checkpoints of this folder, and the current policy."""
+    names = (*baselines_for(config.task), *list_checkpoints(files), config.policy)
+    return tuple(dict.fromkeys(names))
+
+
+def _list_robots(controls: RolloutControls) -> None:
+    """Fill the dropdown of robots from the chosen source."""
+    current, dropdown = controls.config.robots[0], controls.handles["robot"]
+    list_robots = _robot_lists(controls).get(controls.handles["from"].value, list)
+    controls.choices = label_robots(list_robots()[:MAX_CHOICES], (current,))
+    dropdown.options = tuple(controls.choices)
+    dropdown.value = next(label for label, uri in controls.choices.items() if uri == current)
+
+
+def _use_robot(controls: RolloutControls, action: str) -> None:
+    """Use the robot that was named or chosen, see ``ACTIONS``."""
+    robots, text = controls.config.robots, controls.handles["words"].value.strip()
+    uri = controls.choices[controls.handles["robot"].value]
     if text:
-        place = WORDS + text if "=" in text and ":" not in text else text
-        set_value(page.controls["words"], "")
-    if how == "beside":
-        if len(wanted.places) >= MOST:
-            raise MorphgenError(f"{MOST} bodies are shown at most")
-        _change(page, places=(*wanted.places, place))
+        uri = WORDS + text if "=" in text and ":" not in text else text
+        controls.handles["words"].value = ""
+    if action == "add":
+        if len(robots) >= MAX_ROBOTS:
+            raise MorphgenError(f"at most {MAX_ROBOTS} robots are shown")
+        _change(controls, robots=(*robots, uri))
     else:
-        rest = wanted.places[1:] if how == "instead" else ()
-        _change(page, places=(place, *rest))
+        _change(controls, robots=(uri, *(robots[1:] if action == "replace" else ())))
 
 
-def _change_task(page: PlayPage) -> None:
-    """Play another task, with its own reference if the policy is the other's."""
-    wanted = asked(page)
-    task = page.controls["task"].value
-    policy = wanted.policy
-    if policy in BASELINES and policy not in baselines_for(task):
-        policy = baselines_for(task)[0]
-    changed = replace(wanted, task=task, policy=policy)
-    page.controls["policy"].options = _policies(page, changed)
-    set_value(page.controls["policy"], policy)
-    _change(page, task=task, policy=policy)
+def _apply(controls: RolloutControls, name: str) -> None:
+    _change(controls, **{name: controls.handles[name].value})
 
 
-def _change(page: PlayPage, **changes: Any) -> None:  # noqa: ANN401
-    """Begin an episode of something else."""
-    page.wanted = replace(asked(page), **changes)
-    if page.controls["seed"].value != page.wanted.seed:
-        set_value(page.controls["seed"], page.wanted.seed)
-    begin(page)
+def _change_task(controls: RolloutControls) -> None:
+    """Start another task, with its own baseline if the current one is for the other task."""
+    config = replace(controls.config, task=controls.handles["task"].value)
+    if config.policy in BASELINES and config.policy not in baselines_for(config.task):
+        config = replace(config, policy=baselines_for(config.task)[0])
+    controls.handles["policy"].options = _policies(controls.session.files, config)
+    controls.handles["policy"].value = config.policy
+    _change(controls, task=config.task, policy=config.policy)
 
 
-def begin(page: PlayPage) -> None:
-    """Have the page's player begin an episode of what is asked for, and tell its address."""
-    session, wanted = page.session, asked(page)
-    session.address = address_of(wanted)
-    browser.show_query(
-        session.client, session.address.query, f"{wanted.task} {name_of(wanted.places[0])}"
-    )
-    progress = functools.partial(say, session)
-    playing(page).prepare(lambda: Rollout(wanted, session.places, progress))
-
-
-def _value(page: PlayPage, name: str) -> Any:  # noqa: ANN401
-    return page.controls[name].value
+def _change(controls: RolloutControls, **changes: Any) -> None:  # noqa: ANN401
+    """Start an episode with another config."""
+    controls.config = replace(controls.config, **changes)
+    if controls.handles["seed"].value != controls.config.seed:
+        controls.handles["seed"].value = controls.config.seed
+    controls.start(controls.config)

@@ -1,54 +1,64 @@
-"""The page of one robot: moved, looked into, and taken away."""
+"""The page of a robot: move it, show its layers, links and findings, download it."""
 
 from __future__ import annotations
 
+import functools
+import io
+import shlex
+from collections.abc import Callable
 from html import escape
 
 import numpy as np
 import viser
+from PIL import Image
 
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
-from morphgen.formats.bundle import CARD, file_findings, split_colours
+from morphgen.formats.bundle import CARD, MJCF, URDF, file_findings, split_colours
 from morphgen.model.kinematics import joint_limits, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
-from morphgen.viewer import markup, robot_tables, scene_overlays
+from morphgen.viewer import markup, robot_tables
 from morphgen.viewer.address import Address
-from morphgen.viewer.robot_downloads import add_downloads
-from morphgen.viewer.robot_rows import neighbours
-from morphgen.viewer.robot_state import (
+from morphgen.viewer.page_robot_show import (
     RobotPage,
+    add_toggles,
+    apply_toggle,
     parse_joints,
+    read_sliders,
     set_configuration,
-    show_moved,
-    tell_address,
+    show_in_address,
+    update_scene,
 )
-from morphgen.viewer.robot_toggles import add_toggles, toggle
-from morphgen.viewer.robot_uri import MEMBER, name_of, read_robot_uri
+from morphgen.viewer.robot_files import bundle_files, zip_files
+from morphgen.viewer.robot_rows import neighbour_uris
+from morphgen.viewer.robot_tables import has_tool
+from morphgen.viewer.robot_uri import (
+    UPLOAD,
+    WORDS,
+    member_split,
+    parent_folder,
+    read_robot_uri,
+    uri_name,
+)
 from morphgen.viewer.scene_overlays import Overlays
 from morphgen.viewer.scene_robot import (
+    add_floor,
     add_robot,
     look_at,
     paint_red,
     robot_bounds,
 )
-from morphgen.viewer.session import (
-    Session,
-    later,
-    notify,
-    post,
-    say,
-    set_value,
-    when,
-)
+from morphgen.viewer.session import Session, set_value
 
-SIDE = 390.0
-"""Width of the panel, pixels."""
-TRIES = 500
-"""Random configurations tested for a free one."""
+PANEL_WIDTH = 390.0
+"""Width of the panel [pixels]."""
+MAX_TRIES = 500
+"""Random configurations that are tested to find one without collision."""
+RENDER_TIMEOUT = 60.0
+"""Time in which the browser has to send a screenshot [s]."""
 _NO_LINK = "(none)"
 
 
@@ -56,189 +66,235 @@ def show(session: Session) -> None:
     """Build the page of the robot that the address names.
 
     Raises:
-        UnsoundError: If its structure is broken.
-        MorphgenError: If it cannot be read.
+        UnsoundError: If the robot's structure is broken.
+        MorphgenError: If the robot cannot be read.
     """
-    place = session.address.subject
-    gui, scene = session.client.gui, session.client.scene
-    gui.set_panel_label("morphgen")
-    gui.main_panel.dock_right()
-    gui.main_panel.set_width(SIDE)
-    gui.add_html(markup.STYLE + _way(session, place))
-    session.status = gui.add_html(markup.status(f"reading {name_of(place)}"))
-    robot = split_colours(read_robot_uri(place, session.places))
+    uri = session.address.subject
+    gui = session.client.gui
+    open_panel(session, PANEL_WIDTH, _location(session, uri), f"reading {uri_name(uri)}")
+    robot = split_colours(read_robot_uri(uri, session.files))
     low, high = robot_bounds(robot)
-    add_floor(scene, float(np.linalg.norm(high - low)))
+    add_floor(session.client.scene, float(np.linalg.norm(high - low)))
     look_at(session.client, low, high)
-    view = add_robot(scene, robot, "/robot")
-    page = RobotPage(session, place, robot, view, Overlays(view), np.array(robot.home))
-    distance = reach(robot) if scene_overlays.has_tool(robot) and robot.dof else None
-    gui.add_html(
-        markup.framed(
-            f"<h3>{escape(robot.name)}</h3>"
-            f'<div class="dim">{robot_tables.summary(robot, distance)}{_plays(robot, place)}</div>'
-        )
-    )
+    view = add_robot(session.client.scene, robot, "/robot")
+    page = RobotPage(session, uri, robot, view, Overlays(view), np.array(robot.home))
+    gui.add_html(summary(robot, _task_links(robot, uri)))
     tabs = gui.add_tab_group()
     with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
-        _add_moves(page)
+        _add_move_tab(page)
     with tabs.add_tab("Show", viser.Icon.EYE):
         add_toggles(page)
     with tabs.add_tab("Links", viser.Icon.BINARY_TREE):
-        _add_links(page)
+        _add_links_tab(page)
     with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
         page.texts["findings"] = gui.add_html("")
     with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
-        add_downloads(page)
-    say(session, "")
+        _add_downloads_tab(page)
+    session.set_status("")
     _apply_address(page)
-    later(session, lambda: _examine(page))
+    session.run_in_background(lambda: _check_robot(page))
 
 
-def add_floor(scene: viser.SceneApi, size: float) -> None:
-    """A grid on the ground: a cell is 10 cm, a section 1 m."""
-    side = max(2.0, 2.0 * round(2 * size) / 2)
-    scene.add_grid("/floor", width=side, height=side, cell_size=0.1, section_size=1.0)
+def open_panel(session: Session, width: float, header: str, status: str = "") -> None:
+    """Open a page's panel at the right, with breadcrumbs or other HTML and the status line."""
+    gui = session.client.gui
+    gui.set_panel_label("morphgen")
+    gui.main_panel.dock_right()
+    gui.main_panel.set_width(width)
+    gui.add_html(markup.STYLE + header)
+    session.status = gui.add_html(markup.status(status))
+
+
+def summary(robot: Robot, links: str) -> str:
+    """Return a robot's name and facts, followed by links as HTML."""
+    distance = reach(robot) if has_tool(robot) and robot.dof else None
+    facts = robot_tables.summary(robot, distance)
+    return markup.framed(f"<h3>{escape(robot.name)}</h3>", markup.dim(facts + links))
 
 
 def free_configuration(
-    tested: SelfCollisionChecker, robot: Robot, rng: np.random.Generator
+    checker: SelfCollisionChecker, robot: Robot, rng: np.random.Generator
 ) -> Array | None:
-    """A random configuration without self-collision; None if none is found."""
-    for _ in range(TRIES // 10):
-        q = random_configurations(robot, 10, rng)
-        for row, found in zip(q, tested.penetrations(q), strict=True):
-            if not found:
-                return np.asarray(row)
+    """Return a random configuration without self-collision; None if all tries collide."""
+    for _ in range(MAX_TRIES):
+        q = random_configurations(robot, 1, rng)
+        if list(checker.penetrations(q)) == [{}]:
+            return np.asarray(q[0])
     return None
 
 
-def _way(session: Session, place: str) -> str:
-    """Where a robot is from, with links to the one before and after it."""
+def _location(session: Session, uri: str) -> str:
+    """Return breadcrumbs to the robot's set or split, with links to its neighbours there."""
     steps: list[tuple[str, Address | None]] = []
-    if place.startswith(MEMBER):
-        split = place.removeprefix(MEMBER).rpartition("@")[0]
+    if split := member_split(uri):
         steps.append((split, Address("split", (split,))))
-    elif ":" not in place and "/" in place.rstrip("/"):
-        folder = place.rstrip("/").rpartition("/")[0]
+    elif folder := parent_folder(uri):
         steps.append((folder, Address("gallery", (folder,))))
-    before, after = neighbours(place, session.places)
-    ways = [
-        markup.link(Address("robot", (other,)), text)
-        for other, text in ((before, "◂ previous"), (after, "next ▸"))
-        if other
+    previous, following = neighbour_uris(uri, session.files)
+    links = [
+        markup.link(Address("robot", (neighbour,)), text)
+        for neighbour, text in ((previous, "◂ previous"), (following, "next ▸"))
+        if neighbour
     ]
-    beside = f'<div class="dim">{" · ".join(ways)}</div>' if ways else ""
-    return markup.crumbs(*steps, (name_of(place), None)) + markup.framed(beside)
+    neighbours = markup.dim(" · ".join(links)) if links else ""
+    return markup.breadcrumbs(*steps, (uri_name(uri), None)) + markup.framed(neighbours)
 
 
-def _plays(robot: Robot, place: str) -> str:
-    """Links to the pages on which a robot does its tasks; a robot without tool has none."""
-    if not (scene_overlays.has_tool(robot) and robot.dof):
+def _task_links(robot: Robot, uri: str) -> str:
+    """Return links to rollouts of the robot; empty if it has no tool to do tasks with."""
+    if not (has_tool(robot) and robot.dof):
         return ""
-    links = (markup.link(Address("play", (task,), robots=(place,)), task) for task in TASKS)
+    links = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
     return f"<br>see it {' · '.join(links)}"
 
 
-def _add_moves(page: RobotPage) -> None:
+def _add_move_tab(page: RobotPage) -> None:
     gui, session, robot = page.session.client.gui, page.session, page.robot
     buttons = gui.add_button_group("Go to", ("home", "zero", "random free"))
-    when(buttons, session, lambda: _go(page, buttons.value))
+    session.on_change(buttons, lambda: _go_to(page, buttons.value))
     page.texts["collisions"] = gui.add_html("")
-    page.sliders = []
-    handles: dict[int, viser.GuiSliderHandle[float]] = {}
+    sliders: dict[int, viser.GuiSliderHandle[float]] = {}
     limits = joint_limits(robot)
-    for chain in robot_tables.chains(robot):
+    for chain in robot_tables.joint_groups(robot):
         with gui.add_folder(chain.title):
             for row in chain.rows:
                 joint = robot.joints[robot.independent_joints[row]]
                 low, high = (float(value) for value in limits[row])
-                handles[row] = gui.add_slider(
+                sliders[row] = gui.add_slider(
                     robot_tables.short_name(joint, chain),
                     low,
-                    max(high, low + 1e-9),
+                    max(high, low + 1e-9),  # viser rejects an empty range
                     robot_tables.slider_step(low, high),
                     float(np.clip(page.q[row], low, high)),
                     hint=robot_tables.joint_hint(joint),
                 )
-    page.sliders = [handles[row] for row in range(robot.dof)]
-    page.told = [slider.value for slider in page.sliders]
+    page.sliders = [sliders[row] for row in range(robot.dof)]
+    page.slider_values = [slider.value for slider in page.sliders]
     for slider in page.sliders:
-        when(slider, session, lambda: _slid(page), "move")
+        session.on_change(slider, lambda: read_sliders(page), "move")
 
 
-def _add_links(page: RobotPage) -> None:
-    gui, names = page.session.client.gui, [link.name for link in page.robot.links]
-    chosen = gui.add_dropdown("Link", (_NO_LINK, *names))
-    page.texts["link"] = gui.add_html("")
-    gui.add_html(markup.framed(robot_tables.link_table(page.robot)))
-    when(chosen, page.session, lambda: _choose_link(page, chosen.value))
-
-
-def _slid(page: RobotPage) -> None:
-    """Take over what the user moved; the others keep their exact value."""
-    for k, slider in enumerate(page.sliders):
-        if slider.value != page.told[k]:
-            page.q[k] = page.told[k] = slider.value
-    show_moved(page)
+def _go_to(page: RobotPage, target: str) -> None:
+    if target == "random free":
+        if page.checker is None:
+            page.checker = SelfCollisionChecker(page.robot)
+        q = free_configuration(page.checker, page.robot, np.random.default_rng())
+        if q is None:
+            text = f"{MAX_TRIES} random ones collide"
+            page.session.notify("No free configuration", text, error=True)
+            return
+    else:
+        q = np.array(page.robot.home) if target == "home" else np.zeros(page.robot.dof)
+        q = np.clip(q, *joint_limits(page.robot).T)
+    set_configuration(page, q)
 
 
 def _apply_address(page: RobotPage) -> None:
-    """Bring the page into the state that its address tells."""
+    """Restore the configuration and the toggles from the page's address."""
     state = page.session.address.state
     shown = state.get("show", "visual").split(",")
     for name, box in page.toggles.items():
         if box.value != (name in shown):
             set_value(box, name in shown)
-            toggle(page, name)
+            apply_toggle(page, name)
     q = parse_joints(state.get("q", ""), page.robot)
     if q is not None:
         set_configuration(page, q)
     else:
-        tell_address(page)
+        show_in_address(page)
 
 
-def _go(page: RobotPage, where: str) -> None:
-    if where == "random free":
-        if page.tested is None:
-            page.tested = SelfCollisionChecker(page.robot)
-        q = free_configuration(page.tested, page.robot, np.random.default_rng())
-        if q is None:
-            notify(
-                page.session, "No free configuration", f"{TRIES} random ones collide", error=True
-            )
-            return
-    else:
-        rest = np.array(page.robot.home) if where == "home" else np.zeros(page.robot.dof)
-        q = np.clip(rest, *joint_limits(page.robot).T)
-    set_configuration(page, q)
+def _add_links_tab(page: RobotPage) -> None:
+    gui = page.session.client.gui
+    dropdown = gui.add_dropdown("Link", (_NO_LINK, *(link.name for link in page.robot.links)))
+    details = gui.add_html("")
+    gui.add_html(markup.framed(robot_tables.link_table(page.robot)))
+
+    def select_link() -> None:
+        name = dropdown.value
+        if name == _NO_LINK:
+            details.content = ""
+            paint_red(page.view, ())
+        else:
+            details.content = markup.framed(robot_tables.link_details(page.robot, name))
+            paint_red(page.view, (name,))
+
+    page.session.on_change(dropdown, select_link)
 
 
-def _choose_link(page: RobotPage, name: str) -> None:
-    if name == _NO_LINK:
-        page.texts["link"].content = ""
-        paint_red(page.view, ())
-        return
-    page.texts["link"].content = markup.framed(robot_tables.link_details(page.robot, name))
-    paint_red(page.view, (name,))
-
-
-def _examine(page: RobotPage) -> None:
-    """Find what is wrong with the robot, and be ready to see collisions."""
-    session = page.session
-    say(session, "checking")
-    findings = list(check(page.robot, tool_required=scene_overlays.has_tool(page.robot)))
-    if ":" not in page.place and (folder := session.places.path(page.place)).is_dir():
+def _check_robot(page: RobotPage) -> None:
+    """Show the findings of the checks, and build the self-collision checker."""
+    session, redact = page.session, page.session.files.redact
+    session.set_status("checking")
+    findings = list(check(page.robot, tool_required=has_tool(page.robot)))
+    if ":" not in page.uri and (folder := session.files.path(page.uri)).is_dir():
         findings += file_findings(folder) if (folder / CARD).is_file() else ()
-    page.texts["findings"].content = markup.framed(
-        markup.findings_table(findings, session.places.told)
-    )
-    say(session, "")
+    page.texts["findings"].content = markup.framed(markup.findings_table(findings, redact))
+    session.set_status("")
     try:
-        page.tested = SelfCollisionChecker(page.robot)
+        page.checker = SelfCollisionChecker(page.robot)
     except MorphgenError as error:
-        why = escape(session.places.told(error))
-        text = f'<div class="dim">collisions cannot be tested: {why}</div>'
-        page.texts["collisions"].content = markup.framed(text)
+        text = f"collisions cannot be tested: {escape(redact(error))}"
+        page.texts["collisions"].content = markup.framed(markup.dim(text))
         return
-    post(session, lambda: show_moved(page), "move")
+    session.enqueue(lambda: update_scene(page), "move")
+
+
+def _add_downloads_tab(page: RobotPage) -> None:
+    """Add buttons for the bundle, its files and a screenshot, and the command for the robot."""
+    gui, session = page.session.client.gui, page.session
+    downloads: tuple[tuple[str, Callable[[], object]], ...] = (
+        ("Bundle (.zip)", lambda: _send_bundle(page)),
+        ("URDF", lambda: _send_file(page, URDF, ".urdf")),
+        ("MJCF", lambda: _send_file(page, MJCF, ".xml")),
+        ("Screenshot", lambda: _send_screenshot(page)),
+    )
+    for label, send in downloads:
+        button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
+        session.on_change(button, functools.partial(session.run_in_background, send))
+    gui.add_html(markup.framed(markup.command(_command(page))))
+    compare = Address("compare", (page.uri, page.uri))
+    gui.add_html(markup.framed(markup.link(compare, "compare it with another robot")))
+
+
+def _command(page: RobotPage) -> str:
+    """Return the command that makes or shows the robot, and its derivation as a comment."""
+    if page.uri.startswith(WORDS):
+        return shlex.join(["morphgen", "compose", *page.uri.removeprefix(WORDS).split()])
+    derivation = page.robot.provenance.get("derivation")
+    comment = f"# {derivation}" if derivation else ""
+    if ":" not in page.uri:
+        return f"morphgen show {shlex.quote(page.uri)}\n{comment}".rstrip()
+    if page.uri.startswith(UPLOAD):
+        return f"# for the file that you uploaded: morphgen show FILE\n{comment}".rstrip()
+    return comment
+
+
+def _send_bundle(page: RobotPage) -> None:
+    page.session.set_status("packing the bundle")
+    files = page.session.run_in_worker(bundle_files, page.uri, page.session.files)
+    name = page.robot.name or "robot"
+    _send(page, ".zip", zip_files(name, files))
+    page.session.set_status("")
+
+
+def _send_file(page: RobotPage, file: str, suffix: str) -> None:
+    files = page.session.run_in_worker(bundle_files, page.uri, page.session.files)
+    _send(page, suffix, files[file])
+
+
+def _send_screenshot(page: RobotPage) -> None:
+    client = page.session.client
+    height, width = client.camera.image_height, client.camera.image_width
+    try:
+        image = client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT)
+    except (OSError, ValueError, RuntimeError, TimeoutError) as error:
+        raise MorphgenError(f"the browser sent no picture: {error}") from error
+    content = io.BytesIO()
+    Image.fromarray(image).save(content, "PNG")
+    _send(page, ".png", content.getvalue())
+
+
+def _send(page: RobotPage, suffix: str, content: bytes) -> None:
+    name = f"{page.robot.name or 'robot'}{suffix}"
+    page.session.client.send_file_download(name, content, save_immediately=True)

@@ -1,9 +1,8 @@
-"""The page of a split: its two sides, how alike they are, and what the audit says."""
+"""The page of a split: its robots, a map of their similarity, statistics and the audit."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
 from typing import cast
@@ -13,18 +12,25 @@ import viser
 from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.similarity import MEASURES, classical_mds, to_distances
 from morphgen.benchmark.split import REGIMES, SIDES, Member, Split, split_id
-from morphgen.viewer import gallery_grid, markup
+from morphgen.viewer import markup
 from morphgen.viewer.address import Address
-from morphgen.viewer.drawings import heatmap_svg, map_svg
-from morphgen.viewer.gallery_grid import Gallery
-from morphgen.viewer.new_split import save_split
-from morphgen.viewer.robot_rows import split_entries
+from morphgen.viewer.figures import heatmap_svg, map_svg
+from morphgen.viewer.gallery_grid import (
+    Gallery,
+    add_controls,
+    open_panels,
+    passing_rows,
+    show_saved,
+)
+from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
-from morphgen.viewer.session import Session, later, notify, say, when
-from morphgen.viewer.splits import Study, study
+from morphgen.viewer.session import Session
+from morphgen.viewer.splits import SplitStudy, save_split, study_split
 
-SIDE = 520.0
-"""Width of the panel, pixels."""
+PANEL_WIDTH = 520.0
+"""Width of the panel [pixels]."""
+NUM_PLAYED = 4
+"""Test robots of the link to a rollout."""
 
 
 @dataclass(eq=False)
@@ -32,62 +38,62 @@ class SplitPage:
     """A split in one browser."""
 
     session: Session
-    place: str
+    name: str
+    """Name or file of the split, as in the address."""
     split: Split
     gallery: Gallery
-    study: Study | None = None
+    measure: viser.GuiDropdownHandle[str]
+    study: SplitStudy | None = None
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
-    measure: viser.GuiDropdownHandle[str] | None = None
 
 
 def show(session: Session) -> None:
     """Build the page.
 
     Raises:
-        MorphgenError: If there is no such split, or its file cannot be read.
+        MorphgenError: If the split does not exist or cannot be read.
     """
-    place = session.address.subject
-    split = resolve_split(place, session.places)
-    rows = Gallery(session, split.name, split_entries(place, split), columns=SIDES)
-    page = SplitPage(session, place, split, rows)
+    name = session.address.subject
+    split = resolve_split(name, session.files)
+    gallery = Gallery(session, split.name, split_rows(name, split), SIDES)
     gui = session.client.gui
-    gallery_grid.open_panels(
-        rows, markup.crumbs((split.name, None)), _about(split) + _plays(place, split), SIDE
-    )
+    header = _description(split) + _rollout_link(name, split)
+    open_panels(gallery, markup.breadcrumbs((split.name, None)), header, PANEL_WIDTH)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
-        gallery_grid.build(rows)
-        _add_new_split(page)
+        add_controls(gallery)
+        _add_split_form(gallery, split)
+    texts = {}
     with tabs.add_tab("Map", viser.Icon.MAP):
-        page.measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
-        page.texts["map"] = gui.add_html("")
-        page.texts["heatmap"] = gui.add_html("")
+        measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
+        texts["map"], texts["heatmap"] = gui.add_html(""), gui.add_html("")
     with tabs.add_tab("Statistics", viser.Icon.TABLE):
-        page.texts["statistics"] = gui.add_html(markup.framed(statistics_table(split.statistics)))
+        texts["statistics"] = gui.add_html(markup.framed(statistics_table(split.statistics)))
     with tabs.add_tab("Audit", viser.Icon.STETHOSCOPE):
-        page.texts["audit"] = gui.add_html("")
-    when(page.measure, session, lambda: _draw(page))
-    later(session, lambda: _study(page))
+        texts["audit"] = gui.add_html("")
+    page = SplitPage(session, name, split, gallery, measure, texts=texts)
+    session.on_change(measure, lambda: _draw_map(page))
+    session.run_in_background(lambda: _study(page))
 
 
 def statistics_table(statistics: Mapping[str, object]) -> str:
-    """Figures of both sides beside each other; ranges as mean, least and largest."""
+    """Return a table of the statistics of both sides; distributions as mean (min to max)."""
     sides = [statistics.get(side) for side in SIDES]
     train, test = (side if isinstance(side, Mapping) else {} for side in sides)
     if not train or not test:
-        return '<div class="dim">no figures yet</div>'
+        return markup.dim("no statistics yet")
     rows = [
-        (escape(str(key).replace("_", " ")), _figure(train.get(key)), _figure(test.get(key)))
+        (escape(str(key).replace("_", " ")), _format(train.get(key)), _format(test.get(key)))
         for key in train
     ]
     text = markup.table(("", *SIDES), rows, (1, 2))
     if "cosine" in statistics:
-        text += f"<h3>Cosine of test to train</h3>{_figure(statistics['cosine'])}"
+        text += f"<h3>Cosine of test to train</h3>{_format(statistics['cosine'])}"
     return text
 
 
 def audit_text(audit: Audit) -> str:
-    """Findings, those that the author accepted with their reasons, and the nearest robots."""
+    """Return the audit's findings, the accepted ones with reasons, and the nearest robots."""
     text = "<h3>Findings</h3>" + markup.findings_table(audit.findings)
     if audit.accepted:
         rows = [
@@ -95,108 +101,99 @@ def audit_text(audit: Audit) -> str:
             for finding, reason in audit.accepted
         ]
         text += "<h3>Accepted</h3>" + markup.table(("code", "where", "why"), rows)
-    nearest = [
-        (escape(each.test), each.measure, escape(each.train), f"{each.value:.3f}")
-        for each in audit.neighbours
+    neighbours = [
+        (escape(pair.test), pair.measure, escape(pair.train), f"{pair.value:.3f}")
+        for pair in audit.neighbours
     ]
-    return (
-        text
-        + "<h3>Nearest train robots</h3>"
-        + markup.table(("test", "measure", "train", ""), nearest, (3,))
-    )
+    table = markup.table(("test", "measure", "train", ""), neighbours, (3,))
+    return f"{text}<h3>Nearest train robots</h3>{table}"
 
 
-def _about(split: Split) -> str:
+def _description(split: Split) -> str:
     reference = f"<br>{escape(split.reference)}" if split.reference else ""
-    return (
-        f'{escape(split.summary)}<div class="dim">{split.regime} · id {split_id(split)}'
-        f"{reference}</div>"
-    )
+    details = f"{split.regime} · id {split_id(split)}{reference}"
+    return escape(split.summary) + markup.dim(details)
 
 
-def _plays(place: str, split: Split) -> str:
-    """A link to the page on which the first robots to test on do their task."""
+def _rollout_link(name: str, split: Split) -> str:
+    """Return a link to a rollout of the first test robots."""
     first = split.test[0]
     robots = tuple(
-        member_uri(place, "test", member) for member in split.test[:4] if member.task == first.task
+        member_uri(name, "test", member)
+        for member in split.test[:NUM_PLAYED]
+        if member.task == first.task
     )
     state = {"obstacles": "yes"} if first.obstacles else {}
-    link = markup.link(
-        Address("play", (first.task,), state, robots), "see robots to test on at work"
-    )
-    return f'<div class="dim">{link}</div>'
+    address = Address("play", (first.task,), state, robots)
+    return markup.dim(markup.link(address, "see robots to test on at work"))
 
 
-def _figure(value: object) -> str:
+def _format(value: object) -> str:
     if isinstance(value, Mapping):
         return f"{value['mean']:.3g} ({value['min']:.3g} to {value['max']:.3g})"
     return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
 
 
 def _study(page: SplitPage) -> None:
-    """Have the workers examine the robots, once a split for all browsers."""
+    """Study the split in the worker processes, once for all browsers, and show the results."""
     session = page.session
     key = f"study {split_id(page.split)}"
-    if key not in session.shared:
+    if key not in session.cache:
 
         def progress(done: int, total: int) -> None:
-            say(session, f"comparing {total} robots", done / total)
+            session.set_status(f"comparing {total} robots", done / total)
 
-        session.shared[key] = study(page.split, session.places.folders, session.workers, progress)
-        say(session, "")
-    page.study = cast(Study, session.shared[key])
+        folders = session.files.library_folders
+        session.cache[key] = study_split(page.split, folders, session.workers, progress)
+        session.set_status("")
+    page.study = cast(SplitStudy, session.cache[key])
     if page.study.statistics:
         table = statistics_table(page.study.statistics)
         page.texts["statistics"].content = markup.framed(table)
     page.texts["audit"].content = markup.framed(audit_text(page.study.audit))
-    _draw(page)
+    _draw_map(page)
 
 
-def _draw(page: SplitPage) -> None:
+def _draw_map(page: SplitPage) -> None:
     """Draw the map and the heatmap of the chosen measure."""
-    found = page.study
-    if found is None or page.measure is None or not found.members:
+    study = page.study
+    if study is None or not study.members:
         return
     measure = MEASURES[page.measure.value]
-    values = found.matrices[measure.name]
-    names = [member.name for member in found.members]
-    flat = classical_mds(to_distances(values, measure.name))
-    places = _member_places(page, found.members, found.sides)
+    values = study.matrices[measure.name]
+    names = [member.name for _, member in study.members]
+    sides = [side for side, _ in study.members]
+    uris = [member_uri(page.name, side, member) for side, member in study.members]
+    plane = classical_mds(to_distances(values, measure.name))
     page.texts["map"].content = markup.framed(
-        f'<div class="dim">{measure.meaning}; {flat.kept:.0%} of the variation shown; '
-        f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a point</div>",
-        map_svg(flat.points, names, found.sides, places),
+        markup.dim(
+            f"{measure.meaning}; {plane.kept:.0%} of the variation shown; "
+            f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a point"
+        ),
+        map_svg(plane.points, names, sides, uris),
     )
     larger = measure.larger_is_more_alike
+    direction = "larger" if larger else "smaller"
     page.texts["heatmap"].content = markup.framed(
-        f'<div class="dim">dark is alike; {"larger" if larger else "smaller"} is more alike</div>',
-        heatmap_svg(values, names, found.sides, larger=larger),
+        markup.dim(f"dark is more similar; {direction} is more similar"),
+        heatmap_svg(values, names, sides, larger=larger),
     )
 
 
-def _member_places(page: SplitPage, members: Sequence[Member], sides: Sequence[str]) -> list[str]:
-    return [
-        member_uri(page.place, "train" if side == "train" else "test", member)
-        for member, side in zip(members, sides, strict=True)
-    ]
-
-
-def _add_new_split(page: SplitPage) -> None:
-    gui, session = page.session.client.gui, page.session
+def _add_split_form(gallery: Gallery, split: Split) -> None:
+    """Add controls that save the shown members as a new split."""
+    gui, session = gallery.session.client.gui, gallery.session
     with gui.add_folder("New split of what is shown", expand_by_default=False):
         name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", REGIMES, initial_value=page.split.regime)
+        regime = gui.add_dropdown("regime", REGIMES, initial_value=split.regime)
         button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-        told = gui.add_html("")
+        text = gui.add_html("")
 
     def save() -> None:
         sides: dict[str, list[Member]] = {side: [] for side in SIDES}
-        for entry in gallery_grid.passing(page.gallery):
-            sides[entry.role].append(resolve_member(entry.place, session.places))
-        chosen = regime.value
-        path = save_split(name.value, chosen, sides["train"], sides["test"], session.places)
-        shown = path.relative_to(session.places.roots[0])
-        told.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(str(shown))}"))
-        notify(session, "Saved", str(shown))
+        for row in passing_rows(gallery):
+            sides[row.role].append(resolve_member(row.uri, session.files))
+        path = save_split(name.value, regime.value, sides["train"], sides["test"], session.files)
+        show_saved(session, path, text)
 
-    when(button, session, save)
+    session.on_change(button, save)

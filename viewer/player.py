@@ -1,4 +1,4 @@
-"""Plays an episode on a thread of its own: simulates ahead, shows moments in time, obeys orders."""
+"""Playback of an episode: a thread that simulates ahead, shows steps in time and takes commands."""
 
 from __future__ import annotations
 
@@ -9,182 +9,188 @@ from collections.abc import Callable
 from typing import Protocol
 
 from morphgen.errors import MorphgenError
-from morphgen.viewer.rollout import Source
+from morphgen.viewer.rollout import EpisodeSource
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
-REFRESH = 0.04
-"""Seconds between two pictures of a browser: 25 a second."""
-BUSY = 0.12
-"""Seconds after which what was simulated is shown, and orders are looked at, however far behind."""
+"""Speeds of playback [simulated seconds per second]."""
+FRAME_TIME = 0.04
+"""Time between two frames in a browser: 25 per second [s]."""
+MAX_SIMULATION_TIME = 0.12
+"""Time after which simulated steps are shown, and commands handled, however far behind [s]."""
 
 
-class Screen(Protocol):
-    """Where episodes are shown; all of it is called by the player's thread."""
+class Display(Protocol):
+    """Shows an episode; every method is called on the player's thread."""
 
-    def prepared(self, source: Source) -> None:
-        """There is another episode, at its start."""
+    def show_start(self, source: EpisodeSource) -> None:
+        """Show a new episode at its start."""
 
-    def shown(self, step: int) -> None:
-        """A moment of the episode is shown: its start at 0, or after that many control steps."""
+    def show_step(self, step: int) -> None:
+        """Show the episode after a number of control steps."""
 
-    def stopped(self) -> None:
-        """It is over, or paused."""
+    def show_stopped(self) -> None:
+        """The episode has ended or is paused."""
 
-    def failed(self, why: str) -> None:
-        """What was ordered cannot be done."""
+    def show_failure(self, reason: str) -> None:
+        """A command has failed."""
 
 
 class Player:
-    """One browser's playback; ``stop`` ends its thread and frees the simulation."""
+    """Playback for one browser; ``stop`` ends its thread and frees the simulation."""
 
-    def __init__(self, screen: Screen) -> None:
-        self.playing, self.step = False, 0
-        self._screen = screen
-        self._source: Source | None = None
+    def __init__(self, display: Display) -> None:
+        self.is_playing, self.step = False, 0
+        self._display = display
+        self._source: EpisodeSource | None = None
         self._speed = 1.0
-        self._since, self._from = 0.0, 0.0
-        self._orders: dict[str, Callable[[], object]] = {}
-        self._count = itertools.count()
+        self._clock_start, self._step_start = 0.0, 0.0
+        self._commands: dict[str, Callable[[], object]] = {}
+        self._counter = itertools.count()
         self._ended = False
         self._wake = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="morphgen-player", daemon=True)
         self._thread.start()
 
-    def prepare(self, make: Callable[[], Source], *, play: bool = True) -> None:
-        """Show another episode; of several that are asked for meanwhile the last."""
-        self._order("prepare", lambda: self._prepare(make, play))
+    def load(self, make_source: Callable[[], EpisodeSource], *, play: bool = True) -> None:
+        """Show another episode; of several that are requested meanwhile, the last."""
+        self._command("load", lambda: self._load(make_source, play))
 
     def play(self) -> None:
-        """Go on; from the start if all of it was shown."""
-        self._order("play", self._play)
+        """Continue; restart an episode that was shown to its end."""
+        self._command("play", self._play)
 
     def pause(self) -> None:
-        """Stay where it is."""
-        self._order("play", self._pause)
+        """Pause at the current step."""
+        self._command("play", self._pause)
 
     def go_to(self, step: int) -> None:
-        """Show a moment, as far as there is one yet, and stay there."""
-        self._order("step", lambda: self._go_to(step))
+        """Pause at a step, or at the last simulated one before it."""
+        self._command("step", lambda: self._go_to(step))
 
-    def go_by(self, steps: int) -> None:
-        """Pause, and show a moment before or after; what is not there yet is simulated."""
-        self._order(f"by {next(self._count)}", lambda: self._go_by(steps))
+    def go_by(self, num_steps: int) -> None:
+        """Pause a number of steps forward or back; simulate missing steps."""
+        # Each press of a button counts, so each command has a key of its own.
+        self._command(f"by {next(self._counter)}", lambda: self._go_by(num_steps))
 
-    def at_speed(self, speed: float) -> None:
-        """Play at so many simulated seconds a second."""
-        self._order("speed", lambda: self._at_speed(speed))
+    def set_speed(self, speed: float) -> None:
+        """Set the speed of playback [simulated seconds per second]."""
+        self._command("speed", lambda: self._set_speed(speed))
 
     def stop(self) -> None:
-        """End the thread, as soon as what it does is done."""
+        """End the thread after its current work."""
         with self._wake:
             self._ended = True
             self._wake.notify()
 
-    def join(self, seconds: float) -> bool:
-        """Wait for the thread to end; whether it did."""
-        self._thread.join(seconds)
+    def join(self, timeout: float) -> bool:
+        """Wait at most ``timeout`` seconds for the thread to end; return whether it has."""
+        self._thread.join(timeout)
         return not self._thread.is_alive()
 
-    def _order(self, key: str, work: Callable[[], object]) -> None:
+    def _command(self, key: str, work: Callable[[], object]) -> None:
+        """Queue a command at the end; it replaces a waiting command of the same key."""
         with self._wake:
-            self._orders.pop(key, None)
-            self._orders[key] = work
+            self._commands.pop(key, None)
+            self._commands[key] = work
             self._wake.notify()
 
     def _run(self) -> None:
         try:
-            while orders := self._next():
-                for work in orders:
-                    self._do(work)
+            while work := self._next_work():
+                for call in work:
+                    self._call(call)
         finally:
             if self._source is not None:
                 self._source.close()
 
-    def _next(self) -> list[Callable[[], object]]:
-        """What is to be done now; nothing at the end."""
+    def _next_work(self) -> list[Callable[[], object]]:
+        """Wait for commands or the next frame; return nothing when the player is stopped."""
         with self._wake:
-            if not self._orders and not self._ended:
-                self._wake.wait(REFRESH if self.playing else None)
-            orders, self._orders = list(self._orders.values()), {}
+            if not self._commands and not self._ended:
+                self._wake.wait(FRAME_TIME if self.is_playing else None)
+            commands, self._commands = list(self._commands.values()), {}
             if self._ended:
                 return []
-        return orders or [self._tick]
+        return commands or [self._tick]
 
-    def _do(self, work: Callable[[], object]) -> None:
+    def _call(self, work: Callable[[], object]) -> None:
         try:
             work()
         except MorphgenError as error:
-            self.playing = False
-            self._screen.failed(str(error))
+            self.is_playing = False
+            self._display.show_failure(str(error))
         except (RuntimeError, TimeoutError):
-            if not self._ended:  # those of a browser that has gone are none
+            if not self._ended:  # expected from a browser that has disconnected
                 raise
 
-    def _prepare(self, make: Callable[[], Source], play: bool) -> None:
-        self.playing = False
-        old, self._source = self._source, None
-        if old is not None:
-            old.close()
-        self._source = make()
+    def _load(self, make_source: Callable[[], EpisodeSource], play: bool) -> None:
+        self.is_playing = False
+        previous, self._source = self._source, None
+        if previous is not None:
+            previous.close()
+        self._source = make_source()
         self.step = 0
-        self._screen.prepared(self._source)
-        self._screen.shown(0)
+        self._display.show_start(self._source)
+        self._display.show_step(0)
         if play:
             self._play()
 
     def _play(self) -> None:
         if self._source is None:
             return
-        if self.step >= self._source.episode.steps and not self._source.advance():
+        if self.step >= self._source.episode.num_steps and not self._source.advance():
             self.step = 0
-        self.playing = True
-        self._anchor()
+        self.is_playing = True
+        self._restart_clock()
 
     def _pause(self) -> None:
-        self.playing = False
-        self._screen.stopped()
+        self.is_playing = False
+        self._display.show_stopped()
 
     def _go_to(self, step: int) -> None:
         if self._source is None:
             return
-        self.step = max(0, min(step, self._source.episode.steps))
-        self.playing = False
-        self._screen.shown(self.step)
-        self._screen.stopped()
+        self.step = max(0, min(step, self._source.episode.num_steps))
+        self.is_playing = False
+        self._display.show_step(self.step)
+        self._display.show_stopped()
 
-    def _go_by(self, steps: int) -> None:
-        source, wanted = self._source, self.step + steps
+    def _go_by(self, num_steps: int) -> None:
+        source, target = self._source, self.step + num_steps
         if source is None:
             return
-        while source.episode.steps < wanted and source.advance():
+        while source.episode.num_steps < target and source.advance():
             pass
-        self._go_to(wanted)
+        self._go_to(target)
 
-    def _at_speed(self, speed: float) -> None:
+    def _set_speed(self, speed: float) -> None:
         self._speed = speed
-        self._anchor()
+        self._restart_clock()
 
-    def _anchor(self) -> None:
-        """Count time from here and now."""
-        self._since, self._from = time.monotonic(), float(self.step)
+    def _restart_clock(self) -> None:
+        """Measure playback time from now and from the current step."""
+        self._clock_start, self._step_start = time.monotonic(), float(self.step)
 
     def _tick(self) -> None:
-        """Show what is due, simulated if need be; if that takes too long, time has to wait."""
+        """Show the step that is due, simulating as needed; a slow simulation delays the clock."""
         source = self._source
-        if source is None or not self.playing:
+        if source is None or not self.is_playing:
             return
-        begun = time.monotonic()
-        due = int(self._from + (begun - self._since) * self._speed / source.episode.period)
+        now = time.monotonic()
+        elapsed = (now - self._clock_start) * self._speed
+        due = int(self._step_start + elapsed / source.episode.period)
         more = True
-        while more and source.episode.steps < due and time.monotonic() - begun < BUSY:
+        while (
+            more and source.episode.num_steps < due and time.monotonic() - now < MAX_SIMULATION_TIME
+        ):
             more = source.advance()
-        last = source.episode.steps
+        last = source.episode.num_steps
         step = min(due, last)
         if step != self.step:
             self.step = step
-            self._screen.shown(step)
+            self._display.show_step(step)
         if due > last:
-            self._anchor()
+            self._restart_clock()
             if not more:
-                self.playing = False
-                self._screen.stopped()
+                self.is_playing = False
+                self._display.show_stopped()

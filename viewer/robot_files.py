@@ -1,4 +1,4 @@
-"""Thumbnails of robots, and the facts that a gallery shows of them; made by worker processes."""
+"""Files made from robots: thumbnails with the facts of a gallery, and bundles to download."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import io
 import json
 import tempfile
-from concurrent.futures import Future
+import zipfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,53 +17,55 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
-from morphgen.formats.bundle import MJCF, PICTURE, URDF, write_bundle
+from morphgen.formats.bundle import CARD, MJCF, PICTURE, URDF, write_bundle
 from morphgen.formats.files import write_atomic, write_cache_file
 from morphgen.formats.picture import render
-from morphgen.viewer.robot_uri import FileAccess, content_hash, is_robot, read_robot_uri
-from morphgen.viewer.workers import Workers
+from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.model.robot import Robot
+from morphgen.viewer.robot_tables import has_tool
+from morphgen.viewer.robot_uri import FileAccess, content_hash, read_robot_uri
 
 SIZE = (240, 180)
-_QUALITY = 82
-_FORMAT = 1
+"""Largest width and height of a thumbnail [pixels]."""
+_JPEG_QUALITY = 82
+"""Tuned by eye at the size of a card."""
+_CACHE_FORMAT = 1
+"""Raised when a thumbnail or its facts change for the same robot."""
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+"""Time of every file in a zip, so that the same robot gives the same bytes."""
 
 
 @dataclass(frozen=True)
-class Portrait:
-    """A robot at a glance."""
+class Thumbnail:
+    """A small picture of a robot and its facts."""
 
-    thumbnail: str
-    """A JPEG as a ``data:`` URL; empty if none can be drawn."""
+    image: str
+    """A JPEG as a ``data:`` URL; empty if the robot cannot be drawn."""
     facts: dict[str, object]
-    """For ``entries.with_facts``."""
+    """Values of ``Row`` fields."""
     error: str = ""
-    """Why there is no robot; empty if there is."""
+    """Why the robot cannot be read; empty if it can."""
 
 
-def ask(workers: Workers, place: str, places: FileAccess) -> Future[Portrait]:
-    """Have a portrait made."""
-    return workers.submit(portrait, place, places)
-
-
-def portrait(place: str, places: FileAccess) -> Portrait:
-    """The portrait of the robot at a place, from the cache or made and kept there."""
+def make_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
+    """Return the thumbnail of a robot, from the user's cache or drawn now. Runs in a worker."""
     try:
-        name = f"{content_hash(place, places)}.json"
-        path = user_cache_path("morphgen") / f"viewer-{_FORMAT}" / name
+        name = f"{content_hash(uri, files)}.json"
+        path = user_cache_path("morphgen") / f"viewer-{_CACHE_FORMAT}" / name
         if path.is_file():
             data = json.loads(path.read_text(encoding="utf-8"))
             facts = {**data["facts"], "findings": tuple(data["facts"]["findings"])}
-            return Portrait(data["thumbnail"], facts)
-        made = _made(place, places)
+            return Thumbnail(data["thumbnail"], facts)
+        thumbnail = _draw_thumbnail(uri, files)
     except (MorphgenError, OSError) as error:
-        return Portrait("", {"findings": ("broken",)}, places.told(error))
-    with suppress(OSError):  # where nothing can be kept it is drawn again next time
-        write_cache_file(path, json.dumps({"thumbnail": made.thumbnail, "facts": made.facts}))
-    return made
+        return Thumbnail("", {"findings": ("broken",)}, files.redact(error))
+    with suppress(OSError):  # without a writable cache it is drawn again next time
+        write_cache_file(path, json.dumps({"thumbnail": thumbnail.image, "facts": thumbnail.facts}))
+    return thumbnail
 
 
 def thumbnail_of_picture(path: Path) -> str:
-    """A picture file as a small JPEG in a ``data:`` URL; empty if it is none."""
+    """Return a picture file as a small JPEG in a ``data:`` URL; empty if it is not a picture."""
     try:
         with Image.open(path) as picture:
             return _data_url(picture)
@@ -71,34 +73,73 @@ def thumbnail_of_picture(path: Path) -> str:
         return ""
 
 
-def _made(place: str, places: FileAccess) -> Portrait:
-    robot = read_robot_uri(place, places)
-    loud = sorted({finding.code for finding in check(robot) if finding.severity != "info"})
-    known = robot_stats(robot)
-    has_tool = any(frame.name == "tool" for frame in robot.frames)
+def bundle_files(uri: str, files: FileAccess) -> dict[str, bytes]:
+    """Return the files of a robot's bundle by their paths; a robot without bundle gets a new one.
+
+    Raises:
+        MorphgenError: If the robot does not exist, or its bundle cannot be written.
+    """
+    if ":" not in uri and (folder := files.path(uri)).is_dir() and (folder / CARD).is_file():
+        return _read_files(folder)
+    return new_bundle_files(read_robot_uri(uri, files))
+
+
+def new_bundle_files(robot: Robot) -> dict[str, bytes]:
+    """Return the files of a new bundle of a robot by their paths.
+
+    Raises:
+        MorphgenError: If the bundle cannot be written.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return _read_files(write_bundle(robot, Path(folder) / "robot", check(robot), picture=False))
+
+
+def zip_files(folder: str, files: dict[str, bytes]) -> bytes:
+    """Return a zip with the files in a folder; the same files give the same bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path, data in sorted(files.items()):
+            entry = zipfile.ZipInfo(f"{folder}/{path}", _ZIP_TIME)
+            entry.external_attr = 0o644 << 16  # a file that everybody may read
+            archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
+    return content.getvalue()
+
+
+def _read_files(folder: Path) -> dict[str, bytes]:
+    """Read the files below a folder, except links that lead out of it."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.resolve().is_relative_to(folder.resolve())
+    }
+
+
+def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
+    robot = read_robot_uri(uri, files)
+    findings = {finding.code for finding in check(robot) if finding.severity != "info"}
+    stats = robot_stats(robot)
     facts: dict[str, object] = {
-        "dof": known.dof,
-        "links": known.links,
-        "reach": known.reach if has_tool and known.dof else None,
-        "mass": known.mass,
-        "findings": tuple(loud),
+        "dof": stats.dof,
+        "links": stats.links,
+        "reach": stats.reach if has_tool(robot) and stats.dof else None,
+        "mass": stats.mass,
+        "findings": tuple(sorted(findings)),
     }
     with tempfile.TemporaryDirectory() as folder:
         bundle = write_bundle(robot, Path(folder) / "robot", picture=False)
         picture = render(robot, bundle / URDF, bundle / MJCF, size=(2 * SIZE[0], 2 * SIZE[1]))
-    if ":" not in place and is_robot(places.path(place)):
-        _keep_picture(robot_folder=places.path(place), picture=picture)
-    return Portrait(_data_url(picture), facts)
+    if ":" not in uri and is_robot_folder(files.path(uri)):
+        _store_picture(files.path(uri) / PICTURE, picture)
+    return Thumbnail(_data_url(picture), facts)
 
 
-def _keep_picture(robot_folder: Path, picture: Image.Image) -> None:
-    """Leave the picture in a bundle that has none, where that can be written."""
-    path = robot_folder / PICTURE
+def _store_picture(path: Path, picture: Image.Image) -> None:
+    """Store the picture in a bundle that has none, if the folder is writable."""
     if path.exists():
         return
     content = io.BytesIO()
     picture.save(content, "PNG")
-    with suppress(OSError):  # where others own the folder, the user's cache has the thumbnail
+    with suppress(OSError):  # in a folder of somebody else; the user's cache has the thumbnail
         write_atomic(path, content.getvalue())
 
 
@@ -106,5 +147,5 @@ def _data_url(picture: Image.Image) -> str:
     content = io.BytesIO()
     small = picture.convert("RGB")
     small.thumbnail(SIZE)
-    small.save(content, "JPEG", quality=_QUALITY)
+    small.save(content, "JPEG", quality=_JPEG_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()

@@ -1,79 +1,200 @@
-"""The rows of galleries: of a folder or set of robots, of a split, of the library."""
+"""Rows of galleries: robots with their facts, listed, filtered, sorted and paged."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from morphgen.benchmark.split import SIDES, Split
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD
-from morphgen.formats.data_files import parse_json, read_json, read_text
+from morphgen.formats.data_files import read_json
 from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.library import Library
-from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
-from morphgen.viewer.entries import Entry
+from morphgen.grammar.robot_set import INDEX, read_index, read_settings
+from morphgen.grammar.robot_source import DESCRIPTION_SUFFIXES, is_robot_folder
 from morphgen.viewer.robot_uri import (
-    DERIVED,
-    MEMBER,
-    ROBOT_SUFFIXES,
+    DERIVATION,
     WORDS,
     FileAccess,
     UriError,
-    is_robot,
+    member_split,
     member_uri,
+    parent_folder,
     resolve_split,
 )
 
+T = TypeVar("T")
+
+PAGE_SIZES = (24, 48, 96)
+SORTS = ("order", "name", "category", "dof", "links", "reach", "mass", "role", "findings")
+"""Keys by which rows can be sorted; ``order`` is the order of the set."""
+NUMBERS = ("dof", "reach", "mass")
+"""Facts by whose range rows can be filtered."""
 UNREADABLE = "unreadable"
-"""Stands for a finding where a card cannot be read."""
-_LOUD = ("error", "warning")
+"""Finding of a bundle whose card cannot be read."""
 
 
-def folder_entries(text: str, places: FileAccess) -> list[Entry]:
-    """The robots in a folder: of a set by its index, of others by their cards; URDFs, too.
+@dataclass(frozen=True)
+class Row:
+    """A robot in a gallery; unknown facts are None."""
+
+    name: str
+    uri: str
+    category: str = ""
+    role: str = ""
+    """Side of a split, or kind of a part."""
+    task: str = ""
+    dof: int | None = None
+    links: int | None = None
+    reach: float | None = None
+    """Reach [m]; None for a robot without a tool, too."""
+    mass: float | None = None
+    """Mass [kg]."""
+    findings: tuple[str, ...] | None = None
+    """Codes of errors and warnings; of all findings for rows from the index of a set."""
+    order: int = 0
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Conditions on rows; empty ones hold for every row."""
+
+    search: str = ""
+    """Words that must all occur in the name, category, role, task or findings."""
+    category: str = ""
+    role: str = ""
+    findings: str = ""
+    """``with``, ``without``, or empty for both."""
+    ranges: Mapping[str, tuple[float, float]] | None = None
+    """Smallest and largest value by fact; rows whose fact is unknown do not pass."""
+
+    def passes(self, row: Row) -> bool:
+        """Return whether a row meets all conditions."""
+        text = " ".join((row.name, row.category, row.role, row.task, *(row.findings or ())))
+        if not all(word in text.lower() for word in self.search.lower().split()):
+            return False
+        if self.category not in ("", row.category) or self.role not in ("", row.role):
+            return False
+        if self.findings and bool(row.findings) != (self.findings == "with"):
+            return False
+        for fact, (low, high) in (self.ranges or {}).items():
+            value = getattr(row, fact)
+            if value is None or not low <= value <= high:
+                return False
+        return True
+
+
+def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
+    """Sort rows by a fact; a minus before its name sorts in descending order.
+
+    Rows whose fact is unknown come last either way; ties keep the order of the set.
 
     Raises:
-        UriError: If it is no folder, or holds no robot.
+        ValueError: If the key is unknown.
     """
-    folder = places.path(text)
+    name = key.removeprefix("-")
+    if name not in SORTS:
+        raise ValueError(f"cannot sort by {name!r}; valid: {', '.join(SORTS)}")
+
+    def value(row: Row) -> Any:  # noqa: ANN401
+        fact = getattr(row, name)
+        return len(fact) if name == "findings" and fact is not None else fact
+
+    rows = sorted(rows, key=lambda row: row.order)
+    known = [row for row in rows if value(row) is not None]
+    unknown = [row for row in rows if value(row) is None]
+    return [*sorted(known, key=value, reverse=key.startswith("-")), *unknown]
+
+
+def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int, int]:
+    """Return one page of rows.
+
+    Args:
+        rows: All rows.
+        number: Page number, from 1; clipped to the existing pages.
+        size: Rows on a page.
+
+    Returns:
+        The page's rows, its number, and the number of pages (at least 1).
+    """
+    count = max(math.ceil(len(rows) / size), 1)
+    number = min(max(number, 1), count)
+    return list(rows[(number - 1) * size : number * size]), number, count
+
+
+def fact_range(rows: Iterable[Row], fact: str) -> tuple[float, float] | None:
+    """Return smallest and largest value of a fact; None if it is unknown or constant."""
+    values = [float(value) for row in rows if (value := getattr(row, fact)) is not None]
+    if not values or min(values) == max(values):
+        return None
+    return min(values), max(values)
+
+
+def fact_choices(rows: Iterable[Row], fact: str) -> list[str]:
+    """Return the different values of a text fact, sorted, without the empty one."""
+    return sorted({getattr(row, fact) for row in rows} - {""})
+
+
+def facts_line(row: Row) -> str:
+    """Return a row's facts in a few words, such as ``9 DoF · 0.85 m · 3.2 kg``."""
+    parts = []
+    if row.dof is not None:
+        parts.append(f"{row.dof} DoF")
+    if row.reach is not None:
+        parts.append(f"{row.reach:.2f} m")
+    if row.mass is not None:
+        parts.append(f"{row.mass:.3g} kg")
+    return " · ".join(parts)
+
+
+def folder_rows(text: str, files: FileAccess) -> list[Row]:
+    """Return the robots in a folder: a set's from its index, bundles by their cards, URDFs.
+
+    Raises:
+        UriError: If the path is not a folder, or the folder holds no robot.
+        FormatError: If the index of a set is invalid.
+    """
+    folder = files.path(text)
     if not folder.is_dir():
-        raise UriError(f"{text}: no folder")
-    index = folder / INDEX
-    if index.is_file():
-        return list(_set_entries(text.rstrip("/"), folder))
-    found: list[Entry] = []
+        raise UriError(f"{text}: not a folder")
+    text = text.rstrip("/")
+    if (folder / INDEX).is_file():
+        return list(_set_rows(text, folder))
+    rows: list[Row] = []
     for path in sorted(folder.iterdir()):
-        place = f"{text.rstrip('/')}/{path.name}"
-        if path.is_dir() and is_robot(path):
-            found.append(_bundle_entry(place, path, len(found)))
-        elif path.is_file() and path.suffix in ROBOT_SUFFIXES[:2]:
-            found.append(Entry(path.name, place, "description", order=len(found)))
-    if not found:
+        uri = f"{text}/{path.name}"
+        if path.is_dir() and is_robot_folder(path):
+            rows.append(_bundle_row(uri, path, len(rows)))
+        elif path.is_file() and path.suffix in DESCRIPTION_SUFFIXES:
+            rows.append(Row(path.name, uri, "description", order=len(rows)))
+    if not rows:
         raise UriError(f"{text} holds no robot; morphgen sample and morphgen compose make some")
-    return found
+    return rows
 
 
-def subfolders(folder: Path) -> list[str]:
-    """Folders in a folder that hold robots, sorted; cheap, so only their first one is looked at."""
+def robot_subfolders(folder: Path) -> list[str]:
+    """Return the sorted names of the subfolders that hold robots, sets or bundles."""
     if not folder.is_dir():
         return []
-    found = []
+    names = []
     for path in sorted(folder.iterdir()):
-        if path.is_dir() and not path.name.startswith(".") and not is_robot(path):
-            inside = (below for below in path.iterdir() if below.is_dir())
-            if (path / INDEX).is_file() or any(map(is_robot, inside)):
-                found.append(path.name)
-    return found
+        if path.is_dir() and not path.name.startswith(".") and not is_robot_folder(path):
+            children = (child for child in path.iterdir() if child.is_dir())
+            if (path / INDEX).is_file() or any(map(is_robot_folder, children)):
+                names.append(path.name)
+    return names
 
 
-def split_entries(name: str, split: Split) -> list[Entry]:
-    """The members of a split, train first."""
+def split_rows(name: str, split: Split) -> list[Row]:
+    """Return the members of a split, train robots first."""
     members = [(side, member) for side in SIDES for member in split.side(side)]
     return [
-        Entry(
+        Row(
             member.name,
             member_uri(name, side, member),
             member.category,
@@ -85,48 +206,45 @@ def split_entries(name: str, split: Split) -> list[Entry]:
     ]
 
 
-def part_entries(library: Library) -> list[Entry]:
-    """The arms, end-effectors and bodies of a library, each as a robot by itself."""
-    found: list[Entry] = []
+def part_rows(library: Library) -> list[Row]:
+    """Return the arms, end-effectors and bodies of a library, each as a robot of its own."""
+    rows: list[Row] = []
     for manifest in library.manifests():
         if manifest.kind in ("arm", "ee") and manifest.name != "none":
-            place = f"{WORDS}{manifest.kind}={manifest.name}"
+            uri = f"{WORDS}{manifest.kind}={manifest.name}"
         elif manifest.kind == "body":
-            place = f"{DERIVED}body={manifest.name}"
+            uri = f"{DERIVATION}body={manifest.name}"
         else:
             continue
-        made = "template" if manifest.is_template else "real"
-        found.append(Entry(manifest.name, place, made, manifest.kind, order=len(found)))
-    return found
+        category = "template" if manifest.is_template else "real"
+        rows.append(Row(manifest.name, uri, category, manifest.kind, order=len(rows)))
+    return rows
 
 
-def neighbours(place: str, places: FileAccess) -> tuple[str, str]:
-    """The places of the robots before and after one, in its set or split; empty where none is."""
-    if place.startswith(MEMBER):
-        name = place.removeprefix(MEMBER).rpartition("@")[0]
-        rows = split_entries(name, resolve_split(name, places))
-    elif ":" not in place and (folder := place.rstrip("/").rpartition("/")[0]):
-        if not (places.path(folder) / INDEX).is_file():
-            return "", ""
-        rows = folder_entries(folder, places)
+def neighbour_uris(uri: str, files: FileAccess) -> tuple[str, str]:
+    """Return the URIs of the previous and next robot in a robot's set or split, or empty texts."""
+    if split := member_split(uri):
+        rows = split_rows(split, resolve_split(split, files))
+    elif (folder := parent_folder(uri)) and (files.path(folder) / INDEX).is_file():
+        rows = folder_rows(folder, files)
     else:
         return "", ""
-    every = ["", *(entry.place for entry in rows), ""]
-    if place.rstrip("/") not in every:
+    uris = ["", *(row.uri for row in rows), ""]
+    if uri.rstrip("/") not in uris:
         return "", ""
-    i = every.index(place.rstrip("/"))
-    return every[i - 1], every[i + 1]
+    i = uris.index(uri.rstrip("/"))
+    return uris[i - 1], uris[i + 1]
 
 
-def _set_entries(place: str, folder: Path) -> Iterator[Entry]:
+def _set_rows(uri: str, folder: Path) -> Iterator[Row]:
     try:
-        grammar = str(read_json(folder / SETTINGS)["grammar"])
-    except (FormatError, OSError, KeyError, TypeError):
+        grammar = str(read_settings(folder)["grammar"])
+    except FormatError:
         grammar = ""  # a set without its settings still has its robots
-    for record in _index(folder / INDEX, file_stamp(folder / INDEX)):
-        yield Entry(
+    for record in _read_index(folder, file_stamp(folder / INDEX)):
+        yield Row(
             record["name"],
-            f"{place}/{record['name']}",
+            f"{uri}/{record['name']}",
             grammar,
             dof=record["dof"],
             links=record["links"],
@@ -138,37 +256,32 @@ def _set_entries(place: str, folder: Path) -> Iterator[Entry]:
 
 
 @lru_cache(maxsize=16)
-def _index(path: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], ...]:
+def _read_index(folder: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], ...]:
+    """Return the index of a set; the stamp of its file renews the cache when it changes."""
     del stamp
-    try:
-        lines = read_text(path).splitlines()
-        records = tuple(parse_json(line, str(path)) for line in lines)
-        for record in records:
-            record["name"], record["index"], record["dof"], record["findings"]
-    except (FormatError, OSError, KeyError, TypeError) as error:
-        raise UriError(f"{path}: no index of a set: {error!r}") from error
+    records = tuple(read_index(folder))
+    for record in records:
+        if missing := {"dof", "links", "reach", "mass", "findings"} - record.keys():
+            raise UriError(f"{folder / INDEX}: a line has no {', '.join(sorted(missing))}")
     return records
 
 
-def _bundle_entry(place: str, folder: Path, order: int) -> Entry:
+def _bundle_row(uri: str, folder: Path, order: int) -> Row:
     if not (folder / CARD).is_file():
-        return Entry(
-            folder.name, place, "light" if (folder / DERIVATION).is_file() else "", order=order
-        )
+        return Row(folder.name, uri, "light", order=order)
     try:
         card = read_json(folder / CARD)
-        findings = {finding["code"] for finding in card["findings"] if finding["severity"] in _LOUD}
-        category = "composed" if "derivation" in card else "imported"
-        numbers = (card["dof"], card["links"], card["reach"], card["mass"])
+        loud = [f for f in card["findings"] if f["severity"] in ("error", "warning")]
+        return Row(
+            folder.name,
+            uri,
+            "composed" if "derivation" in card else "imported",
+            dof=card["dof"],
+            links=card["links"],
+            reach=card["reach"],
+            mass=card["mass"],
+            findings=tuple(sorted({finding["code"] for finding in loud})),
+            order=order,
+        )
     except (FormatError, OSError, KeyError, TypeError):
-        return Entry(folder.name, place, findings=(UNREADABLE,), order=order)
-    return Entry(
-        folder.name,
-        place,
-        category,
-        "",
-        "",
-        *numbers,
-        findings=tuple(sorted(findings)),
-        order=order,
-    )
+        return Row(folder.name, uri, findings=(UNREADABLE,), order=order)

@@ -1,4 +1,4 @@
-"""What a robot's page says in words and numbers."""
+"""Texts and tables about a robot, its joints and its links."""
 
 from __future__ import annotations
 
@@ -16,40 +16,47 @@ from morphgen.model.robot import TOOL, Joint, Link, Robot
 from morphgen.viewer import markup
 
 _UNITS = {"prismatic": ("m", "N", "m/s")}
-_TURNS = ("rad", "N m", "rad/s")
+"""Units of position, effort and velocity by kind of joint; other joints rotate."""
+_ROTATION_UNITS = ("rad", "N m", "rad/s")
 
 
 @dataclass(frozen=True)
-class Chain:
-    """Joints that belong together."""
+class JointGroup:
+    """Independent joints that came with the same part."""
 
     title: str
+    """Label and name of the part, such as ``left.arm: ur5``."""
     rows: tuple[int, ...]
-    """Positions in q."""
+    """Indices of the joints in q."""
 
 
-def chains(robot: Robot) -> list[Chain]:
-    """The independent joints by the part that they came with; in one chain where it is unknown."""
+def has_tool(robot: Robot) -> bool:
+    """Return whether a robot has a tool frame."""
+    return any(frame.name == TOOL for frame in robot.frames)
+
+
+def joint_groups(robot: Robot) -> list[JointGroup]:
+    """Return the independent joints by part; a robot of unknown parts has one group."""
     parts = cast(Sequence[Mapping[str, Any]], robot.provenance.get("parts", ()))
-    # The longest label first: a joint of "left_arm" is none of "left".
     titles = {str(part["label"]): f"{part['label']}: {part['part']}" for part in parts}
+    # The longest label first: a joint of "left_arm" does not belong to "left".
     labels = sorted(titles, key=len, reverse=True)
-    found: dict[str, list[int]] = {}
+    groups: dict[str, list[int]] = {}
     for row, k in enumerate(robot.independent_joints):
         name = robot.joints[k].name
-        label = next((each for each in labels if name.startswith(f"{each}_")), "")
-        found.setdefault(titles.get(label, "joints"), []).append(row)
-    return [Chain(title, tuple(rows)) for title, rows in found.items()]
+        label = next((label for label in labels if name.startswith(f"{label}_")), "")
+        groups.setdefault(titles.get(label, "joints"), []).append(row)
+    return [JointGroup(title, tuple(rows)) for title, rows in groups.items()]
 
 
-def short_name(joint: Joint, chain: Chain) -> str:
-    """A joint's name without the label of its chain."""
-    return joint.name.removeprefix(chain.title.partition(":")[0] + "_")
+def short_name(joint: Joint, group: JointGroup) -> str:
+    """Return a joint's name without the label of its group."""
+    return joint.name.removeprefix(group.title.partition(":")[0] + "_")
 
 
 def joint_hint(joint: Joint) -> str:
-    """A joint's kind and limits in a line."""
-    position, effort, speed = _UNITS.get(joint.kind, _TURNS)
+    """Return a joint's kind and limits in a line."""
+    position, effort, speed = _UNITS.get(joint.kind, _ROTATION_UNITS)
     low, high = joint.effective_limits
     parts = [f"{joint.name}: {joint.kind}"]
     parts.append(f"{low:.4g} to {high:.4g} {position}" if joint.limits else "no limits")
@@ -61,14 +68,14 @@ def joint_hint(joint: Joint) -> str:
 
 
 def slider_step(low: float, high: float) -> float:
-    """A round step that makes a few hundred of a range."""
+    """Return a power of ten that divides a range into a few hundred to 2000 steps."""
     if not high > low:
         return 0.001
     return float(10.0 ** math.floor(math.log10((high - low) / 200)))
 
 
 def summary(robot: Robot, reach: float | None) -> str:
-    """A robot in one line."""
+    """Return a robot's numbers of links and joints, mass and reach [m] in one line."""
     facts = [f"{len(robot.links)} links", f"{robot.dof} DoF", f"{robot.mass:.3g} kg"]
     if reach is not None:
         facts.append(f"reach {reach:.3g} m")
@@ -79,7 +86,7 @@ def summary(robot: Robot, reach: float | None) -> str:
 
 
 def link_table(robot: Robot) -> str:
-    """The tree of links: a row a link, indented, with the joint that moves it and its mass."""
+    """Return the indented tree of links: joint above the link, mass and shapes."""
     depth = [0] * len(robot.links)
     rows = []
     tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
@@ -92,22 +99,22 @@ def link_table(robot: Robot) -> str:
             (
                 f'<span style="padding-left:{0.7 * min(depth[i], 12):.1f}em">'
                 f"{escape(link.name)}</span>{mark}",
-                escape(_moves(joint)),
+                "root" if joint is None else joint.kind + (" (mimic)" if joint.mimic else ""),
                 f"{link.inertial.mass:.3g}" if link.inertial else "–",  # noqa: RUF001
-                escape(_shapes_text(link.collisions or link.visuals)),
+                escape(_shape_counts(link.collisions or link.visuals)),
             )
         )
-    return markup.table(("link", "moves by", "kg", "shapes"), rows, numbers=(2,))
+    return markup.table(("link", "joint", "kg", "shapes"), rows, numbers=(2,))
 
 
 def link_details(robot: Robot, name: str) -> str:
-    """All about a link and the joint above it."""
+    """Return a table of a link's properties and of the joint above it."""
     link, i = robot.link(name), robot.link_index[name]
     rows: list[tuple[str, str]] = []
     if i:
         joint = robot.joints[i - 1]
-        rows += [("on", joint.parent), ("joint", joint_hint(joint))]
-        rows.append(("at", _numbers(joint.T_parent_joint.position) + " m"))
+        rows += [("parent", joint.parent), ("joint", joint_hint(joint))]
+        rows.append(("position", _numbers(joint.T_parent_joint.position) + " m"))
         if joint.is_movable:
             rows.append(("axis", _numbers(joint.axis)))
         if joint.mimic:
@@ -123,19 +130,13 @@ def link_details(robot: Robot, name: str) -> str:
 
 
 def collision_text(pairs: Mapping[tuple[str, str], float]) -> str:
-    """What collides, and how deep."""
+    """Return the colliding pairs of links with their penetration depths [m], deepest first."""
     if not pairs:
-        return '<div class="dim">no self-collision</div>'
+        return markup.dim("no self-collision")
     deepest = sorted(pairs.items(), key=lambda item: -item[1])
     lines = [f"{escape(a)} in {escape(b)}: {1000 * d:.1f} mm" for (a, b), d in deepest[:6]]
     more = f"<br>and {len(deepest) - 6} more" if len(deepest) > 6 else ""
     return f"{markup.tag('collision', 'error')}<br>{'<br>'.join(lines)}{more}"
-
-
-def _moves(joint: Joint | None) -> str:
-    if joint is None:
-        return "root"
-    return joint.kind + (" (mimic)" if joint.mimic else "")
 
 
 def _inertial_rows(link: Link) -> list[tuple[str, str]]:
@@ -149,7 +150,7 @@ def _inertial_rows(link: Link) -> list[tuple[str, str]]:
     ]
 
 
-def _shapes_text(shapes: Sequence[Shape]) -> str:
+def _shape_counts(shapes: Sequence[Shape]) -> str:
     kinds = Counter(type(shape.geometry).__name__.lower() for shape in shapes)
     return ", ".join(kind if n == 1 else f"{n} {kind}" for kind, n in kinds.items())
 

@@ -1,12 +1,17 @@
-"""Where robots come from: folders, files, words of ``morphgen compose``, splits and uploads.
+"""Robot URIs, and the files that addresses may name.
 
-A robot's place is a text that fits into an address:
+A robot URI is a text that fits into an address:
 
-    robots/ur5-plane                               a bundle's folder, or a URDF or xacro
-    words:arm=ur5 ee=plane                         as for ``morphgen compose``
+    robots/ur5-plane                               the folder of a bundle, or a URDF or xacro
+    words:arm=ur5 ee=plane                         words as for ``morphgen compose``
     derivation:body=cubes(size=0.1)                parts and parameters
     split:extrapolation/arms/reach@test/widowx     a member of a split
-    upload:3f2a/some.urdf                          what a user sent, while the viewer runs
+    upload:3f2a/some.urdf                          a file that a user uploaded to this viewer
+
+Threat: addresses come from whoever can open a page, so every path in them is resolved by
+``FileAccess.path``, which rejects whatever lies outside the allowed folders, symbolic links
+included; and every error is shown through ``FileAccess.redact``, which removes the folders of this
+machine.
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ import hashlib
 import re
 import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -24,7 +29,7 @@ from morphgen.benchmark.split import SIDES, Member, Side, Split, compose_member
 from morphgen.benchmark.split_file import find_split, read_split_file, split_names
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError, nearest
-from morphgen.formats.bundle import CARD, MJCF, URDF, read_robot, split_colours
+from morphgen.formats.bundle import CARD, MJCF, URDF, split_colours
 from morphgen.formats.resolve import file_stamp
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.compose import compose
@@ -32,45 +37,42 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import default_name, parse_words
-from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS
-from morphgen.model.robot import TOOL, Frame, Robot
+from morphgen.grammar.robot_source import RobotSource, light_derivation, read_source
+from morphgen.model.robot import Robot
 
-WORDS, DERIVED, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
-SPLIT_SUFFIX = ".yaml"
+WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
+"""Schemes of robot URIs; a URI without scheme is a path."""
 EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
-PLAYED = (EPISODE_SUFFIX, ".pt")
-"""What files end in that are played: episodes and checkpoints."""
-ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml")
-LONGEST_TOLD = 1000
-"""Characters of an error that a page shows."""
+MAX_ERROR = 1000
+"""Longest error that a page shows [characters]."""
 _TEMPORARY = re.compile(rf"{re.escape(tempfile.gettempdir())}/(tmp|morphgen-)[^/\s]*/?(robot/)?")
 
 
 class UriError(MorphgenError):
-    """There is nothing to see at a place."""
+    """A URI or path does not exist, or the viewer may not read it."""
 
 
 @dataclass(frozen=True)
 class FileAccess:
-    """What may be looked at; plain data that a worker gets, too."""
+    """Folders that a viewer may read. Plain data, so that worker processes get it too."""
 
-    folders: tuple[Path, ...]
-    """Of the library."""
+    library_folders: tuple[Path, ...]
+    """Folders of the library of parts."""
     roots: tuple[Path, ...]
-    """Folders and files that addresses may name, absolute; nothing outside of them is read."""
+    """Absolute folders below which addresses may name files; relative paths start at the first."""
     uploads: Path
-    """Where uploads are kept."""
+    """Folder with the users' uploads."""
 
     @cached_property
     def library(self) -> Library:
-        """Where parts are."""
-        return Library(self.folders)
+        """The library of parts."""
+        return Library(self.library_folders)
 
     def path(self, text: str) -> Path:
-        """The file or folder of a place that is a path.
+        """Return the existing file or folder that a path or an ``upload:`` URI names.
 
         Raises:
-            UriError: If it does not exist, or is outside of ``roots``.
+            UriError: If it does not exist, or lies outside the allowed folders.
         """
         base, name, allowed = self.roots[0], text, self.roots
         if text.startswith(UPLOAD):
@@ -79,210 +81,190 @@ class FileAccess:
         try:
             inside = any(path.resolve().is_relative_to(root) for root in allowed)
             exists = inside and path.exists()
-        except (OSError, ValueError):  # a name that no file system takes
+        except (OSError, ValueError):  # not a valid file name
             inside, exists = True, False
         if not inside:
             raise UriError(
-                f"{shortened(text)}: is outside of the folders that this viewer was started for"
+                f"{shorten(text)}: is outside of the folders that this viewer was started for"
             )
         if not exists:
-            raise UriError(f"{shortened(text)}: no such file or folder")
+            raise UriError(f"{shorten(text)}: no such file or folder")
         return path
 
-    def told(self, error: object) -> str:
-        """The text of an error as a page may show it: without folders of this machine."""
+    def redact(self, error: object) -> str:
+        """Return the text of an error without this machine's folders, for a page."""
         text = str(error).replace(f"{self.uploads}/", UPLOAD).replace(str(self.uploads), UPLOAD)
         text = _TEMPORARY.sub("", text)
         for root in self.roots:
             text = re.sub(rf"{re.escape(str(root))}/(?=\w)", "", text)
             text = re.sub(rf"{re.escape(str(root))}(?![\w.-])", ".", text)
-        return shortened(text, LONGEST_TOLD)
+        return shorten(text, MAX_ERROR)
 
 
-def shortened(text: str, most: int = 100) -> str:
-    """A text for a message: no control characters, and not longer than a number of characters."""
-    plain = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text[: most + 1])
-    return plain if len(plain) <= most else f"{plain[:most]}..."
+def shorten(text: str, limit: int = 100) -> str:
+    """Return a text for a message: control characters escaped, at most ``limit`` characters."""
+    head = text[: limit + 1]
+    plain = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in head)
+    return plain if len(plain) <= limit else f"{plain[:limit]}..."
 
 
-def is_robot(folder: Path) -> bool:
-    """Whether a folder is a robot's: a bundle, or one of a light set."""
-    return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
+def uri_name(uri: str) -> str:
+    """Return a short name for a URI, without reading its robot."""
+    for scheme in (WORDS, DERIVATION):
+        if uri.startswith(scheme):
+            return uri.removeprefix(scheme)
+    return uri.rstrip("/").rpartition("/")[2]
 
 
-def is_set(folder: Path) -> bool:
-    """Whether a folder is a set that ``morphgen sample`` made."""
-    return (folder / INDEX).is_file() or (folder / SETTINGS).is_file()
+def parent_folder(uri: str) -> str:
+    """Return the folder part of a URI that is a path; empty if it has none."""
+    return "" if ":" in uri else uri.rstrip("/").rpartition("/")[0]
 
 
-def read_robot_uri(place: str, places: FileAccess) -> Robot:
-    """The robot at a place.
+def member_uri(split: str, side: Side, member: Member) -> str:
+    """Return the URI of a member of a split."""
+    return f"{MEMBER}{split}@{side}/{member.name}"
+
+
+def member_split(uri: str) -> str:
+    """Return the split that the URI of a member names; empty for other URIs."""
+    return uri.removeprefix(MEMBER).rpartition("@")[0] if uri.startswith(MEMBER) else ""
+
+
+def read_robot_uri(uri: str, files: FileAccess) -> Robot:
+    """Read or compose the robot of a URI.
 
     Raises:
-        UnsoundError: If its structure is broken; the findings say how.
-        MorphgenError: If there is none, or it cannot be read or composed.
+        UnsoundError: If the robot's structure is broken; has the findings.
+        MorphgenError: If the robot does not exist, or cannot be read or composed.
     """
     try:
-        return _read(place, places)
+        if uri.startswith(MEMBER):
+            return compose_member(resolve_member(uri, files), files.library)
+        if uri.startswith(WORDS):
+            derivation, name = resolve_words(uri.removeprefix(WORDS), files)
+            return compose(derivation, files.library, name)
+        if uri.startswith(DERIVATION):
+            derivation = parse_derivation(uri.removeprefix(DERIVATION))
+            return compose(derivation, files.library, default_name(derivation, files.library))
+        path = files.path(uri)
+        # A xacro is a program: those of an upload are never expanded.
+        if uri.startswith(UPLOAD) and path.is_file() and path.suffix != ".urdf":
+            raise UriError(f"{shorten(uri)}: only a URDF or a bundle is read from an upload")
+        return read_source(RobotSource(uri, path), files.library)
     except RecursionError:
-        raise UriError(f"{shortened(place)}: is nested too deeply") from None
+        raise UriError(f"{shorten(uri)}: is nested too deeply") from None
 
 
-def _read(place: str, places: FileAccess) -> Robot:
-    if place.startswith(MEMBER):
-        return compose_member(resolve_member(place, places), places.library)
-    if derivation := resolve_derivation(place, places):
-        return compose(derivation, places.library, _name(place, derivation, places))
-    path = places.path(place)
-    if place.startswith(UPLOAD) and path.is_file() and path.suffix != ROBOT_SUFFIXES[0]:
-        raise UriError(f"{shortened(place)}: only a URDF or a bundle is read from an upload")
-    return _with_tool(read_robot(path))
-
-
-def _with_tool(robot: Robot) -> Robot:
-    """The robot with its link ``tool`` as tool, as tasks take it, if it has no other."""
-    if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
-        return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
-    return robot
-
-
-def resolve_grammar(name: str, places: FileAccess) -> Grammar:
-    """The grammar of a name, or of a file.
+def resolve_derivation(uri: str, files: FileAccess) -> Derivation | None:
+    """Return the derivation of a URI's robot; None if the robot is read from a description.
 
     Raises:
-        UriError: If the file may not be looked at.
-        GrammarError: If there is none, or it cannot be read.
+        MorphgenError: If the robot does not exist, or its derivation is invalid.
     """
-    folders = places.library.folders
-    (word,) = _with_path([name], places)
+    if uri.startswith(WORDS):
+        return resolve_words(uri.removeprefix(WORDS), files)[0]
+    if uri.startswith(DERIVATION):
+        return parse_derivation(uri.removeprefix(DERIVATION))
+    if uri.startswith(MEMBER):
+        return parse_derivation(resolve_member(uri, files).derivation)
+    return light_derivation(files.path(uri))
+
+
+def resolve_grammar(name: str, files: FileAccess) -> Grammar:
+    """Return the grammar of a name or of an allowed file.
+
+    Raises:
+        UriError: If the file may not be read.
+        GrammarError: If the grammar does not exist or is invalid.
+    """
+    folders = files.library.folders
+    (word,) = _resolve_grammar_path([name], files)
     return load_grammar(find_grammar(word, folders), folders)
 
 
-def resolve_words(text: str, places: FileAccess) -> tuple[Derivation, str]:
-    """What words of ``morphgen compose`` derive, and the robot's name; see ``parse_words``.
+def resolve_words(text: str, files: FileAccess) -> tuple[Derivation, str]:
+    """Return the derivation and name of the robot that words of ``morphgen compose`` describe.
 
     Raises:
-        UriError: If they name a grammar's file that may not be looked at.
-        MorphgenError: If they name what does not exist or does not fit.
+        UriError: If they name a grammar's file that may not be read.
+        MorphgenError: If they name something that does not exist or does not fit.
     """
-    return parse_words(_with_path(text.split(), places), places.library)
+    return parse_words(_resolve_grammar_path(text.split(), files), files.library)
 
 
-def _with_path(words: list[str], places: FileAccess) -> list[str]:
-    """Words with the path of the grammar's file that the first of them names, if it does."""
+def _resolve_grammar_path(words: list[str], files: FileAccess) -> list[str]:
+    """Return the words with the absolute path of the grammar's file, if the first names one."""
     first = words[0] if words else ""
     if "=" in first or not (first.endswith(SUFFIX) or "/" in first):
         return words
-    path = places.path(first)
+    path = files.path(first)
     if path.suffix != SUFFIX:
-        raise UriError(f"{shortened(first)}: a grammar's file ends in {SUFFIX}")
+        raise UriError(f"{shorten(first)}: a grammar's file ends in {SUFFIX}")
     return [str(path), *words[1:]]
 
 
-def with_library_meshes(robot: Robot, library: Library) -> Robot:
-    """The robot with the meshes of the library's parts, to which fits are stored.
+def resolve_split(text: str, files: FileAccess) -> Split:
+    """Return a split by its name, its file or its built folder.
 
-    A bundle has copies of them. A robot whose derivation does not give the same text of URDF, but
-    for the meshes' names, stays as it is.
+    Raises:
+        MorphgenError: If the split does not exist or cannot be read.
+    """
+    if text in split_names():
+        return read_split_file(find_split(text)).split
+    path = files.path(text)
+    return read_split_file(path / SPLIT_FILE if path.is_dir() else path).split
+
+
+def resolve_member(uri: str, files: FileAccess) -> Member:
+    """Return the member of a split that a URI names.
+
+    Raises:
+        UriError: If there is no such member.
+    """
+    name, at, member = uri.removeprefix(MEMBER).rpartition("@")
+    side_name, _, robot = member.partition("/")
+    side = next((side for side in SIDES if side == side_name), None)
+    if not at or side is None:
+        raise UriError(f"{uri}: expected split:NAME@train/ROBOT or split:NAME@test/ROBOT")
+    members = {member.name: member for member in resolve_split(name, files).side(side)}
+    if robot not in members:
+        raise UriError(
+            f"{uri}: split {name} has no {side} robot {robot!r}{nearest(robot, members)}"
+        )
+    return members[robot]
+
+
+def with_library_meshes(robot: Robot, library: Library) -> Robot:
+    """Return the robot with the meshes of the library's parts, for which fits are stored.
+
+    A bundle has copies of these meshes. A robot is returned unchanged if its derivation does not
+    compose to the same URDF, apart from the names of the meshes.
     """
     text = robot.provenance.get("derivation")
     if not text:
         return robot
     try:
-        made = compose(parse_derivation(str(text)), library, robot.name)
+        composed = compose(parse_derivation(str(text)), library, robot.name)
     except (MorphgenError, RecursionError):
-        return robot  # its parts are not here, so no fits of them are
-    return made if _nameless(made) == _nameless(robot) else robot
+        return robot  # the library lacks its parts, so it has no fits of them either
+    texts = [urdf_text(split_colours(each), lambda mesh: "") for each in (composed, robot)]
+    return composed if texts[0] == texts[1] else robot
 
 
-def _nameless(robot: Robot) -> str:
-    return urdf_text(split_colours(robot), lambda mesh: "")
-
-
-def name_of(place: str) -> str:
-    """What to call a robot before it is read."""
-    for prefix in (WORDS, DERIVED):
-        if place.startswith(prefix):
-            return place.removeprefix(prefix)
-    return place.rstrip("/").rpartition("/")[2]
-
-
-def resolve_derivation(place: str, places: FileAccess) -> Derivation | None:
-    """How the robot at a place is derived; None if it is read from a URDF.
+def content_hash(uri: str, files: FileAccess) -> str:
+    """Return a hash that changes with the robot's files, its parts and morphgen's version.
 
     Raises:
-        MorphgenError: If there is no such place, or its derivation is none.
-    """
-    if place.startswith(WORDS):
-        return resolve_words(place.removeprefix(WORDS), places)[0]
-    if place.startswith(DERIVED):
-        return parse_derivation(place.removeprefix(DERIVED))
-    if place.startswith(MEMBER):
-        return parse_derivation(resolve_member(place, places).derivation)
-    light = places.path(place) / DERIVATION
-    if light.is_file() and not (places.path(place) / CARD).is_file():
-        return parse_derivation(light.read_text(encoding="utf-8"), str(light))
-    return None
-
-
-def _name(place: str, derivation: Derivation, places: FileAccess) -> str:
-    if place.startswith(WORDS):
-        return resolve_words(place.removeprefix(WORDS), places)[1]
-    if place.startswith(DERIVED):
-        return default_name(derivation, places.library)
-    return places.path(place).resolve().name
-
-
-def resolve_split(text: str, places: FileAccess) -> Split:
-    """A split by its name, file or built folder.
-
-    Raises:
-        MorphgenError: If there is none, or it cannot be read.
-    """
-    if text in split_names():
-        return read_split_file(find_split(text)).split
-    path = places.path(text)
-    return read_split_file(path / SPLIT_FILE if path.is_dir() else path).split
-
-
-def member_uri(split: str, side: Side, member: Member) -> str:
-    """The place of a member of a split."""
-    return f"{MEMBER}{split}@{side}/{member.name}"
-
-
-def resolve_member(place: str, places: FileAccess) -> Member:
-    """The member of a split at a place.
-
-    Raises:
-        UriError: If there is none.
-    """
-    name, at, member = place.removeprefix(MEMBER).rpartition("@")
-    text, _, robot = member.partition("/")
-    side = next((each for each in SIDES if each == text), None)
-    if not at or side is None:
-        raise UriError(f"{place}: expected split:NAME@train/ROBOT or split:NAME@test/ROBOT")
-    members = {each.name: each for each in resolve_split(name, places).side(side)}
-    if robot not in members:
-        raise UriError(
-            f"{place}: split {name} has no {side} robot {robot!r}" + nearest(robot, members)
-        )
-    return members[robot]
-
-
-def content_hash(place: str, places: FileAccess) -> str:
-    """A hash that changes when the robot at a place may: its files, its parts, morphgen.
-
-    Raises:
-        MorphgenError: If there is no such place.
+        MorphgenError: If the robot does not exist.
     """
     lines = [version("morphgen")]
-    if derivation := resolve_derivation(place, places):
-        lines.append(str(derivation))
-        lines += _stamps(_part_files(derivation, places.library))
+    if derivation := resolve_derivation(uri, files):
+        lines += [str(derivation), *_stamps(_part_files(derivation, files.library))]
     else:
-        path = places.path(place)
-        files = (path / URDF, path / MJCF, path / CARD) if path.is_dir() else (path,)
-        lines += [str(path.resolve()), *_stamps(files)]
+        path = files.path(uri)
+        parts = (path / URDF, path / MJCF, path / CARD) if path.is_dir() else (path,)
+        lines += [str(path.resolve()), *_stamps(parts)]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:32]
 
 
@@ -294,5 +276,5 @@ def _part_files(derivation: Derivation, library: Library) -> Iterable[Path]:
             yield manifest.source
 
 
-def _stamps(files: Iterable[Path]) -> list[str]:
-    return [f"{path} {file_stamp(path)}" for path in sorted(set(files))]
+def _stamps(paths: Iterable[Path]) -> list[str]:
+    return [f"{path} {file_stamp(path)}" for path in sorted(set(paths))]

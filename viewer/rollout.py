@@ -1,4 +1,4 @@
-"""Episodes while they are simulated: bodies at a task, each in an environment of its own."""
+"""Episodes that are being simulated: robots at a task, each in an environment of its own."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.play import interface_of, make_controller, require_policy
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
-from morphgen.rl.runs import read_checkpoint
-from morphgen.tasks.batch import Step
+from morphgen.rl.runs import Interface, read_checkpoint
 from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import SIMULATORS, TASKS
@@ -30,257 +29,263 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.viewer.episode import Array, Episode, Track
 from morphgen.viewer.robot_uri import (
     CHECKPOINT,
-    DERIVED,
+    DERIVATION,
     WORDS,
     FileAccess,
     UriError,
-    name_of,
     read_robot_uri,
-    shortened,
+    shorten,
+    uri_name,
     with_library_meshes,
 )
 
-MOST = 9
-"""Bodies that play at once."""
+MAX_ROBOTS = 9
+"""Robots of a rollout."""
+MAX_CHECKPOINTS = 50
+"""Checkpoints that a page offers."""
 
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """What is to be played."""
+    """A task, robots and the policy that acts on them."""
 
     task: str
-    places: tuple[str, ...]
-    """Of the bodies."""
+    robots: tuple[str, ...]
+    """URIs of the robots."""
     policy: str
-    """A name of ``morphgen.rl.play``, or the path of a checkpoint as an address has it."""
+    """Name of a baseline, or the path of a checkpoint as an address names it."""
     seed: int = 0
     obstacles: bool = False
     simulator: str = "mujoco"
 
 
-class Source(Protocol):
-    """What an episode comes from."""
+class EpisodeSource(Protocol):
+    """Where an episode comes from: a simulation or a file."""
 
     episode: Episode
-    longest: int
-    """Control steps of the episode at most."""
+    max_steps: int
+    """Longest possible episode [control steps]."""
     faults: dict[str, str]
-    """Why bodies that were wanted cannot play, by place."""
+    """Errors of robots that cannot do the task, by URI."""
 
     def advance(self) -> bool:
-        """Simulate a control step more; false if the episode is over."""
+        """Simulate one more control step; return False if the episode has ended."""
 
     def close(self) -> None:
-        """Free everything."""
+        """Free the simulation."""
 
 
-class Recorded:
-    """An episode that is over."""
+class RecordedEpisode:
+    """An episode from a file."""
 
     def __init__(self, episode: Episode) -> None:
-        self.episode, self.longest = episode, episode.steps
+        self.episode, self.max_steps = episode, episode.num_steps
         self.faults: dict[str, str] = {}
 
     def advance(self) -> bool:
-        """There is no more."""
+        """Return False: a recorded episode has ended."""
         return False
 
     def close(self) -> None:
-        """There is nothing to free."""
+        """Do nothing: there is no simulation."""
 
 
 @dataclass(eq=False)
-class _Player:
-    """A body in its environment."""
+class _SimulatedRobot:
+    """A robot in its environment, and its track so far."""
 
     env: TaskEnv
-    acting: Controller
+    controller: Controller
     track: Track
-    running: bool = True
+    is_running: bool = True
 
 
 class Rollout:
-    """Bodies under a policy; each has the episode that ``morphgen play`` has of the same seed."""
+    """Robots under a policy; each has the episode of ``morphgen play`` with the same seed."""
 
     def __init__(
         self,
-        wanted: RolloutConfig,
-        places: FileAccess,
+        config: RolloutConfig,
+        files: FileAccess,
         progress: Callable[[str], object] = lambda text: None,
     ) -> None:
-        """Begin an episode.
+        """Start an episode.
 
         Args:
-            wanted: What is to be played.
-            places: Where robots and checkpoints are.
-            progress: Told what is being done.
+            config: Task, robots and policy.
+            files: Robots and checkpoints that may be read.
+            progress: Called with the current activity.
 
         Raises:
-            MorphgenError: If none of the bodies can play; if only some cannot, ``faults`` says why.
+            MorphgenError: If the policy is unknown, or none of the robots can do the task; if only
+                some cannot, ``faults`` says why.
         """
         self.faults: dict[str, str] = {}
-        self._players: list[_Player] = []
-        policy = policy_file(wanted.policy, wanted.task, places)
-        first: MorphgenError | None = None
-        for place in wanted.places[:MOST]:
-            progress(f"preparing {name_of(place)}")
+        self._robots: list[_SimulatedRobot] = []
+        policy = resolve_policy(config.policy, config.task, files)
+        interface = interface_of(policy)
+        first_error: MorphgenError | None = None
+        for uri in config.robots[:MAX_ROBOTS]:
+            progress(f"preparing {uri_name(uri)}")
             try:
-                self._players.append(_player(wanted, place, policy, places))
+                self._robots.append(_start_robot(config, uri, policy, interface, files))
             except MorphgenError as error:
-                first = first or error
-                self.faults[place] = str(error)
-        if not self._players:
-            raise first or UriError("no robot is named: add one with &robot=")
-        self.longest = max(int(each.env.batch.max_episode_steps[0]) for each in self._players)
+                first_error = first_error or error
+                self.faults[uri] = str(error)
+        if not self._robots:
+            raise first_error or UriError("no robot is named: add one with &robot=")
+        self.max_steps = max(int(robot.env.batch.max_episode_steps[0]) for robot in self._robots)
         self.episode = Episode(
-            wanted.task,
-            wanted.policy,
-            wanted.seed,
-            wanted.obstacles,
-            wanted.simulator,
+            config.task,
+            config.policy,
+            config.seed,
+            config.obstacles,
+            config.simulator,
             CONTROL_PERIOD,
-            [each.track for each in self._players],
+            [robot.track for robot in self._robots],
         )
 
     def advance(self) -> bool:
-        """Simulate a control step more of all that are not over; false if all are."""
-        running = [each for each in self._players if each.running]
-        for each in running:
-            _step(each)
+        """Simulate one control step of every running robot; return False if none is running."""
+        running = [robot for robot in self._robots if robot.is_running]
+        for robot in running:
+            _step(robot)
         return bool(running)
 
     def close(self) -> None:
         """Free the simulations."""
-        for each in self._players:
-            each.env.close()
+        for robot in self._robots:
+            robot.env.close()
 
 
 def simulators() -> list[str]:
-    """Return the names of the simulators that are installed, MuJoCo first."""
-    installed = []
+    """Return the names of the installed simulators, MuJoCo first."""
+    names = []
     for name in SIMULATORS:
         with contextlib.suppress(MissingDependencyError):
-            installed.append(SIMULATORS[name].name)
-    return sorted(installed, key=lambda name: name != "mujoco")
+            names.append(SIMULATORS[name].name)
+    return sorted(names, key=lambda name: name != "mujoco")
 
 
-def policy_file(policy: str, task: str, places: FileAccess) -> str:
-    """A policy as ``morphgen.rl.play`` knows it; the path of a checkpoint becomes absolute.
+def resolve_policy(policy: str, task: str, files: FileAccess) -> str:
+    """Return a policy as ``morphgen.rl.play`` names it: a checkpoint by its absolute path.
 
     Raises:
-        TaskError: If there is none of that name, or it is for the other task.
-        UriError: If it is a file that may not be looked at.
+        TaskError: If the policy is unknown, or is for another task.
+        UriError: If it is a file that may not be read.
     """
     if policy not in BASELINES:
-        return str(_checkpoint_file(policy, baselines_for(task), places))
+        return str(_checkpoint_path(policy, baselines_for(task), files))
     require_policy(policy, task)
     return policy
 
 
-def _checkpoint_file(policy: str, references: Iterable[str], places: FileAccess) -> Path:
-    """The file or folder of a checkpoint."""
+def _checkpoint_path(policy: str, baselines: Iterable[str], files: FileAccess) -> Path:
+    """Return the file or run folder of a checkpoint."""
     try:
-        return places.path(policy)
+        return files.path(policy)
     except UriError as error:
         if "/" in policy or policy.endswith(".pt"):
             raise
         raise TaskError(
-            f"{shortened(policy)!r} is no checkpoint, and no policy{nearest(policy, references)}"
+            f"{shorten(policy)!r} is no checkpoint, and no policy{nearest(policy, baselines)}"
         ) from error
 
 
-def checkpoints(places: FileAccess, most: int = 50) -> list[str]:
-    """The first checkpoints below the folder ``runs``, as addresses have them."""
-    root = places.roots[0]
-    found = sorted((root / "runs").rglob(CHECKPOINT))
-    return [path.relative_to(root).as_posix() for path in found[:most]]
+def list_checkpoints(files: FileAccess) -> list[str]:
+    """Return the first checkpoints below the folder ``runs``, as addresses name them."""
+    root = files.roots[0]
+    paths = sorted((root / "runs").rglob(CHECKPOINT))
+    return [path.relative_to(root).as_posix() for path in paths[:MAX_CHECKPOINTS]]
 
 
-def trained_with(policy: str, places: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
-    """What the policy of a checkpoint was trained on.
+def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
+    """Return what the policy of a checkpoint was trained on.
 
     Returns:
-        The task of the first body, whether any had obstacles (then the policy sees where some are),
-        and names and places of all.
+        Task of the first robot; whether any robot had obstacles, because then the policy observes
+        them; names and URIs of all robots.
 
     Raises:
-        MorphgenError: If it is no checkpoint, or its robot has no parts to be made of.
+        MorphgenError: If the file is not a checkpoint, or its robot cannot be read or composed.
     """
-    source = read_checkpoint(_checkpoint_file(policy, BASELINES, places))[0].source
+    source = read_checkpoint(_checkpoint_path(policy, BASELINES, files))[0].source
     rows = members(source)
     if rows:
-        named = [(row.name, f"{DERIVED}{row.derivation}") for row in rows]
-        return rows[0].task, any(row.obstacles for row in rows), named
+        robots = [(row.name, f"{DERIVATION}{row.derivation}") for row in rows]
+        return rows[0].task, any(row.obstacles for row in rows), robots
+    # The name comes from a file, so paths in it are read only through ``files``.
     words = source.name.split()
     if is_robot_file(source.name):
-        robot = read_robot_uri(source.name, places)
+        robot = read_robot_uri(source.name, files)
     elif words and words[0].endswith(SUFFIX):
-        robot = read_robot_uri(WORDS + source.name, places)
+        robot = read_robot_uri(WORDS + source.name, files)
     else:
-        robot = load_robot(source.name, library=places.folders)
+        robot = load_robot(source.name, library=files.library_folders)
     derivation = robot.provenance.get("derivation")
-    place = f"{DERIVED}{derivation}" if derivation else source.name
-    assert source.task is not None  # a split says it of its robots, which are looked at above
-    return source.task, source.obstacles, [(source.name, place)]
+    uri = f"{DERIVATION}{derivation}" if derivation else source.name
+    assert source.task is not None  # only a split has none, and its robots were returned above
+    return source.task, source.obstacles, [(source.name, uri)]
 
 
-def _player(wanted: RolloutConfig, place: str, policy: str, places: FileAccess) -> _Player:
-    read = read_robot_uri(place, places)
-    body = as_primitives(with_library_meshes(read, places.library), places.folders)
-    seen = interface_of(policy)
+def _start_robot(
+    config: RolloutConfig, uri: str, policy: str, interface: Interface, files: FileAccess
+) -> _SimulatedRobot:
+    robot = read_robot_uri(uri, files)
     env = TaskEnv(
-        wanted.task,
-        body,
-        sim=wanted.simulator,
-        obstacles=wanted.obstacles,
-        kind=seen.kind,
-        observe=seen.channels,
-        max_links=seen.max_links,
-        library=places.folders,
+        config.task,
+        as_primitives(with_library_meshes(robot, files.library), files.library_folders),
+        sim=config.simulator,
+        obstacles=config.obstacles,
+        kind=interface.kind,
+        observe=interface.channels,
+        max_links=interface.max_links,
+        library=files.library_folders,
     )
-    try:
-        acting = make_controller(policy, env, wanted.seed)
-        env.batch.reset(wanted.seed)
-    except MorphgenError:
-        env.close()
-        raise
-    now, spec = render_state(env.batch), env.env_spec
-    track = Track(
-        split_colours(read),
-        place,
-        spec.scene.ground,
-        spec.scene.obstacles,
-        TASKS[spec.task].markers(spec.config, spec.goals),
-        spec.scene.block.size if spec.scene.block else None,
-        [now.q],
-        [] if now.block is None else [now.block],
-        {name: [pose] for name, pose in now.markers.items()},
-    )
-    return _Player(env, acting, track)
+    with contextlib.ExitStack() as stack:
+        stack.callback(env.close)
+        controller = make_controller(policy, env, config.seed)
+        env.batch.reset(config.seed)
+        start, spec = render_state(env.batch), env.env_spec
+        track = Track(
+            split_colours(robot),
+            uri,
+            spec.scene.ground,
+            spec.scene.obstacles,
+            TASKS[spec.task].markers(spec.config, spec.goals),
+            spec.scene.block.size if spec.scene.block else None,
+            [start.q],
+            [] if start.block is None else [start.block],
+            {name: [pose] for name, pose in start.markers.items()},
+        )
+        stack.pop_all()  # keeps the environment open
+        return _SimulatedRobot(env, controller, track)
 
 
-def _step(player: _Player) -> None:
-    """Act once; an episode that ends is not followed by another."""
-    batch, track = player.env.batch, player.track
+def _step(robot: _SimulatedRobot) -> None:
+    """Simulate one control step; the robot stops at the end of its episode."""
+    batch, track = robot.env.batch, robot.track
     try:
-        step: Step = batch.step(player.acting.act(batch))
+        step = batch.step(robot.controller.act(batch))
     except MorphgenError as error:
-        player.running, track.fault = False, str(error)
+        robot.is_running, track.fault = False, str(error)
         return
     if track.block:
-        track.block.append(_numbers(step.block_pose[0]))
-    over = bool(step.terminated[0] | step.truncated[0])  # then the batch is at the next episode
+        track.block.append(_to_numpy(step.block_pose[0]))
+    ended = bool(step.terminated[0] | step.truncated[0])
     for name, pose in batch.groups.marker_poses(0).items():
         poses = track.marker_poses[name]
-        poses.append(poses[-1] if over else pose)
+        # A batch resets an environment that ends, so its markers are those of the next episode.
+        poses.append(poses[-1] if ended else pose)
     track.score.append(float(step.score[0]))
     track.distance.append(float(step.distance[0]))
     track.success.append(bool(step.success[0]))
-    track.q.append(_numbers(step.q[0, : track.robot.dof]))
-    player.running = not over
+    # Last, because other threads read a track up to the length of q meanwhile.
+    track.q.append(_to_numpy(step.q[0, : track.robot.dof]))
+    robot.is_running = not ended
     if step.diverged[0]:
-        track.fault = "the simulation became unstable"
+        track.fault = "the simulation diverged"
 
 
-def _numbers(values: torch.Tensor) -> Array:
+def _to_numpy(values: torch.Tensor) -> Array:
     return np.array(values.cpu().numpy(), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""What can be drawn over a robot: axes, centres of mass, ignored pairs, workspace and trail."""
+"""Drawings over a robot: joint axes, centres of mass, ignored pairs, workspace and tool trail."""
 
 from __future__ import annotations
 
@@ -9,34 +9,32 @@ from typing import Any
 import numpy as np
 
 from morphgen.model.kinematics import frame_positions, random_configurations
-from morphgen.model.robot import TOOL, Robot
+from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer.scene_robot import RobotView, robot_extent
 
-POINTS = 12_000
-"""Of a workspace."""
-TRAIL = 400
-"""FileAccess of the tool that a trail keeps."""
-_ORANGE, _BLUE, _GREY = (247, 103, 7), (25, 113, 194), (134, 142, 150)
+NUM_POINTS = 12_000
+"""Configurations that are sampled to draw a workspace."""
+TRAIL_LENGTH = 400
+"""Tool positions that a trail keeps."""
+_ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
+_NEAR, _FAR = np.array([32, 129, 226]), np.array([250, 176, 5])
+"""Colours of the workspace nearest to and farthest from the root."""
 
 
 @dataclass(eq=False)
 class Overlays:
-    """What is drawn over a robot now."""
+    """The overlays of a robot."""
 
     view: RobotView
     nodes: dict[str, list[Any]] = field(default_factory=dict)
-    """viser's nodes by the overlay."""
-    trail: deque[Array] = field(default_factory=lambda: deque(maxlen=TRAIL))
+    """viser's scene nodes by overlay."""
+    trail: deque[Array] = field(default_factory=lambda: deque(maxlen=TRAIL_LENGTH))
+    """Recent tool positions [m]."""
 
 
-def has_tool(robot: Robot) -> bool:
-    """Whether a robot has a tool frame."""
-    return any(frame.name == TOOL for frame in robot.frames)
-
-
-def remove(overlays: Overlays, name: str) -> None:
-    """Take an overlay away."""
+def remove_overlay(overlays: Overlays, name: str) -> None:
+    """Remove an overlay."""
     for node in overlays.nodes.pop(name, []):
         node.remove()
     if name == "trail":
@@ -44,49 +42,51 @@ def remove(overlays: Overlays, name: str) -> None:
 
 
 def show_joint_axes(overlays: Overlays) -> None:
-    """An arrow along every movable joint's axis, orange for turns and blue for slides."""
+    """Draw an arrow along every movable joint's axis: orange rotates, blue slides."""
     view = overlays.view
     length = 0.14 * robot_extent(view.robot)
-    nodes = overlays.nodes.setdefault("joint axes", [])
-    for k in view.robot.movable_joints:
-        joint = view.robot.joints[k]
-        arrow = np.array([[np.zeros(3), length * np.array(joint.unit_axis)]])
-        nodes.append(
-            view.scene.add_arrows(
-                f"{view.name}/{k + 1}/axis",
-                arrow,
-                _BLUE if joint.kind == "prismatic" else _ORANGE,
-                shaft_radius=0.02 * length,
-                head_radius=0.06 * length,
-                head_length=0.2 * length,
-            )
+    overlays.nodes["joint axes"] = [
+        view.scene.add_arrows(
+            f"{view.name}/{k + 1}/axis",  # joint k attaches link k + 1
+            np.array([[np.zeros(3), length * np.array(view.robot.joints[k].unit_axis)]]),
+            _BLUE if view.robot.joints[k].kind == "prismatic" else _ORANGE,
+            shaft_radius=0.02 * length,
+            head_radius=0.06 * length,
+            head_length=0.2 * length,
         )
+        for k in view.robot.movable_joints
+    ]
 
 
 def show_mass_centres(overlays: Overlays) -> None:
-    """A ball at every link's centre of mass, its volume in proportion to the mass."""
+    """Draw a ball at every link's centre of mass; its volume is proportional to the mass."""
     view = overlays.view
-    heaviest = max((link.inertial.mass for link in view.robot.links if link.inertial), default=0.0)
-    nodes = overlays.nodes.setdefault("centres of mass", [])
-    for i, link in enumerate(view.robot.links):
-        if link.inertial is None or link.inertial.mass <= 0:
-            continue
-        share = (link.inertial.mass / heaviest) ** (1 / 3)
-        nodes.append(
-            view.scene.add_icosphere(
-                f"{view.name}/{i}/com",
-                radius=0.022 * robot_extent(view.robot) * share,
-                color=(33, 37, 41),
-                position=link.inertial.com,
-            )
+    inertials = {i: link.inertial for i, link in enumerate(view.robot.links) if link.inertial}
+    heaviest = max((inertial.mass for inertial in inertials.values()), default=0.0)
+    overlays.nodes["centres of mass"] = [
+        view.scene.add_icosphere(
+            f"{view.name}/{i}/com",
+            radius=0.022 * robot_extent(view.robot) * (inertial.mass / heaviest) ** (1 / 3),
+            color=_BLACK,
+            position=inertial.com,
         )
+        for i, inertial in inertials.items()
+        if inertial.mass > 0
+    ]
 
 
 def show_ignored_pairs(overlays: Overlays) -> None:
-    """A line between the links of every pair that is not tested for collision."""
-    remove(overlays, "ignored pairs")
+    """Draw a line between the links of every pair whose contacts are ignored.
+
+    A line ends at the links' centres of mass, or at their origins for links without inertia.
+    """
+    remove_overlay(overlays, "ignored pairs")
     view = overlays.view
-    points = _link_points(view)
+    centres = np.array(
+        [link.inertial.com if link.inertial else (0, 0, 0) for link in view.robot.links]
+    )
+    rotations, origins = view.T_root_link[:, :3, :3], view.T_root_link[:, :3, 3]
+    points = np.einsum("nij,nj->ni", rotations, centres) + origins
     index = view.robot.link_index
     lines = [
         (points[index[a]], points[index[b]])
@@ -94,31 +94,30 @@ def show_ignored_pairs(overlays: Overlays) -> None:
         if a in index and b in index
     ]
     if lines:
-        name = f"{view.name}/ignored"
         node = view.scene.add_line_segments(
-            name, np.array(lines), _GREY, thickness=2.0, thickness_units="screen"
+            f"{view.name}/ignored", np.array(lines), _GREY, thickness=2.0, thickness_units="screen"
         )
         overlays.nodes["ignored pairs"] = [node]
 
 
-def workspace_points(robot: Robot) -> Array:
-    """Where the tool goes, at configurations drawn uniformly, shape (n, 3), metres."""
-    q = random_configurations(robot, POINTS, np.random.default_rng(0))
+def sample_workspace(robot: Robot) -> Array:
+    """Return tool positions at uniformly random configurations, shape (n, 3) [m]."""
+    q = random_configurations(robot, NUM_POINTS, np.random.default_rng(0))
     return frame_positions(robot, q.T).T
 
 
 def show_workspace(overlays: Overlays, points: Array) -> None:
-    """A cloud of places of the tool, coloured by their distance from the root."""
-    remove(overlays, "workspace")
+    """Draw tool positions as a cloud, coloured by their distance from the root."""
+    remove_overlay(overlays, "workspace")
     view = overlays.view
-    far = np.linalg.norm(points, axis=1)
-    share = ((far - far.min()) / max(float(np.ptp(far)), 1e-9))[:, None]
-    colours = (1 - share) * np.array([32, 129, 226]) + share * np.array([250, 176, 5])
+    distances = np.linalg.norm(points, axis=1)
+    spread = max(float(np.ptp(distances)), 1e-9)
+    share = ((distances - distances.min()) / spread)[:, None]
     node = view.scene.add_point_cloud(
         f"{view.name}/workspace",
         points,
-        colours.astype(np.uint8),
-        point_size=0.0014 * max(float(far.max()), 0.1),
+        ((1 - share) * _NEAR + share * _FAR).astype(np.uint8),
+        point_size=0.0014 * max(float(distances.max()), 0.1),
         point_shape="circle",
         precision="float32",
     )
@@ -126,31 +125,19 @@ def show_workspace(overlays: Overlays, points: Array) -> None:
 
 
 def extend_trail(overlays: Overlays, position: Array) -> None:
-    """Draw the way that the tool went, to a new place."""
+    """Extend the trail of the tool to a position, unless it has not moved (10 um)."""
     if overlays.trail and np.linalg.norm(overlays.trail[-1] - position) < 1e-5:
         return
     overlays.trail.append(position)
     for node in overlays.nodes.pop("trail", []):
         node.remove()
     if len(overlays.trail) > 1:
-        places = np.array(overlays.trail)
+        positions = np.array(overlays.trail)
         node = overlays.view.scene.add_line_segments(
             f"{overlays.view.name}/trail",
-            np.stack([places[:-1], places[1:]], axis=1),
+            np.stack([positions[:-1], positions[1:]], axis=1),
             _ORANGE,
             thickness=3.0,
             thickness_units="screen",
         )
         overlays.nodes["trail"] = [node]
-
-
-def _link_points(view: RobotView) -> Array:
-    """The centres of mass, or origins, of links where they are now, shape (n_links, 3)."""
-    if view.T_root_link is None:
-        raise ValueError("the robot was not placed yet")
-    centres = np.array(
-        [link.inertial.com if link.inertial else (0, 0, 0) for link in view.robot.links]
-    )
-    return np.asarray(
-        np.einsum("nij,nj->ni", view.T_root_link[:, :3, :3], centres) + view.T_root_link[:, :3, 3]
-    )

@@ -1,40 +1,52 @@
-"""A robot in a browser's scene: its links, in several layers, at any configuration."""
+"""A robot in viser's scene: its links in several layers, at any configuration."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
+import trimesh
 import viser
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from morphgen.model.geometry import Pose, Shape
+from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
-from morphgen.model.robot import Inertial, Link, Robot
+from morphgen.model.mesh import load_mesh
+from morphgen.model.robot import Inertial, Robot
 from morphgen.typing import Array
-from morphgen.viewer.shapes import Triangles, ellipsoid, triangles
 
 Rgb = tuple[int, int, int]
+Triangles = tuple[NDArray[np.float32], NDArray[np.uint32]]
+"""Vertices (n, 3) [m] and faces (m, 3)."""
 Layer = Literal["visual", "collision", "primitives", "inertia"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
-PLAIN: Rgb = (176, 182, 190)
-"""Colour of what names none."""
+GREY: Rgb = (176, 182, 190)
+"""Colour of shapes without their own."""
 RED: Rgb = (224, 49, 49)
+"""Colour of colliding or selected links."""
 _COLOURS: Mapping[Layer, Rgb] = {
     "collision": (64, 192, 87),
     "primitives": (253, 126, 20),
     "inertia": (151, 117, 250),
 }
 _OPACITY: Mapping[Layer, float] = {"collision": 0.45, "primitives": 0.6, "inertia": 0.5}
+_SHARP_ANGLE = np.radians(35.0)
+"""Edges between faces that meet at a larger angle are drawn sharp. Tuned by eye on real arms."""
+_MAX_SMOOTHED_FACES = 150_000
+"""Largest mesh whose sharp edges are searched; larger ones would take seconds [faces]."""
+_CYLINDER_SECTIONS = 48
+_MIN_EXTENT = 0.05
+"""Smallest extent by which axes and markers are scaled [m]."""
 
 
 @dataclass(eq=False)
-class Drawn:
-    """A mesh in the scene."""
+class DrawnShape:
+    """A mesh in the scene and its own colour."""
 
     handle: viser.MeshHandle
     colour: Rgb
@@ -47,16 +59,16 @@ class RobotView:
     scene: viser.SceneApi
     robot: Robot
     name: str
-    """Of its node in the scene."""
+    """Name of the robot's node in the scene, such as ``/robot``."""
     base: viser.FrameHandle
     links: list[viser.FrameHandle]
-    """Where each link is, in the order of the robot's."""
-    layers: dict[Layer, list[list[Drawn]]] = field(default_factory=dict)
-    """What was drawn so far, by link."""
-    hidden: set[Layer] = field(default_factory=set)
+    """Frames of the links, in the order of ``robot.links``."""
+    layers: dict[Layer, list[list[DrawnShape]]] = field(default_factory=dict)
+    """Shapes by link of the layers drawn so far."""
     red: frozenset[str] = frozenset()
-    T_root_link: Array | None = None
-    """Where the links are now, shape (n_links, 4, 4)."""
+    """Names of the links that are painted red."""
+    T_root_link: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """Current pose of every link in the root frame, shape (n_links, 4, 4)."""
 
 
 def add_robot(
@@ -65,116 +77,122 @@ def add_robot(
     name: str,
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> RobotView:
-    """Draw a robot's visual shapes at home.
+    """Draw a robot's visual shapes at its home configuration.
 
     Args:
-        scene: Where.
-        robot: The body.
-        name: Of its node in the scene, such as ``/robot``.
-        position: Of its root, metres.
+        scene: Scene of a browser or of a server.
+        robot: The robot.
+        name: Name of its node in the scene, such as ``/robot``.
+        position: Position of its root [m].
 
     Raises:
         MeshError: If a mesh cannot be read.
     """
     base = scene.add_frame(name, show_axes=False, position=position)
-    size = 0.12 * robot_extent(robot)
+    length = 0.12 * robot_extent(robot)
     links = [
         scene.add_frame(
             f"{name}/{i}",
             show_axes=False,
-            axes_length=size,
-            axes_radius=0.04 * size,
-            origin_radius=0.08 * size,
+            axes_length=length,
+            axes_radius=0.04 * length,
+            origin_radius=0.08 * length,
         )
         for i in range(len(robot.links))
     ]
     view = RobotView(scene, robot, name, base, links)
-    move(view, robot.home)
-    show_layer(view, "visual", [link.visuals or link.collisions for link in robot.links])
+    set_configuration(view, robot.home)
+    show_shapes(view, "visual", [link.visuals or link.collisions for link in robot.links])
     return view
 
 
-def move(view: RobotView, q: ArrayLike) -> Array:
-    """Show a robot at a configuration.
+def add_floor(scene: viser.SceneApi, size: float) -> None:
+    """Draw a square grid on the ground, twice as wide as a size: cells 10 cm, sections 1 m."""
+    side = max(2.0, 2.0 * round(2 * size) / 2)
+    scene.add_grid("/floor", width=side, height=side, cell_size=0.1, section_size=1.0)
 
-    Args:
-        view: The robot.
-        q: Independent joint positions, shape (dof,), rad or m.
 
-    Returns:
-        Pose of every link in the root frame, shape (n_links, 4, 4).
-    """
-    T_root_link = forward_kinematics(view.robot, q)
-    for handle, T in zip(view.links, T_root_link, strict=True):
+def set_configuration(view: RobotView, q: ArrayLike) -> None:
+    """Move a robot to a configuration: independent joint positions, shape (dof,) [rad or m]."""
+    view.T_root_link = forward_kinematics(view.robot, q)
+    for handle, T in zip(view.links, view.T_root_link, strict=True):
         pose = Pose.from_matrix(T)
         handle.position, handle.wxyz = pose.position, pose.quaternion
-    view.T_root_link = T_root_link
-    return T_root_link
 
 
-def show_layer(view: RobotView, layer: Layer, shapes: Sequence[Sequence[Shape]]) -> None:
-    """Draw shapes by link; what the layer showed before is removed."""
-    drop_layer(view, layer)
-    view.hidden.discard(layer)
-    opacity = _OPACITY.get(layer)
+def show_shapes(view: RobotView, layer: Layer, shapes: Sequence[Sequence[Shape]]) -> None:
+    """Draw shapes, given by link, in a layer; they replace the layer's previous shapes."""
+    remove_layer(view, layer)
     view.layers[layer] = [
         [
-            _draw(view, f"{view.name}/{i}/{layer}{j}", shape, _colour(layer, shape), opacity)
-            for j, shape in enumerate(of_link)
+            _add_mesh(
+                view,
+                f"{view.name}/{i}/{layer}{j}",
+                triangles(shape.geometry),
+                shape.T_link_shape,
+                layer,
+                _shape_colour(layer, shape),
+            )
+            for j, shape in enumerate(link_shapes)
         ]
-        for i, of_link in enumerate(shapes)
+        for i, link_shapes in enumerate(shapes)
     ]
 
 
 def show_inertia(view: RobotView) -> None:
-    """Draw the ellipsoid of every link's inertia: solid, of the link's mass and inertia."""
-    drop_layer(view, "inertia")
-    view.hidden.discard("inertia")
-    view.layers["inertia"] = [
-        _draw_inertia(view, i, link) for i, link in enumerate(view.robot.links)
-    ]
+    """Draw for every link the solid ellipsoid that has its mass and inertia."""
+    remove_layer(view, "inertia")
+    shapes = view.layers["inertia"] = []
+    for i, link in enumerate(view.robot.links):
+        ellipsoid = inertia_ellipsoid(link.inertial) if link.inertial else None
+        shapes.append([])
+        if link.inertial is None or ellipsoid is None:
+            continue
+        semi_axes, axes = ellipsoid
+        T_link_ellipsoid = np.eye(4)
+        T_link_ellipsoid[:3, :3], T_link_ellipsoid[:3, 3] = axes, link.inertial.com
+        ball = trimesh.creation.icosphere(subdivisions=3)
+        surface = _triangles(ball.vertices * semi_axes, ball.faces)
+        name, pose = f"{view.name}/{i}/inertia", Pose.from_matrix(T_link_ellipsoid)
+        shapes[i].append(_add_mesh(view, name, surface, pose, "inertia", _COLOURS["inertia"]))
 
 
-def drop_layer(view: RobotView, layer: Layer) -> None:
+def remove_layer(view: RobotView, layer: Layer) -> None:
     """Remove a layer's shapes."""
-    for of_link in view.layers.pop(layer, []):
-        for drawn in of_link:
-            drawn.handle.remove()
+    for shape in _shapes(view, layer):
+        shape.handle.remove()
+    view.layers.pop(layer, None)
 
 
 def set_visible(view: RobotView, layer: Layer, visible: bool) -> None:
     """Show or hide a layer that was drawn."""
-    (view.hidden.discard if visible else view.hidden.add)(layer)
-    for of_link in view.layers.get(layer, []):
-        for drawn in of_link:
-            drawn.handle.visible = visible
+    for shape in _shapes(view, layer):
+        shape.handle.visible = visible
 
 
 def set_opacity(view: RobotView, opacity: float) -> None:
-    """Make the visual shapes see-through: 0 nothing is seen, 1 nothing behind."""
-    for of_link in view.layers.get("visual", []):
-        for drawn in of_link:
-            drawn.handle.opacity = None if opacity >= 1 else opacity
+    """Set the opacity of the visual shapes, from 0 (invisible) to 1."""
+    for shape in _shapes(view, "visual"):
+        shape.handle.opacity = None if opacity >= 1 else opacity
 
 
 def paint_red(view: RobotView, names: Collection[str]) -> None:
-    """Paint links red, and those that were red before as they were."""
+    """Paint the named links red, and the other links in their own colours."""
     if (names := frozenset(names)) == view.red:
         return
     for layer in ("visual", "collision"):
-        for link, of_link in zip(view.robot.links, view.layers.get(layer, []), strict=False):
+        for link, shapes in zip(view.robot.links, view.layers.get(layer, []), strict=False):
             if (link.name in names) != (link.name in view.red):
-                for drawn in of_link:
-                    drawn.handle.color = RED if link.name in names else drawn.colour
+                for shape in shapes:
+                    shape.handle.color = RED if link.name in names else shape.colour
     view.red = names
 
 
 def paint(view: RobotView, layer: Layer, colours: Mapping[str, Rgb]) -> None:
-    """Give links other colours in a layer."""
-    for link, of_link in zip(view.robot.links, view.layers.get(layer, []), strict=False):
-        for drawn in of_link:
-            if link.name in colours:
-                drawn.handle.color = drawn.colour = colours[link.name]
+    """Set the colours of a layer's shapes, by link."""
+    for link, shapes in zip(view.robot.links, view.layers.get(layer, []), strict=False):
+        for shape in shapes if link.name in colours else ():
+            shape.handle.color = shape.colour = colours[link.name]
 
 
 def show_axes(view: RobotView, visible: bool) -> None:
@@ -184,7 +202,12 @@ def show_axes(view: RobotView, visible: bool) -> None:
 
 
 def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
-    """Lowest and highest corner of a robot with its root's origin, in the root frame, metres."""
+    """Return the lowest and highest corner of a robot in its root frame [m].
+
+    Args:
+        robot: The robot; the origin of its root counts too.
+        q: Configuration, shape (dof,); the home configuration by default.
+    """
     T_root_link = forward_kinematics(robot, robot.home if q is None else q)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
@@ -192,14 +215,14 @@ def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array
             low, high = bounding_box(shapes)
             corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
             points.append(corners @ T[:3, :3].T + T[:3, 3])
-    every = np.concatenate(points)
-    return every.min(axis=0), every.max(axis=0)
+    stacked = np.concatenate(points)
+    return stacked.min(axis=0), stacked.max(axis=0)
 
 
 def robot_extent(robot: Robot) -> float:
-    """Longest side of what holds a robot at home, metres; at least 5 cm."""
+    """Return the longest side of a robot's bounding box at home, at least 5 cm [m]."""
     low, high = robot_bounds(robot)
-    return max(float((high - low).max()), 0.05)
+    return max(float((high - low).max()), _MIN_EXTENT)
 
 
 def look_at(
@@ -208,22 +231,23 @@ def look_at(
     high: Array,
     direction: tuple[float, float, float] = (0.82, 0.52, 0.42),
 ) -> None:
-    """Turn a browser's camera so that a box is seen whole, obliquely from the front."""
-    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    away = max(0.66 * size, 0.12)
-    client.camera.position = middle + 1.35 * away * np.array(direction)
-    client.camera.look_at = middle
-    client.camera.near = min(0.01, away / 50)
+    """Point a browser's camera at a box, from a direction and so far away that all is in view."""
+    centre, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    distance = max(0.66 * diagonal, 0.12)  # tuned by eye for viser's default field of view
+    client.camera.position = centre + 1.35 * distance * np.array(direction)
+    client.camera.look_at = centre
+    client.camera.near = min(0.01, distance / 50)
 
 
-def inertia_semi_axes(inertial: Inertial) -> tuple[Array, Array] | None:
-    """The solid ellipsoid with a link's mass and inertia.
+def inertia_ellipsoid(inertial: Inertial) -> tuple[Array, Array] | None:
+    """Return the solid ellipsoid with a link's mass and inertia.
 
-    Of an ellipsoid with semi-axes a, b, c: I_a = m (b^2 + c^2) / 5.
+    An ellipsoid with semi-axes a, b, c has I_a = m (b^2 + c^2) / 5, and likewise I_b and I_c; the
+    sum of all three gives a^2 = 5 / (2 m) (I_a + I_b + I_c - 2 I_a).
 
     Returns:
-        Semi-axes (3,), metres, and their directions as columns (3, 3) in link axes; None without
-        mass or with an inertia that no body has.
+        Semi-axes (3,) [m], and their directions in the link frame as columns (3, 3). None for
+        a massless link, or if no rigid body has such an inertia.
     """
     if inertial.mass <= 0:
         return None
@@ -231,54 +255,81 @@ def inertia_semi_axes(inertial: Inertial) -> tuple[Array, Array] | None:
     squares = 2.5 / inertial.mass * (moments.sum() - 2 * moments)
     if (squares < -1e-9).any() or not (squares > 0).any():
         return None
-    if np.linalg.det(axes) < 0:
+    if np.linalg.det(axes) < 0:  # a reflection is not a rotation
         axes[:, 0] *= -1
     return np.sqrt(np.maximum(squares, 1e-8)), axes
 
 
-def _draw(view: RobotView, name: str, shape: Shape, colour: Rgb, opacity: float | None) -> Drawn:
-    return _add(view, name, triangles(shape.geometry), shape.T_link_shape, colour, opacity)
+def triangles(geometry: Geometry) -> Triangles:
+    """Return the surface of a geometry in its own frame.
+
+    Vertices at sharp edges are doubled, so that the browser shades them as edges.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    if isinstance(geometry, Mesh):
+        return _mesh_triangles(geometry, load_mesh(geometry))
+    return _primitive_triangles(geometry)
 
 
-def _draw_inertia(view: RobotView, i: int, link: Link) -> list[Drawn]:
-    found = inertia_semi_axes(link.inertial) if link.inertial else None
-    if link.inertial is None or found is None:
-        return []
-    (a, b, c), axes = found[0].tolist(), found[1]
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = axes, link.inertial.com
-    pose = Pose.from_matrix(T)
-    name = f"{view.name}/{i}/inertia"
-    return [_add(view, name, ellipsoid((a, b, c)), pose, _COLOURS["inertia"], _OPACITY["inertia"])]
+@lru_cache(maxsize=512)
+def _mesh_triangles(mesh: Mesh, loaded: trimesh.Trimesh) -> Triangles:
+    """Cached by the loaded mesh, too, which is another object once the file has changed."""
+    del mesh
+    if len(loaded.faces) <= _MAX_SMOOTHED_FACES:
+        loaded = trimesh.graph.smooth_shade(loaded, angle=_SHARP_ANGLE)
+    return _triangles(loaded.vertices, loaded.faces)
 
 
-def _add(
-    view: RobotView,
-    name: str,
-    surface: Triangles,
-    pose: Pose,
-    colour: Rgb,
-    opacity: float | None,
-) -> Drawn:
-    vertices, faces = surface
+@lru_cache(maxsize=1024)
+def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangles:
+    match geometry:
+        case Box(size):
+            mesh = trimesh.creation.box(size)
+        case Sphere(radius):
+            mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        case Cylinder(radius, length):
+            mesh = trimesh.creation.cylinder(
+                radius=radius, height=length, sections=_CYLINDER_SECTIONS
+            )
+        case Capsule(radius, length):
+            mesh = trimesh.creation.capsule(radius=radius, height=length)
+            mesh.apply_translation(-mesh.bounds.mean(axis=0))  # trimesh's starts at the origin
+    if isinstance(geometry, Box | Cylinder):
+        mesh = trimesh.graph.smooth_shade(mesh, angle=_SHARP_ANGLE)
+    return _triangles(mesh.vertices, mesh.faces)
+
+
+def _triangles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Triangles:
+    return np.asarray(vertices, dtype=np.float32), np.asarray(faces, dtype=np.uint32)
+
+
+def _shapes(view: RobotView, layer: Layer) -> Iterable[DrawnShape]:
+    return [shape for shapes in view.layers.get(layer, []) for shape in shapes]
+
+
+def _add_mesh(
+    view: RobotView, name: str, surface: Triangles, pose: Pose, layer: Layer, colour: Rgb
+) -> DrawnShape:
+    opacity = _OPACITY.get(layer)
     handle = view.scene.add_mesh_simple(
         name,
-        vertices,
-        faces,
+        *surface,
         color=colour,
         opacity=opacity,
-        side="double",
+        side="double",  # some meshes have their faces inside out
         position=pose.position,
         wxyz=pose.quaternion,
         cast_shadow=opacity is None,
     )
-    return Drawn(handle, colour)
+    return DrawnShape(handle, colour)
 
 
-def _colour(layer: Layer, shape: Shape) -> Rgb:
+def _shape_colour(layer: Layer, shape: Shape) -> Rgb:
     if layer in _COLOURS:
         return _COLOURS[layer]
     if shape.rgba is None:
-        return PLAIN
+        return GREY
     red, green, blue = (round(255 * channel) for channel in shape.rgba[:3])
     return (red, green, blue)

@@ -1,4 +1,4 @@
-"""viser's server behind a gate: who may ask it, and which messages it takes."""
+"""viser's web server behind the viewer's access policy and message validation."""
 
 from __future__ import annotations
 
@@ -16,28 +16,30 @@ from typing import Any
 import viser
 import websockets.asyncio.server
 import websockets.http11
-from viser import _messages
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from morphgen.viewer.access import AccessPolicy, policy, refusal_reason
+from morphgen.viewer.access import AccessPolicy, content_security_policy, refusal_reason
 from morphgen.viewer.messages import message_fault
+from morphgen.viewer.viser_internals import disable_share_links
 
-LONGEST_LINE = 65_536
-"""Bytes of a request's line. Beyond websockets' own 8,192 a browser would be told nothing."""
+MAX_REQUEST_LINE = 65_536
+"""Longest first line of a request [bytes]. websockets' own limit of 8192 is below the longest
+address of a page with its escapes, and closes the connection without an answer."""
 _POLICY_VIOLATION = 1008
-"""Code with which a websocket is closed."""
+"""Close code of websockets (RFC 6455) for a message that violates the policy."""
 _starting = threading.Lock()
+"""Held while websockets' ``serve`` is replaced."""
 
 Answer = Callable[[ServerConnection, Request], Response | None]
 
 
 class _OneLine(logging.Filter):
-    """Keeps the log to one line a fault, and silent on requests that are no HTTP."""
+    """Logs a fault in one line without traceback, and nothing for requests that are not HTTP."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record is logged; its traceback is not."""
+        """Return whether a record is logged."""
         error = record.exc_info[1] if record.exc_info else None
         record.exc_info = None
         if error is not None:
@@ -50,46 +52,53 @@ _LOG.addFilter(_OneLine())
 
 
 class _Connection(ServerConnection):
-    """A websocket that is closed at the first message that no page of the viewer sends."""
+    """A websocket that closes at the first message that no page of the viewer sends."""
 
-    async def recv(self, decode: bool | None = None) -> Any:  # noqa: ANN401  (as its base)
-        """The next message; what is malformed ends the connection before viser sees it."""
+    async def recv(self, decode: bool | None = None) -> Any:  # noqa: ANN401  (as its base class)
+        """Return the next message; viser never sees a malformed one."""
         data = await super().recv(decode)
         if fault := message_fault(data):
             await self.close(_POLICY_VIOLATION, fault[:120])
-            return await super().recv(decode)  # raises that it is closed
+            return await super().recv(decode)  # raises ConnectionClosed
         return data
 
 
-def start_server(host: str, port: int, gate: AccessPolicy) -> viser.ViserServer:
-    """Start viser's server; every request goes by the gate.
+def start_server(host: str, port: int, policy: AccessPolicy) -> viser.ViserServer:
+    """Start viser's server; every request has to pass the access policy.
 
     Raises:
-        RuntimeError: If this version of viser starts its server otherwise.
+        RuntimeError: If the installed viser does not start a websockets server.
     """
-    with _starting, _gated(gate), contextlib.redirect_stdout(io.StringIO()):
-        # its banner names the port before we do
+    with _starting, _guarded(policy), contextlib.redirect_stdout(io.StringIO()):
+        # Silent, because viser's banner would name the port before ``morphgen view`` does.
         server = viser.ViserServer(host=host, port=port, verbose=False)
-    # Whoever sends one of these would open the page to the internet, by way of another server.
-    for request in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-        server._websock_server.unregister_handler(request)
-    loop = server._event_loop
-    loop.call_soon_threadsafe(loop.set_exception_handler, _tell_fault)
+    disable_share_links(server)
+    loop = server.get_event_loop()
+    loop.call_soon_threadsafe(loop.set_exception_handler, _print_fault)
     return server
 
 
+def stop_server(server: viser.ViserServer) -> None:
+    """Stop viser's server without its message."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
 @contextlib.contextmanager
-def _gated(gate: AccessPolicy) -> Iterator[None]:
-    """Have the server that viser starts ask the gate; viser has no setting for it."""
+def _guarded(policy: AccessPolicy) -> Iterator[None]:
+    """Apply the policy to the websockets server that viser starts meanwhile.
+
+    viser passes no options to ``websockets.serve``, so the function itself is replaced.
+    """
     module = websockets.asyncio.server
-    plain, started = module.serve, []
-    websockets.http11.MAX_LINE_LENGTH = LONGEST_LINE
+    original, started = module.serve, []
+    websockets.http11.MAX_LINE_LENGTH = MAX_REQUEST_LINE
 
     def serve(*arguments: Any, process_request: Answer, **options: Any) -> Any:  # noqa: ANN401
         started.append(True)
-        return plain(
+        return original(
             *arguments,
-            process_request=functools.partial(_answer, gate, process_request),
+            process_request=functools.partial(_answer, policy, process_request),
             create_connection=_Connection,
             logger=_LOG,
             **options,
@@ -99,29 +108,30 @@ def _gated(gate: AccessPolicy) -> Iterator[None]:
     try:
         yield
     finally:
-        module.serve = plain  # type: ignore[misc]
+        module.serve = original  # type: ignore[misc]
     if not started:
-        raise RuntimeError("this version of viser starts no websockets server that could be gated")
+        raise RuntimeError("this version of viser does not start a websockets server to guard")
 
 
 def _answer(
-    gate: AccessPolicy, plain: Answer, connection: ServerConnection, request: Request
+    policy: AccessPolicy, serve_file: Answer, connection: ServerConnection, request: Request
 ) -> Response | None:
     """Answer a request; None lets a websocket be opened."""
-    if why := refusal_reason(gate, request.path, request.headers):
-        return _sentence(http.HTTPStatus.FORBIDDEN, why)
+    if reason := refusal_reason(policy, request.path, request.headers):
+        return _text_response(http.HTTPStatus.FORBIDDEN, reason)
     try:
-        response = plain(connection, request)
-    except (OSError, ValueError):  # a path that no file system takes
-        return _sentence(http.HTTPStatus.NOT_FOUND, "there is no such file.")
+        response = serve_file(connection, request)
+    except (OSError, ValueError):  # the path is not a valid file name
+        return _text_response(http.HTTPStatus.NOT_FOUND, "there is no such file.")
     if response is not None:
-        response.headers["Content-Security-Policy"] = policy(gate, request.headers["Host"])
+        csp = content_security_policy(policy, request.headers["Host"])
+        response.headers["Content-Security-Policy"] = csp
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "same-origin"
     return response
 
 
-def _sentence(status: http.HTTPStatus, text: str) -> Response:
+def _text_response(status: http.HTTPStatus, text: str) -> Response:
     body = f"morphgen view: {text}\n".encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8"})
     headers["Content-Length"] = str(len(body))
@@ -129,8 +139,8 @@ def _sentence(status: http.HTTPStatus, text: str) -> Response:
     return Response(status, status.phrase, headers, body)
 
 
-def _tell_fault(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Tell in one line what a browser's message has made go wrong."""
+def _print_fault(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Print in one line the error that a browser's message has caused in viser."""
     error = context.get("exception")
     text = context["message"] if error is None else f"{type(error).__name__}: {error}"
     print(f"morphgen: a browser's message failed: {' '.join(text.split())}", file=sys.stderr)

@@ -1,10 +1,12 @@
-"""One browser's session: its page, what it may see, and the threads that work for it."""
+"""A session: one browser with its page, its URL, and the threads that work for it."""
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import traceback
+import uuid
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -13,190 +15,216 @@ from typing import Any, Protocol, TypeVar
 import viser
 
 from morphgen.errors import MorphgenError
-from morphgen.viewer import browser, markup
+from morphgen.viewer import markup
 from morphgen.viewer.address import Address
 from morphgen.viewer.robot_uri import FileAccess
+from morphgen.viewer.viser_internals import run_javascript
 from morphgen.viewer.workers import Workers
 
-BUG = "something is wrong with morphgen itself; what it is stands where the viewer was started"
-"""What a page says of an error that should not happen."""
+BUG = "this is a bug of morphgen; its traceback is in the terminal where the viewer was started"
+"""What a page shows for an unexpected error."""
+URL_TIMEOUT = 20.0
+"""Time in which a browser has to report its URL [s]."""
 
 Work = Callable[[], object]
 T = TypeVar("T")
 
 
 class Status(Protocol):
-    """Where a page says what it is doing."""
+    """Part of a page that shows HTML."""
 
     content: str
 
 
 @dataclass(eq=False)
 class Session:
-    """One browser. What its user does is worked off in order by a thread of its own."""
+    """One browser. A thread of its own handles the user's actions one after the other."""
 
     client: viser.ClientHandle
-    places: FileAccess
+    files: FileAccess
     workers: Workers
-    """Processes for what takes long."""
+    """Processes for slow work, shared by all browsers."""
     address: Address
-    shared: dict[str, object] = field(default_factory=dict)
-    """What took long to find, for all browsers."""
+    """The page with its state, as the URL shows it."""
+    cache: dict[str, object] = field(default_factory=dict)
+    """Results of slow work, shared by all browsers."""
     closed: threading.Event = field(default_factory=threading.Event)
-    """Set when the browser is gone; long work looks at it."""
+    """Set when the browser has disconnected; long work has to check it."""
     events: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(1, "morphgen-events")
     )
     background: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(1, "morphgen-background")
     )
-    waiting: set[str] = field(default_factory=set)
-    """Keys of work that is not begun yet."""
+    pending: set[str] = field(default_factory=set)
+    """Keys of queued work that has not started yet."""
     lock: threading.Lock = field(default_factory=threading.Lock)
-    ends: list[Work] = field(default_factory=list)
-    """What is to be done when the browser is gone."""
+    close_callbacks: list[Work] = field(default_factory=list)
     status: Status | None = None
+    """Line of the page that shows the current activity."""
 
+    def enqueue(self, work: Work, key: str = "") -> None:
+        """Run work on the session's event thread, after everything that was enqueued before.
 
-def post(session: Session, work: Work, key: str = "") -> None:
-    """Do something after what was posted before.
+        Args:
+            work: Called without arguments; the page shows a ``MorphgenError`` that it raises.
+            key: If work of the same key is still queued, this call is dropped: the queued work will
+                see the newest state.
+        """
+        self._submit(self.events, work, key)
 
-    Args:
-        session: The browser.
-        work: What is done; a ``MorphgenError`` of it is shown to the user.
-        key: If work of the same key waits already, this is left out: it will see the newest state.
-    """
-    _submit(session, session.events, work, key)
+    def run_in_background(self, work: Work, key: str = "") -> None:
+        """Run slow work on the session's background thread; see ``enqueue``."""
+        self._submit(self.background, work, key)
 
+    def run_in_worker(self, work: Callable[..., T], *arguments: object) -> T:
+        """Run a function in a worker process and return its result.
 
-def later(session: Session, work: Work, key: str = "") -> None:
-    """Do something that takes long, after other such work; see ``post``."""
-    _submit(session, session.background, work, key)
+        Raises:
+            MorphgenError: If the function raises it, or the process died.
+        """
+        return self.workers.result(self.workers.submit(work, *arguments))
 
+    def call_later(self, seconds: float, work: Work, key: str) -> None:
+        """Enqueue work after a delay; calls of the same key until then are merged into one."""
+        timer_key = f"timer {key}"
+        with self.lock:
+            if self.closed.is_set() or timer_key in self.pending:
+                return
+            self.pending.add(timer_key)
 
-def soon(session: Session, seconds: float, work: Work, key: str) -> None:
-    """Post work after a while, once for all that is asked for until then."""
-    with session.lock:
-        if session.closed.is_set() or f"soon {key}" in session.waiting:
-            return
-        session.waiting.add(f"soon {key}")
+        def fire() -> None:
+            with self.lock:
+                self.pending.discard(timer_key)
+            self.enqueue(work, key)
 
-    def begin() -> None:
-        with session.lock:
-            session.waiting.discard(f"soon {key}")
-        post(session, work, key)
+        timer = threading.Timer(seconds, fire)
+        timer.daemon = True
+        timer.start()
 
-    timer = threading.Timer(seconds, begin)
-    timer.daemon = True
-    timer.start()
+    def on_change(self, handle: Any, work: Work, key: str = "") -> None:  # noqa: ANN401
+        """Enqueue work whenever the user changes or clicks a control.
 
+        Values that the server itself assigns to the control do not count.
+        """
 
-def when(handle: Any, session: Session, work: Work, key: str = "") -> None:  # noqa: ANN401
-    """Post work whenever the user changes or clicks a control of viser's.
+        async def changed(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:
+                self.enqueue(work, key)
 
-    What the server sets itself is no such change.
-    """
+        attach = getattr(handle, "on_click", None) or handle.on_update
+        attach(changed)
 
-    async def changed(event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:
-            post(session, work, key)
-
-    attach = getattr(handle, "on_click", None) or handle.on_update
-    attach(changed)
-
-
-def at_end(session: Session, work: Work) -> None:
-    """Do something quick when the browser is gone; at once if it has gone already."""
-    with session.lock:
-        if not session.closed.is_set():
-            session.ends.append(work)
-            return
-    work()
-
-
-def close(session: Session) -> None:
-    """End a session's work; what is being done ends by itself."""
-    with session.lock:
-        session.closed.set()
-        ends, session.ends = session.ends, []
-    for work in ends:
+    def on_close(self, work: Work) -> None:
+        """Call quick work when the browser disconnects; immediately if it already has."""
+        with self.lock:
+            if not self.closed.is_set():
+                self.close_callbacks.append(work)
+                return
         work()
-    session.events.shutdown(wait=False, cancel_futures=True)
-    session.background.shutdown(wait=False, cancel_futures=True)
+
+    def close(self) -> None:
+        """Drop the session's queued work; running work ends by itself."""
+        with self.lock:
+            self.closed.set()
+            callbacks, self.close_callbacks = self.close_callbacks, []
+        for work in callbacks:
+            work()
+        self.events.shutdown(wait=False, cancel_futures=True)
+        self.background.shutdown(wait=False, cancel_futures=True)
+
+    def set_status(self, text: str, fraction: float | None = None) -> None:
+        """Show the current activity and its progress in [0, 1]; an empty text clears the line."""
+        if self.status is not None and not self.closed.is_set():
+            self.status.content = markup.status(text, fraction)
+
+    def notify(self, title: str, text: str, *, error: bool = False) -> None:
+        """Show a notification; it closes after six seconds unless it is an error."""
+        self.client.add_notification(
+            title,
+            text,
+            auto_close_seconds=None if error else 6.0,
+            color="red" if error else None,
+        )
+
+    def report_error(self, error: object) -> None:
+        """Show on the page why an action failed."""
+        self.set_status("")
+        self.notify("That did not work", self.files.redact(error), error=True)
+
+    def show_address(self, title: str) -> None:
+        """Show the address in the browser's URL, without loading it, and a title in its tab."""
+        run_javascript(
+            self.client,
+            f"""window.history.replaceState(null, "", {json.dumps(self.address.query)});
+            document.title = {json.dumps(title)};""",
+        )
+
+    def update_address(self, title: str, **state: str) -> None:
+        """Change the page's state in the URL; see ``Address.with_state``."""
+        self.address = self.address.with_state(**state)
+        self.show_address(title)
+
+    def open_address(self, address: Address) -> None:
+        """Load another page, as a link would."""
+        run_javascript(self.client, f"window.location.assign({json.dumps(address.query)});")
+
+    def _submit(self, threads: ThreadPoolExecutor, work: Work, key: str) -> None:
+        with self.lock:
+            if self.closed.is_set() or (key and key in self.pending):
+                return
+            self.pending.add(key)
+            future = threads.submit(self._run, work, key)
+        future.add_done_callback(self._print_bug)
+
+    def _run(self, work: Work, key: str) -> None:
+        with self.lock:
+            self.pending.discard(key)
+        if self.closed.is_set():
+            return
+        try:
+            work()
+        except (MorphgenError, RecursionError) as error:
+            self.report_error(error)
+        except Exception:
+            if not self.closed.is_set():
+                self.report_error(BUG)
+            raise
+
+    def _print_bug(self, future: Future[None]) -> None:
+        """Print the traceback of an unexpected error, which a thread pool would hide.
+
+        Errors after the browser has disconnected are expected: the work needed the browser.
+        """
+        if future.cancelled() or self.closed.is_set():
+            return
+        if (error := future.exception()) is not None:
+            traceback.print_exception(error, file=sys.stderr)
 
 
-def in_worker(session: Session, work: Callable[..., T], *arguments: object) -> T:
-    """Have a worker process do something, and wait for it.
-
-    Raises:
-        MorphgenError: What the work raises, or that the worker died.
-    """
-    return session.workers.result(session.workers.submit(work, *arguments))
-
-
-def show_state(session: Session, title: str, **changes: str) -> None:
-    """Put a page's state into its address."""
-    session.address = session.address.with_state(**changes)
-    browser.show_query(session.client, session.address.query, title)
-
-
-def say(session: Session, text: str, share: float | None = None) -> None:
-    """Show what is being done, and how much of it is; an empty text when it is done."""
-    if session.status is not None and not session.closed.is_set():
-        session.status.content = markup.status(text, share)
-
-
-def notify(session: Session, title: str, text: str, *, error: bool = False) -> None:
-    """Show a message for a while."""
-    session.client.add_notification(
-        title,
-        text,
-        auto_close_seconds=None if error else 6.0,
-        color="red" if error else None,
-    )
-
-
-def set_value(handle: Any, value: float | str) -> None:  # noqa: ANN401
-    """Change what a control of viser's shows."""
+def set_value(handle: Any, value: object) -> None:  # noqa: ANN401
+    """Set the value of a control, which viser's types declare as read-only."""
     handle.value = value
 
 
-def _submit(session: Session, threads: ThreadPoolExecutor, work: Work, key: str) -> None:
-    with session.lock:
-        if session.closed.is_set() or (key and key in session.waiting):
-            return
-        session.waiting.add(key)
-        future = threads.submit(_do, session, work, key)
-    future.add_done_callback(lambda done: _tell_bug(done, session))
+def read_query(client: viser.ClientHandle) -> str:
+    """Return the query of the browser's URL with its question mark; empty if there is none.
 
+    viser does not tell the server the URL. So a line of JavaScript copies it into the browser's
+    local storage, under a key that no other tab uses, and viser reads it from there.
 
-def _do(session: Session, work: Work, key: str) -> None:
-    with session.lock:
-        session.waiting.discard(key)
-    if session.closed.is_set():
-        return
-    try:
-        work()
-    except (MorphgenError, RecursionError) as error:
-        refuse(session, error)
-    except Exception:
-        if not session.closed.is_set():
-            refuse(session, BUG)
-        raise
-
-
-def refuse(session: Session, error: object) -> None:
-    """Say on the page why something was not done."""
-    say(session, "")
-    notify(session, "That did not work", session.places.told(error), error=True)
-
-
-def _tell_bug(future: Future[None], session: Session) -> None:
-    """Print what should not have happened; a thread's errors are else seen by nobody.
-
-    Where the browser is gone, or the viewer stops, work fails that needs them.
+    Raises:
+        RuntimeError: If the browser has disconnected, or has no local storage.
+        TimeoutError: If it does not answer.
     """
-    if future.cancelled() or session.closed.is_set():
-        return
-    if (error := future.exception()) is not None:
-        traceback.print_exception(error, file=sys.stderr)
+    key = f"morphgen-{uuid.uuid4().hex}"
+    client.local_storage.set_item(key, "")
+    run_javascript(
+        client,
+        f"""const name = Object.keys(localStorage).find((k) => k.endsWith({json.dumps(key)}));
+        if (name) localStorage.setItem(name, window.location.search);""",
+    )
+    try:
+        return client.local_storage.get_item(key, timeout=URL_TIMEOUT) or ""
+    finally:
+        client.local_storage.remove_item(key)

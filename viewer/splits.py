@@ -1,16 +1,18 @@
-"""What a split's page says of its robots: facts, likeness of all pairs, audit, statistics."""
+"""New splits of robots in a gallery, and the survey of a split that its page shows."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from morphgen.benchmark.audit import Audit, audit_survey
-from morphgen.benchmark.similarity import MEASURES, Features
-from morphgen.benchmark.split import SIDES, Member, Split
+from morphgen.benchmark.robot_hash import robot_hash
+from morphgen.benchmark.similarity import MEASURES
+from morphgen.benchmark.split import COMPOSED, SIDES, Member, Regime, Side, Split
+from morphgen.benchmark.split_file import require_split_name, write_split
 from morphgen.benchmark.statistics import summarize_survey
 from morphgen.benchmark.survey import (
     Fault,
@@ -24,61 +26,117 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.typing import Array
+from morphgen.viewer.robot_uri import (
+    MEMBER,
+    FileAccess,
+    read_robot_uri,
+    resolve_derivation,
+    resolve_member,
+    shorten,
+)
 from morphgen.viewer.workers import Workers
 
-LARGEST = 60
-"""The most robots of which every pair is compared; a map of more could not be read."""
+SPLITS = "splits"
+"""Folder in which new splits are written."""
+MAX_NAME = 200
+"""Longest name of a split [characters]."""
+MAX_ROBOTS = 60
+"""Robots of which every pair is compared; a map of more could not be read."""
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
-    """What was found of a split."""
+class SplitStudy:
+    """Survey of a split's robots."""
 
     audit: Audit
     statistics: Mapping[str, object]
-    """Empty if a robot cannot be composed."""
-    members: tuple[Member, ...]
-    """Those that can be compared, train first."""
-    sides: tuple[str, ...]
+    """Statistics by side; empty if a robot cannot be composed."""
+    members: tuple[tuple[Side, Member], ...]
+    """Members that can be composed, train robots first."""
     matrices: Mapping[str, Array]
-    """Likeness of every pair of them by measure, shape (n, n)."""
+    """Similarity of every pair of these members by measure, shape (n, n)."""
 
 
-def study(
+def make_member(uri: str, category: str, task: str, obstacles: bool, files: FileAccess) -> Member:
+    """Return a robot as a member of a split. Runs in a worker.
+
+    Raises:
+        BenchmarkError: If the robot has no derivation.
+        MorphgenError: If it cannot be composed.
+    """
+    if uri.startswith(MEMBER):
+        return replace(resolve_member(uri, files), task=task, obstacles=obstacles)
+    robot = read_robot_uri(uri, files)
+    derivation = str(resolve_derivation(uri, files) or robot.provenance.get("derivation", ""))
+    if not derivation:
+        raise BenchmarkError(f"{uri} was imported: a split names robots by their derivations")
+    composed = compose(parse_derivation(derivation), files.library, robot.name)
+    hash_ = robot_hash(composed)
+    return Member(robot.name, category or COMPOSED, derivation, task, obstacles, hash_)
+
+
+def save_split(
+    name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], files: FileAccess
+) -> Path:
+    """Write a split's file into ``splits/`` of the folder where the viewer was started.
+
+    Raises:
+        BenchmarkError: If the name is invalid, a side is empty, or the file exists or cannot be
+            written.
+    """
+    require_split_name(name)
+    if not train or not test:
+        raise BenchmarkError(
+            f"{len(train)} train and {len(test)} test robots: at least one of each is needed"
+        )
+    if len(name) > MAX_NAME:
+        raise BenchmarkError(f"name {shorten(name)!r}: at most {MAX_NAME} characters")
+    path = files.roots[0] / SPLITS / f"{name}.yaml"
+    if path.exists():
+        raise BenchmarkError(f"{path} exists; choose another name")
+    summary = f"{len(train)} robots to train on, {len(test)} to test on, chosen in the viewer"
+    write_split(Split(name, regime, summary, tuple(train), tuple(test)), path)
+    return path
+
+
+def study_split(
     split: Split,
     folders: tuple[Path, ...],
     workers: Workers,
     progress: Callable[[int, int], None],
-) -> Study:
-    """Examine a split's robots in worker processes.
+) -> SplitStudy:
+    """Measure and compare a split's robots in worker processes.
 
     Args:
-        split: At most ``LARGEST`` robots.
-        folders: Of the library.
+        split: At most ``MAX_ROBOTS`` robots.
+        folders: Folders of the library.
         workers: The processes.
-        progress: Told how many robots are done, and of how many.
+        progress: Called with the number of measured robots and of all robots.
 
     Raises:
-        BenchmarkError: If there are more robots, or what the split says of its making is malformed.
+        BenchmarkError: If there are more robots, or the split's record of its making is malformed.
     """
     members = [*split.train, *split.test]
-    if len(members) > LARGEST:
+    if len(members) > MAX_ROBOTS:
         raise BenchmarkError(
-            f"{len(members)} robots are too many to compare each with each (at most {LARGEST}); "
-            f"morphgen split audit and morphgen split stats take them all"
+            f"{len(members)} robots are too many to compare all pairs (at most {MAX_ROBOTS}); "
+            "use morphgen split audit and morphgen split stats"
         )
-    derivations = list(dict.fromkeys(member.derivation for member in members))
-    links = split.max_links
-    futures = [workers.submit(examine, text, folders, links) for text in derivations]
-    found = {}
-    for i, (derivation, future) in enumerate(zip(derivations, futures, strict=True)):
-        found[derivation] = workers.result(future)
-        progress(i + 1, len(derivations))
-    return workers.result(workers.submit(conclude, split, found, folders))
+    futures = {
+        text: workers.submit(measure_derivation, text, folders, split.max_links)
+        for text in dict.fromkeys(member.derivation for member in members)
+    }
+    measured = {}
+    for i, (text, future) in enumerate(futures.items(), 1):
+        measured[text] = workers.result(future)
+        progress(i, len(futures))
+    return workers.result(workers.submit(conclude_study, split, measured, folders))
 
 
-def examine(derivation: str, folders: tuple[Path, ...], max_links: int) -> MeasuredRobot | Fault:
-    """Compose and measure a robot."""
+def measure_derivation(
+    derivation: str, folders: tuple[Path, ...], max_links: int
+) -> MeasuredRobot | Fault:
+    """Compose and measure a robot. Runs in a worker."""
     try:
         robot = compose(parse_derivation(derivation), Library(folders), "robot")
         return measure_robot(robot, folders, max_links)
@@ -86,56 +144,38 @@ def examine(derivation: str, folders: tuple[Path, ...], max_links: int) -> Measu
         return Fault("body-broken", str(error))
 
 
-def conclude(
-    split: Split, found: Mapping[str, MeasuredRobot | Fault], folders: tuple[Path, ...]
-) -> Study:
-    """Compare the robots, and audit and sum up the split."""
-    sided = [(side, member) for side in SIDES for member in split.side(side)]
-    sound = [(side, m) for side, m in sided if isinstance(found[m.derivation], MeasuredRobot)]
-    known = [
-        each.features for _, m in sound if isinstance(each := found[m.derivation], MeasuredRobot)
+def conclude_study(
+    split: Split, measured: Mapping[str, MeasuredRobot | Fault], folders: tuple[Path, ...]
+) -> SplitStudy:
+    """Compare measured robots, audit the split and compute its statistics. Runs in a worker.
+
+    Args:
+        split: The split.
+        measured: Its robots by derivation.
+        folders: Folders of the library.
+    """
+    members = [(side, member) for side in SIDES for member in split.side(side)]
+    results = [measured[member.derivation] for _, member in members]
+    sound = [i for i, result in enumerate(results) if isinstance(result, MeasuredRobot)]
+    features = [result.features for result in results if isinstance(result, MeasuredRobot)]
+    matrices = {}
+    # Pairs with a robot that cannot be composed stay NaN, as the survey wants them.
+    similarity = np.full((len(members), len(members), len(MEASURES)), np.nan)
+    for k, (name, measure) in enumerate(MEASURES.items()):
+        matrix = np.zeros((len(sound), len(sound)))
+        for i, a in enumerate(features):
+            for j, b in enumerate(features[: i + 1]):
+                matrix[i, j] = matrix[j, i] = measure.function(a, b)
+        matrices[name] = matrix
+        similarity[np.ix_(sound, sound, [k])] = matrix[..., None]
+    robots: list[SurveyedRobot | Fault] = [
+        result.surveyed if isinstance(result, MeasuredRobot) else result for result in results
     ]
-    matrices = {name: _matrix(known, name) for name in MEASURES}
-    survey = _survey(split, found, [m for _, m in sound], matrices)
-    whole = len(sound) == len(sided)
-    return Study(
+    n = len(split.train)
+    survey = SplitSurvey(split, tuple(robots[:n]), tuple(robots[n:]), similarity[:n, n:])
+    return SplitStudy(
         audit_survey(survey, Library(folders)),
-        summarize_survey(survey) if whole else {},
-        tuple(member for _, member in sound),
-        tuple(side for side, _ in sound),
+        summarize_survey(survey) if len(sound) == len(members) else {},
+        tuple(members[i] for i in sound),
         matrices,
-    )
-
-
-def _matrix(known: Sequence[Features], measure: str) -> Array:
-    function = MEASURES[measure].function
-    values = np.zeros((len(known), len(known)))
-    for i, a in enumerate(known):
-        for j in range(i + 1):
-            values[i, j] = values[j, i] = function(a, known[j])
-    return values
-
-
-def _survey(
-    split: Split,
-    found: Mapping[str, MeasuredRobot | Fault],
-    sound: Sequence[Member],
-    matrices: Mapping[str, Array],
-) -> SplitSurvey:
-    """What the audit asks for, of what is known here."""
-    places = [id(member) for member in sound]
-    shape = (len(split.train), len(split.test), len(MEASURES))
-    likeness = np.full(shape, np.nan)
-    for i, a in enumerate(split.train):
-        for j, b in enumerate(split.test):
-            if id(a) in places and id(b) in places:
-                row, column = places.index(id(a)), places.index(id(b))
-                likeness[i, j] = [matrices[name][row, column] for name in MEASURES]
-
-    def surveyed(member: Member) -> SurveyedRobot | Fault:
-        each = found[member.derivation]
-        return each.surveyed if isinstance(each, MeasuredRobot) else each
-
-    return SplitSurvey(
-        split, tuple(map(surveyed, split.train)), tuple(map(surveyed, split.test)), likeness
     )

@@ -1,15 +1,28 @@
-"""Robots that users send: a URDF, or a zip of a bundle, kept while the viewer runs.
+"""Robots that users upload: a URDF, or a zip of a bundle, kept while the viewer runs.
 
-Of an upload only descriptions, meshes and cards are kept, and nothing of it may lie, or point,
-outside of its own folder. A xacro is a program, so none of an upload is expanded.
+Threat: whoever can open the page can upload a file made to do harm. Therefore
+
+- a zip is read within limits of size, number of files and length of names, and rejected if a name
+  leads out of its folder, is a link, or occurs twice;
+- only descriptions, meshes and cards are stored, in a new folder with a random name;
+- every path that they contain must stay inside that folder, so that an upload cannot make the
+  viewer read, draw or send another file;
+- a xacro is a program, so an upload's xacro is never expanded.
+
+If any check fails, nothing of the upload is kept.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import secrets
 import shutil
+import stat
+import struct
+import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 
 from lxml import etree
@@ -19,18 +32,29 @@ from morphgen.formats.bundle import CARD, PICTURE, URDF
 from morphgen.formats.resolve import PackageFinder, resolve_uri
 from morphgen.formats.xml import parse_xml
 from morphgen.model.geometry import MESH_SUFFIXES
-from morphgen.viewer.archives import ArchiveError, is_inside, unpacked
-from morphgen.viewer.messages import LARGEST_UPLOAD
-from morphgen.viewer.robot_uri import UPLOAD, FileAccess, shortened
+from morphgen.viewer.messages import MAX_UPLOAD
+from morphgen.viewer.robot_uri import UPLOAD, FileAccess, shorten
 
-MOST_KEPT = 50
+MAX_UPLOADS = 50
 """Uploads that a viewer keeps."""
+MAX_UNPACKED = 100 * 2**20
+"""Largest total size of the files in a zip [bytes]."""
+MAX_FILES = 2000
+"""Files in a zip."""
+MAX_NAME = 100
+"""Longest name of a file or folder in a zip [bytes]."""
+MAX_DEPTH = 20
+"""Longest path in a zip [names]."""
 PACKAGE = "package.xml"
-"""Names a ROS package, which ``package://`` needs."""
-_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
+"""Marks a ROS package, which ``package://`` needs."""
+_ZIP_ENTRY = b"PK\x01\x02"
+"""Signature of every entry in a zip's table of contents."""
+_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Accepted methods; others (LZMA) can allocate gigabytes before they return a byte."""
+_FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
 _MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")
-"""What meshes consist of, besides themselves."""
-_PATHS = (
+"""Suffixes of files that meshes refer to."""
+_PATH_ATTRIBUTES = (
     "assetdir",
     "file",
     "fileback",
@@ -47,61 +71,134 @@ _PATHS = (
 
 
 class UploadError(MorphgenError):
-    """A file that is no robot, or none that is taken from strangers."""
+    """An upload is not a robot, or is unsafe."""
 
 
-def keep(name: str, content: bytes, places: FileAccess) -> str:
-    """Keep an upload.
+def store_upload(name: str, content: bytes, files: FileAccess) -> str:
+    """Check and store an upload.
 
     Args:
-        name: Of the file.
-        content: All of it.
-        places: Where uploads are kept.
+        name: Name of the file.
+        content: Content of the file.
+        files: Has the folder of uploads.
 
     Returns:
-        The place of the robot.
+        The URI of the robot.
 
     Raises:
-        UploadError: If it is too large, no URDF and no zip of one, or names a path outside of its
-            folder; then nothing is kept.
+        UploadError: If the file is too large, not a URDF or a zip of one, or unsafe.
     """
-    if len(content) > LARGEST_UPLOAD:
+    if len(content) > MAX_UPLOAD:
         raise UploadError(
-            f"{shortened(name)}: {len(content) / 2**20:.0f} MB; at most {LARGEST_UPLOAD // 2**20} "
-            "MB are taken: open it on this machine instead, with morphgen view"
+            f"{shorten(name)}: {len(content) / 2**20:.0f} MB; at most {MAX_UPLOAD // 2**20} "
+            "MB are accepted: open it on this machine instead, with morphgen view"
         )
     file = PurePosixPath(name.replace("\\", "/")).name
-    if not _NAME.fullmatch(file):
+    if not _FILE_NAME.fullmatch(file):
         raise UploadError(
-            f"{shortened(name)!r} is no file name that can be kept: use letters, digits and '.', "
-            "at most 100"
+            f"invalid file name: {shorten(name)!r}; use letters, digits and '.', at most 100"
         )
     suffix = PurePosixPath(file).suffix.lower()
     if suffix not in (".urdf", ".zip"):
         raise UploadError(f"{file}: expected a .urdf, or a .zip of a folder with one")
+    unpacked = _unzip(file, content) if suffix == ".zip" else {file: content}
+    kept = {path: data for path, data in unpacked.items() if _is_kept(path, data)}
+    main = _main_urdf(file, unpacked, kept)
+    for path, data in kept.items():
+        _require_inner_paths(path, data)
+    folder = _write_upload(kept, files.uploads)
+    is_bundle = PurePosixPath(main).name == URDF and str(PurePosixPath(main).parent / CARD) in kept
+    target = str(PurePosixPath(main).parent) if is_bundle else main
+    return f"{UPLOAD}{folder}/{target}".removesuffix("/.")
+
+
+def _unzip(name: str, content: bytes) -> dict[str, bytes]:
+    """Return the files of a zip by their paths, after checking its table of contents."""
+    # Counted in the raw bytes, because zipfile would read a table of millions of entries.
+    if content.count(_ZIP_ENTRY) > MAX_FILES:
+        raise UploadError(f"{name}: holds more than {MAX_FILES} files; nothing was kept")
     try:
-        every = unpacked(file, content) if suffix == ".zip" else {file: content}
-    except ArchiveError as error:
-        raise UploadError(f"{error}; nothing was kept") from error
-    files = {path: data for path, data in every.items() if _is_kept(path, data)}
-    main = _main_file(file, every, files)
-    for path, data in files.items():
-        _require_own_paths(path, data)
-    token = _written(files, places.uploads)
-    is_bundle = PurePosixPath(main).name == URDF and str(PurePosixPath(main).parent / CARD) in files
-    shown = str(PurePosixPath(main).parent) if is_bundle else main
-    return f"{UPLOAD}{token}/{shown}".removesuffix("/.")
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            if sum(entry.file_size for entry in entries) > MAX_UNPACKED:
+                raise UploadError(
+                    f"{name}: unpacks to more than {MAX_UNPACKED // 2**20} MB; nothing was kept"
+                )
+            paths = [_zip_path(name, entry) for entry in entries]
+            _require_distinct(name, paths)
+            return {path: archive.read(entry) for path, entry in zip(paths, entries, strict=True)}
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        struct.error,
+        EOFError,
+        OSError,
+        RuntimeError,  # an encrypted file
+        ValueError,
+    ) as error:
+        raise UploadError(
+            f"{name}: not a readable zip: {shorten(str(error))}; nothing was kept"
+        ) from error
+
+
+def _zip_path(name: str, entry: zipfile.ZipInfo) -> str:
+    """Return the path of a zip's entry, if every file system can store it safely."""
+    path = PurePosixPath(entry.orig_filename.replace("\\", "/"))
+    fault = ""
+    if not _stays_inside(entry.orig_filename) or ".." in path.parts or ":" in str(path):
+        fault = "leads out of its folder"
+    elif stat.S_ISLNK(entry.external_attr >> 16):
+        fault = "is a link"
+    elif entry.compress_type not in _COMPRESSION:
+        fault = "is compressed by a method other than deflate"
+    elif not path.parts or len(path.parts) > MAX_DEPTH or not str(path).isprintable():
+        fault = f"is not a valid file name, or lies in more than {MAX_DEPTH} folders"
+    elif any(len(part.encode()) > MAX_NAME for part in path.parts):
+        fault = f"is longer than {MAX_NAME} characters"
+    if fault:
+        raise UploadError(f"{name}: {shorten(entry.orig_filename)!r} {fault}; nothing was kept")
+    return str(path)
+
+
+def _require_distinct(name: str, paths: list[str]) -> None:
+    """Require that no two files have the same path, and no file the path of a folder.
+
+    Case is ignored, because some file systems ignore it.
+    """
+    seen: set[str] = set()
+    for path in paths:
+        if path.casefold() in seen:
+            raise UploadError(f"{name}: {shorten(path)!r} is there twice; nothing was kept")
+        seen.add(path.casefold())
+    for path in paths:
+        if not seen.isdisjoint(map(str, PurePosixPath(path.casefold()).parents)):
+            raise UploadError(
+                f"{name}: {shorten(path)!r} is in a folder that is a file; nothing was kept"
+            )
+
+
+def _stays_inside(path: str) -> bool:
+    """Return whether a path with slashes or backslashes stays in the folder that it starts in."""
+    depth = 0
+    for part in path.replace("\\", "/").split("/"):
+        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
+        if depth < 0:
+            return False
+    return not path.startswith(("/", "\\"))
 
 
 def _is_kept(path: str, data: bytes) -> bool:
-    """Whether a file is a description, a mesh, a card or the name of a package."""
+    """Return whether a file is a description, a mesh or part of one, a card or a package file."""
     file = PurePosixPath(path)
     if any(part.startswith((".", "__MACOSX")) for part in file.parts):
         return False
     if file.suffix == ".xml":
         return file.name == PACKAGE or _is_mjcf(data)
-    suffixes = (".urdf", *_MESH_PARTS)
-    return file.name in (CARD, PICTURE) or file.suffix in suffixes or _is_mesh(file)
+    return (
+        file.name in (CARD, PICTURE)
+        or file.suffix in (".urdf", *_MESH_PARTS)
+        or file.suffix.lower() in MESH_SUFFIXES
+    )
 
 
 def _is_mjcf(data: bytes) -> bool:
@@ -111,41 +208,41 @@ def _is_mjcf(data: bytes) -> bool:
         return False
 
 
-def _is_mesh(file: PurePosixPath) -> bool:
-    return file.suffix.lower() in MESH_SUFFIXES
-
-
-def _main_file(name: str, every: dict[str, bytes], files: dict[str, bytes]) -> str:
-    """The URDF to show: the shortest path, so that a bundle's is before others below it."""
-    found = sorted(
-        (path for path in files if path.endswith(".urdf")), key=lambda p: (p.count("/"), p)
-    )
-    if found:
-        return found[0]
+def _main_urdf(name: str, unpacked: dict[str, bytes], kept: dict[str, bytes]) -> str:
+    """Return the URDF with the shortest path, which in a bundle is the bundle's own."""
+    urdfs = [path for path in kept if path.endswith(".urdf")]
+    if urdfs:
+        return min(urdfs, key=lambda path: (path.count("/"), path))
     hint = ""
-    if any(path.endswith(".xacro") for path in every):
+    if any(path.endswith(".xacro") for path in unpacked):
         hint = (
             "; no xacro of an upload is expanded: import it on this machine, with morphgen import"
         )
     raise UploadError(f"{name}: holds no .urdf{hint}")
 
 
-def _require_own_paths(path: str, data: bytes) -> None:
+def _require_inner_paths(path: str, data: bytes) -> None:
     """Require that a description or card names files of its own upload only."""
     file = PurePosixPath(path)
     if file.name == CARD:
-        _require_own_card(path, data)
+        try:
+            card = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise UploadError(f"{path}: not valid JSON: {shorten(str(error))}") from error
+        hashes = card.get("hashes") if isinstance(card, dict) else None
+        for name in hashes if isinstance(hashes, dict) else ():
+            _require_inner_uri(path, name)
     elif file.suffix in (".urdf", ".xml") and file.name != PACKAGE:
-        root = _root(path, data)
+        root = _parse(path, data)
         if file.suffix == ".urdf":
             _require_plain_urdf(path, root)
         for element in root.iter(etree.Element):
-            for key in _PATHS:
+            for key in _PATH_ATTRIBUTES:
                 if uri := element.get(key):
-                    _require_own_uri(path, uri)
+                    _require_inner_uri(path, uri)
 
 
-def _root(path: str, data: bytes) -> etree._Element:
+def _parse(path: str, data: bytes) -> etree._Element:
     try:
         return parse_xml(data, path)
     except FormatError as error:
@@ -153,8 +250,11 @@ def _root(path: str, data: bytes) -> etree._Element:
 
 
 def _require_plain_urdf(path: str, root: etree._Element) -> None:
+    """Require that a description is a URDF without xacro."""
     if root.tag != "robot":
-        raise UploadError(f"{path}: no URDF: its root is <{shortened(str(root.tag))}>, not <robot>")
+        raise UploadError(
+            f"{path}: not a URDF: its root is <{shorten(str(root.tag))}>; expected <robot>"
+        )
     for element in root.iter(etree.Element):
         if "xacro" in (etree.QName(element).namespace or "") or element.prefix == "xacro":
             raise UploadError(
@@ -163,32 +263,23 @@ def _require_plain_urdf(path: str, root: etree._Element) -> None:
             )
 
 
-def _require_own_uri(path: str, uri: str) -> None:
+def _require_inner_uri(path: str, uri: str) -> None:
+    """Require that a path or ``package://`` URI in a file stays inside the upload."""
     name = uri.removeprefix("package://")
     if ":" in name:
         raise UploadError(
-            f"{path}: {shortened(uri)!r}: only relative paths and package:// are taken"
+            f"{path}: {shorten(uri)!r}: only relative paths and package:// are accepted"
         )
     below = name if name != uri else str(PurePosixPath(path).parent / name)
-    if name.startswith(("/", "\\")) or not is_inside(below):
-        raise UploadError(f"{path}: {shortened(uri)!r} leads out of its folder; nothing was kept")
+    if name.startswith(("/", "\\")) or not _stays_inside(below):
+        raise UploadError(f"{path}: {shorten(uri)!r} leads out of its folder; nothing was kept")
 
 
-def _require_own_card(path: str, data: bytes) -> None:
-    try:
-        card = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise UploadError(f"{path}: no valid JSON: {shortened(str(error))}") from error
-    hashes = card.get("hashes") if isinstance(card, dict) else None
-    for name in hashes if isinstance(hashes, dict) else ():
-        _require_own_uri(path, name)
-
-
-def _written(files: dict[str, bytes], uploads: Path) -> str:
-    """Write an upload into a folder of its own, or nothing; return the folder's name."""
-    if sum(1 for _ in uploads.iterdir()) >= MOST_KEPT:
-        raise UploadError(f"{MOST_KEPT} uploads are kept already; start the viewer again")
-    folder = uploads / secrets.token_hex(16)
+def _write_upload(files: dict[str, bytes], uploads: Path) -> str:
+    """Write an upload into a new folder, or nothing; return the folder's name."""
+    if sum(1 for _ in uploads.iterdir()) >= MAX_UPLOADS:
+        raise UploadError(f"{MAX_UPLOADS} uploads are kept already; start the viewer again")
+    folder = uploads / secrets.token_hex(16)  # cannot be guessed by other users of the viewer
     try:
         for path, data in files.items():
             target = folder / path
@@ -196,26 +287,29 @@ def _written(files: dict[str, bytes], uploads: Path) -> str:
             target.write_bytes(data)
         for path, data in files.items():
             if path.endswith(".urdf"):
-                _require_own_meshes(folder, path, data)
-    except OSError as error:
+                _require_inner_meshes(folder, path, data)
+    except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise UploadError(f"the upload cannot be kept: {error.strerror}") from error
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise UploadError(f"the upload cannot be kept: {error.strerror}") from error
         raise
     return folder.name
 
 
-def _require_own_meshes(folder: Path, path: str, data: bytes) -> None:
-    """Require that every mesh of a URDF is found, and in its upload."""
-    for element in _root(path, data).iter("mesh"):
+def _require_inner_meshes(folder: Path, path: str, data: bytes) -> None:
+    """Require that every mesh of a URDF exists in its upload.
+
+    Checked by the function that later reads the meshes, after the text of each path has been
+    checked: it also decodes escapes (``%2f``) and finds packages elsewhere on this machine.
+    """
+    for element in _parse(path, data).iter("mesh"):
         uri = element.get("filename", "")
         try:
-            found = resolve_uri(uri, folder / path, PackageFinder())
+            mesh = resolve_uri(uri, folder / path, PackageFinder())
         except FormatError:
-            found = None
-        if found is None or not found.resolve().is_relative_to(folder):
+            mesh = None
+        if mesh is None or not mesh.resolve().is_relative_to(folder):
             raise UploadError(
-                f"{path}:{element.sourceline}: mesh {shortened(uri)!r} is not in the upload: send "
+                f"{path}:{element.sourceline}: mesh {shorten(uri)!r} is not in the upload: send "
                 "a zip of the folder with its meshes; nothing was kept"
             )

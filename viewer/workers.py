@@ -1,4 +1,4 @@
-"""Processes that draw, compare and write for all browsers; started again if one of them dies."""
+"""A pool of worker processes that serves all browsers and replaces processes that die."""
 
 from __future__ import annotations
 
@@ -16,53 +16,50 @@ T = TypeVar("T")
 
 
 class WorkerDied(MorphgenError):  # noqa: N818
-    """A worker died with what it did; there are others now."""
+    """A worker process died; its pool has been replaced."""
 
 
 class Workers:
-    """A pool of processes, replaced when one of them dies."""
+    """A process pool that is replaced when one of its processes dies."""
 
     def __init__(self, n: int) -> None:
-        """Prepare; processes start with the first work."""
+        """Prepare a pool of ``n`` processes; they start with the first work."""
         self._n = n
         self._lock = threading.Lock()
-        self._pool = self._started()
+        self._pool = self._new_pool()
         self._closed = False
 
     def submit(self, work: Callable[..., T], *arguments: object) -> Future[T]:
-        """Have something done."""
+        """Queue a function call for a process."""
         with self._lock, sigint_blocked():
             try:
                 return self._pool.submit(work, *arguments)
             except BrokenProcessPool:
-                self._replace()
+                if not self._closed:
+                    self._pool.shutdown(wait=False, cancel_futures=True)
+                    self._pool = self._new_pool()
                 return self._pool.submit(work, *arguments)
 
     def result(self, future: Future[T]) -> T:
-        """What a worker found.
+        """Wait for the result of a call.
 
         Raises:
-            WorkerDied: If the worker did, or another one while this waited.
-            MorphgenError: What the work raises.
+            WorkerDied: If a process of the pool died before the call was done.
+            MorphgenError: If the call raises it.
         """
         try:
             return future.result()
         except BrokenProcessPool as error:
             raise WorkerDied(
-                "a worker died, perhaps for want of memory; others were started: try again"
+                "a worker process died, perhaps for lack of memory; others were started: try again"
             ) from error
 
     def close(self) -> None:
-        """End the processes; what waits is not done."""
+        """End the processes; waiting calls are dropped."""
         with self._lock:
             self._closed = True
             self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _replace(self) -> None:
-        if self._closed:
-            return
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        self._pool = self._started()
-
-    def _started(self) -> ProcessPoolExecutor:
+    def _new_pool(self) -> ProcessPoolExecutor:
+        # Spawned, because threads and OpenGL do not survive a fork.
         return ProcessPoolExecutor(self._n, get_context("spawn"), init_worker)

@@ -14,7 +14,7 @@ from morphgen.formats.data_files import read_text
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read_urdf
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX as GRAMMAR_SUFFIX
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_DERIVATION_TEXT
@@ -116,14 +116,35 @@ def read_source(source: RobotSource, library: Library, root: Path | None = None)
     if path is None:
         derivation, name = parse_words(source.words, library)
         return compose(derivation, library, name)
-    light = path / DERIVATION
-    if light.is_file() and not (path / CARD).is_file():
-        derivation = parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
-        return compose(derivation, library, path.resolve().name)
+    if light := light_derivation(path):
+        return compose(light, library, path.resolve().name)
     robot = read_robot(path, root=root)
     if TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames):
         return replace(robot, frames=(*robot.frames, Frame(TOOL, TOOL)))
     return robot
+
+
+def light_derivation(folder: Path) -> Derivation | None:
+    """Return the derivation of a robot of a light set; None for anything else.
+
+    Raises:
+        FormatError: If its file cannot be read.
+        GrammarError: If the derivation is malformed.
+    """
+    path = folder / DERIVATION
+    if not path.is_file() or (folder / CARD).is_file():
+        return None
+    return parse_derivation(read_text(path, MAX_DERIVATION_TEXT), str(path))
+
+
+def is_robot_folder(folder: Path) -> bool:
+    """Return whether a folder is a bundle, or a robot of a light set."""
+    return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
+
+
+def is_set_folder(folder: Path) -> bool:
+    """Return whether a folder is a set of ``morphgen sample``, finished or not."""
+    return (folder / INDEX).is_file() or (folder / SETTINGS).is_file()
 
 
 def is_robot_file(text: str) -> bool:
@@ -141,7 +162,11 @@ def is_robot_file(text: str) -> bool:
 
 
 def _holds_robots(folder: Path) -> bool:
-    return _is_robot(folder) or _is_set(folder) or any(map(_is_robot, folder.iterdir()))
+    return (
+        is_robot_folder(folder)
+        or is_set_folder(folder)
+        or any(map(is_robot_folder, folder.iterdir()))
+    )
 
 
 def _robots_at(path: Path) -> list[Path]:
@@ -158,20 +183,12 @@ def _robots_at(path: Path) -> list[Path]:
 
 def _robots_in(folder: Path) -> Iterator[Path]:
     """Robots of a folder: itself, those of a set, or the bundles in it."""
-    if _is_robot(folder):
+    if is_robot_folder(folder):
         yield folder
-    elif _is_set(folder):
+    elif is_set_folder(folder):
         yield from (folder / record["name"] for record in read_index(folder))
     else:
-        yield from (child for child in sorted(folder.iterdir()) if _is_robot(child))
-
-
-def _is_robot(folder: Path) -> bool:
-    return (folder / CARD).is_file() or (folder / DERIVATION).is_file()
-
-
-def _is_set(folder: Path) -> bool:
-    return (folder / INDEX).is_file() or (folder / SETTINGS).is_file()
+        yield from (child for child in sorted(folder.iterdir()) if is_robot_folder(child))
 
 
 def _requested(words: Sequence[str]) -> RobotSource:

@@ -84,7 +84,7 @@ def test_another_host_is_warned_of(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "why"),
-    [("some.npz", "is no episode of morphgen view"), ("some.pt", "is not a checkpoint")],
+    [("some.npz", "is not an episode of morphgen view"), ("some.pt", "is not a checkpoint")],
 )
 def test_a_file_that_cannot_be_played_is_refused(refused, tmp_path, name, why):
     (tmp_path / name).write_text("something else")

@@ -119,7 +119,7 @@ def test_a_foreign_name_gets_no_websocket(viewer):
     host = f"evil.example:{port}"
     with pytest.raises(InvalidStatus) as refused:
         PlainClient(port, host=host, origin=f"http://{host}")
-    assert b"is no name of this viewer" in refused.value.response.body
+    assert b"is not a name of this viewer" in refused.value.response.body
 
 
 @pytest.mark.parametrize("origin", [None, "http://127.0.0.1:{port}", HUB])

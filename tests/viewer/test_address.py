@@ -4,29 +4,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morphgen.viewer.address import PAGES, Address, AddressError, parse_address
+from morphgen.viewer.address import Address, AddressError, parse_address
+from morphgen.viewer.pages import PAGES, load_page
 
 KEYS = st.from_regex(r"[a-z][a-z_ ]{0,8}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
 
 
 @given(
-    st.sampled_from(PAGES),
+    st.sampled_from(tuple(PAGES)),
     st.lists(TEXTS, min_size=1, max_size=4),
     st.dictionaries(KEYS.filter(lambda key: key not in PAGES), TEXTS.filter(bool)),
 )
-def test_what_is_written_is_read(page, of, state):
-    address = Address(page, tuple(of), state)
+def test_a_written_address_is_read(page, subjects, state):
+    address = Address(page, tuple(subjects), state)
     assert parse_address(address.query) == address
 
 
 @given(st.lists(TEXTS, max_size=3), st.dictionaries(st.just("seed"), TEXTS.filter(bool)))
-def test_robots_that_play_are_read_in_their_order(robots, state):
+def test_robots_of_a_rollout_are_read_in_order(robots, state):
     address = Address("play", ("reach",), state, tuple(robots))
     assert parse_address(address.query) == address
 
 
-def test_a_place_stays_readable():
+def test_a_uri_stays_readable():
     address = Address("robot", ("words:arm=ur5 ee=plane",), {"q": "0.1,-2"})
     assert address.query == "?robot=words:arm=ur5%20ee=plane&q=0.1,-2"
 
@@ -44,7 +45,7 @@ def test_no_query_is_the_first_page():
         ("?play=reach&robot=a&split=b", "two pages: split and play"),
     ],
 )
-def test_what_leads_nowhere_is_refused(query, why):
+def test_an_invalid_address_is_rejected(query, why):
     with pytest.raises(AddressError, match=why):
         parse_address(query)
 
@@ -52,3 +53,8 @@ def test_what_leads_nowhere_is_refused(query, why):
 def test_state_at_its_default_is_left_out():
     address = Address("gallery", ("robots",), {"n": "2", "sort": "name"})
     assert address.with_state(n="", sort="-mass").query == "?gallery=robots&sort=-mass"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_page_of_the_table_can_be_loaded(page):
+    assert callable(load_page(page))

@@ -11,16 +11,15 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.kinematics import joint_limits
-from morphgen.viewer.comparison import all_roles, roles, scaled, with_roles
-from morphgen.viewer.drawings import heatmap_svg, map_svg
-from morphgen.viewer.figures import differences, tokens_png
+from morphgen.viewer.comparison import all_roles, joint_roles, normalized_positions, with_roles
+from morphgen.viewer.figures import heatmap_svg, map_svg, token_differences, tokens_png
 from morphgen.viewer.page_compare import (
-    fit_qualities,
+    compare_robots,
+    fit_quality,
     fit_table,
-    heat,
-    likeness,
-    likeness_table,
-    parse_places,
+    iou_colour,
+    parse_uris,
+    similarity_table,
 )
 
 LIBRARY = default_library()
@@ -32,9 +31,9 @@ def robot_of(words):
 
 
 def test_roles_are_places_on_the_way_to_the_tool():
-    assert roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
+    assert joint_roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
     panda = robot_of("arm=panda ee=panda_hand")
-    assert roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
+    assert joint_roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
     assert all_roles([arm(), panda]) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
 
 
@@ -43,11 +42,11 @@ def test_a_role_moves_every_robot_by_the_same_share():
         home = np.array(robot.home)
         assert with_roles(robot, home, {}) == pytest.approx(home)
         moved = with_roles(robot, home, {"joint 2": -1.0, "finger 1": 1.0, "joint 99": 1.0})
-        rows = {role: i for i, role in enumerate(roles(robot))}
+        rows = {role: i for i, role in enumerate(joint_roles(robot))}
         low, high = joint_limits(robot).T
         assert moved[rows["joint 2"]] == pytest.approx(low[rows["joint 2"]])
         assert moved[rows["finger 1"]] == pytest.approx(high[rows["finger 1"]])
-        values = dict(zip(roles(robot), scaled(robot, home), strict=True))
+        values = dict(zip(joint_roles(robot), normalized_positions(robot, home), strict=True))
         assert with_roles(robot, home, values) == pytest.approx(home)
 
 
@@ -55,7 +54,7 @@ def test_differences_are_those_from_the_first():
     a = np.zeros((2, 48))
     b = np.zeros((3, 48))
     b[1, 5] = 0.1
-    same, other = differences([a, b])
+    same, other = token_differences([a, b])
     assert not same.any()
     assert other[1].nonzero()[0].tolist() == [5]
     assert other[2].all()
@@ -73,17 +72,17 @@ def test_the_picture_of_tokens_is_the_same_every_time():
 
 def test_robots_are_like_themselves():
     robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
-    found = likeness(robots, LIBRARY.folders)
+    found = compare_robots(robots, LIBRARY.folders)
     assert found.values["cosine"].diagonal() == pytest.approx([1, 1])
     assert found.values["tree"].diagonal() == pytest.approx([0, 0])
     assert found.values["tree"][0, 1] > 0
-    table = likeness_table(["<a>", "b"], found)
+    table = similarity_table(["<a>", "b"], found)
     assert "&lt;a&gt; and b" in table
 
 
 def test_fits_have_their_quality():
     robot = robot_of("arm=ur5 ee=plane")
-    found = fit_qualities(robot, LIBRARY.folders)
+    found = fit_quality(robot, LIBRARY.folders)
     assert found["ee_plate"][0] == 1.0
     assert 0.5 < found["arm_forearm_link"][0] < 1.0
     table = fit_table(robot, found)
@@ -92,13 +91,13 @@ def test_fits_have_their_quality():
 
 
 def test_heat_goes_from_red_over_yellow_to_green():
-    assert heat(0.2) == heat(0.5) == (224, 49, 49)
-    assert heat(0.75) == (250, 200, 30)
-    assert heat(1.0) == (47, 158, 68)
+    assert iou_colour(0.2) == iou_colour(0.5) == (224, 49, 49)
+    assert iou_colour(0.75) == (250, 200, 30)
+    assert iou_colour(1.0) == (47, 158, 68)
 
 
 def test_places_are_read_a_line_each():
-    assert parse_places(" a \n\nwords:arm=ur5 ee=plane\n") == ("a", "words:arm=ur5 ee=plane")
+    assert parse_uris(" a \n\nwords:arm=ur5 ee=plane\n") == ("a", "words:arm=ur5 ee=plane")
 
 
 def test_drawings_lead_to_robots_and_escape_names():

@@ -15,7 +15,7 @@ def node(viewer, name):
 def test_robots_are_compared(see, viewer, picture):
     on = viewer()
     page = see("?compare=words:base=gantry ee=plane&compare=robots/some-arm", on=on)
-    page.get_by_text("How alike").wait_for()
+    page.get_by_text("Similarity").wait_for()
     page.get_by_text(re.compile("gantry-plane and arm")).wait_for()
     picture(page, "compare")
     page.get_by_role("tab", name="Tokens").click()

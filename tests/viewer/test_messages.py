@@ -54,13 +54,13 @@ def test_messages_of_a_page_are_taken():
     [
         ("Text", "Search", 3, "expected a text"),
         ("Text", "Search", "x" * 200_001, "expected a text"),
-        ("Dropdown", "Sort by", "/etc/passwd", "none of the choices"),
-        ("Dropdown", "Sort by", ["name"], "none of the choices"),
-        ("ButtonGroup", "Page", "beyond", "none of the choices"),
+        ("Dropdown", "Sort by", "/etc/passwd", "not one of the choices"),
+        ("Dropdown", "Sort by", ["name"], "not one of the choices"),
+        ("ButtonGroup", "Page", "beyond", "not one of the choices"),
         ("UploadButton", "Look at a URDF or a zipped bundle", "x", "takes no value"),
     ],
 )
-def test_a_value_that_a_control_cannot_have_is_refused(viewer, capfd, kind, label, value, why):
+def test_a_value_that_a_control_cannot_have_is_rejected(viewer, capfd, kind, label, value, why):
     with PlainClient(viewer().port) as client:
         client.change(client.control(kind, label), value)
         client.shows("That did not work")

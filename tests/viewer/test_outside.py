@@ -99,8 +99,8 @@ def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, quer
 def test_an_odd_address_has_a_sentence_for_an_answer(viewer, capfd, query, why):
     with PlainClient(viewer().port, query) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
-        said = client.text.replace("&#x27;", "'")
-        assert re.search(why, said), said[-600:]
+        shown = client.text.replace("&#x27;", "'")
+        assert re.search(why, shown), shown[-600:]
     assert capfd.readouterr().err == ""
 
 

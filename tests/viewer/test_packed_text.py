@@ -1,4 +1,4 @@
-"""Texts that fit into an address come back from it; others are refused."""
+"""Texts are packed into addresses and unpacked again; invalid ones are rejected."""
 
 import base64
 import random
@@ -9,23 +9,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morphgen.viewer.address import Address, AddressError, parse_address
-from morphgen.viewer.packed_text import LARGEST, LONGEST, packed, unpacked
+from morphgen.viewer.address import (
+    MAX_PACKED,
+    MAX_UNPACKED,
+    Address,
+    AddressError,
+    pack_text,
+    parse_address,
+    unpack_text,
+)
 
 
 @given(st.text(max_size=300))
 def test_a_text_comes_back_from_an_address(text):
-    address = Address("compose", ("chain",), {"text": packed(text)})
+    address = Address("compose", ("chain",), {"text": pack_text(text)})
     assert "%" not in address.query
-    assert unpacked(parse_address(address.query).state["text"]) == text
+    assert unpack_text(parse_address(address.query).state["text"]) == text
 
 
-def test_a_text_that_is_too_long_is_refused():
-    letters = random.Random(0).choices(string.printable, k=2 * LONGEST)
-    with pytest.raises(AddressError, match=f"too long for the page's address.*at most {LONGEST}"):
-        packed("".join(letters))
-    with pytest.raises(AddressError, match=f"at most {LONGEST} are read"):
-        unpacked("A" * (LONGEST + 1))
+def test_a_text_that_is_too_long_is_rejected():
+    letters = random.Random(0).choices(string.printable, k=2 * MAX_PACKED)
+    with pytest.raises(AddressError, match=f"too long for the page.*at most {MAX_PACKED}"):
+        pack_text("".join(letters))
+    with pytest.raises(AddressError, match=f"at most {MAX_PACKED} are read"):
+        unpack_text("A" * (MAX_PACKED + 1))
 
 
 def letters_of(data):
@@ -35,14 +42,14 @@ def letters_of(data):
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        ("!!", "no text that can be read"),
-        (letters_of(b"no zlib"), "no text that can be read"),
-        (letters_of(zlib.compress(b"a text")[:-3]), "no whole text"),
-        (letters_of(zlib.compress(b"\xff\xfe")), "no text that can be read"),
-        (letters_of(zlib.compress(b"a" * (LARGEST + 1))), f"more than {LARGEST} bytes"),
+        ("!!", "no readable text"),
+        (letters_of(b"no zlib"), "no readable text"),
+        (letters_of(zlib.compress(b"a text")[:-3]), "an incomplete text"),
+        (letters_of(zlib.compress(b"\xff\xfe")), "no readable text"),
+        (letters_of(zlib.compress(b"a" * (MAX_UNPACKED + 1))), f"more than {MAX_UNPACKED} bytes"),
     ],
     ids=["letters", "zlib", "cut", "utf-8", "bomb"],
 )
-def test_what_is_no_packed_text_is_refused(content, why):
+def test_an_invalid_packed_text_is_rejected(content, why):
     with pytest.raises(AddressError, match=why):
-        unpacked(content)
+        unpack_text(content)

@@ -1,4 +1,4 @@
-"""Bodies do their tasks in a browser."""
+"""Robots do their tasks in a browser."""
 
 import re
 import threading
@@ -46,7 +46,7 @@ def download(page, button):
     return found.value
 
 
-def test_a_body_reaches_and_is_scrubbed_and_stepped(see, viewer, picture):
+def test_a_robot_reaches_and_is_scrubbed_and_stepped(see, viewer, picture):
     on = viewer()
     page = see(f"?play=reach&robot={CUBE}&policy=ik&seed=3", on=on)
     wait_for_end(page)
@@ -62,7 +62,7 @@ def test_a_body_reaches_and_is_scrubbed_and_stepped(see, viewer, picture):
     assert page.failures == []
 
 
-def test_an_address_is_told_and_new_episodes_have_other_seeds(see, viewer):
+def test_the_address_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page = see(f"?play=reach&robot={CUBE}&policy=random")
     page.wait_for_url(re.compile(r"policy=random&seed=0"))
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
@@ -84,7 +84,7 @@ def test_an_episode_is_saved_opened_and_made_into_a_scene_and_a_film(
     saved = download(page, "Save episode")
     assert saved.suggested_filename == "reach-planar-cube-1.npz"
     saved.save_as(folder / "episode.npz")
-    episode = read_episode(folder / "episode.npz", on.places)
+    episode = read_episode(folder / "episode.npz", on.files)
     assert [len(track.q) for track in episode.tracks] == [301, 301]
     assert all(score_until(track, "reach", 300) > 100 for track in episode.tracks)
     scene = download(page, "Scene (.viser)").path().read_bytes()
@@ -99,20 +99,20 @@ def test_an_episode_is_saved_opened_and_made_into_a_scene_and_a_film(
     assert page.failures == []
 
 
-def test_bodies_are_changed_and_put_beside(see, viewer, picture):
+def test_robots_are_replaced_added_and_removed(see, viewer, picture):
     page = see("?play=reach&robot=robots/prims/prims-000001&policy=ik")
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
-    choose(page, "body", "prims-000002")
+    choose(page, "robot", "prims-000002")
     page.wait_for_url(re.compile(r"robot=robots/prims/prims-000002&policy=ik"))
     number(page, "or words").fill("base=planar ee=cube")
-    press(page, "beside")
+    press(page, "add")
     page.wait_for_url(re.compile(r"prims-000002&robot=words:base=planar%20ee=cube"))
     page.get_by_role("cell", name="planar-cube").wait_for()
-    press(page, "alone")
+    press(page, "only")
     page.wait_for_url(re.compile(r"play=reach&robot=robots/prims/prims-000002&policy"))
 
 
-def test_what_cannot_play_says_why_in_a_sentence(see, viewer):
+def test_a_robot_that_cannot_do_the_task_says_why(see, viewer):
     page = see(f"?play=push&robot={CUBE}")
     page.get_by_text(re.compile("robot 'planar-cube' can hardly push")).wait_for()
     choose(page, "task", "reach")
@@ -133,11 +133,11 @@ def test_what_cannot_play_says_why_in_a_sentence(see, viewer):
         ("?play=nothing.npz", "no such file"),
     ],
 )
-def test_addresses_that_play_nothing_say_why(see, query, why):
+def test_an_invalid_rollout_says_why(see, query, why):
     see(query).get_by_text(re.compile(re.escape(why))).first.wait_for()
 
 
-def test_a_checkpoint_plays_the_body_it_was_trained_on(see, viewer, folder, tmp_path):
+def test_a_checkpoint_starts_with_the_robot_it_was_trained_on(see, viewer, folder, tmp_path):
     train(folder / "runs" / "small", small_config(small_source()), execution=QUIET)
     on = viewer("runs/small")
     page = see(on=on)

@@ -1,4 +1,4 @@
-"""A player simulates, shows and obeys on a thread of its own."""
+"""A player simulates, shows steps and takes commands on a thread of its own."""
 
 import threading
 import time
@@ -15,10 +15,10 @@ WAIT = 30
 class Counting:
     """An episode of so many steps, each of which takes a while."""
 
-    longest = 100
+    max_steps = 100
 
     def __init__(self, steps=100, pause=0.0, fault=None):
-        self.episode = SimpleNamespace(steps=0, period=0.02)
+        self.episode = SimpleNamespace(num_steps=0, period=0.02)
         self.closed = False
         self._steps, self._pause, self._fault = steps, pause, fault
 
@@ -26,33 +26,33 @@ class Counting:
         time.sleep(self._pause)
         if self._fault is not None:
             raise self._fault
-        more = self.episode.steps < self._steps
-        self.episode.steps += more
+        more = self.episode.num_steps < self._steps
+        self.episode.num_steps += more
         return more
 
     def close(self):
         self.closed = True
 
 
-class Screen:
+class Display:
     def __init__(self):
         self.steps, self.faults, self.threads = [], [], set()
         self.changed = threading.Condition()
 
-    def prepared(self, source):
-        self._tell(lambda: self.steps.append("prepared"))
+    def show_start(self, source):
+        self._record(lambda: self.steps.append("start"))
 
-    def shown(self, step):
+    def show_step(self, step):
         self.threads.add(threading.current_thread())
-        self._tell(lambda: self.steps.append(step))
+        self._record(lambda: self.steps.append(step))
 
-    def stopped(self):
-        self._tell(lambda: self.steps.append("stopped"))
+    def show_stopped(self):
+        self._record(lambda: self.steps.append("stopped"))
 
-    def failed(self, why):
-        self._tell(lambda: self.faults.append(why))
+    def show_failure(self, why):
+        self._record(lambda: self.faults.append(why))
 
-    def _tell(self, change):
+    def _record(self, change):
         with self.changed:
             change()
             self.changed.notify_all()
@@ -63,85 +63,85 @@ class Screen:
 
 
 @pytest.fixture
-def screen():
-    return Screen()
+def display():
+    return Display()
 
 
 @pytest.fixture
-def player(screen):
-    made = Player(screen)
+def player(display):
+    made = Player(display)
     yield made
     made.stop()
     assert made.join(WAIT)
 
 
-def test_it_plays_to_the_end_in_order_and_again_from_the_start(player, screen):
+def test_an_episode_plays_to_its_end_and_restarts(player, display):
     source = Counting()
-    player.at_speed(4.0)
-    player.prepare(lambda: source)
-    screen.wait_for(lambda: screen.steps[-1:] == ["stopped"])
-    assert screen.steps[:2] == ["prepared", 0]
-    numbers = screen.steps[1:-1]
+    player.set_speed(4.0)
+    player.load(lambda: source)
+    display.wait_for(lambda: display.steps[-1:] == ["stopped"])
+    assert display.steps[:2] == ["start", 0]
+    numbers = display.steps[1:-1]
     assert numbers == sorted(set(numbers))
-    assert numbers[-1] == source.episode.steps == 100
-    screen.steps.clear()
+    assert numbers[-1] == source.episode.num_steps == 100
+    display.steps.clear()
     player.play()
-    screen.wait_for(lambda: screen.steps[-1:] == ["stopped"])
-    assert screen.steps[0] < 100
-    assert screen.threads == {player._thread}
+    display.wait_for(lambda: display.steps[-1:] == ["stopped"])
+    assert display.steps[0] < 100
+    assert display.threads == {player._thread}
 
 
-def test_it_is_paused_stepped_and_scrubbed(player, screen):
+def test_playback_is_paused_stepped_and_scrubbed(player, display):
     source = Counting()
-    player.prepare(lambda: source, play=False)
+    player.load(lambda: source, play=False)
     for _ in range(3):
         player.go_by(1)
-    screen.wait_for(lambda: 3 in screen.steps)
-    assert source.episode.steps == 3
+    display.wait_for(lambda: 3 in display.steps)
+    assert source.episode.num_steps == 3
     player.go_by(-2)
-    screen.wait_for(lambda: screen.steps[-2:] == [1, "stopped"])
+    display.wait_for(lambda: display.steps[-2:] == [1, "stopped"])
     player.go_to(50)
-    screen.wait_for(lambda: screen.steps[-2:] == [3, "stopped"])
-    assert source.episode.steps == 3
+    display.wait_for(lambda: display.steps[-2:] == [3, "stopped"])
+    assert source.episode.num_steps == 3
     player.go_by(-9)
-    screen.wait_for(lambda: screen.steps[-2:] == [0, "stopped"])
+    display.wait_for(lambda: display.steps[-2:] == [0, "stopped"])
 
 
-def test_what_is_slow_is_shown_as_it_comes(player, screen):
+def test_slow_steps_are_shown_as_they_come(player, display):
     source = Counting(steps=8, pause=0.1)
-    player.at_speed(4.0)
-    player.prepare(lambda: source)
-    screen.wait_for(lambda: screen.steps[-1:] == ["stopped"])
-    assert len(screen.steps) >= 6
+    player.set_speed(4.0)
+    player.load(lambda: source)
+    display.wait_for(lambda: display.steps[-1:] == ["stopped"])
+    assert len(display.steps) >= 6
 
 
-def test_another_episode_frees_the_one_before(player, screen):
+def test_another_episode_frees_the_previous_one(player, display):
     sources = [Counting(), Counting()]
     for source in sources:
-        player.prepare(lambda source=source: source, play=False)
-        screen.wait_for(lambda: "prepared" in screen.steps)
-        screen.steps.clear()
+        player.load(lambda source=source: source, play=False)
+        display.wait_for(lambda: "start" in display.steps)
+        display.steps.clear()
     assert [source.closed for source in sources] == [True, False]
     player.stop()
     assert player.join(WAIT)
     assert sources[1].closed
 
 
-def test_what_fails_is_told_and_the_next_can_play(player, screen):
+def test_a_failure_is_shown_and_the_next_episode_can_play(player, display):
     def fail():
         raise TaskError("no such body")
 
-    player.prepare(fail)
-    screen.wait_for(lambda: screen.faults == ["no such body"])
+    player.load(fail)
+    display.wait_for(lambda: display.faults == ["no such body"])
     player.play()
     player.go_by(1)
-    player.prepare(lambda: Counting(fault=TaskError("unstable")))
-    screen.wait_for(lambda: screen.faults == ["no such body", "unstable"])
-    player.prepare(Counting, play=False)
-    screen.wait_for(lambda: screen.steps[-2:] == ["prepared", 0])
+    player.load(lambda: Counting(fault=TaskError("unstable")))
+    display.wait_for(lambda: display.faults == ["no such body", "unstable"])
+    player.load(Counting, play=False)
+    display.wait_for(lambda: display.steps[-2:] == ["start", 0])
 
 
-def test_it_ends_while_it_prepares(screen):
+def test_a_player_stops_while_it_loads(display):
     begun, source = threading.Event(), Counting()
 
     def slow():
@@ -149,8 +149,8 @@ def test_it_ends_while_it_prepares(screen):
         time.sleep(0.3)
         return source
 
-    player = Player(screen)
-    player.prepare(slow)
+    player = Player(display)
+    player.load(slow)
     assert begun.wait(WAIT)
     player.stop()
     assert player.join(WAIT)

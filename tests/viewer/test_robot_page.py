@@ -16,7 +16,7 @@ from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.model.kinematics import frame_pose
-from morphgen.viewer.robot_state import joints_text
+from morphgen.viewer.page_robot_show import format_joints
 from morphgen.viewer.robot_uri import read_robot_uri
 from morphgen.viewer.scene_robot import RED
 
@@ -91,9 +91,11 @@ def test_an_address_brings_a_configuration_and_layers_back(see, viewer, picture)
 def test_collisions_are_red_while_they_last(see, viewer):
     on = viewer()
     q = [0.0, -1.0, 2.6, 2.5, 0.0, 0.0]
-    page = see(f"?robot=words:arm=ur5 ee=plane&q={joints_text(q)}&show=visual,ignored pairs", on=on)
+    page = see(
+        f"?robot=words:arm=ur5 ee=plane&q={format_joints(q)}&show=visual,ignored pairs", on=on
+    )
     page.get_by_text("collision", exact=True).wait_for()
-    robot = read_robot_uri("words:arm=ur5 ee=plane", on.places)
+    robot = read_robot_uri("words:arm=ur5 ee=plane", on.files)
     (pairs,) = SelfCollisionChecker(robot).penetrations([q])
     assert len(pairs) > 0
     links = [robot.link_index[name] for pair in pairs for name in pair]
@@ -122,29 +124,29 @@ def test_workspace_trail_and_gizmo(see, viewer, picture):
     names = session.client.scene._handle_from_node_name
     page.wait_for_timeout(1000)
     assert {"/robot/workspace", "/robot/trail", "/gizmo"} <= names.keys()
-    robot = read_robot_uri("robots/some-arm", on.places)
+    robot = read_robot_uri("robots/some-arm", on.files)
     pose = frame_pose(robot, [0.5, *robot.home[1:]])
     assert names["/gizmo"].position == pytest.approx(pose[:3, 3], abs=1e-6)
     picture(page)
 
 
 @pytest.mark.slow
-def test_links_and_findings_are_told(see, viewer):
+def test_links_and_findings_are_shown(see, viewer):
     on = viewer()
-    place = "words:arm=panda ee=panda_hand"
-    page = see(f"?robot={place}", on=on)
+    uri = "words:arm=panda ee=panda_hand"
+    page = see(f"?robot={uri}", on=on)
     wait_for_page(page)
     show_tab(page, "Links")
     page.get_by_role("cell", name="ee_panda_rightfinger").wait_for()
     show_tab(page, "Check")
-    codes = {finding.code for finding in check(read_robot_uri(place, on.places))}
+    codes = {finding.code for finding in check(read_robot_uri(uri, on.files))}
     assert len(codes) > 0
     for code in codes:
         page.get_by_text(code, exact=True).first.wait_for()
 
 
 @pytest.mark.slow
-def test_a_bundle_is_taken_away_whole(see, folder):
+def test_a_bundle_is_downloaded_whole(see, folder):
     page = see(ARM)
     wait_for_page(page)
     show_tab(page, "Get")
@@ -244,7 +246,7 @@ def test_a_browser_that_is_killed_leaves_nothing(see, viewer, browser_command, t
             b'<mesh filename="../../secret.stl"/></geometry></visual></link></robot>',
             "leads out of its folder",
         ),
-        ("large.urdf", b" " * (200 * 2**20), "large.urdf: 200 MB; at most 100 MB are taken"),
+        ("large.urdf", b" " * (200 * 2**20), "large.urdf: 200 MB; at most 100 MB are accepted"),
     ],
     ids=["no-urdf", "climbs-out", "large"],
 )

@@ -1,4 +1,4 @@
-"""What a robot's page says."""
+"""Texts, tables and configurations of a robot's page."""
 
 from dataclasses import replace
 
@@ -8,29 +8,34 @@ import pytest
 from helpers.robots import arm
 from morphgen.model.robot import Inertial
 from morphgen.viewer.page_robot import free_configuration
-from morphgen.viewer.robot_state import joints_text, parse_joints
+from morphgen.viewer.page_robot_show import format_joints, parse_joints
 from morphgen.viewer.robot_tables import (
-    chains,
     collision_text,
+    joint_groups,
     joint_hint,
     link_details,
     link_table,
     slider_step,
     summary,
 )
-from morphgen.viewer.scene_robot import inertia_semi_axes, robot_bounds
+from morphgen.viewer.scene_robot import inertia_ellipsoid, robot_bounds
 
 
 def test_joints_are_grouped_by_their_part():
     robot = arm()
-    assert [(chain.title, chain.rows) for chain in chains(robot)] == [("joints", (0, 1, 2, 3))]
+    assert [(chain.title, chain.rows) for chain in joint_groups(robot)] == [
+        ("joints", (0, 1, 2, 3))
+    ]
     renamed = tuple(
         replace(joint, name=f"{'ee' if i > 2 else 'arm'}_{joint.name}", mimic=None, limits=(-1, 1))
         for i, joint in enumerate(robot.joints)
     )
     parts = [{"label": "arm", "part": "x"}, {"label": "ee", "part": "y"}]
-    made = replace(robot, joints=renamed, home=(0,) * 5, provenance={"parts": parts})
-    assert [(c.title, c.rows) for c in chains(made)] == [("arm: x", (0, 1, 2)), ("ee: y", (3, 4))]
+    named = replace(robot, joints=renamed, home=(0,) * 5, provenance={"parts": parts})
+    assert [(c.title, c.rows) for c in joint_groups(named)] == [
+        ("arm: x", (0, 1, 2)),
+        ("ee: y", (3, 4)),
+    ]
 
 
 def test_a_hint_names_kind_and_limits():
@@ -63,7 +68,7 @@ def test_tables_name_every_link_and_escape_it():
     assert summary(robot, 0.9).startswith("6 links · 4 DoF · 1 mimic joint · ")
 
 
-def test_collisions_are_told_deepest_first():
+def test_collisions_are_listed_deepest_first():
     assert "no self-collision" in collision_text({})
     text = collision_text({("a", "b"): 0.001, ("c", "d"): 0.02})
     assert text.index("c in d: 20.0 mm") < text.index("a in b: 1.0 mm")
@@ -72,7 +77,7 @@ def test_collisions_are_told_deepest_first():
 def test_configurations_go_through_addresses():
     robot = arm()
     q = np.array([0.1234, -1.5, 0.02, 0.04])
-    assert parse_joints(joints_text(q), robot) == pytest.approx(q)
+    assert parse_joints(format_joints(q), robot) == pytest.approx(q)
     assert parse_joints("9,9,9,9", robot) == pytest.approx([2, 2, 0.04, 0.04])
     for bad in ("", "1,2", "a,b,c,d", "nan,0,0,0"):
         assert parse_joints(bad, robot) is None
@@ -81,14 +86,14 @@ def test_configurations_go_through_addresses():
 def test_the_ellipsoid_has_the_inertia_of_the_link():
     a, b, c, m = 0.1, 0.2, 0.3, 2.0
     moments = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) * m / 5
-    found = inertia_semi_axes(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
+    found = inertia_ellipsoid(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
     assert found is not None
     sizes, axes = found
     rebuilt = axes @ np.diag(m / 5 * (np.sum(sizes**2) - sizes**2)) @ axes.T
     assert rebuilt == pytest.approx(np.diag(moments))
     assert np.linalg.det(axes) == pytest.approx(1)
-    assert inertia_semi_axes(Inertial(0.0)) is None
-    assert inertia_semi_axes(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
+    assert inertia_ellipsoid(Inertial(0.0)) is None
+    assert inertia_ellipsoid(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
 
 
 def test_bounds_hold_the_foot_and_the_tip():
@@ -101,7 +106,7 @@ def test_a_free_configuration_is_free():
     from morphgen.checks.self_collision import SelfCollisionChecker
 
     robot = arm()
-    tested = SelfCollisionChecker(robot)
-    q = free_configuration(tested, robot, np.random.default_rng(0))
+    checker = SelfCollisionChecker(robot)
+    q = free_configuration(checker, robot, np.random.default_rng(0))
     assert q is not None
-    assert list(tested.penetrations([q])) == [{}]
+    assert list(checker.penetrations([q])) == [{}]

@@ -1,4 +1,4 @@
-"""Robots are found at their places, and nowhere else."""
+"""Robots are found at their files, and nowhere else."""
 
 import tempfile
 from pathlib import Path
@@ -10,12 +10,13 @@ from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
+from morphgen.viewer.app import start_address
 from morphgen.viewer.robot_rows import (
-    folder_entries,
-    neighbours,
-    part_entries,
-    split_entries,
-    subfolders,
+    folder_rows,
+    neighbour_uris,
+    part_rows,
+    robot_subfolders,
+    split_rows,
 )
 from morphgen.viewer.robot_uri import (
     FileAccess,
@@ -25,11 +26,10 @@ from morphgen.viewer.robot_uri import (
     resolve_split,
     with_library_meshes,
 )
-from morphgen.viewer.targets import target_address
 
 
 @pytest.fixture
-def places(tmp_path, monkeypatch):
+def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_bundle(arm(), tmp_path / "robots" / "one", picture=False)
     (tmp_path / "uploads").mkdir()
@@ -53,8 +53,8 @@ SPLIT = "extrapolation/primitives/reach"
         (["base=planar", "ee=cube"], "?robot=words:base=planar%20ee=cube"),
     ],
 )
-def test_a_target_is_what_it_is(places, words, query):
-    assert target_address(words, places).query == query
+def test_a_target_opens_its_page(files, words, query):
+    assert start_address(words, files).query == query
 
 
 @pytest.mark.parametrize(
@@ -66,13 +66,13 @@ def test_a_target_is_what_it_is(places, words, query):
         (["/etc"], "outside of the folders"),
     ],
 )
-def test_an_unknown_target_is_refused(places, words, why):
+def test_an_unknown_target_is_rejected(files, words, why):
     with pytest.raises(MorphgenError, match=why):
-        target_address(words, places)
+        start_address(words, files)
 
 
 @pytest.mark.parametrize(
-    ("place", "name"),
+    ("uri", "name"),
     [
         ("robots/one", "arm"),
         ("robots/one/robot.urdf", "arm"),
@@ -81,23 +81,23 @@ def test_an_unknown_target_is_refused(places, words, why):
         (f"split:{SPLIT}@test/chain-000001", "chain-000001"),
     ],
 )
-def test_robots_are_read(places, place, name):
-    robot = read_robot_uri(place, places)
+def test_robots_are_read(files, uri, name):
+    robot = read_robot_uri(uri, files)
     assert robot.name.startswith(name)
     assert robot.dof > 0
 
 
 @pytest.mark.parametrize(
-    "place",
+    "uri",
     ["../x", "/etc/passwd", "upload:../../etc/passwd", "robots/../../x", "upload:/etc/hostname"],
 )
-def test_nothing_outside_is_read(places, place):
+def test_nothing_outside_is_read(files, uri):
     with pytest.raises(UriError, match="outside of the folders"):
-        read_robot_uri(place, places)
+        read_robot_uri(uri, files)
 
 
 @pytest.mark.parametrize(
-    ("place", "why"),
+    ("uri", "why"),
     [
         (f"split:{SPLIT}@both/x", "expected split:NAME@train/ROBOT"),
         (f"split:{SPLIT}@test/chain-000009", "did you mean 'chain-000001'|no test robot"),
@@ -105,23 +105,23 @@ def test_nothing_outside_is_read(places, place):
         ("words:arm", "'arm' is no part"),
     ],
 )
-def test_bad_places_say_why(places, place, why):
+def test_invalid_uris_say_why(files, uri, why):
     with pytest.raises(MorphgenError, match=why):
-        read_robot_uri(place, places)
+        read_robot_uri(uri, files)
 
 
-def test_a_key_changes_with_the_file(places):
-    before = content_hash("robots/one", places)
-    assert content_hash("robots/one", places) == before
-    urdf = places.path("robots/one/robot.urdf")
+def test_a_key_changes_with_the_file(files):
+    before = content_hash("robots/one", files)
+    assert content_hash("robots/one", files) == before
+    urdf = files.path("robots/one/robot.urdf")
     urdf.write_text(urdf.read_text() + "\n")
-    assert content_hash("robots/one", places) != before
-    words = content_hash("words:base=planar ee=cube", places)
-    assert words == content_hash("derivation:" + str(_derivation(places)), places)
+    assert content_hash("robots/one", files) != before
+    words = content_hash("words:base=planar ee=cube", files)
+    assert words == content_hash("derivation:" + str(_derivation(files)), files)
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("{uploads}/ab/a.urdf:3: bad", "upload:ab/a.urdf:3: bad"),
         ("{uploads}: bad", "upload:: bad"),
@@ -134,51 +134,51 @@ def test_a_key_changes_with_the_file(places):
         ("a\0b\nc", "a\\x00b\\nc"),
     ],
 )
-def test_a_page_tells_no_folder_of_the_machine(text, told):
+def test_errors_name_no_folder_of_the_machine(text, expected):
     root, temporary = Path("/home/me/work"), tempfile.gettempdir()
-    places = FileAccess((), (root,), Path(temporary) / "morphgen-uploads-1")
-    given = text.format(uploads=places.uploads, root=root, temporary=temporary)
-    assert places.told(given) == told
+    files = FileAccess((), (root,), Path(temporary) / "morphgen-uploads-1")
+    given = text.format(uploads=files.uploads, root=root, temporary=temporary)
+    assert files.redact(given) == expected
 
 
-def _derivation(places):
+def _derivation(files):
     from morphgen.viewer.robot_uri import resolve_derivation
 
-    return resolve_derivation("words:base=planar ee=cube", places)
+    return resolve_derivation("words:base=planar ee=cube", files)
 
 
-def test_a_bundle_takes_the_librarys_meshes_only_if_it_is_the_same(places, tmp_path):
-    made = read_robot_uri("words:arm=ur5 ee=plane", places)
+def test_a_bundle_takes_the_librarys_meshes_only_if_it_is_the_same(files, tmp_path):
+    made = read_robot_uri("words:arm=ur5 ee=plane", files)
     bundle = write_bundle(made, tmp_path / "robots" / "ur5", picture=False)
-    read = read_robot_uri("robots/ur5", places)
-    assert robot_hash(with_library_meshes(read, places.library)) == robot_hash(made)
+    read = read_robot_uri("robots/ur5", files)
+    assert robot_hash(with_library_meshes(read, files.library)) == robot_hash(made)
     text = (bundle / "robot.urdf").read_text()
     (bundle / "robot.urdf").write_text(text.replace('mass value="3.7"', 'mass value="3.8"'))
-    changed = read_robot_uri("robots/ur5", places)
+    changed = read_robot_uri("robots/ur5", files)
     assert changed.mass != made.mass
-    assert with_library_meshes(changed, places.library) is changed
+    assert with_library_meshes(changed, files.library) is changed
 
 
-def test_folders_are_listed(places, tmp_path):
+def test_folders_are_listed(files, tmp_path):
     broken = write_bundle(arm(), tmp_path / "robots" / "two", picture=False)
     (broken / "card.json").write_text("{")
     (tmp_path / "robots" / "three.urdf").write_text("<robot/>")
-    rows = folder_entries("robots", places)
+    rows = folder_rows("robots", files)
     assert [(row.name, row.dof, row.findings) for row in rows] == [
         ("one", 4, ()),
         ("three.urdf", None, None),
         ("two", None, ("unreadable",)),
     ]
-    assert subfolders(tmp_path) == ["robots"]
+    assert robot_subfolders(tmp_path) == ["robots"]
     with pytest.raises(UriError, match="holds no robot"):
-        folder_entries("uploads", places)
+        folder_rows("uploads", files)
 
 
-def test_splits_and_parts_are_listed(places):
-    rows = split_entries(SPLIT, resolve_split(SPLIT, places))
+def test_splits_and_parts_are_listed(files):
+    rows = split_rows(SPLIT, resolve_split(SPLIT, files))
     assert [row.role for row in rows] == ["train"] * 10 + ["test"] * 2
-    assert neighbours(rows[1].place, places) == (rows[0].place, rows[2].place)
-    assert neighbours(rows[0].place, places)[0] == ""
-    parts = part_entries(places.library)
+    assert neighbour_uris(rows[1].uri, files) == (rows[0].uri, rows[2].uri)
+    assert neighbour_uris(rows[0].uri, files)[0] == ""
+    parts = part_rows(files.library)
     assert {row.role for row in parts} == {"arm", "ee", "body"}
-    assert "words:arm=ur5" in [row.place for row in parts]
+    assert "words:arm=ur5" in [row.uri for row in parts]

@@ -1,4 +1,4 @@
-"""Episodes of playback are those of ``morphgen play``, and come back from their files."""
+"""Rollouts equal those of ``morphgen play``, and episodes come back from their files."""
 
 import json
 from dataclasses import replace
@@ -19,13 +19,13 @@ from morphgen.rl.play import make_controller, play
 from morphgen.rl.training import train
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.viewer.address import Address
-from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, still
-from morphgen.viewer.episode_export import recording, renderer_of
-from morphgen.viewer.page_play_controls import address_of, parse_rollout
+from morphgen.viewer.app import start_address
+from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
+from morphgen.viewer.episode_export import make_renderer, record_scene
+from morphgen.viewer.page_play_controls import parse_rollout, rollout_address
 from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess
-from morphgen.viewer.rollout import Recorded, Rollout, RolloutConfig, simulators
-from morphgen.viewer.scene_episode import GAP, area, places_in_grid
-from morphgen.viewer.targets import target_address
+from morphgen.viewer.rollout import RecordedEpisode, Rollout, RolloutConfig, simulators
+from morphgen.viewer.scene_rollout import GAP, grid_positions, track_area
 
 CUBE = "words:base=planar ee=cube"
 
@@ -38,7 +38,7 @@ def root(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def places(root):
+def files(root):
     return FileAccess(default_library().folders, (root,), root / "none")
 
 
@@ -50,43 +50,43 @@ def cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def episode(places, cache):
-    """Two bodies that reached: one composed, one a bundle."""
-    rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "ik", 3), places)
+def episode(files, cache):
+    """Two robots that reach: one composed, one from a bundle."""
+    rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "ik", 3), files)
     while rollout.advance():
         pass
     rollout.close()
     return rollout.episode
 
 
-def test_an_episode_is_the_one_that_morphgen_play_has(episode):
+def test_an_episode_equals_that_of_morphgen_play(episode):
     env = TaskEnv("reach", "planar-cube", sim="mujoco")
     results = []
     list(play(env, make_controller("ik", env, 3), 1, 3, results.append))
     env.close()
     track = episode.tracks[0]
     (result,) = results
-    assert track.steps == 300
+    assert track.num_steps == 300
     assert track.distance[-1] == pytest.approx(result.distance)
     assert score_until(track, "reach", 300) == pytest.approx(result.score)
     assert track.success[-1] == result.success
 
 
-def test_a_score_is_of_the_steps_until_then(episode):
+def test_a_score_counts_the_steps_so_far(episode):
     track = episode.tracks[0]
     assert score_until(track, "reach", 0) is None
     assert score_until(track, "reach", 2) == pytest.approx(sum(track.score[:2]) / 2)
     assert score_until(track, "push", 2) == track.score[1]
 
 
-def test_an_episode_comes_back_from_its_file(episode, places, root):
+def test_an_episode_comes_back_from_its_file(episode, files, root):
     content = episode_bytes(episode)
     assert content == episode_bytes(episode)
     (root / "episode.npz").write_bytes(content)
-    read = read_episode(root / "episode.npz", places)
+    read = read_episode(root / "episode.npz", files)
     assert (read.task, read.policy, read.seed, read.simulator) == ("reach", "ik", 3, "mujoco")
     for one, other in zip(read.tracks, episode.tracks, strict=True):
-        assert one.place == other.place
+        assert one.uri == other.uri
         assert np.array_equal(one.q, other.q)
         assert np.array_equal(one.marker_poses["goal"], other.marker_poses["goal"])
         assert one.score == pytest.approx(other.score, rel=1e-6)
@@ -100,13 +100,13 @@ def test_an_episode_comes_back_from_its_file(episode, places, root):
         assert file["1/tool"][-1, :3] == pytest.approx(last[:3, 3], abs=1e-6)
 
 
-def test_an_episode_is_what_a_viewer_can_be_started_for(episode, places, root, monkeypatch):
+def test_a_viewer_can_be_started_for_an_episode(episode, files, root, monkeypatch):
     monkeypatch.chdir(root)
     (root / "episode.npz").write_bytes(episode_bytes(episode))
-    assert target_address(("episode.npz",), places) == Address("play", ("episode.npz",))
+    assert start_address(("episode.npz",), files) == Address("play", ("episode.npz",))
 
 
-def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, places, root):
+def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, files, root):
     for extra, marker in ((None, "goal"), (0.2, "line")):
         path = root / "first.npz"
         path.write_bytes(episode_bytes(episode))
@@ -122,7 +122,7 @@ def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, place
             else:
                 row["block"], arrays[f"{i}/block"] = [0.2, 0.2, 0.2], block
         np.savez(path, **(arrays | {"about": np.array(json.dumps(about))}))
-        track = read_episode(path, places).tracks[0]
+        track = read_episode(path, files).tracks[0]
         (shown,) = track.markers
         assert (shown.name, len(track.marker_poses[marker])) == (marker, 301)
         if extra is None:
@@ -133,13 +133,13 @@ def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, place
             assert track.marker_poses["line"][0][:3] == pytest.approx((0.3, 0.2, 0.0))
 
 
-def test_an_episode_at_its_start_can_be_saved(places, root, cache):
-    rollout = Rollout(RolloutConfig("reach", ("robots/one",), "zero"), places)
+def test_an_episode_at_its_start_can_be_saved(files, root, cache):
+    rollout = Rollout(RolloutConfig("reach", ("robots/one",), "zero"), files)
     (root / "start.npz").write_bytes(episode_bytes(rollout.episode))
     rollout.close()
-    read = read_episode(root / "start.npz", places)
-    assert read.steps == 0
-    assert not Recorded(read).advance()
+    read = read_episode(root / "start.npz", files)
+    assert read.num_steps == 0
+    assert not RecordedEpisode(read).advance()
 
 
 def changed(path, **arrays):
@@ -153,8 +153,8 @@ def changed(path, **arrays):
 @pytest.mark.parametrize(
     ("arrays", "why"),
     [
-        ({"about": None}, "is no episode of morphgen view"),
-        ({"about": np.array("{")}, "is no episode of morphgen view"),
+        ({"about": None}, "is not an episode of morphgen view"),
+        ({"about": np.array("{")}, "is not an episode of morphgen view"),
         ({"about": np.array('{"format": 9, "task": "reach"}')}, "format 9"),
         ({"0_q": None}, "'q'"),
         ({"0_q": np.zeros(3)}, "expected"),
@@ -163,51 +163,51 @@ def changed(path, **arrays):
         ({"0_score": np.zeros(2)}, "score has shape"),
     ],
 )
-def test_what_is_no_episode_is_refused(episode, places, root, arrays, why):
+def test_an_invalid_episode_is_rejected(episode, files, root, arrays, why):
     path = root / "changed.npz"
     path.write_bytes(episode_bytes(episode))
     changed(path, **arrays)
     with pytest.raises(EpisodeError, match=why):
-        read_episode(path, places)
+        read_episode(path, files)
 
 
-def test_files_of_another_kind_are_refused(places, root):
+def test_a_text_file_is_rejected(files, root):
     (root / "text.npz").write_text("no archive")
-    with pytest.raises(EpisodeError, match="is no episode of morphgen view"):
-        read_episode(root / "text.npz", places)
+    with pytest.raises(EpisodeError, match="is not an episode of morphgen view"):
+        read_episode(root / "text.npz", files)
 
 
-def test_an_episode_of_a_robot_that_has_changed_is_refused(places, root, cache):
+def test_an_episode_of_a_changed_robot_is_rejected(files, root, cache):
     write_bundle(arm(), root / "robots" / "two", picture=False)
-    rollout = Rollout(RolloutConfig("reach", ("robots/two",), "zero"), places)
+    rollout = Rollout(RolloutConfig("reach", ("robots/two",), "zero"), files)
     rollout.close()
     (root / "two.npz").write_bytes(episode_bytes(rollout.episode))
     urdf = root / "robots" / "two" / "robot.urdf"
     urdf.write_text(urdf.read_text().replace('upper="2"', 'upper="1.5"'))
     with pytest.raises(EpisodeError, match="the robot at robots/two is not the one"):
-        read_episode(root / "two.npz", places)
+        read_episode(root / "two.npz", files)
 
 
-def test_one_that_cannot_play_does_not_keep_the_others_from_it(places, cache):
-    rollout = Rollout(RolloutConfig("reach", ("robots/none", "robots/one"), "zero"), places)
+def test_a_robot_that_fails_does_not_stop_the_others(files, cache):
+    rollout = Rollout(RolloutConfig("reach", ("robots/none", "robots/one"), "zero"), files)
     assert list(rollout.faults) == ["robots/none"]
     assert "no such file" in rollout.faults["robots/none"]
-    assert [track.place for track in rollout.episode.tracks] == ["robots/one"]
+    assert [track.uri for track in rollout.episode.tracks] == ["robots/one"]
     rollout.close()
 
 
-def test_a_policy_that_sees_its_tool_is_shown_it(root, places, cache):
+def test_a_policy_gets_the_observations_it_was_trained_with(root, files, cache):
     config = small_config(total_timesteps=32)
     config = replace(config, policy=replace(config.policy, tool_position=True))
     train(root / "run", config, execution=QUIET)
-    rollout = Rollout(RolloutConfig("reach", (CUBE,), "run"), places)
+    rollout = Rollout(RolloutConfig("reach", (CUBE,), "run"), files)
     assert rollout.faults == {}
     assert rollout.advance()
     rollout.close()
 
 
 @pytest.mark.parametrize(
-    ("wanted", "why"),
+    ("config", "why"),
     [
         (RolloutConfig("reach", (), "zero"), "no robot is named"),
         (RolloutConfig("reach", ("robots/none",), "zero"), "no such file"),
@@ -219,33 +219,35 @@ def test_a_policy_that_sees_its_tool_is_shown_it(root, places, cache):
         (RolloutConfig("reach", ("robots/one",), "robots/one/robot.urdf"), "is not a checkpoint"),
     ],
 )
-def test_what_cannot_be_played_is_refused(places, cache, wanted, why):
+def test_an_invalid_rollout_is_rejected(files, cache, config, why):
     with pytest.raises(MorphgenError, match=why):
-        Rollout(wanted, places)
+        Rollout(config, files)
 
 
-def test_a_run_is_known_by_its_checkpoint():
+def test_the_name_of_a_checkpoint_is_that_of_runs():
     assert CHECKPOINT == runs.CHECKPOINT
 
 
-def test_an_address_tells_what_is_played():
+def test_a_rollout_comes_back_from_its_address():
     for simulator in simulators():
-        wanted = RolloutConfig("push", ("robots/one", CUBE), "random", 7, True, simulator)
-        assert parse_rollout(address_of(wanted), []) == wanted
-    default = parse_rollout(address_of(RolloutConfig("push", (), "zero")), [("it", "robots/one")])
-    assert default.places == ("robots/one",)
+        config = RolloutConfig("push", ("robots/one", CUBE), "random", 7, True, simulator)
+        assert parse_rollout(rollout_address(config), []) == config
+    default = parse_rollout(
+        rollout_address(RolloutConfig("push", (), "zero")), [("it", "robots/one")]
+    )
+    assert default.robots == ("robots/one",)
 
 
-def test_an_episode_as_it_is_now_does_not_grow(episode):
-    kept = still(episode)
+def test_a_snapshot_does_not_grow(episode):
+    kept = snapshot(episode)
     for track in kept.tracks:
         track.q.append(track.q[-1])
-    assert [track.steps for track in episode.tracks] == [300, 300]
+    assert [track.num_steps for track in episode.tracks] == [300, 300]
 
 
-def test_bodies_stand_apart(episode):
-    areas = [area(track) for track in (*episode.tracks, episode.tracks[0])]
-    spots = np.array(places_in_grid(areas))
+def test_robots_do_not_overlap(episode):
+    areas = [track_area(track) for track in (*episode.tracks, episode.tracks[0])]
+    spots = np.array(grid_positions(areas))
     for i, (low, high) in enumerate(areas):
         for k in range(i):
             other_low, other_high = areas[k]
@@ -255,20 +257,20 @@ def test_bodies_stand_apart(episode):
             assert apart[:2].max() >= GAP - 1e-9
 
 
-def test_a_recording_is_of_all_moments_that_are_shown(episode):
-    content = recording(episode)
+def test_a_recording_has_all_shown_steps(episode):
+    content = record_scene(episode)
     payload = zstandard.ZstdDecompressor().decompressobj().decompress(content[8:])
     assert len(payload) == int.from_bytes(content[:8], "little")
     length = int.from_bytes(payload[:8], "little")
-    told = msgspec.msgpack.decode(payload[8 : 8 + length])
-    assert told["durationSeconds"] == pytest.approx((150 + 1) * 2 * episode.period)
-    kinds = {message["type"] for _, message in told["messages"]}
+    content_info = msgspec.msgpack.decode(payload[8 : 8 + length])
+    assert content_info["durationSeconds"] == pytest.approx((150 + 1) * 2 * episode.period)
+    kinds = {message["type"] for _, message in content_info["messages"]}
     assert {"SetPositionMessage", "SetOrientationMessage", "MeshMessage"} <= kinds
 
 
-def test_the_camera_of_a_film_sees_what_the_episode_has(episode):
+def test_the_camera_of_a_video_sees_the_whole_episode(episode):
     track = episode.tracks[0]
-    points = renderer_of(track, (64, 48))._model.points
+    points = make_renderer(track, (64, 48))._model.points
     low, high = points.min(axis=0), points.max(axis=0)
     tools = frame_pose(track.robot, np.array(track.q))[:, :3, 3]
     for point in (track.marker_poses["goal"][0][:3], tools[-1]):

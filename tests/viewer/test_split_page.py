@@ -8,10 +8,10 @@ from morphgen.benchmark.split_file import find_split, read_split
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
 from morphgen.viewer.address import parse_address
-from morphgen.viewer.entries import Entry
-from morphgen.viewer.new_split import member_of, save_split
-from morphgen.viewer.page_gallery import sides_of
+from morphgen.viewer.page_gallery import choose_sides
+from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess
+from morphgen.viewer.splits import make_member, save_split
 
 SPLIT = "extrapolation/primitives/reach"
 
@@ -24,7 +24,7 @@ def test_both_sides_the_map_and_the_audit(see, picture):
     page.wait_for_selector(".card:has-text('chain-000001') img")
     picture(page, "split")
     at_work = page.get_by_role("link", name="see robots to test on at work").get_attribute("href")
-    assert parse_address(at_work).of == ("reach",)
+    assert parse_address(at_work).subjects == ("reach",)
     assert [robot.rpartition("/")[2] for robot in parse_address(at_work).robots] == [
         member.name for member in read_split(find_split(SPLIT)).test
     ]
@@ -63,28 +63,28 @@ def test_a_new_split_is_saved_of_what_is_shown(see, folder):
 
 def test_robots_of_a_set_become_members(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    places = FileAccess(default_library().folders, (folder.resolve(),), folder / "none")
+    files = FileAccess(default_library().folders, (folder.resolve(),), folder / "none")
     members = [
-        member_of(f"robots/prims/prims-{i:06d}", "prims", "push", False, places) for i in range(4)
+        make_member(f"robots/prims/prims-{i:06d}", "prims", "push", False, files) for i in range(4)
     ]
-    path = save_split("mine/prims", "interpolation", members[:3], members[3:], places)
+    path = save_split("mine/prims", "interpolation", members[:3], members[3:], files)
     split = read_split(path)
     assert split.train == tuple(members[:3])
     assert {member.task for member in split.train} == {"push"}
 
 
 def test_sides_are_inside_and_outside_of_the_filter():
-    rows = [Entry(name, name) for name in "abcdef"]
-    train, test = sides_of(rows, rows[2:5], 2, 3)
+    rows = [Row(name, name) for name in "abcdef"]
+    train, test = choose_sides(rows, rows[2:5], 2, 3)
     assert [row.name for row in train] == ["c", "d"]
     assert [row.name for row in test] == ["a", "b", "f"]
     with pytest.raises(BenchmarkError, match="3 robots pass the filter and 3 do not: too few"):
-        sides_of(rows, rows[2:5], 4, 1)
+        choose_sides(rows, rows[2:5], 4, 1)
 
 
 def test_sides_must_not_be_empty_and_names_must_be_names(folder):
-    places = FileAccess((), (folder.resolve(),), folder / "none")
+    files = FileAccess((), (folder.resolve(),), folder / "none")
     with pytest.raises(BenchmarkError, match="0 train and 0 test"):
-        save_split("mine", "interpolation", [], [], places)
+        save_split("mine", "interpolation", [], [], files)
     with pytest.raises(BenchmarkError, match="use letters"):
-        save_split("../mine", "interpolation", [], [], places)
+        save_split("../mine", "interpolation", [], [], files)

@@ -1,4 +1,4 @@
-"""Uploads are kept only if they are robots that keep to their folder."""
+"""Uploads are kept only if they are robots that store_upload to their folder."""
 
 import html
 import io
@@ -17,10 +17,10 @@ from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
-from morphgen.viewer import archives, uploads
-from morphgen.viewer.downloads import bundle_files, zipped
+from morphgen.viewer import uploads
+from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
-from morphgen.viewer.uploads import UploadError, keep
+from morphgen.viewer.uploads import UploadError, store_upload
 
 URDF = b'<robot name="r"><link name="a"/></robot>'
 MESHED = (
@@ -30,7 +30,7 @@ MESHED = (
 
 
 @pytest.fixture
-def places(tmp_path):
+def access(tmp_path):
     folder = tmp_path / "uploads"
     folder.mkdir()
     return FileAccess(default_library().folders, (tmp_path.resolve(),), folder.resolve())
@@ -44,19 +44,19 @@ def archive(files, how=zipfile.ZIP_STORED):
     return content.getvalue()
 
 
-def test_a_urdf_is_kept_and_read(places):
-    place = keep("some.urdf", URDF, places)
-    assert place.startswith("upload:")
-    assert read_robot_uri(place, places).name == "r"
+def test_a_urdf_is_kept_and_read(access):
+    uri = store_upload("some.urdf", URDF, access)
+    assert uri.startswith("upload:")
+    assert read_robot_uri(uri, access).name == "r"
 
 
-def test_a_zipped_bundle_comes_back_as_it_left(places, tmp_path):
+def test_a_zipped_bundle_comes_back_as_it_left(access, tmp_path):
     write_bundle(arm(), tmp_path / "arm", picture=False)
-    files = bundle_files("arm", places)
+    files = bundle_files("arm", access)
     assert {"robot.urdf", "robot.xml", "card.json"} <= files.keys()
-    sent = zipped("arm", files)
-    assert sent == zipped("arm", dict(reversed(files.items())))
-    assert read_robot_uri(keep("arm.zip", sent, places), places).home == arm().home
+    sent = zip_files("arm", files)
+    assert sent == zip_files("arm", dict(reversed(files.items())))
+    assert read_robot_uri(store_upload("arm.zip", sent, access), access).home == arm().home
 
 
 @pytest.mark.parametrize(
@@ -65,8 +65,8 @@ def test_a_zipped_bundle_comes_back_as_it_left(places, tmp_path):
         ("a.urdf", b"no xml", "a.urdf:1:1"),
         ("a.urdf", b"<mujoco/>", "its root is <mujoco>"),
         ("a.xacro", URDF, "expected a .urdf, or a .zip"),
-        ("a.zip", b"PK nothing", "no readable zip"),
-        ("..", URDF, "no file name"),
+        ("a.zip", b"PK nothing", "not a readable zip"),
+        ("..", URDF, "invalid file name"),
         ("a.zip", archive({"b.txt": b""}), "holds no .urdf"),
         ("a.zip", archive({"../b.urdf": URDF}), "leads out of its folder"),
         ("a.zip", archive({"/b.urdf": URDF}), "leads out of its folder"),
@@ -79,38 +79,38 @@ def test_a_zipped_bundle_comes_back_as_it_left(places, tmp_path):
         ("a.urdf", b'<!DOCTYPE r [<!ENTITY x "y">]><robot name="r"/>', "DOCTYPE"),
     ],
 )
-def test_what_is_no_robot_or_climbs_out_is_refused(places, name, content, why):
+def test_what_is_no_robot_or_climbs_out_is_rejected(access, name, content, why):
     with pytest.raises(MorphgenError, match=why):
-        keep(name, content, places)
-    assert list(places.uploads.iterdir()) == []
+        store_upload(name, content, access)
+    assert list(access.uploads.iterdir()) == []
 
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_a_damaged_zip_is_refused(places, how):
+def test_a_damaged_zip_is_rejected(access, how):
     whole = archive({"a.urdf": 50 * URDF}, how)
     at = whole.index(b"a.urdf") + len(b"a.urdf")
-    with pytest.raises(UploadError, match="no readable zip"):
-        keep("a.zip", whole[:at] + b"\xff" * 10 + whole[at + 10 :], places)
-    assert list(places.uploads.iterdir()) == []
+    with pytest.raises(UploadError, match="not a readable zip"):
+        store_upload("a.zip", whole[:at] + b"\xff" * 10 + whole[at + 10 :], access)
+    assert list(access.uploads.iterdir()) == []
 
 
-def test_large_uploads_are_refused(places, monkeypatch):
-    monkeypatch.setattr(uploads, "LARGEST_UPLOAD", 1000)
+def test_large_uploads_are_rejected(access, monkeypatch):
+    monkeypatch.setattr(uploads, "MAX_UPLOAD", 1000)
     with pytest.raises(UploadError, match="at most"):
-        keep("a.urdf", b" " * 1001, places)
-    monkeypatch.setattr(archives, "LARGEST", 1000)
+        store_upload("a.urdf", b" " * 1001, access)
+    monkeypatch.setattr(uploads, "MAX_UNPACKED", 1000)
     bomb = archive({"a.urdf": URDF, "b.stl": b"0" * 5000}, zipfile.ZIP_DEFLATED)
     assert len(bomb) < 1000
     with pytest.raises(UploadError, match="unpacks to more"):
-        keep("a.zip", bomb, places)
-    assert list(places.uploads.iterdir()) == []
+        store_upload("a.zip", bomb, access)
+    assert list(access.uploads.iterdir()) == []
 
 
-def test_a_zip_unpacks_to_no_more_than_it_says(places):
+def test_a_zip_unpacks_to_no_more_than_it_says(access):
     whole = archive({"a.urdf": URDF, "b.stl": b"0" * 5_000_000}, zipfile.ZIP_DEFLATED)
     small = (10).to_bytes(4, "little")
-    with pytest.raises(UploadError, match="no readable zip"):
-        keep("a.zip", whole.replace((5_000_000).to_bytes(4, "little"), small), places)
+    with pytest.raises(UploadError, match="not a readable zip"):
+        store_upload("a.zip", whole.replace((5_000_000).to_bytes(4, "little"), small), access)
 
 
 XACRO = b"""<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="a"/>
@@ -150,17 +150,17 @@ def patched(whole, old, new):
         (archive({"a" * 300 + ".urdf": URDF}), "longer than 100"),
         (archive({"é" * 80 + ".urdf": URDF}), "longer than 100"),
         (archive({"d/" * 30 + "a.urdf": URDF}), "more than 20 folders"),
-        (archive({"a\n.urdf": URDF}), "no name of a file"),
+        (archive({"a\n.urdf": URDF}), "not a valid file name"),
         (archive({"C:/a.urdf": URDF}), "leads out"),
         (archive({"b/../a.urdf": URDF}), "leads out"),
-        (patched(archive({"aXb.urdf": URDF}), b"aXb", b"a\0b"), "no name of a file|no readable"),
+        (patched(archive({"aXb.urdf": URDF}), b"aXb", b"a\0b"), "not a valid file|not a readable"),
         (linked("meshes", "/etc"), "is a link"),
         (linked("meshes/x.stl", "../../../etc/passwd"), "is a link"),
         (archive({f"{i}.stl": b"" for i in range(2001)}), "more than 2000 files"),
         (archive({"a.urdf": URDF}, zipfile.ZIP_LZMA), "method other than deflate"),
         (archive({"a.urdf": URDF}, zipfile.ZIP_BZIP2), "method other than deflate"),
-        (archive({"a.urdf": URDF})[:-30], "no readable zip"),
-        (b"", "no readable zip"),
+        (archive({"a.urdf": URDF})[:-30], "not a readable zip"),
+        (b"", "not a readable zip"),
         (archive({"a.urdf.xacro": XACRO}), "no xacro of an upload is expanded"),
         (archive({"a.xacro": XACRO, "b.yaml": b"x: 1"}), "no xacro of an upload is expanded"),
         (archive({"a.urdf": XACRO}), "a.urdf:2: is a xacro; none of an upload is expanded"),
@@ -170,8 +170,8 @@ def patched(whole, old, new):
          "leads out"),
         (archive({"a.urdf": URDF, "m.xml": b'<mujoco><asset><mesh file="/x"/></asset></mujoco>'}),
          "leads out"),
-        (archive({"robot.urdf": URDF, "card.json": b"["}), "card.json: no valid JSON"),
-        (archive({"robot.urdf": URDF, "card.json": b"[" * 100_000}), "card.json: no valid JSON"),
+        (archive({"robot.urdf": URDF, "card.json": b"["}), "card.json: not valid JSON"),
+        (archive({"robot.urdf": URDF, "card.json": b"[" * 100_000}), "card.json: not valid JSON"),
         (archive({"robot.urdf": URDF, "card.json": b'{"hashes": {"/etc/passwd": "0"}}'}),
          "leads out"),
         (archive({"robot.urdf": URDF, "card.json": b'{"hashes": {"../x": "0"}}'}), "leads out"),
@@ -182,37 +182,37 @@ def patched(whole, old, new):
     ],
     ids=lambda each: each[:40] if isinstance(each, str) else "",
 )  # fmt: skip
-def test_an_odd_zip_is_refused_in_a_sentence(places, content, why):
+def test_an_odd_zip_is_rejected_in_a_sentence(access, content, why):
     with pytest.raises(UploadError, match=why) as refused:
-        keep("a.zip", content, places)
-    assert str(places.uploads) not in str(refused.value)
+        store_upload("a.zip", content, access)
+    assert str(access.uploads) not in str(refused.value)
     assert "\n" not in str(refused.value)
-    assert list(places.uploads.iterdir()) == []
+    assert list(access.uploads.iterdir()) == []
 
 
 @pytest.mark.parametrize(
     "name", ["a" * 300 + ".urdf", "\0.urdf", "a b.urdf", "a\n.urdf", "", "é.urdf"]
 )
-def test_an_odd_name_is_refused(places, name):
-    with pytest.raises(UploadError, match="no file name that can be kept"):
-        keep(name, URDF, places)
+def test_an_odd_name_is_rejected(access, name):
+    with pytest.raises(UploadError, match="invalid file name"):
+        store_upload(name, URDF, access)
 
 
-def test_a_mesh_is_not_taken_from_another_upload_or_the_folder_above(places):
+def test_a_mesh_is_not_taken_from_another_upload_or_the_folder_above(access):
     box = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
-    first = keep(
-        "a.zip", archive({"p/m.stl": box, "a.urdf": MESHED % b"package://p/m.stl"}), places
+    first = store_upload(
+        "a.zip", archive({"p/m.stl": box, "a.urdf": MESHED % b"package://p/m.stl"}), access
     )
-    assert read_robot_uri(first, places).links[0].visuals
-    (places.uploads.parent / "q").mkdir()
-    (places.uploads.parent / "q" / "m.stl").write_bytes(box)
+    assert read_robot_uri(first, access).links[0].visuals
+    (access.uploads.parent / "q").mkdir()
+    (access.uploads.parent / "q" / "m.stl").write_bytes(box)
     token = first.removeprefix("upload:").partition("/")[0]
     for uri in (f"package://{token}/p/m.stl", "package://q/m.stl", f"..%2f{token}/p/m.stl"):
         with pytest.raises(UploadError, match="is not in the upload"):
-            keep("a.urdf", MESHED % uri.encode(), places)
+            store_upload("a.urdf", MESHED % uri.encode(), access)
 
 
-def test_only_descriptions_meshes_and_cards_are_kept(places):
+def test_only_descriptions_meshes_and_cards_are_kept(access):
     box = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
     files = {
         "p/urdf/a.urdf": MESHED % b"package://p/meshes/m.STL",
@@ -229,64 +229,64 @@ def test_only_descriptions_meshes_and_cards_are_kept(places):
         "p/.git/config": b"",
         "__MACOSX/p/._a.urdf": b"\0",
     }
-    place = keep("p.zip", archive(files), places)
-    assert read_robot_uri(place, places).name == "r"
-    (folder,) = places.uploads.iterdir()
+    uri = store_upload("p.zip", archive(files), access)
+    assert read_robot_uri(uri, access).name == "r"
+    (folder,) = access.uploads.iterdir()
     kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert kept == {"p/urdf/a.urdf", "p/meshes/m.STL", "p/package.xml", "p/robot.xml"}
 
 
-def test_no_xacro_is_read_below_the_uploads(places):
-    folder = places.uploads / "1"
+def test_no_xacro_is_read_below_the_uploads(access):
+    folder = access.uploads / "1"
     folder.mkdir()
     (folder / "a.xacro").write_bytes(XACRO)
     with pytest.raises(UriError, match="only a URDF or a bundle is read from an upload"):
-        read_robot_uri("upload:1/a.xacro", places)
+        read_robot_uri("upload:1/a.xacro", access)
 
 
-def test_no_more_are_kept_than_a_number(places, monkeypatch):
-    monkeypatch.setattr(uploads, "MOST_KEPT", 2)
-    keep("a.urdf", URDF, places)
-    keep("a.urdf", URDF, places)
+def test_no_more_are_kept_than_a_number(access, monkeypatch):
+    monkeypatch.setattr(uploads, "MAX_UPLOADS", 2)
+    store_upload("a.urdf", URDF, access)
+    store_upload("a.urdf", URDF, access)
     with pytest.raises(UploadError, match="2 uploads are kept already"):
-        keep("a.urdf", URDF, places)
+        store_upload("a.urdf", URDF, access)
 
 
-def test_a_full_disk_keeps_nothing(places, monkeypatch):
+def test_a_full_disk_keeps_nothing(access, monkeypatch):
     def full(self, data):
         raise OSError(28, "No space left on device", str(self))
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
     with pytest.raises(UploadError, match="cannot be kept: No space left on device") as refused:
-        keep("a.urdf", URDF, places)
-    assert str(places.uploads) not in str(refused.value)
-    assert list(places.uploads.iterdir()) == []
+        store_upload("a.urdf", URDF, access)
+    assert str(access.uploads) not in str(refused.value)
+    assert list(access.uploads.iterdir()) == []
 
 
 @pytest.mark.parametrize(("as_zip", "pairs"), [(False, ()), (True, (("upper", "right"),))])
-def test_a_robot_of_morphgen_keeps_its_tool_and_home(places, tmp_path, as_zip, pairs):
+def test_a_robot_of_morphgen_keeps_its_tool_and_home(access, tmp_path, as_zip, pairs):
     robot = replace(arm(), ignore_pairs=(("upper", "right"),), provenance={"source": "x.urdf"})
     write_bundle(robot, tmp_path / "arm", picture=False)
-    files = bundle_files("arm", places)
+    files = bundle_files("arm", access)
     name, content = (
-        ("arm.zip", zipped("arm", files)) if as_zip else ("robot.urdf", files["robot.urdf"])
+        ("arm.zip", zip_files("arm", files)) if as_zip else ("robot.urdf", files["robot.urdf"])
     )
-    back = read_robot_uri(keep(name, content, places), places)
+    back = read_robot_uri(store_upload(name, content, access), access)
     assert (back.home, back.ignore_pairs) == (robot.home, pairs)
     assert robot_hash(back) == robot_hash(robot)
     assert bool(back.provenance) == as_zip
 
 
-def test_a_link_called_tool_is_the_tool(places):
+def test_a_link_called_tool_is_the_tool(access):
     text = b"""<robot name="r"><link name="a"/><link name="tool"/><joint name="j" type="fixed">
     <parent link="a"/><child link="tool"/></joint></robot>"""
-    assert read_robot_uri(keep("a.urdf", text, places), places).frame("tool").link == "tool"
+    assert read_robot_uri(store_upload("a.urdf", text, access), access).frame("tool").link == "tool"
 
 
 def test_uploads_come_through_a_websocket_and_are_read(viewer, tmp_path):
     write_bundle(arm(), tmp_path / "arm", picture=False)
     on = viewer()
-    content = zipped("arm", {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()})
+    content = zip_files("arm", {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()})
     with PlainClient(on.port) as client:
         client.upload("arm.zip", content)
         query = client.sent_to()
@@ -305,7 +305,7 @@ def test_uploads_come_through_a_websocket_and_are_read(viewer, tmp_path):
         ("a.zip", linked("x", "/etc/passwd"), "is a link"),
         ("a.urdf", b"", "a.urdf:1:1"),
         ("a.urdf", MESHED % b"x.stl", "is not in the upload"),
-        ("../../a" + "b" * 10_000 + ".urdf", URDF, "no file name that can be kept"),
+        ("../../a" + "b" * 10_000 + ".urdf", URDF, "invalid file name"),
     ],
 )
 def test_a_hostile_upload_is_a_sentence_on_the_page(viewer, capfd, name, content, why):
@@ -314,7 +314,7 @@ def test_a_hostile_upload_is_a_sentence_on_the_page(viewer, capfd, name, content
         client.upload(name, content)
         client.shows(why)
         assert tempfile.gettempdir() not in client.text
-        assert list(on.places.uploads.iterdir()) == []
+        assert list(on.files.uploads.iterdir()) == []
     assert capfd.readouterr() == ("", "")
 
 
@@ -322,9 +322,9 @@ def test_an_upload_that_is_not_as_it_was_said_to_be_is_dropped(viewer, capfd):
     on = viewer()
     with PlainClient(on.port) as client:
         client.upload("a.urdf", b" " * 2000, size=1000)
-        client.shows("longer than it was said to be")
+        client.shows("longer than its announced size")
         client.upload("a.urdf", b"", size=200 * 2**20, parts=1)
-        client.shows("200 MB; at most 100 MB are taken")
+        client.shows("200 MB; at most 100 MB are accepted")
         client.upload("a.urdf", b"", size=-1, parts=0)
         client.shows("-1 bytes in 0 parts")
         client.upload("a.urdf", b"", size=10, parts=10**9)
@@ -348,10 +348,10 @@ def test_an_error_tells_no_temporary_path(viewer, capfd):
         client.shows("tag error")
         assert tempfile.gettempdir() not in client.text
     for text in (
-        f"{on.places.uploads}/x/a.urdf:1: bad",
+        f"{on.files.uploads}/x/a.urdf:1: bad",
         f"{tempfile.gettempdir()}/tmpab12/robot/x",
     ):
-        assert tempfile.gettempdir() not in on.places.told(text)
+        assert tempfile.gettempdir() not in on.files.redact(text)
 
 
 def test_names_of_an_upload_are_text_on_the_page(viewer):

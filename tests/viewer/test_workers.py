@@ -16,7 +16,7 @@ def workers():
     made.close()
 
 
-def test_a_worker_that_dies_is_told_once_and_replaced(workers):
+def test_a_worker_that_dies_is_reported_once_and_replaced(workers):
     value, first = workers.result(workers.submit(power, 2, 3))
     assert value == 9
     dying, waiting = workers.submit(die_later, 1.0), workers.submit(power, 2, 4)

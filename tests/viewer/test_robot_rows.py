@@ -1,23 +1,21 @@
-"""Rows of galleries are filtered, sorted and paged."""
+"""Rows of galleries are filtered, sorted and select_page."""
 
 import pytest
 
-from morphgen.viewer.entries import (
-    Entry,
+from morphgen.viewer.robot_rows import (
     Filter,
-    choices,
-    extent,
+    Row,
+    fact_choices,
+    fact_range,
     facts_line,
-    filtered,
-    ordered,
-    paged,
-    with_facts,
+    select_page,
+    sort_rows,
 )
 
 ROWS = [
-    Entry("b-arm", "b", "arms", "train", dof=6, reach=0.9, mass=20.0, findings=(), order=0),
-    Entry("a-hand", "a", "hands", "test", dof=2, reach=None, mass=1.0, findings=("axis",), order=1),
-    Entry("c-arm", "c", "arms", "test", dof=7, reach=1.2, mass=None, findings=None, order=2),
+    Row("b-arm", "b", "arms", "train", dof=6, reach=0.9, mass=20.0, findings=(), order=0),
+    Row("a-hand", "a", "hands", "test", dof=2, reach=None, mass=1.0, findings=("axis",), order=1),
+    Row("c-arm", "c", "arms", "test", dof=7, reach=1.2, mass=None, findings=None, order=2),
 ]
 
 
@@ -26,7 +24,7 @@ def names(rows):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "left"),
+    ("condition", "left"),
     [
         (Filter(), "bac"),
         (Filter("ARM"), "bc"),
@@ -42,8 +40,8 @@ def names(rows):
         (Filter("arm", role="test", ranges={"dof": (7, 7)}), "c"),
     ],
 )
-def test_filters(wanted, left):
-    assert names(filtered(ROWS, wanted)) == list(left)
+def test_filters(condition, left):
+    assert names(filter(condition.passes, ROWS)) == list(left)
 
 
 @pytest.mark.parametrize(
@@ -61,12 +59,12 @@ def test_filters(wanted, left):
     ],
 )
 def test_sorting_puts_the_unknown_last(key, order):
-    assert names(ordered(ROWS, key)) == list(order)
+    assert names(sort_rows(ROWS, key)) == list(order)
 
 
 def test_unknown_keys_are_refused():
     with pytest.raises(ValueError, match="cannot sort by 'colour'"):
-        ordered(ROWS, "colour")
+        sort_rows(ROWS, "colour")
 
 
 @pytest.mark.parametrize(
@@ -80,20 +78,20 @@ def test_unknown_keys_are_refused():
     ],
 )
 def test_pages(number, size, expected):
-    assert paged(range(7), number, size) == expected
+    assert select_page(range(7), number, size) == expected
 
 
 def test_no_rows_make_one_empty_page():
-    assert paged([], 3, 24) == ([], 1, 1)
+    assert select_page([], 3, 24) == ([], 1, 1)
 
 
 def test_extents_and_choices():
-    assert extent(ROWS, "reach") == (0.9, 1.2)
-    assert extent(ROWS[:1], "reach") is None
-    assert choices([*ROWS, Entry("d", "d")], "category") == ["arms", "hands"]
+    assert fact_range(ROWS, "reach") == (0.9, 1.2)
+    assert fact_range(ROWS[:1], "reach") is None
+    assert fact_choices([*ROWS, Row("d", "d")], "category") == ["arms", "hands"]
 
 
-def test_facts_become_known():
-    row = with_facts(Entry("d", "d"), {"dof": 3, "reach": 0.5, "mass": 1.25, "findings": ()})
+def test_known_facts_are_in_a_line():
+    row = Row("d", "d", dof=3, reach=0.5, mass=1.25, findings=())
     assert facts_line(row) == "3 DoF · 0.50 m · 1.25 kg"
-    assert facts_line(Entry("d", "d")) == ""
+    assert facts_line(Row("d", "d")) == ""

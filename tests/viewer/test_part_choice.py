@@ -6,12 +6,12 @@ from morphgen.errors import MorphgenError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.viewer.choice import (
-    NOTHING,
+from morphgen.viewer.part_choice import (
+    NO_PART,
     controls_of,
     first_parts,
-    options,
     parse_choice,
+    part_options,
     slots_of,
     with_part,
     with_value,
@@ -55,8 +55,8 @@ def test_parts_offer_slots_and_each_can_be_filled(words, slots):
 
 
 def test_options_begin_with_nothing():
-    assert options("left.arm", LIBRARY)[0] == NOTHING
-    assert "none" not in options("ee", LIBRARY)
+    assert part_options("left.arm", LIBRARY)[0] == NO_PART
+    assert "none" not in part_options("ee", LIBRARY)
 
 
 def test_every_parameter_has_a_control_with_its_range():
@@ -94,7 +94,7 @@ def test_another_part_takes_its_parameters_with_it():
     other = with_part(choice, "left.ee", "stick", LIBRARY)
     assert "left.ee.size" not in other.values
     assert other.values == {"base.height": 0.7}
-    assert "left.arm" not in with_part(choice, "left.arm", NOTHING, LIBRARY).parts
+    assert "left.arm" not in with_part(choice, "left.arm", NO_PART, LIBRARY).parts
 
 
 def test_another_base_keeps_the_limbs_that_it_has_ports_for():

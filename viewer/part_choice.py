@@ -1,4 +1,4 @@
-"""What the compose panel has chosen, as words of ``morphgen compose`` and as controls."""
+"""The parts chosen on the compose page, as words of ``morphgen compose`` and as controls."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from morphgen.grammar.parameters import MOUNT_YAW, Parameter, parse_value
 from morphgen.grammar.request import MAIN_PORTS, SLOTS
 from morphgen.viewer.robot_tables import slider_step
 
-NOTHING = "(none)"
-"""Stands for no part in a dropdown."""
+NO_PART = "(none)"
+"""Option of a dropdown that leaves a slot empty."""
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Parts by slot, such as ``left.arm``, and parameters that are not at their default."""
+class PartChoice:
+    """Parts by slot, and the parameters that differ from their defaults."""
 
     parts: Mapping[str, str]
+    """Names of parts by slot, such as ``left.arm``."""
     values: Mapping[str, float] = field(default_factory=dict)
-    """By ``slot.parameter``, SI units."""
+    """Parameters by ``slot.parameter``, in SI units."""
 
     @property
     def words(self) -> str:
-        """The words of ``morphgen compose`` that say the same."""
+        """The words of ``morphgen compose`` for the same robot."""
         parts = [f"{slot}={part}" for slot, part in self.parts.items() if part]
         return " ".join([*parts, *(f"{key}={number(value)}" for key, value in self.values.items())])
 
@@ -38,7 +39,7 @@ class Control:
     """A slider for a parameter."""
 
     key: str
-    """Such as ``ee.size``."""
+    """Slot and parameter, such as ``ee.size``."""
     label: str
     low: float
     high: float
@@ -47,12 +48,12 @@ class Control:
     hint: str
 
 
-def parse_choice(words: Sequence[str], library: Library) -> Choice:
-    """What words of ``morphgen compose`` choose.
+def parse_choice(words: Sequence[str], library: Library) -> PartChoice:
+    """Parse words of ``morphgen compose``.
 
     Raises:
-        CompositionError: If a word is none.
-        PartError: If a part or parameter is unknown, or a value is wrong.
+        CompositionError: If a word is not of the form key=value, or its slot is empty.
+        PartError: If a part or parameter is unknown, or a value is invalid.
     """
     parts: dict[str, str] = {}
     texts: dict[str, str] = {}
@@ -69,26 +70,27 @@ def parse_choice(words: Sequence[str], library: Library) -> Choice:
         slot, _, name = key.rpartition(".")
         if slot not in parts:
             raise CompositionError(f"{key}: no part is chosen for {slot!r}{nearest(slot, parts)}")
-        known = parameters_of(slot, library.manifest(parts[slot], kind_of(slot)))
-        if name not in known:
+        parameters = parameters_of(slot, library.manifest(parts[slot], kind_of(slot)))
+        if name not in parameters:
             raise CompositionError(
-                f"{key}: {parts[slot]!r} has no such parameter{nearest(name, known)}"
+                f"{key}: {parts[slot]!r} has no such parameter{nearest(name, parameters)}"
             )
-        values[key] = parse_value(text, known[name], key)
-    return Choice(parts, values)
+        values[key] = parse_value(text, parameters[name], key)
+    return PartChoice(parts, values)
 
 
 def kind_of(slot: str) -> PartKind:
-    """The kind of part that a slot takes."""
+    """Return the kind of part that a slot takes."""
     last = slot.rpartition(".")[2]
     return next(kind for kind in SLOTS if kind == last)
 
 
-def slots_of(choice: Choice, library: Library) -> list[str]:
-    """The slots that chosen parts offer, besides the base's own.
+def slots_of(choice: PartChoice, library: Library) -> list[str]:
+    """Return the slots that the chosen parts offer, except the base's own slot.
 
-    Every port of the base has an arm, and an end-effector on it; an arm of several ports has one
-    on each. Where the main arm stands, an end-effector on another port of the base needs an arm.
+    Every port of the base takes an arm with an end-effector; an arm with several ports takes an
+    end-effector on each. If there is a main arm, an end-effector on another port of the base needs
+    an arm there.
     """
     base = library.manifest(choice.parts["base"], "base")
     arm = choice.parts.get("arm")
@@ -102,19 +104,19 @@ def slots_of(choice: Choice, library: Library) -> list[str]:
     return list(dict.fromkeys(slots))
 
 
-def options(slot: str, library: Library) -> list[str]:
-    """Parts that a slot can have, nothing first."""
-    return [NOTHING, *(name for name in library.names(kind_of(slot)) if name != "none")]
+def part_options(slot: str, library: Library) -> list[str]:
+    """Return the parts that fit a slot, after the option to leave it empty."""
+    return [NO_PART, *(name for name in library.names(kind_of(slot)) if name != "none")]
 
 
 def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
-    """The parameters of a part in a slot: its own, and the turn of its mount."""
-    own = dict(manifest.parameters)
-    return own if kind_of(slot) == "base" else {**own, MOUNT_YAW.name: MOUNT_YAW}
+    """Return the parameters of a part in a slot: its own, and the yaw of its mount."""
+    parameters = dict(manifest.parameters)
+    return parameters if kind_of(slot) == "base" else {**parameters, MOUNT_YAW.name: MOUNT_YAW}
 
 
 def controls_of(slot: str, manifest: Manifest) -> list[Control]:
-    """A slider for every parameter of a part."""
+    """Return a slider for every parameter of a part."""
     return [
         Control(
             f"{slot}.{name}",
@@ -129,46 +131,41 @@ def controls_of(slot: str, manifest: Manifest) -> list[Control]:
     ]
 
 
-def with_part(choice: Choice, slot: str, part: str, library: Library) -> Choice:
-    """The choice with another part; what cannot stand any more is left out.
+def with_part(choice: PartChoice, slot: str, part: str, library: Library) -> PartChoice:
+    """Return the choice with another part in a slot, without parts whose slot no longer exists.
 
     Args:
-        choice: What was chosen.
-        slot: Where.
-        part: Its name, or ``NOTHING``.
-        library: Where parts are.
+        choice: The current choice.
+        slot: The slot.
+        part: Name of a part, or ``NO_PART``.
+        library: The library of parts.
     """
-    chosen = {**choice.parts, slot: "" if part == NOTHING else part}
+    chosen = {**choice.parts, slot: "" if part == NO_PART else part}
     parts = {key: name for key, name in chosen.items() if name}
-    allowed = {"base", *slots_of(Choice(parts), library)}
+    allowed = {"base", *slots_of(PartChoice(parts), library)}
     parts = {key: name for key, name in parts.items() if key in allowed}
     values = {
         key: value
         for key, value in choice.values.items()
         if key.rpartition(".")[0] in parts and key.rpartition(".")[0] != slot
     }
-    return Choice(parts, values)
+    return PartChoice(parts, values)
 
 
-def with_value(choice: Choice, control: Control, value: float) -> Choice:
-    """The choice with a parameter's value; a default is left out."""
-    values = {key: old for key, old in choice.values.items() if key != control.key}
+def with_value(choice: PartChoice, control: Control, value: float) -> PartChoice:
+    """Return the choice with another value of a parameter; default values are left out."""
+    values = {key: other for key, other in choice.values.items() if key != control.key}
     if abs(value - control.default) > 1e-9:
         values[control.key] = float(number(value))
     return replace(choice, values=values)
 
 
 def first_parts(derivation: Derivation, n: int) -> Derivation:
-    """The derivation as far as its first parts, in the order in which they were attached.
-
-    Args:
-        derivation: All of it.
-        n: How many parts, at least 1.
-    """
+    """Return a derivation of only the first ``n`` parts (at least 1), in order of attachment."""
     kept = {id(node) for node in list(derivation.walk())[: max(n, 1)]}
 
-    def pruned(node: Derivation) -> Derivation:
-        children = ((port, pruned(child)) for port, child in node.children if id(child) in kept)
+    def prune(node: Derivation) -> Derivation:
+        children = ((port, prune(child)) for port, child in node.children if id(child) in kept)
         return replace(node, children=tuple(children))
 
-    return pruned(derivation)
+    return prune(derivation)

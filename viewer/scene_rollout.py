@@ -1,0 +1,151 @@
+"""An episode in viser's scene: its robots side by side, with goals, obstacles and blocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+
+from morphgen.model.geometry import Pose
+from morphgen.tasks.sim.base import Block
+from morphgen.tasks.task import Marker
+from morphgen.typing import Array
+from morphgen.viewer.episode import Episode, Track
+from morphgen.viewer.scene_robot import Rgb, RobotView, add_robot, robot_bounds, set_configuration
+
+Position = tuple[float, float, float]
+
+NODE = "/play"
+"""Name of the scene node above everything of an episode."""
+GAP = 0.3
+"""Distance between the areas of two robots [m]."""
+_GOAL: Rgb = (26, 166, 64)
+_BLOCK: Rgb = (230, 140, 38)
+_OBSTACLE: Rgb = (140, 64, 64)
+
+
+@dataclass(eq=False)
+class DrawnTrack:
+    """A robot of an episode in the scene."""
+
+    track: Track
+    view: RobotView
+    block: viser.BoxHandle | None
+    markers: dict[str, viser.FrameHandle | viser.BoxHandle]
+
+
+@dataclass(eq=False)
+class RolloutScene:
+    """An episode in a scene."""
+
+    root: viser.FrameHandle
+    tracks: list[DrawnTrack]
+    low: Array
+    """Lowest corner of the episode's bounding box, shape (3,) [m]."""
+    high: Array
+    """Highest corner of the episode's bounding box, shape (3,) [m]."""
+
+
+def add_episode(scene: viser.SceneApi, episode: Episode) -> RolloutScene:
+    """Draw an episode's robots and their surroundings at its start.
+
+    Raises:
+        MeshError: If a mesh cannot be read.
+    """
+    areas = [track_area(track) for track in episode.tracks]
+    positions = grid_positions(areas)
+    root = scene.add_frame(NODE, show_axes=False)
+    tracks = [
+        _add_track(scene, f"{NODE}/{i}", track, position, labelled=len(positions) > 1)
+        for i, (track, position) in enumerate(zip(episode.tracks, positions, strict=True))
+    ]
+    low = np.min([area[0] + at for area, at in zip(areas, positions, strict=True)], axis=0)
+    high = np.max([area[1] + at for area, at in zip(areas, positions, strict=True)], axis=0)
+    # A grid at the lowest ground, about 1 m wider than the robots on each side.
+    ground = min((t.ground for t in episode.tracks if t.ground is not None), default=0.0)
+    x, y, _ = ((low + high) / 2).tolist()
+    scene.add_grid(
+        f"{NODE}/ground",
+        width=2.0 * math.ceil(float(high[0] - low[0]) / 2 + 1),
+        height=2.0 * math.ceil(float(high[1] - low[1]) / 2 + 1),
+        cell_size=0.1,
+        section_size=1.0,
+        position=(x, y, ground),
+    )
+    rollout_scene = RolloutScene(root, tracks, low, high)
+    show_step(rollout_scene, 0)
+    return rollout_scene
+
+
+def show_step(scene: RolloutScene, step: int) -> None:
+    """Move everything to its pose after a number of control steps, or after its last one."""
+    for drawn in scene.tracks:
+        track = drawn.track
+        i = min(step, track.num_steps)
+        set_configuration(drawn.view, track.q[i])
+        moving = [(handle, track.marker_poses[name]) for name, handle in drawn.markers.items()]
+        if drawn.block is not None:
+            moving.append((drawn.block, track.block))
+        for handle, poses in moving:
+            pose = poses[i].tolist()
+            handle.position, handle.wxyz = tuple(pose[:3]), tuple(pose[3:])
+
+
+def track_area(track: Track) -> tuple[Array, Array]:
+    """Return the lowest and highest corner of a robot with its surroundings at the start [m]."""
+    points = [np.zeros(3)]
+    for q in (track.robot.home, track.q[0]):
+        points += robot_bounds(track.robot, q)
+    moving = [*([track.block] if track.block else []), *track.marker_poses.values()]
+    points += [poses[0][:3].astype(np.float64) for poses in moving]
+    points += [np.array(block.pose.position) for block in track.obstacles]
+    return np.min(points, axis=0), np.max(points, axis=0)
+
+
+def grid_positions(areas: Sequence[tuple[Array, Array]]) -> list[Position]:
+    """Return positions of roots in a square grid, so that no area overlaps another."""
+    columns = math.ceil(math.sqrt(len(areas)))
+    reach = np.max([np.maximum(np.abs(low), np.abs(high))[:2] for low, high in areas], axis=0)
+    dx, dy = (2 * reach + GAP).tolist()
+    middle = (columns - 1) / 2
+    return [(-(i // columns) * dx, (middle - i % columns) * dy, 0.0) for i in range(len(areas))]
+
+
+def _add_track(
+    scene: viser.SceneApi, name: str, track: Track, position: Position, *, labelled: bool
+) -> DrawnTrack:
+    scene.add_frame(name, show_axes=False, position=position)
+    view = add_robot(scene, track.robot, f"{name}/robot")
+    for i, obstacle in enumerate(track.obstacles):
+        _add_box(scene, f"{name}/obstacle{i}", obstacle, _OBSTACLE)
+    markers = {m.name: _add_marker(scene, f"{name}/{m.name}", m) for m in track.markers}
+    block = None
+    if track.block and track.block_size is not None:
+        block = _add_box(scene, f"{name}/block", Block(track.block_size, Pose()), _BLOCK)
+    if labelled:
+        top = float(robot_bounds(track.robot)[1][2])
+        scene.add_label(f"{name}/label", track.robot.name, position=(0.0, 0.0, top + 0.1))
+    return DrawnTrack(track, view, block, markers)
+
+
+def _add_marker(
+    scene: viser.SceneApi, name: str, marker: Marker
+) -> viser.FrameHandle | viser.BoxHandle:
+    """Add a marker of a goal: a box, or axes inside a translucent ball."""
+    if marker.shape == "box":
+        return scene.add_box(name, _GOAL, marker.size, cast_shadow=False)
+    radius = marker.size[0] / 2
+    frame = scene.add_frame(
+        name, axes_length=2 * radius, axes_radius=0.1 * radius, origin_radius=0.15 * radius
+    )
+    scene.add_icosphere(f"{name}/near", radius, _GOAL, opacity=0.45, cast_shadow=False)
+    return frame
+
+
+def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> viser.BoxHandle:
+    return scene.add_box(
+        name, colour, block.size, position=block.pose.position, wxyz=block.pose.quaternion
+    )
