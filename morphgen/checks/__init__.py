@@ -1,7 +1,8 @@
-"""Findings about a robot, each with a code, a severity and the fix; and the safe repairs.
+"""Checks of a robot: findings with a code, a severity and a remedy, and the safe repairs.
 
-``error`` means that a simulator refuses the robot or simulates something else than it says,
-``warning`` that something is suspicious, ``info`` names a trap that a bundle already avoids.
+An ``error`` means that a simulator rejects the robot or simulates something other than the file
+describes; a ``warning``, that something is suspicious; an ``info``, a limitation of some loader
+that a bundle already works around.
 """
 
 from __future__ import annotations
@@ -10,11 +11,16 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import cast
 
-from morphgen.checks.frames import check_tool
-from morphgen.checks.gaps import check_links_apart
-from morphgen.checks.home import check_self_collision
+from morphgen.checks.home_pose import check_links_apart, check_self_collision
 from morphgen.checks.inertia import check_inertia, check_masses
-from morphgen.checks.joints import check_axes, check_drive, check_home, check_limits
+from morphgen.checks.joints import (
+    check_axes,
+    check_drive,
+    check_home,
+    check_limits,
+    check_mimic,
+    check_mimic_range,
+)
 from morphgen.checks.loaders import (
     check_capsules,
     check_link_count,
@@ -22,8 +28,7 @@ from morphgen.checks.loaders import (
     check_mimic_loaders,
     check_root,
 )
-from morphgen.checks.mimic import check_mimic, check_mimic_range
-from morphgen.checks.names import check_frame_names, check_names, check_reserved
+from morphgen.checks.names import check_frame_names, check_names, check_reserved, check_tool
 from morphgen.checks.repairs import repaired
 from morphgen.checks.shapes import check_shapes, check_units
 from morphgen.model.findings import Finding
@@ -53,8 +58,9 @@ CHECKS: tuple[Check, ...] = (
     check_link_count,
     check_root,
 )
+"""The checks that apply to robots and parts; ``check_tool`` applies to robots only."""
 
-_RANK = {"error": 0, "warning": 1, "info": 2}
+_SEVERITY_RANK = {"error": 0, "warning": 1, "info": 2}
 
 __all__ = ["CHECKS", "Check", "check", "fix", "record_repairs"]
 
@@ -62,28 +68,31 @@ __all__ = ["CHECKS", "Check", "check", "fix", "record_repairs"]
 def check(
     robot: Robot, *, tool_required: bool = True, home_tested: bool = False
 ) -> tuple[Finding, ...]:
-    """Run every check.
+    """Run every check on a robot.
 
     Args:
-        robot: The body.
-        tool_required: Whether a missing or motionless tool is a finding; not so for a part.
-        home_tested: Whether it is known that nothing collides at home, as after ``survey_split``.
+        robot: The robot.
+        tool_required: Whether a missing or immobile tool is a finding; False for parts.
+        home_tested: Whether ``survey_collisions`` has already tested the home configuration, so
+            that the self-collision check can be skipped.
 
     Returns:
-        Findings by severity, code and place; the same robot gives the same ones.
+        Findings, sorted by severity, code and place.
     """
     checks = (*CHECKS, check_tool) if tool_required else CHECKS
     if home_tested:
         checks = tuple(run for run in checks if run is not check_self_collision)
-    findings = {_judged(finding, robot) for run in checks for finding in run(robot)}
+    findings = {_apply_accepted(finding, robot) for run in checks for finding in run(robot)}
     findings.update(robot.source_findings)
-    return tuple(sorted(findings, key=lambda f: (_RANK[f.severity], f.code, f.where, f.why)))
+    return tuple(
+        sorted(findings, key=lambda f: (_SEVERITY_RANK[f.severity], f.code, f.where, f.why))
+    )
 
 
-def _judged(finding: Finding, robot: Robot) -> Finding:
-    """The finding, turned to information where a part says why it is as it should be.
+def _apply_accepted(finding: Finding, robot: Robot) -> Finding:
+    """Lower a finding to ``info`` if a part's manifest accepts it and gives a reason.
 
-    One of the two links of a pair may say so for both.
+    A finding about two links is accepted if either of them accepts it.
     """
     accepted = cast(Mapping[str, Mapping[str, str]], robot.provenance.get("accepted", {}))
     for name in finding.where.partition(" ")[2].split(", "):
@@ -94,24 +103,23 @@ def _judged(finding: Finding, robot: Robot) -> Finding:
 
 
 def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
-    """Repair what can be repaired safely.
+    """Apply all safe repairs to a robot.
 
     Args:
-        robot: The body.
+        robot: The robot.
 
     Returns:
-        The repaired body, whose provenance names the repairs, and the findings that are gone.
+        The repaired robot, whose provenance lists the repairs, and the repaired findings.
     """
-    gone = tuple(f for f in check(robot, tool_required=False) if f.fixable)
-    return (record_repairs(repaired(robot), gone) if gone else robot), gone
+    fixable = tuple(f for f in check(robot, tool_required=False) if f.fixable)
+    return (record_repairs(repaired(robot), fixable) if fixable else robot), fixable
 
 
 def record_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:
-    """A copy whose provenance, and with it its card, names repairs after those that it names.
+    """Return a robot whose provenance, and therefore its card, lists further repairs.
 
-    What was repaired in its file is no finding any more: nothing written of the robot has it.
+    The findings of its source file are cleared, because the repaired robot does not have them.
     """
-    made = cast(list[str], robot.provenance.get("repairs", []))
-    new = [f"{finding.where}: {finding.repair}" for finding in findings]
-    provenance = {**robot.provenance, "repairs": [*made, *new]}
-    return replace(robot, provenance=provenance, source_findings=())
+    earlier = cast(list[str], robot.provenance.get("repairs", []))
+    repairs = [*earlier, *(f"{finding.where}: {finding.repair}" for finding in findings)]
+    return replace(robot, provenance={**robot.provenance, "repairs": repairs}, source_findings=())

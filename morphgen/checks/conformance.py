@@ -1,4 +1,4 @@
-"""Conformance: do all loaders read a bundle as the same robot?"""
+"""Conformance: compare how different loaders read a bundle."""
 
 from __future__ import annotations
 
@@ -8,55 +8,58 @@ from pathlib import Path
 
 import numpy as np
 
-from morphgen.checks.readers import LOADERS, Loader, Reading
+from morphgen.checks.readers import LOADERS, Loader
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_bundle
 from morphgen.formats.mujoco_urdf import BOUND_MASS
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
-from morphgen.model.robot import Frame, Robot
+from morphgen.model.robot import TOOL, Frame, Robot
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5
-"""Largest distance of a loader's tool from ours, metres."""
+"""Largest accepted distance between a loader's tool and morphgen's [m]."""
 ROTATION_TOLERANCE = 1e-5
-"""Largest angle of a loader's tool to ours, rad."""
+"""Largest accepted angle between a loader's tool and morphgen's [rad]."""
 LARGEST_POSITION = 10.0
-"""Joints without sensible limits are compared up to here, rad or m: PyBullet counts in floats."""
+"""Bound of the compared joint positions [rad or m], because PyBullet uses single precision."""
 MASS_TOLERANCE = 1e-6
-"""Largest difference of a loader's total mass from ours, relative to ours.
+"""Largest accepted relative difference between a loader's total mass and morphgen's.
 
-MuJoCo may add ``BOUND_MASS`` a link.
+In addition, MuJoCo may add ``BOUND_MASS`` per link.
 """
 
 
 @dataclass(frozen=True)
 class ConformanceRow:
-    """What one loader makes of a bundle."""
+    """Result of one loader."""
 
     loader: str
     passed: bool | None
-    """Whether it agrees; None if the loader is not installed."""
+    """Whether the loader agrees with morphgen; None if it is not installed."""
     joints: bool | None = None
-    """Whether it has the same movable joints, by name."""
+    """Whether the loader has the same movable joints, by name."""
     mass: float | None = None
-    """Total mass, kg."""
+    """Total mass [kg]."""
     position_error: float | None = None
-    """Largest distance of the frame from ours over the configurations, metres."""
+    """Largest distance between the frame and morphgen's over all configurations [m]."""
     rotation_error: float | None = None
-    """Largest angle of the frame to ours over the configurations, rad."""
+    """Largest angle between the frame and morphgen's over all configurations [rad]."""
     message: str = ""
-    """What is wrong, or that the loader is not installed."""
+    """Description of the disagreement, or ``not installed``."""
 
 
 @dataclass(frozen=True)
 class ConformanceReport:
-    """What every loader makes of a bundle."""
+    """Results of all loaders for one bundle."""
 
     robot: str
+    """Name of the robot."""
     frame: str
-    """The frame or link whose pose was compared."""
+    """Name of the compared frame or link."""
     samples: int
+    """Number of configurations."""
     seed: int
+    """Seed of the configurations."""
     passed: bool
     """Whether every installed loader agrees."""
     rows: tuple[ConformanceRow, ...]
@@ -65,24 +68,24 @@ class ConformanceReport:
 def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
     """Load a bundle in every loader and compare joints, total mass and tool pose.
 
-    The loaders are yourdfpy, PyBullet, MuJoCo (the URDF), MuJoCo (the MJCF) and Pinocchio; ours is
-    ``morphgen.model.kinematics``. Mimic joints are set like any other, except in yourdfpy, which
-    moves them itself. A robot without a frame ``tool`` is compared at its last link.
+    The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. They are compared with
+    ``morphgen.model.kinematics``. Mimic joints are set like any other joint, except in yourdfpy,
+    which moves them itself. A robot without a frame ``tool`` is compared at its last link.
 
     Args:
-        bundle_dir: The bundle.
-        samples: Random configurations within the joint limits.
-        seed: Their seed.
+        bundle_dir: Folder of the bundle.
+        samples: Number of random configurations within the joint limits.
+        seed: Seed of the configurations.
 
     Raises:
-        FormatError: If ``bundle_dir`` is no bundle.
+        FormatError: If ``bundle_dir`` is not a bundle.
     """
     return compare(read_bundle(bundle_dir), bundle_dir, samples, seed)
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
     """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``."""
-    frame = next((frame for frame in robot.frames if frame.name == "tool"), None)
+    frame = next((frame for frame in robot.frames if frame.name == TOOL), None)
     if frame is None:
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
         robot = replace(robot, frames=(frame,))
@@ -102,14 +105,10 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
         reading = loader.read(folder, frame, positions, len(q))
     except FormatError as error:
         return ConformanceRow(loader.name, False, message=str(error))
-    return _judged(robot, loader.name, frame, q, reading)
-
-
-def _judged(robot: Robot, loader: str, frame: str, q: Array, reading: Reading) -> ConformanceRow:
     expected = frame_pose(robot, q, frame)
-    offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
-    position_error = float(np.linalg.norm(offset, axis=1).max(initial=0.0))
-    rotation_error = _angle(reading.T_root_frame[:, :3, :3], expected[:, :3, :3])
+    position_offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
+    position_error = float(np.linalg.norm(position_offset, axis=1).max(initial=0.0))
+    rotation_error = _max_angle(reading.T_root_frame[:, :3, :3], expected[:, :3, :3])
     ours = {robot.joints[k].name for k in robot.movable_joints}
     theirs = set(reading.joints)
     faults = []
@@ -125,7 +124,7 @@ def _judged(robot: Robot, loader: str, frame: str, q: Array, reading: Reading) -
     if rotation_error > ROTATION_TOLERANCE:
         faults.append(f"{frame} is {rotation_error:.3g} rad off")
     return ConformanceRow(
-        loader,
+        loader.name,
         passed=not faults,
         joints=ours == theirs,
         mass=reading.mass,
@@ -135,7 +134,10 @@ def _judged(robot: Robot, loader: str, frame: str, q: Array, reading: Reading) -
     )
 
 
-def _angle(a: Array, b: Array) -> float:
-    """Largest angle between rotations of two stacks (n, 3, 3), rad, exact for small angles."""
+def _max_angle(a: Array, b: Array) -> float:
+    """Return the largest angle between rotations (n, 3, 3) [rad], exact for small angles.
+
+    The Frobenius norm of the difference is sqrt(8) sin(angle / 2).
+    """
     chord = np.linalg.norm(a - b, axis=(1, 2)) / np.sqrt(8.0)
     return float(2 * np.arcsin(np.clip(chord, 0.0, 1.0)).max(initial=0.0))

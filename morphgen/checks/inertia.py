@@ -1,4 +1,4 @@
-"""Mass properties: missing, impossible, or far from what the geometry suggests."""
+"""Checks of mass properties: missing, impossible, or inconsistent with the geometry."""
 
 from __future__ import annotations
 
@@ -7,29 +7,32 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morphgen.checks.solids import body_shapes, solid_of
+from morphgen.checks.shapes import unit_density_inertial
 from morphgen.model.findings import Finding
 from morphgen.model.inertia import bounding_box
 from morphgen.model.robot import Inertial, Link, Robot
 from morphgen.model.tree import RigidGroup, rigid_groups
+from morphgen.typing import Array
 
 DEFAULT_DENSITY = 1000.0
-"""Density of a link whose source gives no mass, kg/m^3."""
+"""Density of a link whose source gives no mass [kg/m^3]; that of water."""
 GYRATION_FACTOR = 5.0
-"""Radii of gyration may differ from those of the solid geometry by this factor."""
+"""Largest plausible ratio between radii of gyration and those of the solid geometry."""
 COM_MARGIN = 0.5
-"""How far the centre of mass may lie outside the bounding box, as a fraction of half its size."""
+"""Distance of the centre of mass from the bounding box that is still plausible, as a fraction of
+half the size of the box."""
 DENSITY_RANGE = (20.0, 25_000.0)
-"""Plausible mean densities, kg/m^3: from foam to tungsten."""
+"""Plausible mean densities, from foam to more than tungsten [kg/m^3]."""
 TRIANGLE_MARGIN = 1e-12
-"""Relative margin of the triangle inequality; MuJoCo refuses what rounding pushes over it."""
+"""Relative margin of the triangle inequality, because MuJoCo refuses values at the limit after
+rounding."""
 _FROM_SOLID = (
     f"its mass and inertia were set to those of its solid geometry at {DEFAULT_DENSITY:g} kg/m^3"
 )
 
 
 def check_masses(robot: Robot) -> Iterator[Finding]:
-    """Find moving bodies without mass, and links whose mass is impossible."""
+    """Find moving links without mass, and links whose mass is invalid."""
     for group in rigid_groups(robot):
         if not group.is_root:
             yield from _group_findings(group)
@@ -42,7 +45,7 @@ def check_masses(robot: Robot) -> Iterator[Finding]:
                 f"mass {link.inertial.mass:g} kg with its centre at {link.inertial.com}",
                 f"write a finite mass of at least 0; the repair takes the solid geometry's at "
                 f"{DEFAULT_DENSITY:g} kg/m^3",
-                repair=_FROM_SOLID if solid_of(link) is not None else "",
+                repair=_FROM_SOLID if unit_density_inertial(link) is not None else "",
             )
         if is_inertia_without_mass(link):
             yield Finding(
@@ -58,11 +61,11 @@ def check_masses(robot: Robot) -> Iterator[Finding]:
 def check_inertia(robot: Robot) -> Iterator[Finding]:
     """Compare the mass properties of every link with physics and with its geometry."""
     for link in robot.links:
-        body = link.inertial
-        if body is None or not is_mass_valid(body) or body.mass == 0:
+        inertial = link.inertial
+        if inertial is None or not is_mass_valid(inertial) or inertial.mass == 0:
             continue
-        solid = solid_of(link)
-        fault = inertia_fault(body)
+        solid = unit_density_inertial(link)
+        fault = inertia_fault(inertial)
         if fault is not None:
             yield Finding(
                 "inertia-not-physical",
@@ -73,38 +76,42 @@ def check_inertia(robot: Robot) -> Iterator[Finding]:
                 f"without any, that of a ball of {DEFAULT_DENSITY:g} kg/m^3",
                 repair="its inertia was set to that of "
                 + ("a ball" if solid is None else "its solid geometry")
-                + f" at the same mass, {body.mass:g} kg",
+                + f" at the same mass, {inertial.mass:g} kg",
             )
         if solid is not None:
             if fault is None:
-                yield from _gyration_findings(link, body, solid)
-            yield from _placement_findings(link, body, solid)
+                yield from _gyration_findings(link, inertial, solid)
+            yield from _placement_findings(link, inertial, solid)
 
 
-def is_mass_valid(body: Inertial) -> bool:
-    """Whether mass and centre of mass are finite, and the mass not negative."""
-    return math.isfinite(body.mass) and body.mass >= 0 and all(math.isfinite(x) for x in body.com)
+def is_mass_valid(inertial: Inertial) -> bool:
+    """Return whether mass and centre of mass are finite, and the mass is not negative."""
+    return (
+        math.isfinite(inertial.mass)
+        and inertial.mass >= 0
+        and all(map(math.isfinite, inertial.com))
+    )
 
 
 def is_inertia_without_mass(link: Link) -> bool:
-    """Whether a bare frame turns heavily: inertia without mass."""
+    """Return whether a link without mass and shapes has an inertia."""
     return link.is_empty and link.inertial is not None and any(link.inertial.inertia)
 
 
 def lacks_mass(link: Link) -> bool:
-    """Whether a link has geometry but no mass."""
+    """Return whether a link has shapes but no mass."""
     return not link.is_empty and (link.inertial is None or link.inertial.mass == 0)
 
 
-def inertia_fault(body: Inertial) -> str | None:
-    """Why no rigid body of positive mass has this inertia; None if one can.
+def inertia_fault(inertial: Inertial) -> str | None:
+    """Return why no rigid body with positive mass can have this inertia; None if it is possible.
 
-    The principal moments must be positive, and none as large as the sum of the others: that is
-    reached only by a body without any thickness.
+    The principal moments must be positive and each smaller than the sum of the other two, which it
+    equals only for bodies without thickness.
     """
-    if not np.isfinite(body.matrix).all():
-        return f"inertia {body.inertia} is not finite"
-    low, middle, high = np.linalg.eigvalsh(body.matrix).tolist()
+    if not np.isfinite(inertial.matrix).all():
+        return f"inertia {inertial.inertia} is not finite"
+    low, middle, high = np.linalg.eigvalsh(inertial.matrix).tolist()
     moments = f"principal moments {low:.4g}, {middle:.4g}, {high:.4g} kg m^2"
     if low <= 0:
         return f"{moments} are not all positive"
@@ -133,7 +140,7 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
             why,
             f"give it mass and inertia; the repair takes those of its solid geometry at "
             f"{DEFAULT_DENSITY:g} kg/m^3",
-            repair=_FROM_SOLID if solid_of(link) is not None else "",
+            repair=_FROM_SOLID if unit_density_inertial(link) is not None else "",
         )
     if group.mass > 0 or any(not link.is_empty for link in group.links):
         return
@@ -152,8 +159,8 @@ def _group_findings(group: RigidGroup) -> Iterator[Finding]:
         )
 
 
-def _gyration_findings(link: Link, body: Inertial, solid: Inertial) -> Iterator[Finding]:
-    radii, expected = gyration_radii(body), gyration_radii(solid)
+def _gyration_findings(link: Link, inertial: Inertial, solid: Inertial) -> Iterator[Finding]:
+    radii, expected = gyration_radii(inertial), gyration_radii(solid)
     ratio = radii / expected
     if ratio.max() <= GYRATION_FACTOR and ratio.min() >= 1 / GYRATION_FACTOR:
         return
@@ -167,11 +174,11 @@ def _gyration_findings(link: Link, body: Inertial, solid: Inertial) -> Iterator[
     )
 
 
-def _placement_findings(link: Link, body: Inertial, solid: Inertial) -> Iterator[Finding]:
-    low, high = bounding_box(body_shapes(link))
+def _placement_findings(link: Link, inertial: Inertial, solid: Inertial) -> Iterator[Finding]:
+    low, high = bounding_box(link.collisions or link.visuals)
     margin = COM_MARGIN * (high - low) / 2
-    if np.any(body.com < low - margin) or np.any(body.com > high + margin):
-        x, y, z = body.com
+    if np.any(inertial.com < low - margin) or np.any(inertial.com > high + margin):
+        x, y, z = inertial.com
         yield Finding(
             "com-outside",
             "warning",
@@ -180,25 +187,25 @@ def _placement_findings(link: Link, body: Inertial, solid: Inertial) -> Iterator
             f"({_corner(low)} to {_corner(high)} m)",
             "check the origin of <inertial>",
         )
-    density = body.mass / solid.mass
+    density = inertial.mass / solid.mass
     if not DENSITY_RANGE[0] <= density <= DENSITY_RANGE[1]:
         yield Finding(
             "density-implausible",
             "warning",
             f"link {link.name}",
-            f"{body.mass:.4g} kg in {solid.mass * 1e6:.4g} cm^3 are {density:.4g} kg/m^3",
+            f"{inertial.mass:.4g} kg in {solid.mass * 1e6:.4g} cm^3 are {density:.4g} kg/m^3",
             f"check mass and geometry; {DENSITY_RANGE[0]:g} to {DENSITY_RANGE[1]:g} is plausible",
         )
 
 
-def gyration_radii(body: Inertial) -> np.ndarray:
-    """Principal radii of gyration about the centre of mass, ascending, shape (3,), metres."""
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(body.matrix) / body.mass))
+def gyration_radii(inertial: Inertial) -> Array:
+    """Return the principal radii of gyration about the centre of mass, ascending, (3,) [m]."""
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(inertial.matrix) / inertial.mass))
 
 
-def _millimetres(values: np.ndarray) -> str:
+def _millimetres(values: Array) -> str:
     return ", ".join(f"{1000 * value:.3g}" for value in values.tolist())
 
 
-def _corner(point: np.ndarray) -> str:
+def _corner(point: Array) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in point.tolist()) + ")"

@@ -1,19 +1,23 @@
-"""Joints: axes, limits, effort, velocity and the home position."""
+"""Checks of joints: axes, limits, effort, velocity, home positions and mimic joints."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from morphgen.model.findings import Finding
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Joint, Robot
 
 AXIS_TOLERANCE = 1e-3
-"""How far an axis may be from unit length, as rounding in a file makes it."""
+"""Deviation of an axis from unit length that counts as rounding in a file."""
 REVOLUTE_SPAN = 4 * 2 * math.pi
-"""Widest plausible range of a revolute joint, rad; more is likely to be degrees."""
+"""Widest plausible range of a revolute joint [rad]; wider limits are likely degrees."""
 PRISMATIC_SPAN = 10.0
-"""Widest plausible range of a prismatic joint, m; more is likely to be millimetres."""
+"""Widest plausible range of a prismatic joint [m]; wider limits are likely millimetres."""
+MIMIC_RANGE_TOLERANCE = 0.01
+"""Overshoot of a mimic joint's limits that is not reported, as a fraction of their span."""
 
 
 def check_axes(robot: Robot) -> Iterator[Finding]:
@@ -58,11 +62,12 @@ def check_limits(robot: Robot) -> Iterator[Finding]:
                 )
             continue
         if joint.limits is None or not all(map(math.isfinite, joint.limits)):
+            limits = "without limits" if joint.limits is None else f"with limits {joint.limits}"
             yield Finding(
                 "limits-missing",
                 "error",
                 where,
-                f"it is {joint.kind} {_limits_in_words(joint)}: PyBullet refuses the file, "
+                f"it is {joint.kind} {limits}: PyBullet refuses the file, "
                 "MuJoCo lets it move without end",
                 "write limits" + (", or make it continuous" if joint.kind == "revolute" else ""),
             )
@@ -111,7 +116,7 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
                 "effort-missing",
                 "warning",
                 where,
-                f"{_in_words('effort', joint.effort)}: PyBullet has no force to move it, MuJoCo no "
+                f"{_describe('effort', joint.effort)}: PyBullet has no force to move it, MuJoCo no "
                 "limit",
                 f"write its largest effort; the repair takes {effort}",
                 repair=f"its effort was set to {effort}",
@@ -121,7 +126,7 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
                 "velocity-missing",
                 "warning",
                 where,
-                _in_words("velocity", joint.velocity),
+                _describe("velocity", joint.velocity),
                 f"write its largest velocity; the repair takes {velocity}",
                 repair=f"its velocity was set to {velocity}",
             )
@@ -140,7 +145,7 @@ def check_home(robot: Robot) -> Iterator[Finding]:
     """Find home positions outside the limits."""
     for k, position in zip(robot.independent_joints, robot.home, strict=True):
         joint = robot.joints[k]
-        lower, upper = reachable(joint)
+        lower, upper = position_range(joint)
         if not (math.isfinite(position) and lower <= position <= upper):
             yield Finding(
                 "home-outside-limits",
@@ -152,19 +157,85 @@ def check_home(robot: Robot) -> Iterator[Finding]:
             )
 
 
+def check_mimic(robot: Robot) -> Iterator[Finding]:
+    """Find mimic joints that cannot move, or whose leader is fixed."""
+    for joint in robot.joints:
+        mimic = joint.mimic
+        if mimic is None:
+            continue
+        where = f"joint {joint.name}"
+        if not joint.is_movable:
+            yield Finding(
+                "mimic-on-fixed",
+                "warning",
+                where,
+                f"it is fixed but mimics {mimic.joint}",
+                "remove <mimic>, or give the joint a movable type",
+            )
+            continue
+        if not robot.joints[robot.joint_index[mimic.joint]].is_movable:
+            yield Finding(
+                "mimic-leader-fixed",
+                "error",
+                where,
+                f"it mimics {mimic.joint}, which is fixed: loaders disagree whether it moves",
+                "make it fixed, let it move by itself or name another leader",
+            )
+        if not (math.isfinite(mimic.multiplier) and math.isfinite(mimic.offset)):
+            yield Finding(
+                "mimic-invalid",
+                "error",
+                where,
+                f"it follows as {mimic.multiplier} q + {mimic.offset}",
+                "write a finite multiplier and offset",
+            )
+        elif mimic.multiplier == 0:
+            yield Finding(
+                "mimic-still",
+                "warning",
+                where,
+                f"its multiplier is 0: it never moves with {mimic.joint}",
+                "write the multiplier, or make the joint fixed",
+            )
+
+
+def check_mimic_range(robot: Robot) -> Iterator[Finding]:
+    """Find mimic joints that their leaders drive beyond their own limits."""
+    matrix, offset = robot.mimic_map
+    for row, k in enumerate(robot.movable_joints):
+        follower = robot.joints[k]
+        lower, upper = position_range(follower)
+        leaders = np.flatnonzero(matrix[row]).tolist()
+        if follower.mimic is None or not leaders or not math.isfinite(upper - lower):
+            continue
+        leader = robot.joints[robot.independent_joints[leaders[0]]]
+        gain = float(matrix[row, leaders[0]])
+        low, high = sorted(gain * q + float(offset[row]) for q in position_range(leader))
+        slack = MIMIC_RANGE_TOLERANCE * (upper - lower)
+        if low < lower - slack or high > upper + slack:
+            yield Finding(
+                "mimic-range",
+                "warning",
+                f"joint {follower.name}",
+                f"joint {leader.name} sends it from {low:.4g} to {high:.4g}; its limits are "
+                f"{lower:.4g} to {upper:.4g}",
+                "widen its limits, or narrow its leader's",
+            )
+
+
 def is_axis_valid(joint: Joint) -> bool:
-    """Whether the axis has a direction."""
+    """Return whether the axis is finite and not zero."""
     length = math.hypot(*joint.axis)
     return math.isfinite(length) and length >= 1e-9
 
 
 def is_axis_unit(joint: Joint) -> bool:
-    """Whether the axis is of unit length, up to rounding in a file."""
+    """Return whether the axis has unit length, up to rounding in a file."""
     return abs(math.hypot(*joint.axis) - 1) <= AXIS_TOLERANCE
 
 
 def has_inverted_limits(joint: Joint) -> bool:
-    """Whether the lower limit is above the upper one."""
+    """Return whether the lower limit is above the upper one."""
     return (
         joint.kind in ("revolute", "prismatic")
         and joint.limits is not None
@@ -174,7 +245,7 @@ def has_inverted_limits(joint: Joint) -> bool:
 
 
 def is_locked(robot: Robot, joint: Joint) -> bool:
-    """Whether a joint's limits hold it at zero, so that a fixed joint is the same to the robot."""
+    """Return whether limits of zero make the joint equivalent to a fixed one."""
     mimics = (other.mimic for other in robot.joints if other.mimic is not None)
     return (
         joint.kind in ("revolute", "prismatic")
@@ -184,24 +255,20 @@ def is_locked(robot: Robot, joint: Joint) -> bool:
     )
 
 
-def reachable(joint: Joint) -> tuple[float, float]:
-    """Lowest and highest position that the limits allow, in whatever order they are written."""
+def position_range(joint: Joint) -> tuple[float, float]:
+    """Return the lowest and highest position within the limits, even if these are inverted."""
     if joint.limits is None or joint.kind == "continuous" or any(map(math.isnan, joint.limits)):
         return (-math.inf, math.inf)
     return (min(joint.limits), max(joint.limits))
 
 
 def is_positive(value: float | None) -> bool:
-    """Whether a value is given, finite and above zero."""
+    """Return whether a value is given, finite and above zero."""
     return value is not None and math.isfinite(value) and value > 0
 
 
-def _in_words(name: str, value: float | None) -> str:
+def _describe(name: str, value: float | None) -> str:
     return f"it has no {name}" if value is None else f"its {name} is {value:g}"
-
-
-def _limits_in_words(joint: Joint) -> str:
-    return "without limits" if joint.limits is None else f"with limits {joint.limits}"
 
 
 def _movable(robot: Robot) -> Iterator[Joint]:

@@ -1,21 +1,21 @@
-"""Traps of single loaders that a bundle already avoids: worth knowing, no fault."""
+"""Checks for limitations of single loaders, most of which a bundle works around."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from morphgen.checks.solids import is_scale_valid
+from morphgen.checks.shapes import is_scale_valid
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Mesh
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 
 PYBULLET_LINKS = 127
-"""Links below the root that PyBullet 3.2.7 holds; of more it answers nothing."""
+"""Largest number of links below the root in PyBullet 3.2.7, which fails silently on more."""
 
 
 def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:
-    """Tell which joints a URDF loader may leave without their leader."""
+    """Report mimic joints, which some URDF loaders do not couple to their leader."""
     followers = [
         robot.joints[k].name for k in robot.movable_joints if robot.joints[k].mimic is not None
     ]
@@ -31,7 +31,7 @@ def check_mimic_loaders(robot: Robot) -> Iterator[Finding]:
 
 
 def check_capsules(robot: Robot) -> Iterator[Finding]:
-    """Tell which links have capsules."""
+    """Report links with capsules, which URDF does not have."""
     for link in robot.links:
         shapes = (*link.visuals, *link.collisions)
         if any(isinstance(shape.geometry, Capsule) for shape in shapes):
@@ -45,7 +45,7 @@ def check_capsules(robot: Robot) -> Iterator[Finding]:
 
 
 def check_mesh_scales(robot: Robot) -> Iterator[Finding]:
-    """Tell which meshes are mirrored or stretched by their scale."""
+    """Report meshes that their scale mirrors or stretches."""
     for link in robot.links:
         shapes = (*link.visuals, *link.collisions)
         meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
@@ -68,7 +68,7 @@ def check_mesh_scales(robot: Robot) -> Iterator[Finding]:
 
 
 def check_link_count(robot: Robot) -> Iterator[Finding]:
-    """Tell whether the robot has more links than PyBullet holds."""
+    """Find robots with more links than PyBullet supports."""
     links = len(robot.links) + len(robot.frames)
     if links - 1 > PYBULLET_LINKS:
         yield Finding(
@@ -81,7 +81,7 @@ def check_link_count(robot: Robot) -> Iterator[Finding]:
 
 
 def check_root(robot: Robot) -> Iterator[Finding]:
-    """Tell whether the root has geometry but weighs nothing."""
+    """Report a base with shapes but without mass."""
     base = rigid_groups(robot)[0]
     if base.mass == 0 and any(not link.is_empty for link in base.links):
         yield Finding(

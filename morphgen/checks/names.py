@@ -1,4 +1,4 @@
-"""Names that loaders take as they are."""
+"""Checks of names and frames: unsafe characters, name clashes and the tool frame."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import re
 from collections.abc import Iterable, Iterator
 
 from morphgen.model.findings import Finding
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 
-_DISLIKED = re.compile(r"[^A-Za-z0-9_.\-]")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.\-]")
 _WORLD = "world"
 
 
 def check_names(robot: Robot) -> Iterator[Finding]:
-    """Find empty names and characters that loaders take for something else."""
-    for what, names in named(robot).items():
+    """Find empty names and names with characters that loaders misinterpret."""
+    for element, names in all_names(robot).items():
         for name in names:
             if is_name_safe(name):
                 continue
-            characters = " ".join(repr(c) for c in dict.fromkeys(_DISLIKED.findall(name)))
+            characters = " ".join(repr(c) for c in dict.fromkeys(_UNSAFE.findall(name)))
             yield Finding(
                 "name-characters",
                 "warning",
-                f"{what} {name}",
+                f"{element} {name}",
                 f"its name holds {characters or 'nothing'}: paths, scopes and USD break on that",
                 "use letters, digits, '_', '-' and '.'; the repair writes '_'",
                 repair="its name was rewritten with '_' for what loaders dislike",
@@ -30,7 +30,7 @@ def check_names(robot: Robot) -> Iterator[Finding]:
 
 
 def check_reserved(robot: Robot) -> Iterator[Finding]:
-    """Find a link that has the name MuJoCo keeps for the world."""
+    """Find a link other than the root that has MuJoCo's reserved name ``world``."""
     if robot.link_index.get(_WORLD, 0) > 0:
         yield Finding(
             "name-reserved",
@@ -43,9 +43,9 @@ def check_reserved(robot: Robot) -> Iterator[Finding]:
 
 
 def check_frame_names(robot: Robot) -> Iterator[Finding]:
-    """Find frames that cannot be written as links of a URDF beside the others."""
+    """Find frames whose link and joint in a URDF would clash with existing names."""
     for frame in robot.frames:
-        for what, name, taken in (
+        for element, name, taken in (
             ("link", frame.name, robot.link_index),
             ("joint", f"{frame.name}_joint", robot.joint_index),
         ):
@@ -54,18 +54,41 @@ def check_frame_names(robot: Robot) -> Iterator[Finding]:
                     "frame-name-taken",
                     "error",
                     f"frame {frame.name}",
-                    f"in a URDF it is a {what} {name!r}, and there is one of that name",
-                    "rename the frame or the " + what,
+                    f"in a URDF it is a {element} {name!r}, and there is one of that name",
+                    "rename the frame or the " + element,
                 )
 
 
+def check_tool(robot: Robot) -> Iterator[Finding]:
+    """Find a robot without a tool frame, or with one that no joint moves."""
+    tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
+    if tool is None:
+        yield Finding(
+            "tool-missing",
+            "warning",
+            f"robot {robot.name}",
+            "it has no frame 'tool': tasks and reach need one",
+            "name the frame at the working point 'tool'",
+        )
+    elif robot.dof > 0 and not any(
+        robot.joints[k].is_movable for k in robot.joint_chain(tool.link)
+    ):
+        yield Finding(
+            "tool-still",
+            "warning",
+            f"frame {TOOL}",
+            f"it is on link {tool.link}, which no joint moves",
+            "put the frame on the end-effector",
+        )
+
+
 def is_name_safe(name: str) -> bool:
-    """Whether a name holds only letters, digits, ``_``, ``-`` and ``.``."""
-    return bool(name) and _DISLIKED.search(name) is None
+    """Return whether a name has letters, digits, ``_``, ``-`` and ``.`` only, and at least one."""
+    return bool(name) and _UNSAFE.search(name) is None
 
 
-def named(robot: Robot) -> dict[str, tuple[str, ...]]:
-    """All names of a robot by what they name; within each they are unique."""
+def all_names(robot: Robot) -> dict[str, tuple[str, ...]]:
+    """Return all names of a robot by kind of element; they are unique within each kind."""
     return {
         "robot": (robot.name,),
         "link": tuple(link.name for link in robot.links),
@@ -75,17 +98,17 @@ def named(robot: Robot) -> dict[str, tuple[str, ...]]:
 
 
 def safe_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str, str]:
-    """A safe and unique new name for every name; safe names that are not reserved stay."""
+    """Return a safe, unique new name for every name; safe names that are not reserved stay."""
     names, reserved = tuple(names), tuple(reserved)
     kept = {name for name in names if is_name_safe(name) and name not in reserved}
     taken = {*kept, *reserved}
-    renamed: dict[str, str] = {}
+    new_names: dict[str, str] = {}
     for name in names:
-        stem = new = name if name in kept else _DISLIKED.sub("_", name) or "_"
+        stem = new = name if name in kept else _UNSAFE.sub("_", name) or "_"
         k = 1
         while name not in kept and new in taken:
             k += 1
             new = f"{stem}_{k}"
         taken.add(new)
-        renamed[name] = new
-    return renamed
+        new_names[name] = new
+    return new_names

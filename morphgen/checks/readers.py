@@ -1,9 +1,10 @@
-"""Other libraries' readings of a bundle: joints, mass, and where they put a frame."""
+"""Read a bundle with other libraries: joints, total mass and poses of a frame."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +17,19 @@ from morphgen.typing import Array
 
 @dataclass(frozen=True)
 class Reading:
-    """What a loader understood."""
+    """Robot as a loader reads it."""
 
     joints: tuple[str, ...]
     """Names of the movable joints."""
     mass: float
-    """Total mass, kg."""
+    """Total mass [kg]."""
     T_root_frame: Array
-    """Pose of the frame at every configuration, shape (n, 4, 4)."""
+    """Pose of the frame in each configuration, shape (n, 4, 4)."""
 
 
 Read = Callable[[Path, str, Mapping[str, Array], int], Reading]
-"""Reads the bundle (folder, frame, position of every movable joint, shape (n,), and n)."""
+"""Function of the bundle's folder, a frame's name, the positions of every movable joint, shape (n,)
+[rad or m], and the number n of configurations."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +37,15 @@ class Loader:
     """A library that reads one file of a bundle."""
 
     name: str
+    """Name of the loader and its file."""
     module: str
-    """The library's import name."""
+    """Import name of the library."""
     read: Read
-    """Raises ``FormatError`` if the library refuses the file or lacks the frame."""
+    """Reads the file; raises ``FormatError`` if the library rejects it or lacks the frame."""
 
 
 def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF in yourdfpy, which moves mimic joints itself."""
+    """Read the URDF with yourdfpy, which moves mimic joints itself."""
     import yourdfpy
 
     urdf = yourdfpy.URDF.load(str(folder / "robot.urdf"), load_meshes=False)
@@ -59,7 +62,7 @@ def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
 
 
 def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF in PyBullet, floating, because a fixed base reports no mass."""
+    """Read the URDF with PyBullet, with a floating base, because a fixed one reports no mass."""
     with quiet():
         import pybullet
 
@@ -101,18 +104,8 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
     return Reading(tuple(movable), float(mass), poses)
 
 
-def read_mujoco_urdf(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF in MuJoCo."""
-    return _read_mujoco(folder / "robot.urdf", frame, q, n)
-
-
-def read_mujoco_mjcf(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the MJCF in MuJoCo."""
-    return _read_mujoco(folder / "robot.xml", frame, q, n)
-
-
 def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF in Pinocchio, mimic joints as joints of their own."""
+    """Read the URDF with Pinocchio, without coupling mimic joints."""
     import pinocchio
 
     with quiet():
@@ -138,20 +131,12 @@ def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> 
     return Reading(names, float(sum(body.mass for body in model.inertias)), poses)
 
 
-LOADERS = (
-    Loader("yourdfpy", "yourdfpy", read_yourdfpy),
-    Loader("pybullet", "pybullet", read_pybullet),
-    Loader("mujoco (urdf)", "mujoco", read_mujoco_urdf),
-    Loader("mujoco (mjcf)", "mujoco", read_mujoco_mjcf),
-    Loader("pinocchio", "pinocchio", read_pinocchio),
-)
-
-
-def _read_mujoco(path: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
+    """Read ``robot.urdf`` or ``robot.xml`` with MuJoCo."""
     import mujoco
 
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_path(str(folder / file))
     except ValueError as error:
         raise FormatError("MuJoCo: " + " ".join(str(error).split())) from error
     data = mujoco.MjData(model)
@@ -169,3 +154,12 @@ def _read_mujoco(path: Path, frame: str, q: Mapping[str, Array], n: int) -> Read
         poses[i, :3, 3] = placed.xpos
         poses[i, :3, :3] = placed.xmat.reshape(3, 3)
     return Reading(tuple(address), float(model.body_mass.sum()), poses)
+
+
+LOADERS = (
+    Loader("yourdfpy", "yourdfpy", read_yourdfpy),
+    Loader("pybullet", "pybullet", read_pybullet),
+    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, "robot.urdf")),
+    Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, "robot.xml")),
+    Loader("pinocchio", "pinocchio", read_pinocchio),
+)

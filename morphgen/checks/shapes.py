@@ -1,37 +1,40 @@
-"""Shapes: meshes that load, sizes that make sense."""
+"""Checks of shapes: unreadable meshes, invalid sizes and likely wrong units."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from morphgen.checks.solids import is_scale_valid, is_sound, mesh_fault
+from morphgen.errors import MeshError
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Mesh, Shape, dimensions
-from morphgen.model.inertia import bounding_box
+from morphgen.model.geometry import Geometry, Mesh, Shape, dimensions
+from morphgen.model.inertia import bounding_box, inertial_from_density
 from morphgen.model.mesh import MAX_STL_FACES, convex_hull, load_mesh
-from morphgen.model.robot import Robot
+from morphgen.model.robot import Inertial, Link, Robot
 
 EXTENT_RANGE = (1e-3, 10.0)
-"""Plausible largest extent of a link, metres."""
+"""Plausible range of a link's longest edge [m]."""
 UNIT_RATIOS = {1000.0: "mm and m", 25.4: "inch and mm", 39.37: "inch and m"}
-"""Ratios between lengths that a mistaken unit causes."""
+"""Ratios of lengths that indicate a mistaken unit."""
 UNIT_TOLERANCE = 1.2
 """Factor within which a ratio counts as one of ``UNIT_RATIOS``."""
+MIN_SOLIDITY = 1e-9
+"""Volume over the cube of the longest edge below which shapes count as flat."""
 
 
 def check_shapes(robot: Robot) -> Iterator[Finding]:
-    """Find shapes that cannot be read or have no size; each mesh is reported once per link."""
+    """Find unreadable shapes and shapes without a size; each mesh is reported once per link."""
     for link in robot.links:
         where = f"link {link.name}"
-        touched = {shape.geometry for shape in link.collisions}
+        collisions = {shape.geometry for shape in link.collisions}
         for geometry in dict.fromkeys(
             shape.geometry for shape in (*link.visuals, *link.collisions)
         ):
             if isinstance(geometry, Mesh):
-                yield from _mesh_findings(geometry, where, collides=geometry in touched)
-            elif not is_sound(geometry):
+                yield from _mesh_findings(geometry, where, collides=geometry in collisions)
+            elif not is_readable(geometry):
                 kind = type(geometry).__name__.lower()
                 yield Finding(
                     "size-not-positive",
@@ -43,7 +46,7 @@ def check_shapes(robot: Robot) -> Iterator[Finding]:
 
 
 def check_units(robot: Robot) -> Iterator[Finding]:
-    """Find links whose size, or the ratio of its visual to its collision size, hints at a unit."""
+    """Find links with an implausible size, or a visual-to-collision ratio that is one of units."""
     for link in robot.links:
         visual, collision = _extent(link.visuals), _extent(link.collisions)
         for kind, extent in (("visual", visual), ("collision", collision)):
@@ -69,6 +72,48 @@ def check_units(robot: Robot) -> Iterator[Finding]:
                     "correct the mesh scale of one of them",
                 )
                 break
+
+
+def is_readable(geometry: Geometry) -> bool:
+    """Return whether a primitive has positive dimensions, or a mesh can be loaded."""
+    if isinstance(geometry, Mesh):
+        return is_scale_valid(geometry) and mesh_fault(geometry) is None
+    return all(math.isfinite(size) and size > 0 for size in dimensions(geometry))
+
+
+def has_hull(geometry: Geometry) -> bool:
+    """Return whether a primitive has positive dimensions, or a mesh has a convex hull."""
+    if isinstance(geometry, Mesh):
+        return is_scale_valid(geometry) and mesh_fault(geometry, reader=convex_hull) is None
+    return is_readable(geometry)
+
+
+def is_scale_valid(mesh: Mesh) -> bool:
+    """Return whether every scale factor is finite and not zero."""
+    return all(math.isfinite(factor) and factor != 0 for factor in mesh.scale)
+
+
+def mesh_fault(mesh: Mesh, reader: Callable[[Mesh], object] = load_mesh) -> str | None:
+    """Return why ``load_mesh`` or ``convex_hull`` fails on a mesh; None if it succeeds."""
+    try:
+        reader(mesh)
+    except MeshError as error:
+        return str(error)
+    return None
+
+
+def unit_density_inertial(link: Link) -> Inertial | None:
+    """Return the mass properties of a link's solid shapes at 1 kg/m^3.
+
+    Collision shapes count, or visual ones if there are none. Returns None if there are no shapes,
+    if one is invalid, or if all are flat.
+    """
+    shapes = link.collisions or link.visuals
+    if not shapes or not all(has_hull(shape.geometry) for shape in shapes):
+        return None
+    solid = inertial_from_density(shapes, density=1.0)
+    extent = float(np.ptp(bounding_box(shapes), axis=0).max())
+    return solid if solid.mass > MIN_SOLIDITY * extent**3 else None
 
 
 def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Finding]:
@@ -106,6 +151,6 @@ def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Findin
 
 
 def _extent(shapes: Sequence[Shape]) -> float | None:
-    """Longest edge of the bounding box of the sound shapes, metres; None without any."""
-    sound = [shape for shape in shapes if is_sound(shape.geometry)]
-    return float(np.ptp(bounding_box(sound), axis=0).max()) if sound else None
+    """Return the longest edge of the valid shapes' bounding box [m]; None without any."""
+    valid = [shape for shape in shapes if has_hull(shape.geometry)]
+    return float(np.ptp(bounding_box(valid), axis=0).max()) if valid else None

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from morphgen.checks import gaps
-from morphgen.checks.gaps import check_links_apart
+from morphgen.checks import home_pose
+from morphgen.checks.home_pose import check_links_apart
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.kinematics import forward_kinematics
@@ -27,7 +27,7 @@ def variation(*factors):
 @given(st.tuples(*[FACTOR] * 7))
 def test_no_gap_opens_between_neighbours_whatever_the_factors(factors):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaps, "MAX_GAP", SLIT)
+        patch.setattr(home_pose, "MAX_GAP", SLIT)
         assert list(check_links_apart(variation(*factors))) == []
 
 

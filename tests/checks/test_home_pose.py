@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from helpers.faulty_robots import hinge, sound, with_end, with_link
-from morphgen.checks import check, gaps
-from morphgen.checks.gaps import MAX_GAP, check_links_apart
+from morphgen.checks import check, home_pose
+from morphgen.checks.home_pose import MAX_GAP, check_links_apart
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
@@ -101,7 +101,7 @@ def test_the_distance_of_dense_meshes_is_exact_however_few_triangles_are_tried_f
     ball = mesh(tmp_path, "ball.stl", trimesh.creation.icosphere(5, radius=0.1))
     turned = Pose.from_xyz_rpy((0.0, 0.12, 0.16), (0.3, 0.2, 0.1))
     for few in (5, 500, 10**6):
-        monkeypatch.setattr(gaps, "_FEW", few)
+        monkeypatch.setattr(home_pose, "_COARSE_TRIANGLES", few)
         assert found(pair(ball, ball, Pose((0.0, 0.12, 0.16)))) == []
         assert found(pair(ball, Sphere(0.1), turned)) == []
         (where_why,) = found(pair(ball, ball, replace(turned, position=(0.0, 0.138, 0.184))))
