@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
-from morphgen.cli.command import Command, Option, flag, option, path_option, repeated
+from morphgen.cli.command import Command, Option, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
 
 if TYPE_CHECKING:
@@ -68,7 +68,12 @@ def _regime_options(train: str, train_default: str = "") -> tuple[Option, ...]:
         ),
         flag("--obstacles", "tasks have obstacles"),
         opt.SEED,
-        opt.MAX_LINKS,
+        number(
+            "--max-links",
+            "largest number of links of a robot, and the number that its tokens are padded to "
+            "(default: 23)",
+            least=2,
+        ),
         option("--name", help="name of the split (default: from the other options)"),
         path_option(
             "--out",

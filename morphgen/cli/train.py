@@ -265,7 +265,6 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     Raises:
         TaskError: If a number is out of its range.
     """
-    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.rl.agent_spec import configs_of, parse_constants
     from morphgen.rl.robot_source import tasks_of
     from morphgen.rl.runs import RunConfig
@@ -281,9 +280,25 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
         num_envs=args.envs,
         device=args.device,
         full_budget=args.whole and AGENTS[spec.agent].per_robot,
-        max_links=MAX_LINKS if args.max_links is None else args.max_links,
+        max_links=args.max_links or _max_links(source),
         tasks=_task_configs(source, args.train_goals),
     )
+
+
+def _max_links(source: RobotSource) -> int:
+    """Return the number of links that observations are padded to, unless ``--max-links`` is given.
+
+    It is the split's; or the benchmark's, or that of the one robot if it has more, such as a robot
+    with two arms.
+    """
+    from morphgen.benchmark.split_file import parse_split
+    from morphgen.benchmark.token_layout import MAX_LINKS
+    from morphgen.tasks.env_specs import load_robot
+
+    if source.split:
+        return parse_split(source.split, Path(source.name)).split.max_links
+    robot = load_robot(source.name, library=map(Path, source.library))
+    return max(MAX_LINKS, len(robot.links))
 
 
 def _task_configs(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]:

@@ -73,19 +73,20 @@ def test_one_body_is_trained_resumed_evaluated_and_played(run, tmp_path):
     assert out.startswith("episode 1: ")
 
 
-def test_bodies_of_many_links_are_for_those_who_ask(run, tmp_path):
+def test_a_robot_of_many_links_is_trained_without_an_option(run, tmp_path):
     words = ("train", "chain", "beads=7", "task=reach", "--agent", "me-mlp", *SMALL)
-    words += ("--steps", "32", "--out", "run")
-    code, out, err = run(*words)
+    words += ("--steps", "32")
+    code, out, err = run(*words, "--out", "run", "--max-links", "23")
     assert (code, out, tree(tmp_path)) == (2, "", {})
     assert "has 25 links, more than max_links 23; make max_links 25 or more" in err
 
-    assert run(*words, "--max-links", "26")[0] == 0
-    assert read_checkpoint(Path("run"))[1]["layout"]["links"] == 26
-    code, out, _ = run("eval", "run", "--episodes", "1", "--mode", "deterministic")
+    for options, links in (((), 25), (("--max-links", "26"), 26)):
+        assert run(*words, "--out", f"run{links}", *options)[0] == 0
+        assert read_checkpoint(Path(f"run{links}"))[1]["layout"]["links"] == links
+    code, out, _ = run("eval", "run26", "--episodes", "1", "--mode", "deterministic")
     assert code == 0
     assert "chain" in out
-    for policy in ("run", "zero"):
+    for policy in ("run26", "zero"):
         code, out, err = run("play", "reach", "chain", "beads=7", "--policy", policy)
         assert (code, err) == (0, "")
         assert out.startswith("episode 1: ")
