@@ -1,4 +1,4 @@
-"""Controllers that learn nothing: they show that a task can be done, and policies beside them."""
+"""The baseline ``ik`` of reach: inverse kinematics, and a collision-free path to its solution."""
 
 from __future__ import annotations
 
@@ -8,135 +8,144 @@ import numpy as np
 import torch
 
 from morphgen.model.inverse_kinematics_torch import solve_position_ik
-from morphgen.rl.baselines.path_planner import FreeWays, Routes, Way, shares_to
+from morphgen.rl.baselines.path_planner import (
+    Path,
+    PathFollower,
+    PathPlanner,
+    Tree,
+    fractions_towards,
+)
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
 STARTS = 16
 """Configurations from which inverse kinematics is tried for every goal."""
-ROUNDS = 4
-"""Times that these are others, as long as no free way is found."""
+ATTEMPTS = 4
+"""Most attempts per goal, each with other starts, until a free path is found."""
+TREE_ITERATIONS = 200
+"""Random configurations of the tree that is grown where inverse kinematics has no solution."""
 ITERATIONS = 60
 DAMPING = 0.05
 """Damping of the least squares [joint units per metre]."""
 MAX_STEP = 0.5
-"""Largest change of a joint in one iteration, rad or m."""
+"""Largest change of a joint in one iteration [rad or m]."""
 CLOSE = 0.003
-"""Distance from a goal that counts as solved, metres."""
+"""Distance of tool and goal that counts as solved [m]."""
 
 
 class InverseKinematics:
-    """Finds a configuration whose tool is at the goal when an episode begins, and goes there.
+    """Plans to a configuration with the tool at the goal when an episode begins, and goes there.
 
-    Damped least squares (Wampler 1986) from several starts within the joints' limits; the nearest
-    that arrives is taken to which a way is free, as ``FreeWays`` finds them; only if there is none,
-    the nearest.
+    Inverse kinematics is damped least squares (Wampler 1986) from several starts. Of its solutions
+    the nearest with a free path is taken; if there is none, the nearest, in a straight line.
     """
 
     def __init__(self, seed: int) -> None:
-        self._generator = torch.Generator().manual_seed(seed)
-        self._seed = seed
+        self._seed, self._generator = seed, torch.Generator().manual_seed(seed)
         self._specs: Sequence[EnvSpec] = ()
-        self._spaces: list[FreeSpace] = []
-        self._ways: dict[int, FreeWays] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
-        """A step along the way, all joints in proportion."""
+        """Return a step along the paths, shape (n, L); all joints move in proportion."""
         if self._specs is not task.specs:
-            self._specs, self._ways = task.specs, {}
+            self._specs = task.specs
             self._spaces = [FreeSpace(spec.scene) for spec in task.specs]
+            self._planners = [self._planner(task, i) for i in range(len(task.specs))]
         if self._task is not task:
-            self._task, self._routes = task, Routes(task)
+            self._task, self._follower = task, PathFollower(task)
         new = torch.nonzero(task.episode_step == 0)[:, 0]
         if len(new):
             self._plan(task, new)
-        self._routes.go_on()
-        return encode_actions(shares_to(task, self._routes.wanted), task.action_kind)
+        self._follower.advance()
+        return encode_actions(fractions_towards(task, self._follower.waypoint), task.action_kind)
+
+    def _planner(self, task: TaskBatch, robot: int) -> PathPlanner:
+        dof = task.specs[robot].robot.dof
+        step, movable = task.robot_tables.max_step[robot, :dof], task.robot_tables.moves_tool[robot, :dof]
+        seed = int(np.random.SeedSequence([self._seed, robot]).generate_state(1)[0])
+        return PathPlanner(self._spaces[robot], _array(step), seed, movable.cpu().numpy())
 
     def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
-        for attempt in range(ROUNDS):
-            found = self._solved(task, envs, attempt)
-            missed = []
-            for i, (env, ends) in enumerate(zip(envs.tolist(), found, strict=True)):
-                way = self._way(task, env, ends, attempt)
-                if way is None:
-                    missed.append(i)
-                if way or attempt == 0:
-                    self._routes.take(env, way.points if way else (ends[0],))
-            envs = envs[missed]
+        """Plan a path in some environments."""
+        trees: dict[int, Tree | None] = {}
+        for attempt in range(ATTEMPTS):
+            solutions = self._solve(task, envs, trees)
+            failed = []
+            for i, (env, goals) in enumerate(zip(envs.tolist(), solutions, strict=True)):
+                path, trees[env] = self._path(task, env, goals, attempt)
+                if path is None:
+                    failed.append(i)
+                if path or attempt == 0:
+                    self._follower.follow(env, path.waypoints if path else (goals[0],))
+            envs = envs[failed]
             if not len(envs):
                 break
 
-    def _solved(self, task: TaskBatch, envs: torch.Tensor, attempt: int) -> list[Array]:
-        """Of each environment those configurations that arrive, nearest first; or the best."""
-        body, starts = task.env_robot_index[envs], task.targets[envs]
-        tried = random_starts(task.robot_tables, body, starts, self._generator)
-        if attempt:
-            for i, robot in enumerate(body.tolist()):
-                ways, q = self._ways_of(task, robot, starts[i])
-                nodes = ways.reached(q, STARTS, attempt=attempt)
-                tried[:, i, : len(q)] = torch.from_numpy(nodes)
-        rows = body.repeat(STARTS)
-        found, error = solve_position_ik(
+    def _solve(
+        self, task: TaskBatch, envs: torch.Tensor, trees: dict[int, Tree | None]
+    ) -> list[Array]:
+        """Return the solutions of each environment, nearest first; if there is none, the best try.
+
+        With a tree of reachable configurations, its nodes are the starts.
+        """
+        robots, now = task.env_robot_index[envs], task.targets[envs]
+        starts = random_starts(task, envs, self._generator)
+        for i, env in enumerate(envs.tolist()):
+            if tree := trees.get(env):
+                nodes = np.array(tree.nodes)
+                rows = torch.randint(len(nodes), (STARTS,), generator=self._generator)
+                starts[:, i, : nodes.shape[1]] = torch.from_numpy(nodes[rows.numpy()])
+        rows = robots.repeat(STARTS)
+        q, error = solve_position_ik(
             task.robot_tables.tool_chain,
             rows,
-            tried.flatten(0, 1),
+            starts.flatten(0, 1),
             task.field("goal")[envs, :3].repeat(STARTS, 1),
             (task.robot_tables.lower[rows], task.robot_tables.upper[rows]),
             iterations=ITERATIONS,
             damping=DAMPING,
             max_step=MAX_STEP,
         )
-        found = found.view_as(tried)
-        left = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
-        step = task.robot_tables.max_step[body].clamp(min=1e-9)
-        far = ((found - starts) / step).abs().amax(dim=2)
-        order = torch.where(left < CLOSE, far, 1e9 * (1 + left)).argsort(dim=0)
-        count = (left < CLOSE).sum(dim=0).clamp(min=1).tolist()
+        q = q.view_as(starts)
+        distance = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
+        steps = ((q - now) / task.robot_tables.max_step[robots].clamp(min=1e-9)).abs().amax(dim=2)
+        # Solutions come before all others, by control steps; others by their distance.
+        order = torch.where(distance < CLOSE, steps, 1e9 * (1 + distance)).argsort(dim=0)
+        count = (distance < CLOSE).sum(dim=0).clamp(min=1).tolist()
         return [
-            _numbers(found[some[:k], i, : task.specs[robot].robot.dof])
-            for i, (some, k, robot) in enumerate(zip(order.T, count, body.tolist(), strict=True))
+            _array(q[order[: count[i], i], i, : task.specs[robot].robot.dof])
+            for i, robot in enumerate(robots.tolist())
         ]
 
-    def _way(self, task: TaskBatch, env: int, ends: Array, attempt: int) -> Way | None:
-        """A free way to one of the ends."""
+    def _path(
+        self, task: TaskBatch, env: int, goals: Array, attempt: int
+    ) -> tuple[Path | None, Tree | None]:
+        """Return a free path to one of the goals, and the tree of RRT-Connect if it was needed."""
         robot = int(task.env_robot_index[env])
-        ends = ends[self._spaces[robot].free(ends)]
-        if not len(ends):
-            return None
-        ways, start = self._ways_of(task, robot, task.targets[env])
-        return ways.find(start, ends, attempt=attempt) or ways.find_round_about(
-            start, ends, attempt=attempt
-        )
-
-    def _ways_of(self, task: TaskBatch, robot: int, q: torch.Tensor) -> tuple[FreeWays, Array]:
-        """The ways of a robot, and where its joints are, from (J,) to (dof,)."""
-        dof = task.specs[robot].robot.dof
-        if robot not in self._ways:
-            step, moves = (
-                task.robot_tables.max_step[robot, :dof],
-                task.robot_tables.moves_tool[robot, :dof],
-            )
-            rng = np.random.default_rng([self._seed, robot])
-            space = self._spaces[robot]
-            self._ways[robot] = FreeWays(space, _numbers(step), rng, moves.cpu().numpy())
-        return self._ways[robot], _numbers(q[:dof])
+        planner, goals = self._planners[robot], goals[self._spaces[robot].free(goals)]
+        start = _array(task.targets[env, : task.specs[robot].robot.dof])
+        path = planner.plan_straight(start, goals)
+        if path:
+            return path, None
+        if len(goals):
+            return planner.plan_rrt(start, goals, attempt=attempt)
+        return planner.plan_rrt(start, goals, attempt=attempt, iterations=TREE_ITERATIONS)
 
 
-def random_starts(
-    robot_tables: RobotTables, body: torch.Tensor, near: torch.Tensor, generator: torch.Generator
-) -> torch.Tensor:
-    """Configurations to start from, shape (STARTS, n, J): those given (n, J), and random ones."""
-    lower, upper = robot_tables.lower[body], robot_tables.upper[body]
-    drawn = torch.rand(STARTS - 1, *near.shape, generator=generator).to(near.device)
-    starts = torch.cat([near[None], lower + (upper - lower) * drawn])
-    return torch.where(robot_tables.moves_tool[body], starts, near)
+def random_starts(task: TaskBatch, envs: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Return starts of inverse kinematics, shape (STARTS, n, J): the targets, and random ones.
+
+    Joints that do not move the tool, such as fingers, keep their targets.
+    """
+    robots, now = task.env_robot_index[envs], task.targets[envs]
+    lower, upper = task.robot_tables.lower[robots], task.robot_tables.upper[robots]
+    random = torch.rand(STARTS - 1, *now.shape, generator=generator).to(now.device)
+    starts = torch.cat([now[None], lower + (upper - lower) * random])
+    return torch.where(task.robot_tables.moves_tool[robots], starts, now)
 
 
-def _numbers(values: torch.Tensor) -> Array:
+def _array(values: torch.Tensor) -> Array:
     return values.double().cpu().numpy()

@@ -1,269 +1,331 @@
-"""Free ways in joint space: straight, by way of a free configuration, or round about."""
+"""Collision-free paths in joint space: straight lines, or RRT-Connect with shortcuts.
+
+Distances between configurations are counted in control steps: the largest change of a joint,
+divided by what that joint may change in one control step.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.model.kinematics import joint_limits, unwrap_joints
-from morphgen.rl.baselines.rrt_connect import FreePart, Tree, connected, explored, shortened
-from morphgen.tasks.actions import BINS
+from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.actions import BINS
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.typing import Array
 
-ALONG = 6
-"""Free ways along a tree that are compared."""
-GROWN = 12
-"""Times that a tree grows for every configuration that is drawn from it."""
-STOPS = 12
-"""Free configurations by way of which an end may be reached, besides home."""
-ATTEMPTS = 4
-"""Times that these are others."""
-STRIDE = 0.05
-"""Largest change of a joint between configurations of a way that are tested, rad or m."""
-LATE, TOO_LATE = 20.0, 400.0
-"""Control steps that one is worth by which a way is late, and that it is worth at most."""
-LEGS = 24
-"""Of a way for which there is room before there is one with more."""
-NEAR = 1.01 * min(share for share in BINS if share > 0)
-"""Part of a joint's step that is left where a leg ends: discrete actions get no nearer."""
+FreeFraction = Callable[[Array, Array], float]
+"""Fraction of the straight line between two configurations (dof,) that is free; 1 if all is."""
+
+ITERATIONS = 2500
+"""Random configurations that RRT-Connect extends its trees towards before it gives up."""
+MIN_EDGE, MAX_EDGE = 1.0, 12.0
+"""Length of a tree's edges [control steps]."""
+SHORTCUTS = 60
+"""Random pairs of waypoints of a path that are tried as shortcuts."""
+COMPARED = 6
+"""Free paths along a tree whose costs are compared; the candidates come cheapest first."""
+RESOLUTION = 0.05
+"""Largest change of a joint between tested configurations of a line [rad or m]."""
+LATE_COST, MAX_LATE_COST = 20.0, 400.0
+"""Cost of each control step after the deadline, and the largest such cost [control steps]."""
+ARRIVED = 1.01 * min(fraction for fraction in BINS if fraction > 0)
+"""Distance from a waypoint that counts as arrived [control steps]: the smallest discrete action."""
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """A free way."""
+class Path:
+    """A path of straight lines to one of several goals."""
 
-    points: tuple[Array, ...]
-    """Configurations to go through in straight lines, the end among them, each (dof,)."""
-    end: int
-    """Which of the ends it is."""
+    waypoints: tuple[Array, ...]
+    """Configurations to go through after the start, each (dof,); the last is the goal."""
+    goal: int
+    """Index of the goal."""
 
 
 @dataclass(frozen=True, eq=False)
-class Price:
-    """What ways to several ends are worth, in control steps."""
+class PathCost:
+    """Cost of paths to n goals, in control steps."""
 
-    after: Array
-    """What it is worth to go on from each end, shape (n,)."""
-    left: Array
-    """In how many a way has to be at each end, shape (n,)."""
+    goal_cost: Array
+    """Cost of what comes after each goal, shape (n,)."""
+    deadline: Array
+    """Control steps within which a path should reach each goal, shape (n,)."""
 
-    def of(self, steps: Array | float, ends: int | slice = slice(None)) -> Array:
-        """Of ways that take so many control steps, to all ends, shape (n,), or to one, ()."""
-        late = np.maximum(steps - self.left[ends], 0)
-        return steps + self.after[ends] + np.minimum(LATE * late, TOO_LATE)
+    def of(self, length: Array | float, goal: int | slice = slice(None)) -> Array:
+        """Return the cost of paths of a length [control steps] to all goals (n,), or to one ()."""
+        late = np.maximum(length - self.deadline[goal], 0)
+        return length + self.goal_cost[goal] + np.minimum(LATE_COST * late, MAX_LATE_COST)
 
 
-class FreeWays:
-    """Ways of one robot."""
+class Tree:
+    """Configurations, each reached from another one by a free straight line."""
 
-    def __init__(
-        self,
-        space: FreeSpace,
-        step: Array,
-        rng: np.random.Generator,
-        moves: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Draw stops.
+    def __init__(self, roots: Array, step: Array, free_fraction: FreeFraction) -> None:
+        """Start with roots of shape (n, dof); other arguments as of ``rrt_connect``."""
+        self._step, self._free_fraction = step, free_fraction
+        self.nodes = [*roots]
+        self._parents = [-1] * len(roots)
 
-        Args:
-            space: What is free.
-            step: Largest change of every joint in a control step, shape (dof,).
-            rng: Where stops come from.
-            moves: Which joints move, shape (dof,); by default all.
-        """
-        self._space, self._step = space, step
-        robot = space.scene.robot
-        self._moves = np.ones(robot.dof, dtype=np.bool_) if moves is None else moves
-        self._home, self._bounds = np.array(robot.home), joint_limits(robot)
-        self._seed = int(rng.integers(2**63))
-        self._stops, _ = space.draw(STOPS * ATTEMPTS, rng)
+    def nearest(self, q: Array) -> int:
+        """Return the index of the node from which q, shape (dof,), takes the fewest steps."""
+        return int((np.abs(np.array(self.nodes) - q) / self._step).max(axis=1).argmin())
 
-    def steps(self, start: Array, ends: Array) -> Array:
-        """Control steps that straight ways to ends (..., dof) take, shape (...,)."""
-        return np.asarray((np.abs(ends - start) / self._step).max(axis=-1))
-
-    def find(
-        self,
-        start: Array,
-        ends: Array,
-        *,
-        vias: Array | None = None,
-        price: Price | None = None,
-        block: Array | None = None,
-        attempt: int = 0,
-    ) -> Way | None:
-        """The free way that costs least, to one of several ends, by way of one stop at most.
-
-        Args:
-            start: Where it begins, shape (dof,).
-            ends: Where it may end, shape (n, dof).
-            vias: By way of which each end may also be reached, shape (n, dof).
-            price: What ways are worth; by default the control steps that they take.
-            block: Where the block is, shape (7,); nowhere without.
-            attempt: Which stops there are: others for the next ``ATTEMPTS`` numbers.
+    def extend(self, near: int, q: Array) -> int | None:
+        """Add a node from a node towards q, as far as the line is free; None if that is too short.
 
         Returns:
-            None if no way is free.
+            Index of the new node.
         """
-        known: dict[bytes, float] = {}
-
-        def free_part(a: Array, b: Array) -> float:
-            key = a.tobytes() + b.tobytes()
-            if key not in known:
-                known[key] = self._free_part(a, b, block)
-            return known[key]
-
-        first = STOPS * (attempt % ATTEMPTS)
-        drawn = np.array([self._home, *self._stops[first : first + STOPS]])
-        drawn = unwrap_joints(self._space.scene.robot, start, drawn)
-        stops = [np.where(self._moves, stop, start) for stop in drawn]
-        price = price or Price(np.zeros(len(ends)), np.full(len(ends), np.inf))
-        ways = self._ways(start, ends, vias, stops, price)
-        for _, way in sorted(ways, key=lambda each: each[0]):
-            if _all_free((start, *way.points), free_part):
-                return way
-        return None
-
-    def find_round_about(self, start: Array, ends: Array, *, attempt: int = 0) -> Way | None:
-        """Any free way to one of several ends; see ``connected``. Arguments as of ``find``."""
-        free_part = partial(self._free_part, block=None)
-        rng = np.random.default_rng([self._seed, attempt])
-        found = connected(start, ends, self._within(start), self._step, free_part, rng)
-        if found is None:
+        origin = self.nodes[near]
+        length = float((np.abs(q - origin) / self._step).max())
+        new = q if length <= MAX_EDGE else origin + (q - origin) * (MAX_EDGE / length)
+        fraction = self._free_fraction(origin, new)
+        if fraction * min(length, MAX_EDGE) < MIN_EDGE and fraction < 1:
             return None
-        return Way(found[1:], int(np.abs(ends - found[-1]).max(axis=1).argmin()))
+        self.nodes.append(new if fraction == 1 else origin + fraction * (new - origin))
+        self._parents.append(near)
+        return len(self.nodes) - 1
 
-    def explored(
-        self, start: Array, times: int, *, block: Array | None = None, attempt: int = 0
-    ) -> Tree:
-        """A tree of configurations to which free ways lead, grown so many times."""
-        free_part, within = partial(self._free_part, block=block), self._within(start)
-        rng = np.random.default_rng([self._seed, attempt])
-        return explored(start, within, self._step, free_part, rng, times)
+    def connect(self, q: Array) -> int | None:
+        """Extend the tree until it reaches q; None if it cannot."""
+        node: int | None = self.nearest(q)
+        while node is not None and not np.array_equal(self.nodes[node], q):
+            node = self.extend(node, q)
+        return node
 
-    def reached(self, start: Array, count: int, *, attempt: int = 0) -> Array:
-        """Configurations to which free ways lead without the block, shape (count, dof).
+    def to_root(self, node: int) -> list[Array]:
+        """Return the configurations from a node to its root."""
+        path = []
+        while node >= 0:
+            path.append(self.nodes[node])
+            node = self._parents[node]
+        return path
 
-        They are drawn from a tree, maybe more than once.
+
+def rrt_connect(
+    start: Array,
+    goals: Array,
+    limits: Array,
+    step: Array,
+    free_fraction: FreeFraction,
+    rng: np.random.Generator,
+    iterations: int = ITERATIONS,
+) -> tuple[list[Array] | None, Tree]:
+    """Grow a tree from the start and one from the goals until they meet.
+
+    RRT-Connect (Kuffner and LaValle 2000). Without goals, the tree of the start grows alone.
+
+    Args:
+        start: Configuration, shape (dof,).
+        goals: Configurations, shape (n, dof); n may be 0.
+        limits: Limits of the joints, shape (dof, 2).
+        step: Largest change of every joint in a control step, shape (dof,).
+        free_fraction: Collision test of a straight line.
+        rng: Source of random configurations.
+        iterations: Number of random configurations.
+
+    Returns:
+        Waypoints from the start to a goal, None if the trees did not meet; and the tree of the
+        start, whose nodes can all be reached.
+    """
+    start_tree = Tree(start[None], step, free_fraction)
+    growing, other = start_tree, Tree(goals, step, free_fraction)
+    for _ in range(iterations):
+        sample = rng.uniform(limits[:, 0], limits[:, 1])
+        new = growing.extend(growing.nearest(sample), sample)
+        if not len(goals):
+            continue
+        met = None if new is None else other.connect(growing.nodes[new])
+        if new is not None and met is not None:
+            ends = growing.to_root(new), other.to_root(met)
+            first, second = ends if growing is start_tree else ends[::-1]
+            return [*first[::-1], *second[1:]], start_tree
+        growing, other = other, growing
+    return None, start_tree
+
+
+def shortcut(
+    path: list[Array], free_fraction: FreeFraction, rng: np.random.Generator
+) -> list[Array]:
+    """Return a path with straight lines between random pairs of its waypoints, where free."""
+    for _ in range(SHORTCUTS):
+        if len(path) < 3:
+            break
+        i, j = sorted(rng.choice(len(path), size=2, replace=False).tolist())
+        if j > i + 1 and free_fraction(path[i], path[j]) == 1:
+            path = [*path[: i + 1], *path[j:]]
+    return path
+
+
+class PathPlanner:
+    """Plans paths of one robot; the same seed and arguments give the same path."""
+
+    def __init__(
+        self, space: FreeSpace, step: Array, seed: int, movable: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Set up.
+
+        Args:
+            space: Collision test of configurations.
+            step: Largest change of every joint in a control step, shape (dof,).
+            seed: Seed of random configurations.
+            movable: Joints that a path may move, shape (dof,); by default all.
         """
-        nodes = np.array(self.explored(start, GROWN * count, attempt=attempt).nodes)
-        return nodes[np.random.default_rng([self._seed, attempt]).integers(len(nodes), size=count)]
+        self._space, self._step, self._seed = space, step, seed
+        self._limits = joint_limits(space.scene.robot)
+        self._movable = np.ones(len(step), dtype=np.bool_) if movable is None else movable
 
-    def find_along(
-        self, tree: Tree, ends: Array, *, vias: Array, price: Price, block: Array
-    ) -> Way | None:
-        """A free way along a tree to one of several ends.
+    def steps(self, start: Array, ends: Array) -> Array:
+        """Return the length of straight lines to ends (..., dof) [control steps], shape (...,)."""
+        return np.asarray((np.abs(ends - start) / self._step).max(axis=-1))
 
-        Arguments as of ``find``. Ends that cost less come first, how far they are from the tree
-        counted, by way of a configuration of the tree each, and of the end's via if need be; of
-        the first ``ALONG`` ways that are free it is the one that costs least.
-        """
-        near = [tree.nearest(end) for end in ends]
-        far = self.steps(np.array([tree.nodes[i] for i in near]), ends) if near else price.after
-        free_part = partial(self._free_part, block=block)
-        found: list[tuple[float, Way]] = []
-        for i in np.argsort(price.after + far, kind="stable").tolist():
-            if len(found) == ALONG:
-                break
-            for last in ((ends[i],), (vias[i], ends[i])):
-                if _all_free((tree.nodes[near[i]], *last), free_part):
-                    points = [*tree.back(near[i])[::-1], *last]
-                    rng = np.random.default_rng([self._seed, i])
-                    way = Way(tuple(shortened(points, free_part, rng)[1:]), i)
-                    found.append((float(price.of(self.length(points[0], way), i)), way))
-                    break
-        return min(found, key=lambda each: each[0])[1] if found else None
-
-    def length(self, start: Array, way: Way) -> float:
-        """Control steps that a way takes from a start, shape (dof,)."""
-        points = np.array([start, *way.points])
+    def length(self, start: Array, path: Path) -> float:
+        """Return the length of a path from a start (dof,) [control steps]."""
+        points = np.array([start, *path.waypoints])
         return float(self.steps(points[:-1], points[1:]).sum())
 
-    def _within(self, start: Array) -> Array:
-        """Bounds of the joints; those that do not move are where they are."""
-        return np.where(self._moves[:, None], self._bounds, start[:, None])
-
-    def _ways(
+    def plan_straight(
         self,
         start: Array,
-        ends: Array,
-        vias: Array | None,
-        stops: Sequence[Array],
-        price: Price,
-    ) -> Iterator[tuple[float, Way]]:
-        """All ways there may be, with what they cost."""
-        for i, end in enumerate(ends):
-            lasts = ((end,),) if vias is None else ((end,), (vias[i], end))
-            for before in ((), *((stop,) for stop in stops)):
-                for last in lasts:
-                    way = Way((*before, *last), i)
-                    yield float(price.of(self.length(start, way), i)), way
+        goals: Array,
+        *,
+        vias: Array | None = None,
+        cost: PathCost | None = None,
+        block: Array | None = None,
+        tree: Tree | None = None,
+    ) -> Path | None:
+        """Return the cheapest free path that goes straight to a goal, or by way of its via.
 
-    def _free_part(self, start: Array, end: Array, block: Array | None) -> float:
-        """Which part of the straight way between two configurations is free, from the start."""
-        parts = max(math.ceil(np.abs(end - start).max() / STRIDE), 1) + 1
-        way = start + np.linspace(0, 1, parts)[:, None] * (end - start)
-        free = self._space.free(way, None if block is None else np.tile(block, (parts, 1)))
-        return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (parts - 1)
+        Args:
+            start: Configuration, shape (dof,).
+            goals: Configurations, shape (n, dof).
+            vias: A configuration from which each goal may be approached, shape (n, dof).
+            cost: Cost of paths; by default their lengths.
+            block: Pose of the block, shape (7,); without it the block is nowhere.
+            tree: Tree from the start: a path follows it to the node nearest to the goal, goes
+                straight from there, and is shortened. Of the first free paths, cheapest first, the
+                one that is cheapest after that is returned.
+
+        Returns:
+            None if no path is free.
+        """
+        free_fraction = partial(self._free_fraction, block=block)
+        cost = cost or PathCost(np.zeros(len(goals)), np.full(len(goals), np.inf))
+        candidates: list[tuple[float, int, Path]] = []
+        for i, goal in enumerate(goals):
+            along = [] if tree is None else tree.to_root(tree.nearest(goal))[-2::-1]
+            for last in ((goal,),) if vias is None else ((goal,), (vias[i], goal)):
+                path = Path((*along, *last), i)
+                candidates.append((float(cost.of(self.length(start, path), i)), len(last), path))
+        free: list[tuple[float, Path]] = []
+        for _, new, path in sorted(candidates, key=lambda candidate: candidate[0]):
+            points = [start, *path.waypoints]
+            # From the goal backwards: there the room is least. The tree's own lines are free.
+            if any(free_fraction(a, b) < 1 for a, b in pairwise(points[: -new - 2 : -1])):
+                continue
+            if tree is None:
+                return path
+            shortened = shortcut(
+                points, free_fraction, np.random.default_rng([self._seed, path.goal])
+            )
+            path = Path(tuple(shortened[1:]), path.goal)
+            free.append((float(cost.of(self.length(start, path), path.goal)), path))
+            if len(free) == COMPARED:
+                break
+        return min(free, key=lambda pair: pair[0])[1] if free else None
+
+    def plan_rrt(
+        self,
+        start: Array,
+        goals: Array,
+        *,
+        block: Array | None = None,
+        attempt: int = 0,
+        iterations: int = ITERATIONS,
+    ) -> tuple[Path | None, Tree]:
+        """Plan by RRT-Connect to any of several goals; see ``rrt_connect``.
+
+        Args:
+            start: Configuration, shape (dof,).
+            goals: Configurations, shape (n, dof); n may be 0.
+            block: Pose of the block, shape (7,); without it the block is nowhere.
+            attempt: Selects the random configurations, together with the planner's seed.
+            iterations: Number of random configurations.
+
+        Returns:
+            The shortened path, None if none was found; and the tree of the start.
+        """
+        free_fraction = partial(self._free_fraction, block=block)
+        rng = np.random.default_rng([self._seed, attempt])
+        # Joints that may not move have limits without width.
+        limits = np.where(self._movable[:, None], self._limits, start[:, None])
+        points, tree = rrt_connect(start, goals, limits, self._step, free_fraction, rng, iterations)
+        if points is None:
+            return None, tree
+        points = shortcut(points, free_fraction, rng)
+        goal = int(np.abs(goals - points[-1]).max(axis=1).argmin())
+        return Path(tuple(points[1:]), goal), tree
+
+    def _free_fraction(self, start: Array, end: Array, block: Array | None) -> float:
+        count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
+        line = start + np.linspace(0, 1, count)[:, None] * (end - start)
+        free = self._space.free(line, None if block is None else np.tile(block, (count, 1)))
+        return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
 
-def _all_free(points: Sequence[Array], free_part: FreePart) -> bool:
-    """Whether straight lines through configurations are free; from the end, where room is least."""
-    return all(free_part(b, a) == 1 for a, b in zip(points[-2::-1], points[:0:-1], strict=True))
-
-
-class Routes:
-    """Ways that the robots of a batch follow, each a leg after the other."""
+class PathFollower:
+    """Waypoints that the robots of a batch go through, one after the other."""
 
     def __init__(self, task: TaskBatch) -> None:
-        """All stay where they are."""
+        """Let all robots stay where they are."""
         self._task = task
-        self._points = task.targets[:, None].repeat(1, LEGS, 1)
-        self._leg, self._last = torch.zeros(2, task.num_envs, dtype=torch.int64).to(task.device)
-        self._rows = torch.arange(task.num_envs, device=task.device)
+        self._waypoints = task.targets[:, None].clone()
+        self._index, self._last = torch.zeros(2, task.num_envs, dtype=torch.int64).to(task.device)
+        self._envs = torch.arange(task.num_envs, device=task.device)
 
-    def take(self, env: int, points: Sequence[Array]) -> None:
-        """Begin a way through configurations, each (dof,)."""
-        more = len(points) - self._points.shape[1]
-        if more > 0:
-            last = self._points[:, -1:].repeat(1, more, 1)
-            self._points = torch.cat([self._points, last], dim=1)
-        for i, q in enumerate(points):
-            self._points[env, i, : len(q)] = torch.from_numpy(q)
-        self._leg[env], self._last[env] = 0, len(points) - 1
+    def follow(self, env: int, waypoints: Sequence[Array]) -> None:
+        """Start a path of waypoints (dof,) in one environment."""
+        missing = max(len(waypoints) - self._waypoints.shape[1], 0)
+        padding = self._waypoints[:, -1:].repeat(1, missing, 1)
+        self._waypoints = torch.cat([self._waypoints, padding], dim=1)
+        for i, q in enumerate(waypoints):
+            self._waypoints[env, i, : len(q)] = torch.from_numpy(q)
+        self._index[env], self._last[env] = 0, len(waypoints) - 1
 
     @property
-    def wanted(self) -> torch.Tensor:
-        """Where the leg of each robot ends, shape (n, J)."""
-        points: torch.Tensor = self._points[self._rows, self._leg]
-        return points
+    def waypoint(self) -> torch.Tensor:
+        """Waypoint that each robot is going to, shape (n, J)."""
+        waypoints: torch.Tensor = self._waypoints[self._envs, self._index]
+        return waypoints
 
-    def go_on(self) -> torch.Tensor:
-        """Begin the next leg where one is at its end; where the last is, shape (n,), bool."""
+    def advance(self) -> torch.Tensor:
+        """Go on to the next waypoint where one is reached; return where the last one is, (n,)."""
         task = self._task
         step = task.robot_tables.max_step[task.env_robot_index].clamp(min=1e-9)
-        done = ((self.wanted - task.targets) / step).abs().amax(dim=1) < NEAR
-        final: torch.Tensor = done & (self._leg == self._last)
-        self._leg = torch.where(done & ~final, self._leg + 1, self._leg)
-        return final
+        arrived = ((self.waypoint - task.targets) / step).abs().amax(dim=1) < ARRIVED
+        finished: torch.Tensor = arrived & (self._index == self._last)
+        self._index = torch.where(arrived & ~finished, self._index + 1, self._index)
+        return finished
 
 
-def shares_to(task: TaskBatch, wanted: torch.Tensor) -> torch.Tensor:
-    """Shares of the joints' steps, a number a link (n, L), that bring targets to others (n, J).
+def fractions_towards(task: TaskBatch, targets: torch.Tensor) -> torch.Tensor:
+    """Return fractions of the joints' steps that move targets straight to others (n, J).
 
-    All joints get there at once.
+    Returns:
+        A number per link, shape (n, L): all joints arrive at the same time.
     """
     step = task.robot_tables.max_step[task.env_robot_index]
-    ahead = wanted - task.targets
-    shares = torch.where(step > 0, ahead / step.clamp(min=1e-9), torch.zeros_like(ahead))
-    shares = shares / shares.abs().amax(dim=1, keepdim=True).clamp(min=1)
+    change = targets - task.targets
+    fractions = torch.where(step > 0, change / step.clamp(min=1e-9), torch.zeros_like(change))
+    fractions = fractions / fractions.abs().amax(dim=1, keepdim=True).clamp(min=1)
     joint = task.robot_tables.joint_of_link[task.env_robot_index]
-    return torch.gather(shares, 1, joint.clamp(min=0)) * (joint >= 0)
+    return torch.gather(fractions, 1, joint.clamp(min=0)) * (joint >= 0)

@@ -1,4 +1,4 @@
-"""Where a robot would touch the block, found by moving the block until it does."""
+"""Contacts of a robot with a block, found by moving the block until they collide."""
 
 from __future__ import annotations
 
@@ -10,73 +10,75 @@ from numpy.typing import NDArray
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.typing import Array
 
-NEARER = np.arange(0.05, 2.0, 0.1)
-"""How far the block is moved to the robot to see where they touch, in its edges."""
-HALVINGS = 5
-"""Times that what is between two of these is halved."""
-ASIDE = np.array([-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0])
-"""How far aside, to see how broadly they do, in its edges."""
-LOWERED, RAISED = -0.5, 0.15
-"""Shifts up with which only what is below the block's middle touches it, and with which what is at
-its upper edge does too, in its edges."""
-FIRM = 0.1
-"""How far it is pressed against the robot to see how broadly they touch, in its edges."""
+# All lengths are in edges of the block.
+SHIFTS = np.arange(0.05, 2.0, 0.1)
+"""Distances that the block is moved towards the robot to find their contact."""
+BISECTIONS = 5
+"""Bisections of the interval between two of these shifts."""
+OFFSETS = np.linspace(-1.0, 1.0, 9)
+"""Offsets of the block along x at which the width of the contact is tested."""
+BELOW, ABOVE = -0.5, 0.15
+"""Shifts of the block along z: lowered by half an edge, only what is below its middle touches it;
+raised, what is just above it touches it as well."""
+PRESSED = 0.1
+"""Distance that the block is pressed against the robot when the width is tested."""
 
 
 @dataclass(frozen=True, eq=False)
-class Poised:
-    """Configurations behind the block, a row each."""
+class PreContact:
+    """Configurations behind the block that touch it if they move along y, a row each."""
 
     q: Array
-    """Shape (n, dof), rad or m."""
+    """Configurations, shape (n, dof) [rad or m]."""
     gap: Array
-    """How far the robot goes along y until it touches the block, shape (n,), metres."""
-    middle: Array
-    """How far aside the block has to be for the touch to be on its middle, shape (n,), metres."""
+    """Motion along y until the robot touches the block, shape (n,) [m]."""
+    offset: Array
+    """Offset of the block along x for which the contact is on its middle, shape (n,) [m]."""
     width: Array
-    """Share of the shifts ``ASIDE`` at which the block is still touched, shape (n,)."""
-    over: Array
-    """How much earlier the robot touches what is above the block's middle, or just above the block,
-    than what is below, 0 to 1, in its edges. What leans over a block presses it to the ground, or
-    tips it over. Shape (n,)."""
+    """Fraction of ``OFFSETS`` at which the block is touched, shape (n,)."""
+    overhang: Array
+    """See the function ``overhang``, shape (n,)."""
 
 
-def poised(space: FreeSpace, q: Array, block: Array, edge: float) -> Poised:
-    """Those configurations that touch the block if they go along y, and how.
+def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreContact:
+    """Return those configurations that touch the block if they move along y.
 
     Args:
-        space: What is free, with the block.
+        space: Collision test with the block.
         q: Configurations free of the block, shape (n, dof).
         block: Pose of the block, shape (7,).
-        edge: Of the block, metres.
+        edge: Edge length of the block [m].
     """
     gap = _gaps(space, q, np.tile(block, (len(q), 1)), edge, 0.0)
-    some = np.isfinite(gap)
-    q, gap = q[some], gap[some]
-    nearer = (gap + FIRM * edge)[:, None]
-    broad = touches(space, q, block, ASIDE * edge, -nearer)
-    count = np.maximum(broad.sum(axis=1), 1)
-    middle = (broad * ASIDE).sum(axis=1) / count * edge
+    touching = np.isfinite(gap)
+    q, gap = q[touching], gap[touching]
+    pressed = (gap + PRESSED * edge)[:, None]
+    touched = touches(space, q, block, OFFSETS * edge, -pressed)
+    count = np.maximum(touched.sum(axis=1), 1)
+    offset = (touched * OFFSETS).sum(axis=1) / count * edge
     blocks = np.tile(block, (len(q), 1))
-    blocks[:, 0] += middle
-    return Poised(q, gap, middle, count / len(ASIDE), leaning(space, q, blocks, edge))
+    blocks[:, 0] += offset
+    return PreContact(q, gap, offset, count / len(OFFSETS), overhang(space, q, blocks, edge))
 
 
-def leaning(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
-    """How far configurations lean over the block that they touch if they go along y.
+def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
+    """Return how much a robot leans over the block that it touches if it moves along y.
+
+    That is how much earlier the robot touches what is above the block's middle than what is below
+    it, from 0 to 1 edges. A robot that leans over presses the block to the ground, or tips it over.
 
     Args:
-        space: What is free, with the block.
-        q: Configurations free of it, shape (n, dof).
-        blocks: Its pose, one for each, shape (n, 7).
-        edge: Of the block, metres.
+        space: Collision test with the block.
+        q: Configurations free of the block, shape (n, dof).
+        blocks: Pose of the block for each of them, shape (n, 7).
+        edge: Edge length of the block [m].
 
     Returns:
-        ``Poised.over``, shape (n,).
+        Overhangs, shape (n,) [edges].
     """
     below, above = (
-        np.minimum(_gaps(space, q, blocks, edge, dz * edge), NEARER[-1] * edge)
-        for dz in (LOWERED, RAISED)
+        np.minimum(_gaps(space, q, blocks, edge, dz * edge), SHIFTS[-1] * edge)
+        for dz in (BELOW, ABOVE)
     )
     return np.asarray(np.clip((below - above) / edge, 0.0, 1.0))
 
@@ -84,18 +86,15 @@ def leaning(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
 def touches(
     space: FreeSpace, q: Array, block: Array, dx: Array, dy: Array, dz: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Whether configurations touch the block where it is shifted.
+    """Return whether configurations touch the shifted block, shape (n, k).
 
     Args:
-        space: What is free, with the block.
-        q: Shape (n, dof).
-        block: Pose of the block, shape (7,), or one for each, (n, 7).
-        dx: Shifts along x, shape (n, k) or one that broadcasts to it, metres.
+        space: Collision test with the block.
+        q: Configurations, shape (n, dof).
+        block: Pose of the block, shape (7,), or one for each configuration, (n, 7).
+        dx: Shifts along x, of a shape that broadcasts to (n, k) [m].
         dy: Shifts along y, likewise.
-        dz: Shift along z.
-
-    Returns:
-        Shape (n, k).
+        dz: Shift along z [m].
     """
     n, k = len(q), max(dx.shape[-1], dy.shape[-1])
     blocks = np.broadcast_to(block.reshape(-1, 1, 7), (n, k, 7)).copy()
@@ -106,18 +105,21 @@ def touches(
     return ~free.reshape(n, k)
 
 
-def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, raised: float) -> Array:
-    """How far blocks (n, 7) come nearer until they are touched, (n,), metres; infinite if never."""
-    shifts, none = NEARER * edge, np.zeros(1)
-    touched = touches(space, q, blocks, none, -shifts, raised)
-    at = touched.argmax(axis=1)
-    far = np.where(touched.any(axis=1), shifts[at], np.inf)
-    some = np.isfinite(far)
-    q, blocks, most = q[some], blocks[some], far[some]
-    least = np.where(at[some] > 0, shifts[at[some] - 1], 0.0)
-    for _ in range(HALVINGS):
-        between = (least + most) / 2
-        hit = touches(space, q, blocks, none, -between[:, None], raised)[:, 0]
-        least, most = np.where(hit, least, between), np.where(hit, between, most)
-    far[some] = most
-    return far
+def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, dz: float) -> Array:
+    """Return how far blocks (n, 7), shifted along z, move to the robot until they touch it [m].
+
+    It is infinite where they never do.
+    """
+    shifts, zero = SHIFTS * edge, np.zeros(1)
+    touched = touches(space, q, blocks, zero, -shifts, dz)
+    first = touched.argmax(axis=1)
+    gaps = np.where(touched.any(axis=1), shifts[first], np.inf)
+    rows = np.isfinite(gaps)
+    q, blocks, high = q[rows], blocks[rows], gaps[rows]
+    low = np.where(first[rows] > 0, shifts[first[rows] - 1], 0.0)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        hit = touches(space, q, blocks, zero, -middle[:, None], dz)[:, 0]
+        low, high = np.where(hit, low, middle), np.where(hit, middle, high)
+    gaps[rows] = high
+    return gaps

@@ -1,324 +1,371 @@
-"""Plans of a push: a configuration behind the block, a free way there, and how to go on."""
+"""Plans of pushes: a configuration behind the block, a free path to it, and the push from there.
+
+A robot pushes its block along y, across a line. A *pre-contact* is a configuration with the tool
+behind the block, from which the robot touches the block if it moves along y.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from morphgen.model.dynamics import actuation
-from morphgen.model.inverse_kinematics import solve_position_ik
+from morphgen.model.inverse_kinematics import MAX_STEP, solve_position_ik
+from morphgen.model.inverse_kinematics_torch import pose_ik_step
 from morphgen.model.kinematics import frame_jacobian, unwrap_joints
-from morphgen.rl.baselines.cartesian import OneTool
-from morphgen.rl.baselines.path_planner import FreeWays, Price, Way
-from morphgen.rl.baselines.push_contacts import Poised, leaning, poised, touches
-from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.feasibility import sample_tools_in_box
-from morphgen.tasks.push.starts import PushStartSet
+from morphgen.model.kinematics_torch import frame_pose
+from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner, Tree
+from morphgen.rl.baselines.push_contacts import PreContact, find_contacts, overhang, touches
 from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.push.feasibility import free_within
+from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import GRAVITY
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
 SPEED = 0.006
-"""Largest way of the tool in a control step while it pushes, metres: 0.3 m/s."""
+"""Largest motion of the tool in a control step while it pushes [m]: 0.3 m/s."""
 
-_BEHIND = (0.1, 0.4, 0.8, 1.3)
-"""Distances of the tool behind the block's hindmost point that are tried, in its edges."""
+# Lengths below are in edges of the block, costs in control steps; both were tuned on the robots of
+# the shipped splits.
+_DISTANCES = (0.1, 0.4, 0.8, 1.3)
+"""Distances of the tool behind the block's hindmost point that are tried."""
 _NEAREST, _QUICKEST = 24, 36
-"""Configurations from which each of them is tried: where the tool is near it, and those to which
-the joints get soonest."""
-_LOW, _HIGH = 0.2, 0.45
-"""Heights of the tool that are aimed at, in edges: pushed above its middle, a block with a friction
-of 1 tips over."""
-_KEPT = 24
-"""Configurations behind the block to which simple ways are looked for."""
-_POINTS, _LOOKED = 12, 3
-"""Of a push, at which it is tried out, and every how many of them it is looked how far it leans."""
-_REACHED = 0.02
-"""Distance from a point that counts as there, in edges."""
-_TOLERANCE = (0.3, 0.4)
-"""How much nearer the block has to touch, and how much farther be free, further on; in edges."""
+"""Starts of inverse kinematics per distance: those nearest in space, and nearest in joint space."""
+_MIN_HEIGHT, _MAX_HEIGHT = 0.2, 0.45
+"""Heights of the tool: pushed above its middle, a block with a friction of 1 tips over."""
+_CANDIDATES = 24
+"""Pre-contacts, the cheapest first, to which straight paths are tried."""
+_SIMULATED, _OVERHANG_EVERY = 12, 3
+"""Points of a push where it is tested, and every how many of them the overhang is tested."""
+_TOLERANCE = 0.02
+"""Distance from a point that counts as reached."""
+_NEARER, _FARTHER = 0.3, 0.4
+"""During a push, the robot has to touch a block that is nearer by the one, and none that is farther
+by the other."""
 _LIFT = 1.4
-"""How far above its place the tool comes down, in edges."""
-_PARTING = 0.15, 8
-"""Way of the tool in a step away from the block, in edges, and how many steps there may be."""
-_AWAY = ((0.0, -1.0, 0.0), (0.0, -0.7, 0.7), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
-_UNFINISHED, _NARROW = 400.0, 120.0
-"""Control steps that it is worth to get all the way, and on a broad front."""
-_OVER, _MOST = 3000.0, 0.1
-"""Control steps that an edge is worth by which the robot leans over the block, and edges from which
-more of it is no worse."""
-_SOFT = 3000.0
-"""Control steps that a metre is worth by which the tool gives way to the block's friction."""
-_SETTLED = 25
-"""Control steps that a push takes besides those of its way, until arm and block are at speed."""
-_DEAR, _GROWN = 350.0, 1500
-"""Control steps that a plan takes, or is worth, from which a tree is grown for others, and how many
-times it is."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Ends:
-    """Configurations behind the block from which a push begins, a row each."""
-
-    q: Array
-    """Shape (n, dof)."""
-    position: Array
-    """Of the tool, shape (n, 3), metres."""
-    rotation: Array
-    """Of the tool, shape (n, 3, 3)."""
-    aside: Array
-    """x of the tool less x of the block when it pushes, shape (n,), metres."""
-    gap: Array
-    """How far the tool goes until it touches, shape (n,), metres."""
-    cost: Array
-    """What a push from there is worth, in control steps, shape (n,)."""
-    steps: Array
-    """Control steps that it takes, shape (n,)."""
-
-    def price(self, left: float) -> Price:
-        """Of ways to them, if the push is to be over in so many control steps."""
-        return Price(self.cost, left - self.steps)
-
-    def taken(self, rows: NDArray[np.intp]) -> _Ends:
-        """Some of the rows."""
-        return _Ends(*(getattr(self, each.name)[rows] for each in fields(self)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A way to one of some ends."""
-
-    ends: _Ends
-    way: Way
-    cost: float
-    """Of the way and of what comes after it, control steps."""
+"""Height above a pre-contact from which the tool may come down to it."""
+_RETREAT_STEP, _RETREAT_STEPS = 0.15, 8
+"""Motion of the tool in a step away from the block, and the largest number of such steps."""
+_RETREAT_DIRECTIONS = (
+    (0.0, -1.0, 0.0),
+    (0.0, -0.7, 0.7),
+    (0.0, 0.0, 1.0),
+    (1.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0),
+)
+_UNFINISHED_COST, _NARROW_COST = 400.0, 120.0
+"""Cost of a push that moves the block by nothing, and of contact on a front without width."""
+_OVERHANG_COST, _MAX_OVERHANG = 3000.0, 0.1
+"""Cost per edge of overhang, and the overhang from which more costs the same."""
+_COMPLIANCE_COST = 3000.0
+"""Cost per metre by which the tool yields to the block's friction."""
+_ACCELERATION_STEPS = 25
+"""Control steps that a push takes until arm and block are at speed."""
+_EXPENSIVE, _TREE_ITERATIONS = 350.0, 1500
+"""Cost of a plan from which a tree of reachable configurations is grown to find a cheaper one, and
+the random configurations of that tree."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
     """How to push."""
 
-    way: tuple[Array, ...]
-    """Configurations to go through, each (dof,); at the last the tool is behind the block."""
+    path: tuple[Array, ...]
+    """Waypoints, each (dof,); at the last one the tool is behind the block."""
     rotation: torch.Tensor
-    """How the tool is turned there, shape (3, 3)."""
+    """Rotation of the tool at the last waypoint, shape (3, 3)."""
     height: float
-    """Of the tool there, metres."""
-    aside: float
-    """x of the tool less x of the block, so that it pushes the middle, metres."""
+    """Height of the tool at the last waypoint [m]."""
+    offset: float
+    """x of the tool minus x of the block with which the tool pushes the block's middle [m]."""
     gap: float
-    """How far the tool goes until it touches, metres."""
+    """Motion of the tool along y until it touches the block [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Pre-contacts that can begin a push, a row each."""
+
+    q: Array
+    """Configurations, shape (n, dof)."""
+    position: Array
+    """Positions of the tool, shape (n, 3) [m]."""
+    rotation: Array
+    """Rotations of the tool, shape (n, 3, 3)."""
+    offset: Array
+    """``Plan.offset``, shape (n,)."""
+    gap: Array
+    """``Plan.gap``, shape (n,)."""
+    cost: Array
+    """Cost of the push [control steps], shape (n,)."""
+    steps: Array
+    """Duration of the push [control steps], shape (n,)."""
+
+    def take(self, rows: NDArray[np.intp]) -> Self:
+        """Return some of the rows."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+class ToolKinematics:
+    """Kinematics of the tool of one robot of a batch, in NumPy arrays."""
+
+    def __init__(self, tables: RobotTables, robot: int) -> None:
+        self._tables, self._robot = tables, robot
+        self._dof = tables.robots[robot].dof
+
+    def poses(self, q: Array) -> tuple[Array, Array]:
+        """Return positions (n, 3) and rotations (n, 3, 3) of the tool at q (n, dof)."""
+        T = frame_pose(self._tables.tool_chain, *self._rows(q)).double().cpu().numpy()
+        return T[:, :3, 3], T[:, :3, :3]
+
+    def move_towards(self, q: Array, position: Array, rotation: Array, iterations: int) -> Array:
+        """Return configurations after some iterations of ``pose_ik_step``, shape (n, dof).
+
+        Args:
+            q: Configurations to start from, shape (n, dof).
+            position: Goal positions of the tool, shape (n, 3) [m].
+            rotation: Goal rotations of the tool, shape (n, 3, 3).
+            iterations: Number of iterations.
+        """
+        robots, rows = self._rows(q)
+        goals = [torch.from_numpy(values).to(rows) for values in (position, rotation)]
+        limits = self._tables.lower[robots], self._tables.upper[robots]
+        for _ in range(iterations):
+            target = pose_ik_step(self._tables.tool_chain, robots, rows, *goals, limits)
+            rows = rows + (target - rows).clamp(-MAX_STEP, MAX_STEP)
+        return rows[:, : self._dof].double().cpu().numpy()
+
+    def _rows(self, q: Array) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return robot indices (n,) and configurations padded to the batch's joints, (n, J)."""
+        device = self._tables.device
+        rows = torch.zeros(len(q), self._tables.max_joints, device=device)
+        rows[:, : self._dof] = torch.from_numpy(q).to(rows)
+        return torch.full((len(q),), self._robot, device=device), rows
 
 
 class PushPlanner:
-    """Plans for one robot and its block."""
+    """Plans pushes of one robot and its block."""
 
-    def __init__(
-        self, spec: EnvSpec, robot_tables: RobotTables, index: int, rng: np.random.Generator
-    ) -> None:
-        """Collect free configurations that are low and where the block is pushed.
+    def __init__(self, spec: EnvSpec, tables: RobotTables, robot: int, rng: np.random.Generator) -> None:
+        """Collect free configurations with a low tool in the region of the push.
 
         Args:
-            spec: A robot that pushes.
-            robot_tables: Robots.
-            index: Which of them the specification is of.
-            rng: Where configurations come from.
+            spec: Environment of a robot that pushes.
+            tables: Robots of the batch.
+            robot: Index of the robot in it.
+            rng: Source of random configurations.
 
         Raises:
             ValueError: If the robot does not push.
         """
-        pushes, robot = spec.goals, spec.robot
-        if not isinstance(pushes, PushStartSet):
-            raise ValueError(f"{robot.name} does not push")
-        self._robot, self._tool = robot, OneTool(robot_tables, index)
-        self._edge, self._line, self._ground = pushes.block.size[0], pushes.line, pushes.ground
-        self._friction = pushes.block.friction * pushes.block.mass * GRAVITY
-        self._stiffness = np.array([gain.stiffness for gain in actuation(robot)])
-        self._others = ~robot_tables.moves_tool[index, : robot.dof].cpu().numpy()
+        starts, self._robot = spec.goals, spec.robot
+        if not isinstance(starts, PushStartSet):
+            raise ValueError(f"{self._robot.name} does not push")
+        self._tool = ToolKinematics(tables, robot)
+        self._edge, self._line, self._ground = starts.block.size[0], starts.line, starts.ground
+        self._friction = starts.block.friction * starts.block.mass * GRAVITY
+        self._stiffness = np.array([gain.stiffness for gain in actuation(self._robot)])
+        self._idle = ~tables.moves_tool[robot, : self._robot.dof].cpu().numpy()
         self._space = FreeSpace(spec.scene)
-        step = robot_tables.max_step[index, : robot.dof].double().cpu().numpy()
-        self._ways = FreeWays(self._space, step, rng)
-        edge, first, last = self._edge, pushes.blocks.min(axis=0), pushes.blocks.max(axis=0)
+        step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
+        self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
+        edge, first, last = self._edge, starts.blocks.min(axis=0), starts.blocks.max(axis=0)
         low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
         high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
-        self._bank, self._tools = sample_tools_in_box(self._space, low, high, rng)
-
-    def plan(self, q: Array, block: Array, attempt: int = 0, left: float = np.inf) -> Plan | None:
-        """Look for a way to push.
-
-        Args:
-            q: Where the joints are, shape (dof,).
-            block: Pose of the block, shape (7,).
-            attempt: How many plans were made before; each goes by way of other configurations.
-            left: Control steps until the episode ends. Plans that take longer come last.
-
-        Returns:
-            The plan that takes the least time, or gets farthest; None if there is none, or no
-            block gets as far in the time that is left.
-        """
-        if left < (self._line - block[1]) / SPEED:
-            return None
-        start = self._parted(q, block)
-        found = self._by_stops(start, q, block, attempt, left)
-        if found is None or found.cost > _DEAR:
-            other = self._along_a_tree(start, block, attempt, left)
-            if found is None or (other and other.cost < found.cost):
-                found = other
-        if found is None:
-            return None
-        ends, i, points = found.ends, found.way.end, found.way.points
-        return Plan(
-            way=points if start is q else (start, *points),
-            rotation=torch.from_numpy(ends.rotation[i]).float(),
-            height=float(ends.position[i, 2]),
-            aside=float(ends.aside[i]),
-            gap=float(ends.gap[i]),
-        )
+        self._bank, self._bank_tools = free_within(self._space, low, high, rng)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
-        """Whether configurations (n, dof) are free of all but the block, shape (n,)."""
+        """Return whether configurations (n, dof) are free of all but the block, shape (n,)."""
         return self._space.free(q)
 
-    def _by_stops(
-        self, start: Array, q: Array, block: Array, attempt: int, left: float
-    ) -> _Found | None:
-        """The cheapest simple way to the ends that are known."""
-        ends = self._judged(self._behind(q, block), block)
-        order = np.argsort(ends.price(left).of(self._ways.steps(q, ends.q)), kind="stable")
-        ends = ends.taken(order[:_KEPT])
-        price, vias = ends.price(left), self._lifted(ends)
-        way = self._ways.find(start, ends.q, vias=vias, price=price, block=block, attempt=attempt)
-        return None if way is None else self._found(start, ends, way, price)
+    def plan(
+        self, q: Array, block: Array, attempt: int = 0, steps_left: float = np.inf
+    ) -> Plan | None:
+        """Return the cheapest plan that is found.
 
-    def _along_a_tree(self, start: Array, block: Array, attempt: int, left: float) -> _Found | None:
-        """A way to ends near configurations that the robot gets to from where it is.
+        Args:
+            q: Configuration of the robot, shape (dof,).
+            block: Pose of the block, shape (7,).
+            attempt: Number of earlier plans in this episode; selects random configurations.
+            steps_left: Control steps until the episode ends. Plans that take longer cost more.
 
-        Others may be out of its reach: links that are in each other's way divide what is free.
+        Returns:
+            None if no plan was found, or no block gets across in the time that is left.
         """
-        tree = self._ways.explored(start, _GROWN, block=block, attempt=attempt)
+        if steps_left < (self._line - block[1]) / SPEED:
+            return None
+        start = self._retreat(q, block)
+        plans = [self._plan_straight(start, self._candidates_near(q, block), block, steps_left)]
+        if plans[0] is None or plans[0][0] > _EXPENSIVE:
+            # Links that are in each other's way divide free space: look for pre-contacts near
+            # configurations that can be reached.
+            nowhere = np.zeros((0, len(q)))
+            _, tree = self._planner.plan_rrt(
+                start, nowhere, block=block, attempt=attempt, iterations=_TREE_ITERATIONS
+            )
+            candidates = self._candidates_on(tree, block)
+            plans.append(self._plan_straight(start, candidates, block, steps_left, tree))
+        found = [plan for plan in plans if plan is not None]
+        if not found:
+            return None
+        _, path, candidates = min(found, key=lambda plan: plan[0])
+        i = path.goal
+        return Plan(
+            path=path.waypoints if start is q else (start, *path.waypoints),
+            rotation=torch.from_numpy(candidates.rotation[i]).float(),
+            height=float(candidates.position[i, 2]),
+            offset=float(candidates.offset[i]),
+            gap=float(candidates.gap[i]),
+        )
+
+    def _plan_straight(
+        self,
+        start: Array,
+        candidates: _Candidates,
+        block: Array,
+        steps_left: float,
+        tree: Tree | None = None,
+    ) -> tuple[float, Path, _Candidates] | None:
+        """Return the cheapest path to the candidates, after its cost; see ``plan_straight``."""
+        cost = PathCost(candidates.cost, steps_left - candidates.steps)
+        if tree is None:
+            order = np.argsort(cost.of(self._planner.steps(start, candidates.q)), kind="stable")
+            candidates = candidates.take(order[:_CANDIDATES])
+            cost = PathCost(candidates.cost, steps_left - candidates.steps)
+        path = self._planner.plan_straight(
+            start, candidates.q, vias=self._lift(candidates), cost=cost, block=block, tree=tree
+        )
+        if path is None:
+            return None
+        value = float(cost.of(self._planner.length(start, path), path.goal))
+        return value, path, candidates
+
+    def _candidates_near(self, q: Array, block: Array) -> _Candidates:
+        """Return candidates found from random free configurations."""
+        bank = unwrap_joints(self._robot, q, self._bank)
+        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
+        starts, goals = self._behind(bank, self._bank_tools, block, quickest)
+        starts[::2, self._idle] = q[self._idle]
+        starts[1::2, self._idle] = np.array(self._robot.home)[self._idle]
+        free = self._solve(starts, goals, block)
+        return self._evaluate(unwrap_joints(self._robot, q, free), block)
+
+    def _candidates_on(self, tree: Tree, block: Array) -> _Candidates:
+        """Return candidates found from the nodes of a tree."""
         nodes = np.array(tree.nodes)
         tools, _ = self._tool.poses(nodes)
-        none = np.zeros(0, dtype=np.intp)
-        behind = self._free_behind(*self._near_behind(nodes, tools, block, none), block)
-        ends = self._judged(behind, block)
-        price, vias = ends.price(left), self._lifted(ends)
-        way = self._ways.find_along(tree, ends.q, vias=vias, price=price, block=block)
-        return None if way is None else self._found(start, ends, way, price)
+        starts, goals = self._behind(nodes, tools, block, np.zeros(0, dtype=np.intp))
+        return self._evaluate(self._solve(starts, goals, block), block)
 
-    def _found(self, start: Array, ends: _Ends, way: Way, price: Price) -> _Found:
-        return _Found(ends, way, float(price.of(self._ways.length(start, way), way.end)))
-
-    def _judged(self, q: Array, block: Array) -> _Ends:
-        """From which configurations behind the block a push begins, and what it costs."""
-        found = poised(self._space, q, block, self._edge)
-        position, rotation = self._tool.poses(found.q)
-        aside = position[:, 0] - block[0] - found.middle
-        share, over = self._tried_out(found, position, rotation, aside, block)
-        cost = _UNFINISHED * (1 - share) + _NARROW * (1 - found.width)
-        cost += _OVER * np.minimum(over, _MOST) + found.gap / SPEED
-        cost += _SOFT * self._given_way(found.q)
-        steps = (found.gap + self._line - block[1]) / SPEED + _SETTLED
-        ends = _Ends(found.q, position, rotation, aside, found.gap, cost, steps)
-        return ends.taken(np.flatnonzero(share > 0))
-
-    def _behind(self, q: Array, block: Array) -> Array:
-        """Free configurations with the tool behind the block, shape (n, dof)."""
-        bank = unwrap_joints(self._robot, q, self._bank)
-        quick = np.argsort(self._ways.steps(q, bank), kind="stable")[:_QUICKEST]
-        start, goal = self._near_behind(bank, self._tools, block, quick)
-        start[::2, self._others] = q[self._others]
-        start[1::2, self._others] = np.array(self._robot.home)[self._others]
-        return unwrap_joints(self._robot, q, self._free_behind(start, goal, block))
-
-    def _near_behind(
-        self, q: Array, tools: Array, block: Array, more: NDArray[np.intp]
+    def _behind(
+        self, q: Array, tools: Array, block: Array, also: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Configurations with the tool near places behind the block, and those places.
+        """Return starts of inverse kinematics (n, dof) and goals of the tool behind the block.
 
-        Taken from all (n, dof), whose tools are at (n, 3), and more of them for each place.
+        Args:
+            q: Configurations to choose from, shape (k, dof).
+            tools: Positions of their tools, shape (k, 3) [m].
+            block: Pose of the block, shape (7,).
+            also: Indices of configurations to use for every goal, besides those near it.
         """
-        edge = self._edge
-        yaw = 2 * np.arctan2(block[6], block[3])
+        edge, yaw = self._edge, 2 * np.arctan2(block[6], block[3])
         hindmost = block[1] - edge / 2 * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
-        goals, starts = [], []
-        for distance in _BEHIND:
-            place = np.array([block[0], hindmost - distance * edge])
-            apart = np.linalg.norm(tools[:, :2] - place, axis=1)
+        starts, goals = [], []
+        for distance in _DISTANCES:
+            xy = np.array([block[0], hindmost - distance * edge])
+            apart = np.linalg.norm(tools[:, :2] - xy, axis=1)
             apart += np.maximum(tools[:, 2] - self._ground - edge, 0)
-            near = np.concatenate([np.argsort(apart, kind="stable")[:_NEAREST], more])
-            height = np.clip(tools[near, 2] - self._ground, _LOW * edge, _HIGH * edge)
-            goals.append(np.column_stack([np.tile(place, (len(near), 1)), self._ground + height]))
+            near = np.concatenate([np.argsort(apart, kind="stable")[:_NEAREST], also])
+            height = np.clip(tools[near, 2] - self._ground, _MIN_HEIGHT * edge, _MAX_HEIGHT * edge)
+            goals.append(np.column_stack([np.tile(xy, (len(near), 1)), self._ground + height]))
             starts.append(q[near])
         return np.concatenate(starts), np.concatenate(goals)
 
-    def _free_behind(self, start: Array, goal: Array, block: Array) -> Array:
-        """Configurations that are free with the tool at goals (n, 3), near others (n, dof)."""
-        found, error = solve_position_ik(self._robot, start, goal)
-        there = (np.abs(error[:, :2]) < _REACHED * self._edge).all(axis=1)
-        found = found[there & (np.abs(error[:, 2]) < self._edge / 2)]
-        return found[self._space.free(found, np.tile(block, (len(found), 1)))]
+    def _solve(self, starts: Array, goals: Array, block: Array) -> Array:
+        """Return free configurations with the tool at goals (n, 3), as far as they are solved."""
+        q, error = solve_position_ik(self._robot, starts, goals)
+        solved = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
+        q = q[solved & (np.abs(error[:, 2]) < self._edge / 2)]
+        return q[self._space.free(q, np.tile(block, (len(q), 1)))]
 
-    def _given_way(self, q: Array) -> Array:
-        """How far tools give way along y where the block's friction pushes back, (n,), metres."""
+    def _evaluate(self, q: Array, block: Array) -> _Candidates:
+        """Return the configurations behind the block (n, dof) that begin a push, with its cost."""
+        contacts = find_contacts(self._space, q, block, self._edge)
+        position, rotation = self._tool.poses(contacts.q)
+        offset = position[:, 0] - block[0] - contacts.offset
+        finished, over = self._simulate(contacts, position, rotation, offset, block)
+        cost = _UNFINISHED_COST * (1 - finished) + _NARROW_COST * (1 - contacts.width)
+        cost += _OVERHANG_COST * np.minimum(over, _MAX_OVERHANG) + contacts.gap / SPEED
+        cost += _COMPLIANCE_COST * self._compliance(contacts.q)
+        steps = (contacts.gap + self._line - block[1]) / SPEED + _ACCELERATION_STEPS
+        candidates = _Candidates(contacts.q, position, rotation, offset, contacts.gap, cost, steps)
+        return candidates.take(np.flatnonzero(finished > 0))
+
+    def _simulate(
+        self, contacts: PreContact, position: Array, rotation: Array, offset: Array, block: Array
+    ) -> tuple[Array, Array]:
+        """Move the tools along their pushes, in kinematics alone.
+
+        At each point the arm has to be free, and to touch a block that is slightly nearer than the
+        pushed one, and not one that is slightly farther.
+
+        Returns:
+            Fraction of each push that succeeds, and the largest overhang, each (n,).
+        """
+        edge, q = self._edge, contacts.q
+        length = contacts.gap + self._line - block[1] + 0.1 * edge
+        good, fraction = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
+        over = contacts.overhang.copy()
+        for i in range(1, _SIMULATED + 1):
+            ahead = length * i / _SIMULATED
+            goal = position.copy()
+            goal[:, 0] = block[0] + offset
+            goal[:, 1] += ahead
+            q = self._tool.move_towards(q, goal, rotation, 4)
+            error = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
+            good &= (error < _TOLERANCE * edge + 0.002) & self._space.free(q)
+            moved = np.maximum(ahead - contacts.gap, 0)[:, None]
+            shifts = moved + np.array([-_NEARER, _FARTHER]) * edge
+            nearer, farther = touches(self._space, q, block, np.zeros(1), shifts).T
+            good &= (nearer & ~farther) | (ahead < contacts.gap)
+            fraction[good] = i / _SIMULATED
+            if i % _OVERHANG_EVERY == 0:
+                rows = np.flatnonzero(good)
+                blocks = np.tile(block, (len(rows), 1))
+                blocks[:, 1] += moved[rows, 0] + _FARTHER * edge
+                over[rows] = np.maximum(over[rows], overhang(self._space, q[rows], blocks, edge))
+        begun = fraction * length > contacts.gap + 0.1 * edge
+        return np.where(begun, fraction, 0.0), over
+
+    def _compliance(self, q: Array) -> Array:
+        """Return how far tools yield along y to the friction of the block, shape (n,) [m]."""
         _, J = frame_jacobian(self._robot, q)
         return np.asarray(self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1))
 
-    def _tried_out(
-        self, found: Poised, position: Array, rotation: Array, aside: Array, block: Array
-    ) -> tuple[Array, Array]:
-        """Which share of the push configurations get through, and how far they lean over, (n,).
-
-        The tool is taken along its way as it will be; where the block then is, it is to be near,
-        and not in the way.
-        """
-        edge, q = self._edge, found.q
-        through = found.gap + self._line - block[1] + 0.1 * edge
-        good, share = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
-        over = found.over.copy()
-        for i in range(1, _POINTS + 1):
-            ahead = through * i / _POINTS
-            goal = position.copy()
-            goal[:, 0] = block[0] + aside
-            goal[:, 1] += ahead
-            q = self._tool.brought(q, goal, rotation, 4)
-            off = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
-            good &= (off < _REACHED * edge + 0.002) & self._space.free(q)
-            moved = np.maximum(ahead - found.gap, 0)[:, None]
-            shifts = moved + np.array([-_TOLERANCE[0], _TOLERANCE[1]]) * edge
-            near, far = touches(self._space, q, block, np.zeros(1), shifts).T
-            good &= (near & ~far) | (ahead < found.gap)
-            share[good] = i / _POINTS
-            if i % _LOOKED == 0:
-                at = np.flatnonzero(good)
-                blocks = np.tile(block, (len(at), 1))
-                blocks[:, 1] += moved[at, 0] + _TOLERANCE[1] * edge
-                over[at] = np.maximum(over[at], leaning(self._space, q[at], blocks, edge))
-        begun = share * through > found.gap + 0.1 * edge
-        return np.where(begun, share, 0.0), over
-
-    def _lifted(self, ends: _Ends) -> Array:
-        """Configurations with the tool above, or as high as it gets, shape (n, dof)."""
-        goal, q = ends.position.copy(), ends.q
+    def _lift(self, candidates: _Candidates) -> Array:
+        """Return configurations with the tool above the candidates, or as high as it gets."""
+        goal, q = candidates.position.copy(), candidates.q
         for _ in range(5):
             goal[:, 2] += _LIFT * self._edge / 5
-            q = self._tool.brought(q, goal, ends.rotation, 3)
+            q = self._tool.move_towards(q, goal, candidates.rotation, 3)
         return q
 
-    def _parted(self, q: Array, block: Array) -> Array:
-        """The configuration itself if it is free of the block, or one near it that is."""
+    def _retreat(self, q: Array, block: Array) -> Array:
+        """Return q if it is free of the block, else a configuration near it that is, if any."""
         if self._space.free(q[None], block[None])[0]:
             return q
         position, rotation = self._tool.poses(q[None])
-        stride, steps = _PARTING
-        for direction in _AWAY:
-            goal, found = position.copy(), q[None]
-            for _ in range(steps):
-                goal += stride * self._edge * np.array(direction)
-                found = self._tool.brought(found, goal, rotation, 3)
-                if self._space.free(found, block[None])[0]:
-                    return np.asarray(found[0])
+        for direction in _RETREAT_DIRECTIONS:
+            goal, retreated = position.copy(), q[None]
+            for _ in range(_RETREAT_STEPS):
+                goal += _RETREAT_STEP * self._edge * np.array(direction)
+                retreated = self._tool.move_towards(retreated, goal, rotation, 3)
+                if self._space.free(retreated, block[None])[0]:
+                    return np.asarray(retreated[0])
         return q

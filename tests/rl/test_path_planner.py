@@ -1,138 +1,243 @@
-"""Ways between configurations that touch nothing, and which of them are taken."""
+"""Collision-free paths in joint space, and robots that follow them."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 
-from helpers.scenes import ball
-from morphgen.model.geometry import Pose
-from morphgen.rl.baselines.path_planner import STRIDE, FreeWays, Price
+from helpers.scenes import ball, robot
+from morphgen.model.geometry import Pose, Shape, Sphere
+from morphgen.model.kinematics import joint_limits
+from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.rl.baselines.path_planner import (
+    RESOLUTION,
+    PathCost,
+    PathFollower,
+    PathPlanner,
+    fractions_towards,
+    rrt_connect,
+)
+from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.make import make_batch
 from morphgen.tasks.sim.base import Block, Scene
 
-NO_HURRY = np.array([np.inf, np.inf])
-UR5, PANDA = "arm=ur5 ee=plane", "arm=panda ee=panda_hand"
+STEP = np.array([0.02, 0.02])
+FAR_AWAY = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
+NO_DEADLINE = np.array([np.inf, np.inf])
+NO_GOALS = np.zeros((0, 2))
 
 
-def test_ways_go_round_what_is_in_between():
+def space_of(*walls):
+    """Free space of a ball of 0.1 m on slides along x and y, with a block and walls."""
+    return FreeSpace(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls))
+
+
+def planner_of(*walls):
+    return PathPlanner(space_of(*walls), STEP, 0)
+
+
+def assert_free(space, start, path, least=1.0):
+    for a, b in pairwise((start, *path.waypoints)):
+        line = a + np.linspace(0, 1, 199)[:, None] * (b - a)
+        assert space.free(line).mean() >= least
+
+
+def test_straight_paths_to_the_nearest_goal_or_by_its_via():
     wall = Block((0.2, 2.0, 0.4), Pose((0.0, -1.0, 0.2)))
-    scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=(wall,))
-    space, step = FreeSpace(scene), np.array([0.02, 0.02])
-    ways = FreeWays(space, step, np.random.default_rng(0))
-    start, ends = np.array([-0.5, -0.5]), np.array([[0.5, -0.5], [-0.5, 0.5]])
+    planner, space = planner_of(wall), space_of(wall)
+    start, goals = np.array([-0.5, -0.5]), np.array([[0.5, -0.5], [-0.5, 0.5]])
     block = np.array([1.5, 1.5, 0.1, 1.0, 0.0, 0.0, 0.0])
-    assert ways.steps(start, ends) == pytest.approx([50, 50])
-    nearest = ways.find(start, ends, block=block)
-    assert nearest.end == 1
-    assert len(nearest.points) == 1
-    over = ways.find(start, ends[:1], vias=np.array([[0.5, 0.5]]), block=block)
-    assert over.end == 0
-    assert len(over.points) >= 2
-    for a, b in zip((start, *over.points), over.points, strict=False):
-        between = a + np.linspace(0, 1, 99)[:, None] * (b - a)
-        assert space.free(between).all()
+    assert planner.steps(start, goals) == pytest.approx([50, 50])
+    nearest = planner.plan_straight(start, goals, block=block)
+    assert (nearest.goal, len(nearest.waypoints)) == (1, 1)
+    assert planner.plan_straight(start, goals[:1], block=block) is None
+    via = np.array([[-0.5, 0.5]])
+    around = planner.plan_straight(start, np.array([[0.5, 0.5]]), vias=via, block=block)
+    assert [q.tolist() for q in around.waypoints] == [[-0.5, 0.5], [0.5, 0.5]]
+    assert_free(space, start, around)
     inside = np.array([[0.0, -0.5]])
-    assert ways.find(start, inside, block=block) is None
-    on_the_end = np.array([-0.5, 0.5, 0.1, 1.0, 0.0, 0.0, 0.0])
-    assert ways.find(start, ends[1:], block=on_the_end) is None
-    assert ways.find(start, ends[1:]).points[-1].tolist() == ends[1].tolist()
+    assert planner.plan_straight(start, inside, block=block) is None
+    on_the_goal = np.array([-0.5, 0.5, 0.1, 1.0, 0.0, 0.0, 0.0])
+    assert planner.plan_straight(start, goals[1:], block=on_the_goal) is None
+    path = planner.plan_straight(start, goals[1:])
+    assert path.waypoints[-1].tolist() == goals[1].tolist()
 
 
-def test_a_way_round_about_is_found_where_no_simple_one_is():
-    """Out of a pocket that is open to the other side, to the nearer of two ends that is free."""
+def test_rrt_connect_finds_a_way_out_of_a_pocket():
+    """The pocket is open to the other side; of two goals one is in a wall."""
     walls = (
         Block((0.1, 1.2, 0.4), Pose((0.5, 0.0, 0.2))),
         Block((1.0, 0.1, 0.4), Pose((0.0, 0.6, 0.2))),
         Block((1.0, 0.1, 0.4), Pose((0.0, -0.6, 0.2))),
     )
-    scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls)
-    space = FreeSpace(scene)
-    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
-    start, ends = np.array([0.2, 0.0]), np.array([[0.5, 0.0], [1.0, 0.0]])
-    found = ways.find_round_about(start, ends)
-    assert found.end == 1
-    assert found.points[-1].tolist() == [1.0, 0.0]
-    for a, b in pairwise((start, *found.points)):
-        assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).all()
-    again = ways.find_round_about(start, ends)
-    assert all((a == b).all() for a, b in zip(found.points, again.points, strict=True))
-    assert ways.find_round_about(start, ends[:1]) is None
-    assert ways.find_round_about(start, ends[:0]) is None
+    planner, space = planner_of(*walls), space_of(*walls)
+    start, goals = np.array([0.2, 0.0]), np.array([[0.5, 0.0], [1.0, 0.0]])
+    assert planner.plan_straight(start, goals) is None
+    path, _ = planner.plan_rrt(start, goals)
+    assert path.goal == 1
+    assert path.waypoints[-1].tolist() == [1.0, 0.0]
+    assert_free(space, start, path)
+    again, _ = planner.plan_rrt(start, goals)
+    assert all((a == b).all() for a, b in zip(path.waypoints, again.waypoints, strict=True))
+    for unreachable in (goals[:1], NO_GOALS):
+        path, tree = planner.plan_rrt(start, unreachable, iterations=50)
+        assert path is None
+        assert space.free(np.array(tree.nodes)).all()
 
 
-def test_ends_are_got_to_along_a_tree_if_it_grows_there():
-    """Of two ends the cheaper is behind a wall without a gap."""
+def test_joints_that_may_not_move_stay():
+    """A ball on slides along x and y, and a slide that does not move it."""
+    links = [Link("base"), Link("cart"), Link("ball", collisions=(Shape(Sphere(0.1)),))]
+    joints = (
+        Joint("x", "prismatic", "base", "cart", Pose((0, 0, 0.2)), (1, 0, 0), (-2.0, 2.0)),
+        Joint("y", "prismatic", "cart", "ball", Pose(), (0, 1, 0), (-2.0, 2.0)),
+        Joint("idle", "prismatic", "base", "idle", Pose(), (0, 0, 1), (-1.0, 1.0)),
+    )
+    frames = (Frame("tool", "ball"),)
+    slides = Robot("ball", (*links, Link("idle")), joints, frames, (0.0, 0.0, 0.0))
+    wall = Block((0.2, 1.0, 0.4), Pose((0.0, -0.5, 0.2)))
+    space = FreeSpace(Scene(slides, obstacles=(wall,)))
+    planner = PathPlanner(space, np.full(3, 0.05), 0, np.array([True, True, False]))
+    start, goals = np.array([-0.5, -0.5, 0.7]), np.array([[0.5, -0.5, 0.7]])
+    path, tree = planner.plan_rrt(start, goals)
+    assert len(path.waypoints) > 1
+    assert {q[2] for q in (*path.waypoints, *tree.nodes)} == {0.7}
+    assert_free(space, start, path)
+
+
+def test_a_tree_stays_on_its_side_of_a_wall():
+    wall = Block((0.2, 10.0, 0.4), Pose((0.0, 0.0, 0.2)))
+    planner, start = planner_of(wall), np.array([-1.0, 0.0])
+
+    def nodes(attempt=0):
+        _, tree = planner.plan_rrt(start, NO_GOALS, attempt=attempt, iterations=100)
+        return np.array(tree.nodes)
+
+    assert nodes()[:, 0].max() < -0.19
+    assert np.ptp(nodes(), axis=0).min() > 0.5
+    assert np.array_equal(nodes(), nodes())
+    assert not np.array_equal(nodes(), nodes(attempt=1))
+
+
+def test_a_tree_that_cannot_grow_is_its_start():
+    limits, rng = np.array([[0.0, 1.0]]), np.random.default_rng(0)
+    path, tree = rrt_connect(
+        np.array([0.5]), np.zeros((0, 1)), limits, np.array([0.1]), lambda a, b: 0.0, rng, 3
+    )
+    assert path is None
+    assert np.array(tree.nodes).tolist() == [[0.5]]
+    assert tree.to_root(0) == [0.5]
+
+
+def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
+    """Of two goals the cheaper one is behind a wall without a gap."""
     walls = (
         Block((0.1, 4.5, 0.4), Pose((0.5, 0.0, 0.2))),
         Block((0.1, 1.0, 0.4), Pose((-0.3, 0.0, 0.2))),
     )
-    scene = Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls)
-    space = FreeSpace(scene)
-    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
-    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
-    start, ends = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [-1.0, 0.0]])
-    tree = ways.explored(start, 400, block=block)
+    planner, space = planner_of(*walls), space_of(*walls)
+    start, goals = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [-1.0, 0.0]])
+    _, tree = planner.plan_rrt(start, NO_GOALS, block=FAR_AWAY, iterations=400)
     assert max(q[0] for q in tree.nodes) < 0.5
-    price = Price(np.array([0.0, 500.0]), NO_HURRY)
-    found = ways.find_along(tree, ends, vias=ends, price=price, block=block)
-    assert found.end == 1
-    assert found.points[-1].tolist() == [-1.0, 0.0]
-    for a, b in pairwise((start, *found.points)):
-        assert space.free(a + np.linspace(0, 1, 199)[:, None] * (b - a)).mean() > 0.95
-    assert ways.length(start, found) >= 50
-    one = Price(np.zeros(1), NO_HURRY[:1])
-    assert ways.find_along(tree, ends[:1], vias=ends, price=one, block=block) is None
-    none = np.zeros((0, 2))
-    nothing = Price(np.zeros(0), np.zeros(0))
-    assert ways.find_along(tree, none, vias=none, price=nothing, block=block) is None
+
+    def plan(goals, goal_cost):
+        cost = PathCost(np.array(goal_cost), NO_DEADLINE[: len(goals)])
+        options = {"vias": goals, "cost": cost, "block": FAR_AWAY, "tree": tree}
+        return planner.plan_straight(start, goals, **options)
+
+    path = plan(goals, [0.0, 500.0])
+    assert path.goal == 1
+    assert path.waypoints[-1].tolist() == [-1.0, 0.0]
+    assert_free(space, start, path, least=0.95)
+    assert planner.length(start, path) >= 50
+    assert plan(goals[:1], [0.0]) is None
+    assert plan(NO_GOALS, np.zeros(0)) is None
 
 
-def test_of_the_ways_along_a_tree_it_is_the_one_that_costs_least():
-    """Not the one to the end that costs least itself, which is far."""
-    space = FreeSpace(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1))))
-    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
-    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
-    tree = ways.explored(np.array([0.0, 0.0]), 400, block=block)
-    ends, costs = np.array([[1.8, 1.8], [0.3, 0.0]]), np.array([0.0, 40.0])
+def test_the_cheapest_path_along_a_tree_is_taken():
+    """Not the one to the cheapest goal, which is far."""
+    planner, start = planner_of(), np.array([0.0, 0.0])
+    _, tree = planner.plan_rrt(start, NO_GOALS, block=FAR_AWAY, iterations=400)
+    goals, goal_cost = np.array([[1.8, 1.8], [0.3, 0.0]]), np.array([0.0, 40.0])
 
-    def end(costs, left):
-        return ways.find_along(tree, ends, vias=ends, price=Price(costs, left), block=block).end
+    def goal(goal_cost, deadline):
+        cost = PathCost(goal_cost, deadline)
+        return planner.plan_straight(start, goals, cost=cost, block=FAR_AWAY, tree=tree).goal
 
-    assert end(costs, NO_HURRY) == 1
-    assert end(3 * costs, NO_HURRY) == 0
-    assert end(3 * costs, np.array([70.0, 70.0])) == 1, "the other is too far for what is left"
+    assert goal(goal_cost, NO_DEADLINE) == 1
+    assert goal(3 * goal_cost, NO_DEADLINE) == 0
+    assert goal(3 * goal_cost, np.array([70.0, 70.0])) == 1, "the other path would be late"
 
 
-def test_ways_that_take_longer_than_there_is_time_come_last():
-    space = FreeSpace(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1))))
-    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
-    block = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
-    start, ends = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [0.3, 0.0]])
+def test_late_paths_come_last():
+    planner = planner_of()
+    start, goals = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [0.3, 0.0]])
 
-    def end(left):
-        price = Price(np.array([0.0, 100.0]), np.array(left))
-        return ways.find(start, ends, price=price, block=block).end
+    def goal(deadline):
+        cost = PathCost(np.array([0.0, 100.0]), np.array(deadline))
+        return planner.plan_straight(start, goals, cost=cost, block=FAR_AWAY).goal
 
-    assert end([np.inf, np.inf]) == 0
-    assert end([51.0, 0.0]) == 0
-    assert end([40.0, 40.0]) == 1
-    assert end([-30.0, -30.0]) == 0, "both are far too late"
+    assert goal([np.inf, np.inf]) == 0
+    assert goal([51.0, 0.0]) == 0
+    assert goal([40.0, 40.0]) == 1
+    assert goal([-30.0, -30.0]) == 0, "both are far too late"
 
 
 @pytest.mark.parametrize("far", [0.0, 0.03, 0.0501, 0.0999, 0.1499, 0.52, 0.999])
-def test_no_two_configurations_that_are_tested_are_farther_apart_than_the_stride(far):
-    class Noting(FreeSpace):
-        tested = None
-
+def test_tested_configurations_are_no_farther_apart_than_the_resolution(far):
+    class Recording(FreeSpace):
         def free(self, q, blocks=None):
             self.tested = np.array(q)
             return super().free(q, blocks)
 
-    space = Noting(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1))))
-    ways = FreeWays(space, np.array([0.02, 0.02]), np.random.default_rng(0))
+    space = Recording(space_of().scene)
     start = np.array([-0.5, -0.5])
     end = start + np.array([far, far / 3])
-    assert ways.find(start, end[None]) is not None
+    assert PathPlanner(space, STEP, 0).plan_straight(start, end[None]) is not None
     assert space.tested[[0, -1]] == pytest.approx(np.array([end, start]))
-    assert np.abs(np.diff(space.tested, axis=0)).max() <= STRIDE + 1e-12
+    assert np.abs(np.diff(space.tested, axis=0)).max() <= RESOLUTION + 1e-12
+
+
+@pytest.fixture
+def slider_batch(tmp_path):
+    batches = []
+
+    def make(n, **options):
+        batch = make_batch("reach", [robot("prims")], n, cache=tmp_path, sim="mujoco", **options)
+        batches.append(batch)
+        batch.reset()
+        return batch
+
+    yield make
+    for batch in batches:
+        batch.close()
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_robots_pass_waypoints_that_the_smallest_bin_cannot_reach(slider_batch, kind):
+    batch = slider_batch(1, kind=kind)
+    follower = PathFollower(batch)
+    start = batch.targets[0].numpy().astype(np.float64)
+    low, high = joint_limits(batch.specs[0].robot).T
+    waypoint, goal = 0.6 * start + 0.4 * low, 0.6 * start + 0.4 * high
+    follower.follow(0, [waypoint, goal])
+    for _ in range(200):
+        finished = follower.advance()
+        batch.step(encode_actions(fractions_towards(batch, follower.waypoint), kind))
+    assert finished.all()
+    step = batch.robot_tables.max_step[0]
+    assert ((batch.targets[0] - torch.from_numpy(goal)).abs() <= step / 16 + 1e-6).all()
+
+
+def test_followers_take_paths_of_any_length(slider_batch):
+    batch = slider_batch(2)
+    follower = PathFollower(batch)
+    starts = batch.targets.numpy().astype(np.float64)
+    other = starts[1] + 0.1
+    follower.follow(1, [starts[1], other])
+    follower.follow(0, [starts[0]] * 27)
+    finished = torch.stack([follower.advance() for _ in range(27)])
+    assert finished[:, 0].tolist() == [False] * 26 + [True]
+    assert follower.waypoint[1].numpy() == pytest.approx(other, abs=1e-6)

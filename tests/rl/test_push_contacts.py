@@ -6,7 +6,7 @@ import pytest
 from helpers.scenes import ball
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import Link
-from morphgen.rl.baselines.push_contacts import leaning, poised
+from morphgen.rl.baselines.push_contacts import find_contacts, overhang
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 
@@ -17,15 +17,15 @@ def test_contacts_are_where_the_block_would_be_touched():
 
     def found(height):
         scene = Scene(ball(height), block=Block((0.4, 0.4, 0.4)), ground=None)
-        return poised(FreeSpace(scene), q, block, 0.4)
+        return find_contacts(FreeSpace(scene), q, block, 0.4)
 
     low = found(0.2)
     assert low.q.tolist() == q[:2].tolist()
     assert low.gap == pytest.approx(0.2, abs=0.002)
-    assert low.middle == pytest.approx([0.0, 0.1], abs=0.05)
+    assert low.offset == pytest.approx([0.0, 0.1], abs=0.05)
     assert low.width == pytest.approx(0.5, abs=0.12)
-    assert low.over.max() == 0
-    assert found(0.35).over.min() > 0.5
+    assert low.overhang.max() == 0
+    assert found(0.35).overhang.min() > 0.5
 
 
 @pytest.mark.parametrize(("ahead", "over"), [(0.01, 0.025), (0.002, 0.005), (-0.01, 0.0)])
@@ -36,13 +36,13 @@ def test_a_brim_that_is_ahead_leans_over_the_block_by_as_much(ahead, over):
     wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
     scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
     block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
-    found = poised(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
     assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
-    assert found.over[0] == pytest.approx(over, abs=0.0035)
+    assert found.overhang[0] == pytest.approx(over, abs=0.0035)
 
     beyond = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
-    each = leaning(FreeSpace(scene), np.array([[0.0, -0.5]] * 2), beyond, 0.4)
-    assert each[0] == found.over[0]
+    each = overhang(FreeSpace(scene), np.array([[0.0, -0.5]] * 2), beyond, 0.4)
+    assert each[0] == found.overhang[0]
     assert each[1] == 0
 
 
@@ -51,5 +51,5 @@ def test_a_plate_touches_on_its_whole_breadth():
     wide = ball(0.2).with_links([plate])
     scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
     block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
-    found = poised(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
     assert found.width[0] == 1

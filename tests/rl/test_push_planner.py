@@ -11,9 +11,9 @@ from helpers.scenes import robot
 from morphgen.benchmark.split_file import read_split
 from morphgen.grammar.library import default_library
 from morphgen.rl.baselines import push_planner
-from morphgen.rl.baselines.cartesian import OneTool
-from morphgen.rl.baselines.push_contacts import poised
-from morphgen.rl.baselines.push_planner import SPEED, PushPlanner
+from morphgen.rl.baselines.push_contacts import find_contacts
+from morphgen.rl.baselines.push_planner import SPEED, PushPlanner, ToolKinematics
+from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig
@@ -27,10 +27,10 @@ PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
-    space, tool = FreeSpace(setting.scene), OneTool(build_robot_tables([setting.robot]), 0)
+    space, tool = FreeSpace(setting.scene), ToolKinematics(build_robot_tables([setting.robot]), 0)
     for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
         plan = planner.plan(q, block)
-        points = [q, *plan.way]
+        points = [q, *plan.path]
         for a, b in pairwise(points):
             between = a + np.linspace(0, 1, 200)[:, None] * (b - a)
             assert space.free(between, np.tile(block, (200, 1))).mean() > 0.99
@@ -39,8 +39,8 @@ def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
         assert position[2] == pytest.approx(plan.height)
         assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
     across = (setting.goals.line - block[1]) / SPEED
-    assert planner.plan(q, block, left=across + 1) is not None
-    assert planner.plan(q, block, left=across - 1) is None
+    assert planner.plan(q, block, steps_left=across + 1) is not None
+    assert planner.plan(q, block, steps_left=across - 1) is None
 
 
 def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
@@ -48,7 +48,7 @@ def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
     q, block = setting.goals.q[0], setting.goals.blocks[0]
-    first = planner.plan(q, block).way[-1]
+    first = planner.plan(q, block).path[-1]
 
     def near(configurations):
         return np.abs(configurations - first).max(axis=-1) < 1.0
@@ -58,9 +58,9 @@ def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
         assert (blocks[:, 1] > block[1]).all()
         return near(configurations).astype(float)
 
-    monkeypatch.setattr(push_planner, "leaning", said)
+    monkeypatch.setattr(push_planner, "overhang", said)
     assert near(first)
-    assert not near(planner.plan(q, block).way[-1])
+    assert not near(planner.plan(q, block).path[-1])
 
 
 def test_a_setting_of_another_task_is_refused(tmp_path):
@@ -83,5 +83,15 @@ def test_arms_in_each_others_way_push_below_the_middle(tmp_path):
         plan = planner.plan(setting.goals.q[i], setting.goals.blocks[i])
         if plan is not None:
             block = setting.goals.blocks[i]
-            over += poised(space, plan.way[-1][None], block, edge).over.tolist()
+            over += find_contacts(space, plan.path[-1][None], block, edge).overhang.tolist()
     assert (np.array(over) < 0.05).sum() >= 5
+
+
+def test_a_tool_turns_around():
+    tables = build_robot_tables([robot(PANDA)])
+    tool, q = ToolKinematics(tables, 0), np.array([tables.robots[0].home])
+    position, rotation = tool.poses(q)
+    turned = rotation @ np.diag([-1.0, -1.0, 1.0])
+    reached = tool.poses(tool.move_towards(q, position, turned, 60))
+    assert np.abs(reached[0] - position).max() < 5e-3
+    assert np.abs(reached[1] - turned).max() < 0.02

@@ -7,7 +7,7 @@ import torch
 from helpers.scenes import robot
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.rl.baselines.push_planner import PushPlanner
-from morphgen.rl.baselines.scripted_push import PLANS, RISE, ScriptedPush
+from morphgen.rl.baselines.scripted_push import MAX_PLANS, RISE, ScriptedPush
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
@@ -108,7 +108,7 @@ def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
         if task.step(controller.act(task)).terminated.any():
             break
     task.close()
-    assert 2 <= len(made) <= PLANS
+    assert 2 <= len(made) <= MAX_PLANS
     assert not np.allclose(made[0][1], made[1][1])
     left = [args[3] for args in made]
     assert left[0] == PUSH.max_episode_steps
@@ -128,14 +128,8 @@ def test_a_tool_whose_arm_gets_into_something_rises(free, tmp_path, monkeypatch)
     heights = []
     while len(heights) < 12:
         acting = controller.act(task)
-        if controller._state.pushing[0]:
-            heights.append(
-                float(
-                    frame_positions(
-                        task.robot_tables.tool_chain, task.env_robot_index, task.targets
-                    )[0, 2]
-                )
-            )
+        if controller.pushing[0]:
+            heights.append(float(frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.targets)[0, 2]))
         assert not task.step(acting).terminated.any()
     task.close()
     rise = 0.0 if free else RISE
