@@ -10,7 +10,6 @@ Outside of morphgen; registered, it works with every command, run as this script
 A package names its tasks in the entry point group ``morphgen.tasks`` instead.
 """
 
-import math
 import sys
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,12 +18,13 @@ import numpy as np
 import torch
 
 from morphgen.model.kinematics import frame_pose
-from morphgen.model.robot import TOOL
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.rows import padded_rows, row_norms
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Scene
-from morphgen.tasks.task import GOAL, Marker, StepResult, Task, TaskEnvs
+from morphgen.tasks.task import GOAL, Marker, ObservationField, StepResult, Task, TaskEnvs
+
+TIME = ObservationField("time", 1, GOAL.mask)  # an input [s] that only this task has
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class FollowEnvs(TaskEnvs):
     @property
     def goal(self):
         """Pose of the goal now, shape (k, 7)."""
-        goal, angle = self.first.clone(), 2 * math.pi * self.time / self.config.period
+        goal, angle = self.first.clone(), 2 * np.pi * self.time / self.config.period
         circle = torch.stack([torch.cos(angle) - 1, torch.sin(angle)], dim=1)
         goal[:, :2] += self.config.radius * circle
         return goal
@@ -101,7 +101,7 @@ class FollowEnvs(TaskEnvs):
 
     def observe(self, block_pose):
         """Return the goal, in the field that policies know from reach."""
-        return {"goal": self.goal}
+        return {"goal": self.goal, "time": self.time[:, None]}
 
     def marker_poses(self, row):
         """Return the pose of the goal."""
@@ -112,14 +112,14 @@ class Follow(Task):
     """Follow a moving goal with the tool."""
 
     name, config_type, goal_set_type = "follow", FollowConfig, FollowSet
-    goal_format, cache_folder, fields = 1, "follow-1", (GOAL,)
+    goal_format, cache_folder, fields = 1, "follow-1", (GOAL, TIME)
 
     def sample(self, robot, config, *, obstacles, ground, seeds, identity):
         """Draw free configurations."""
         space = FreeSpace(Scene(robot, ground=ground))
         q, tried = space.draw(config.num_goals, np.random.default_rng(seeds))
         poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(q), 1))
-        poses[:, :3] = frame_pose(robot, q, TOOL)[:, :3, 3]
+        poses[:, :3] = frame_pose(robot, q)[:, :3, 3]
         return FollowSet(q=q, goal_poses=poses, tried=tried, accepted=len(q), **identity)
 
     def certify(self, goals, robot, scene):

@@ -115,9 +115,10 @@ def _layout(stored: Mapping[str, Any], where: str) -> Layout:
         stored["channels"] = tuple(stored["channels"])
     require_fields(Layout, stored, where)
     layout = layout_from(stored)
-    for name in ("links", "token", "obstacles", "points"):
-        if not 0 <= getattr(layout, name) <= MAX_ROWS:
-            raise TaskError(f"{where}: {name} {getattr(layout, name)}: expected 0 to {MAX_ROWS:,}")
+    sizes = {name: getattr(layout, name) for name in ("links", "token", "obstacles", "points")}
+    for name, size in [*sizes.items(), *(field[:2] for field in layout.fields)]:
+        if not 0 <= size <= MAX_ROWS:
+            raise TaskError(f"{where}: {name} {size}: expected 0 to {MAX_ROWS:,}")
     return layout
 
 

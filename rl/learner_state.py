@@ -31,7 +31,7 @@ def state_of(learner: Learner) -> dict[str, Any]:
         "update": learner.update,
         "updates": learner.num_updates,
         "device": learner.device.type,
-        "layout": asdict(learner.layout),
+        "layout": learner.layout.as_data(),
         "policy": asdict(learner.policy),
         "config": asdict(learner.config),
     }

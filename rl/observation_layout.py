@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,11 +12,18 @@ from torch.nn import functional
 from morphgen.errors import TaskError
 from morphgen.rl.heads import REST
 from morphgen.tasks.observation import Observation
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.task import STANDARD_FIELDS
 
 CHANNELS = ("velocity", "previous_action")
 """Optional channels with one number per link, in the order in which networks concatenate them."""
 LINK_ROWS = ("tokens", "links", "actions", *CHANNELS)
 """Channels that have a row for each link."""
+KNOWN = {
+    *(*LINK_ROWS, "tool", "points", "point_mask", "obstacles", "obstacle_mask"),
+    *(name for field in STANDARD_FIELDS for name in (field.name, field.mask)),
+}
+"""Entries of observations that networks encode in their own way."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +42,21 @@ class Layout:
     """Those of ``CHANNELS`` that the observations have."""
     tool: bool = False
     """Whether the observations have the tool's position."""
+    fields: tuple[tuple[str, int, str], ...] = ()
+    """Name, size and mask of the fields that tasks of other packages declare, by name."""
+
+    def as_data(self) -> dict[str, Any]:
+        """Return plain data for a checkpoint; without ``fields`` if there are none."""
+        data = asdict(self)
+        return data if self.fields else {k: v for k, v in data.items() if k != "fields"}
 
 
 def layout_of(observation: Observation) -> Layout:
-    """Return the layout of an observation."""
+    """Return the layout of an observation.
+
+    Raises:
+        TaskError: If an entry is no field of a registered task, or has another size than declared.
+    """
     return Layout(
         links=observation["tokens"].shape[1],
         token=observation["tokens"].shape[2],
@@ -45,12 +64,39 @@ def layout_of(observation: Observation) -> Layout:
         points=observation["points"].shape[1] if "points" in observation else 0,
         channels=tuple(name for name in CHANNELS if name in observation),
         tool="tool" in observation,
+        fields=_declared_fields(observation),
     )
 
 
-def layout_from(stored: dict[str, Any]) -> Layout:
-    """Return the layout that ``dataclasses.asdict`` made a dictionary of."""
-    return Layout(**{**stored, "channels": tuple(stored["channels"])})
+def _declared_fields(observation: Observation) -> tuple[tuple[str, int, str], ...]:
+    """Return the fields of an observation that only tasks of other packages have."""
+    names = sorted(observation.keys() - KNOWN)
+    if not names:
+        return ()
+    declared = {field.name: field for task in TASKS for field in TASKS[task].fields}
+    masks = {field.mask for field in declared.values()}
+    fields = []
+    for name in names:
+        if name not in declared and name not in masks:
+            raise TaskError(
+                f"observation entry {name!r}: networks cannot encode it; expected a field of a "
+                "registered task: declare an ObservationField in the task's `fields`"
+            )
+        if name in declared:
+            field, shape = declared[name], tuple(observation[name].shape)
+            if shape[1:] != (field.size,) or field.mask not in observation:
+                raise TaskError(
+                    f"observation field {name!r} has shape {shape}; expected (n, {field.size}), "
+                    f"and the entry {field.mask!r}"
+                )
+            fields.append((name, field.size, field.mask))
+    return tuple(fields)
+
+
+def layout_from(stored: Mapping[str, Any]) -> Layout:
+    """Return the layout that ``Layout.as_data`` made a dictionary of."""
+    fields = tuple(tuple(field) for field in stored.get("fields", ()))
+    return Layout(**{**stored, "channels": tuple(stored["channels"]), "fields": fields})
 
 
 def require_layout(stored: Layout, observed: Layout, what: str) -> None:

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 ENTITIES = ("links", "goal", "object", "line", "obstacles", "cloud")
 """Kinds of vectors, in the order of the vectors and of the rows of ``Entities.kind``.
 
-Checkpoints have the rows in this order, without the kinds that a layout lacks."""
+Checkpoints have the rows in this order, without the kinds that a layout lacks; fields that tasks of
+other packages declare come last."""
 LAST_LAYER_SCALE = 0.01
 """Factor on the initial weights of the last layer, so that all actions start out almost equally
 likely and values near zero."""
@@ -79,6 +80,10 @@ class Entities(nn.Module):
             )
             sizes["cloud"] = features
         self.channels = layout.channels
+        self.fields = layout.fields
+        # Numbered, as the names of fields may be unfit for modules.
+        extra = {f"field{i}": size for i, (_, size, _) in enumerate(self.fields)}
+        sizes |= extra
         self.project = nn.ModuleDict(
             {name: nn.Linear(size, features, bias=False) for name, size in sizes.items()}
         )
@@ -89,10 +94,10 @@ class Entities(nn.Module):
         ).repeat(2)
         with torch.no_grad():
             next(self.project["links"].parameters()).mul_(smooth)
-        self.kinds = tuple(name for name in ENTITIES if name in sizes)
+        self.kinds = tuple(name for name in (*ENTITIES, *extra) if name in sizes)
         """Name of each row of ``kind``."""
         self.kind = nn.Parameter(0.02 * torch.randn(len(self.kinds), features))
-        self.count = layout.links + 3 + layout.obstacles + bool(layout.points)
+        self.count = layout.links + 3 + layout.obstacles + bool(layout.points) + len(extra)
 
     def forward(self, observation: Observation) -> tuple[torch.Tensor, torch.Tensor]:
         """Return vectors (n, T, features), zeros in the padding, and their mask (n, T), bool."""
@@ -116,6 +121,10 @@ class Entities(nn.Module):
             "goal": (torch.cat([observation["goal"], *tool], dim=-1)[:, None], reach),
             "object": (torch.cat([observation["object"], *tool], dim=-1)[:, None], push),
             "line": (observation["line"][:, None], push),
+            **{
+                f"field{i}": (observation[name][:, None], observation[mask][:, None])
+                for i, (name, _, mask) in enumerate(self.fields)
+            },
         }
         if "obstacles" in self.project:
             entries["obstacles"] = (observation["obstacles"], observation["obstacle_mask"])

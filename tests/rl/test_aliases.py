@@ -92,7 +92,7 @@ def test_a_run_of_format_2_is_read_and_resumed_to_the_same_weights(tmp_path, age
     assert equal(weights(old), weights(whole))
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", list(AGENTS))
 def test_sizes_of_other_agents_are_left_out(agent):
     policy = small_config(agent=agent).policy
     assert policy_from(current_policy(old_policy(asdict(policy)))) == policy

@@ -95,7 +95,7 @@ def outputs(actor, critic, seen):
     return head.mode(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
 
 
-agents = pytest.mark.parametrize("agent", AGENTS)
+agents = pytest.mark.parametrize("agent", list(AGENTS))
 kinds = pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
 
 
