@@ -64,7 +64,10 @@ class InverseKinematics:
 
     def _planner(self, task: TaskBatch, robot: int) -> PathPlanner:
         dof = task.specs[robot].robot.dof
-        step, movable = task.robot_tables.max_step[robot, :dof], task.robot_tables.moves_tool[robot, :dof]
+        step, movable = (
+            task.robot_tables.max_step[robot, :dof],
+            task.robot_tables.moves_tool[robot, :dof],
+        )
         seed = int(np.random.SeedSequence([self._seed, robot]).generate_state(1)[0])
         return PathPlanner(self._spaces[robot], _array(step), seed, movable.cpu().numpy())
 

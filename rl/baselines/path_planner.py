@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.kinematics import joint_limits
-from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.actions import BINS
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.typing import Array
 

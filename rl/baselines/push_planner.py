@@ -20,10 +20,10 @@ from morphgen.model.kinematics import frame_jacobian, unwrap_joints
 from morphgen.model.kinematics_torch import frame_pose
 from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner, Tree
 from morphgen.rl.baselines.push_contacts import PreContact, find_contacts, overhang, touches
-from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.feasibility import free_within
 from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.sim.base import GRAVITY
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
@@ -152,7 +152,9 @@ class ToolKinematics:
 class PushPlanner:
     """Plans pushes of one robot and its block."""
 
-    def __init__(self, spec: EnvSpec, tables: RobotTables, robot: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, spec: EnvSpec, tables: RobotTables, robot: int, rng: np.random.Generator
+    ) -> None:
         """Collect free configurations with a low tool in the region of the push.
 
         Args:

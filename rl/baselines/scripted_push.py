@@ -13,8 +13,8 @@ from morphgen.rl.baselines.path_planner import PathFollower, fractions_towards
 from morphgen.rl.baselines.push_planner import SPEED, PushPlanner
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.push.starts import PushStartSet
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import EnvSpec
 
 MAX_PLANS = 8
@@ -139,7 +139,9 @@ class ScriptedPush:
         """Return where a pushing arm's targets collide with anything but the block, (n,), bool."""
         blocked = torch.zeros_like(self._active)
         for robot, planner in self._planners.items():
-            envs = torch.nonzero(self._active & self.pushing & (task.env_robot_index == robot))[:, 0]
+            envs = torch.nonzero(self._active & self.pushing & (task.env_robot_index == robot))[
+                :, 0
+            ]
             q = task.targets[envs, : task.specs[robot].robot.dof].double().cpu().numpy()
             blocked[envs] = ~torch.from_numpy(planner.free(q)).to(blocked.device)
         return blocked
@@ -161,10 +163,16 @@ class ScriptedPush:
             task.targets,
             goal,
             self._rotation,
-            (task.robot_tables.lower[task.env_robot_index], task.robot_tables.upper[task.env_robot_index]),
+            (
+                task.robot_tables.lower[task.env_robot_index],
+                task.robot_tables.upper[task.env_robot_index],
+            ),
             rotation_budget=task.robot_tables.max_step[task.env_robot_index],
         )
-        short = goal[:, 1] - frame_positions(task.robot_tables.tool_chain, task.env_robot_index, targets)[:, 1]
+        short = (
+            goal[:, 1]
+            - frame_positions(task.robot_tables.tool_chain, task.env_robot_index, targets)[:, 1]
+        )
         stuck = self.pushing & (dy > 0) & (short > 0.8 * SPEED)
         self._stuck = torch.where(stuck, self._stuck + 1, 0)
         return targets

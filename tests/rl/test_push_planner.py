@@ -13,7 +13,6 @@ from morphgen.grammar.library import default_library
 from morphgen.rl.baselines import push_planner
 from morphgen.rl.baselines.push_contacts import find_contacts
 from morphgen.rl.baselines.push_planner import SPEED, PushPlanner, ToolKinematics
-from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.config import PushConfig

@@ -129,7 +129,13 @@ def test_a_tool_whose_arm_gets_into_something_rises(free, tmp_path, monkeypatch)
     while len(heights) < 12:
         acting = controller.act(task)
         if controller.pushing[0]:
-            heights.append(float(frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.targets)[0, 2]))
+            heights.append(
+                float(
+                    frame_positions(
+                        task.robot_tables.tool_chain, task.env_robot_index, task.targets
+                    )[0, 2]
+                )
+            )
         assert not task.step(acting).terminated.any()
     task.close()
     rise = 0.0 if free else RISE
