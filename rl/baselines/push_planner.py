@@ -21,7 +21,7 @@ from morphgen.model.kinematics_torch import frame_pose
 from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner, Tree
 from morphgen.rl.baselines.push_contacts import PreContact, find_contacts, overhang, touches
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.feasibility import free_within
+from morphgen.tasks.push.feasibility import sample_tools_in_box
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.sim.base import GRAVITY
@@ -134,10 +134,10 @@ class ToolKinematics:
             iterations: Number of iterations.
         """
         robots, rows = self._rows(q)
-        goals = [torch.from_numpy(values).to(rows) for values in (position, rotation)]
+        goal, rotations = (torch.from_numpy(each).to(rows) for each in (position, rotation))
         limits = self._tables.lower[robots], self._tables.upper[robots]
         for _ in range(iterations):
-            target = pose_ik_step(self._tables.tool_chain, robots, rows, *goals, limits)
+            target = pose_ik_step(self._tables.tool_chain, robots, rows, goal, rotations, limits)
             rows = rows + (target - rows).clamp(-MAX_STEP, MAX_STEP)
         return rows[:, : self._dof].double().cpu().numpy()
 
@@ -180,7 +180,7 @@ class PushPlanner:
         edge, first, last = self._edge, starts.blocks.min(axis=0), starts.blocks.max(axis=0)
         low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
         high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
-        self._bank, self._bank_tools = free_within(self._space, low, high, rng)
+        self._bank, self._bank_tools = sample_tools_in_box(self._space, low, high, rng)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """Return whether configurations (n, dof) are free of all but the block, shape (n,)."""
