@@ -1,4 +1,4 @@
-"""Pictures of how alike bodies are: heatmaps and maps, the same bytes every time."""
+"""Pictures of the similarity of robots: heatmaps and maps, with reproducible bytes."""
 
 from __future__ import annotations
 
@@ -24,34 +24,37 @@ from morphgen.typing import Array
 P = ParamSpec("P")
 T = TypeVar("T")
 
-NAMED = 60
-"""The most robots whose names are written."""
-WRITTEN = 16
-"""The most robots whose values are written into the cells."""
+MAX_NAMED = 60
+"""Largest number of robots whose names are drawn."""
+MAX_WITH_VALUES = 16
+"""Largest number of robots whose values are written into the cells."""
 
 _DPI = 100
-_LINE = 0.19
-"""Height of a named row of a heatmap, inches."""
-_LETTER = 0.075
-"""Width of a letter of a name, inches."""
-_SMALLEST, _UNNAMED = 3.2, 8.0
-"""Least side of a heatmap, and side of one without names, inches."""
-_DISTANCES = (9, 16, 26, 40, 58, 80)
-"""How far names may be from their points, pixels."""
-_FONT = 7.5
-_DIRECTIONS = np.array(
+_ROW_HEIGHT = 0.19
+"""Height of a named row of a heatmap [inches]."""
+_LETTER_WIDTH = 0.075
+"""Width of a letter of a name [inches]."""
+_MIN_SIDE, _UNNAMED_SIDE = 3.2, 8.0
+"""Smallest side of a heatmap, and side of one without names [inches]."""
+_LABEL_DISTANCES = (9, 16, 26, 40, 58, 80)
+"""Distances of a name from its point, tried in turn [pixels]."""
+_LABEL_FONT_SIZE = 7.5
+"""Font size of the names in a map [points]."""
+_LABEL_DIRECTIONS = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (0.8, 0.7), (-0.8, 0.7), (0.8, -0.7), (-0.8, -0.7)]
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A matrix to draw."""
+    """A similarity matrix to draw."""
 
     title: str
+    """Title above the matrix."""
     values: Array
-    """Shape (n, n)."""
+    """The matrix, shape (n, n)."""
     larger_is_more_alike: bool
+    """Whether the values are similarities; distances otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,35 +62,36 @@ class MapPanel:
     """A map to draw."""
 
     title: str
+    """Title above the map."""
     map: MdsMap
-    """Of n points."""
+    """The map of n points."""
 
 
-def _in_own_style(draw: Callable[P, T]) -> Callable[P, T]:
-    """Let no settings of the user's change a picture."""
+def _with_default_style(draw: Callable[P, T]) -> Callable[P, T]:
+    """Draw with matplotlib's default settings, whatever the user's."""
 
     @functools.wraps(draw)
-    def drawn(*args: P.args, **kwargs: P.kwargs) -> T:
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
         with matplotlib.rc_context():
             matplotlib.rcdefaults()
             return draw(*args, **kwargs)
 
-    return drawn
+    return wrapper
 
 
-@_in_own_style
+@_with_default_style
 def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
-    """Draw matrices beside each other, bright where robots are alike; a PNG.
+    """Draw matrices side by side, bright where robots are similar, and return the PNG.
 
-    Up to ``NAMED`` robots are named, and up to ``WRITTEN`` have their values written.
+    Up to ``MAX_NAMED`` robots are named, and up to ``MAX_WITH_VALUES`` have their values written.
 
     Args:
-        names: Of n robots.
-        panels: At least one.
+        names: Names of n robots.
+        panels: At least one matrix.
     """
     n = len(names)
-    side = max(_SMALLEST, n * _LINE) if n <= NAMED else _UNNAMED
-    margin = _LETTER * max(map(len, names)) if n <= NAMED else 0.3
+    side = max(_MIN_SIDE, n * _ROW_HEIGHT) if n <= MAX_NAMED else _UNNAMED_SIDE
+    margin = _LETTER_WIDTH * max(map(len, names)) if n <= MAX_NAMED else 0.3
     size = (margin + len(panels) * (side + 0.9), margin + side + 0.5)
     figure = Figure(figsize=size, dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1))
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -98,21 +102,21 @@ def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
         figure.colorbar(image, ax=ax, fraction=0.045, pad=0.02).ax.tick_params(labelsize=8)
         ax.set_title(panel.title, fontsize=10)
         _name_rows(ax, names, first=panel is panels[0])
-        if n <= WRITTEN:
+        if n <= MAX_WITH_VALUES:
             _write_values(ax, panel, float(apart.min()), float(apart.max()))
     return _png(figure)
 
 
-@_in_own_style
+@_with_default_style
 def map_png(names: Sequence[str], panels: Sequence[MapPanel]) -> bytes:
-    """Draw maps beside each other; a PNG.
+    """Draw maps side by side and return the PNG.
 
-    Colours tell families: robots whose names differ in the number at their end only. Up to
-    ``NAMED`` robots are named, but for those without room for a name.
+    Colours distinguish families: robots whose names differ only in the number at their end. Up to
+    ``MAX_NAMED`` robots are named where there is room.
 
     Args:
-        names: Of n robots.
-        panels: At least one.
+        names: Names of n robots.
+        panels: At least one map.
     """
     figure = Figure(figsize=(7.5 * len(panels), 7), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
@@ -130,22 +134,22 @@ def map_png(names: Sequence[str], panels: Sequence[MapPanel]) -> bytes:
         axes[-1].legend(fontsize=8, loc="best")
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    if len(names) <= NAMED:
+    if len(names) <= MAX_NAMED:
         for panel, ax in zip(panels, axes, strict=True):
             _name_points(ax, panel.map.points, names, canvas)
     return _png(figure)
 
 
 def _png(figure: Figure) -> bytes:
-    """The figure's bytes, without date or version in them."""
+    """Return the figure as a PNG without date and version, so that its bytes are reproducible."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def _name_rows(ax: Axes, names: Sequence[str], *, first: bool) -> None:
-    """Names along the bottom, and at the left of the first matrix."""
-    if len(names) > NAMED:
+    """Write the names along the bottom, and at the left of the first matrix."""
+    if len(names) > MAX_NAMED:
         ax.set_xlabel(f"{len(names)} robots in the order given", fontsize=9)
         return
     size = 8 if len(names) <= 30 else 7
@@ -156,7 +160,7 @@ def _name_rows(ax: Axes, names: Sequence[str], *, first: bool) -> None:
 
 
 def _write_values(ax: Axes, panel: Panel, low: float, high: float) -> None:
-    """The value in every cell, dark on bright."""
+    """Write the value into every cell, dark on bright and white on dark."""
     for (row, column), value in np.ndenumerate(panel.values):
         bright = (value - low) / (high - low) if high > low else 0.0
         if not panel.larger_is_more_alike:
@@ -167,22 +171,22 @@ def _write_values(ax: Axes, panel: Panel, low: float, high: float) -> None:
 
 
 def _scatter(ax: Axes, points: Array, families: Sequence[str]) -> None:
-    """Points, a colour and a marker a family; grey without one."""
+    """Draw the points with a colour and marker per family; grey for robots without a family."""
     colours = [colour for i, colour in enumerate(matplotlib.color_sequences["tab10"]) if i != 7]
     for i, family in enumerate(sorted(set(families) - {""})):
-        mine = [each == family for each in families]
+        members = [other == family for other in families]
         marker = "os^Dvph"[i // len(colours) % 7]
-        x, y = points[mine].T
+        x, y = points[members].T
         ax.scatter(x, y, s=28, color=colours[i % len(colours)], marker=marker, label=family)
-    x, y = points[[each == "" for each in families]].T
+    x, y = points[[family == "" for family in families]].T
     if len(x):
         ax.scatter(x, y, s=28, color="0.4", label="others")
 
 
 def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCanvasAgg) -> None:
-    """Names beside their points, moved until they cover neither each other nor a point."""
+    """Write names beside their points, where they cover neither each other nor a point."""
     renderer = canvas.get_renderer()  # type: ignore[no-untyped-call]
-    font = FontProperties(size=_FONT)
+    font = FontProperties(size=_LABEL_FONT_SIZE)
     centres = ax.transData.transform(points)
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in centres]
     legend = ax.get_legend()
@@ -190,10 +194,10 @@ def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCa
         taken.append(legend.get_window_extent(renderer))
     for point, centre, name in zip(points, centres, names, strict=True):
         width, height, _ = renderer.get_text_width_height_descent(name, font, ismath=False)
-        place = _free_place(centre, (width, height), taken, ax.bbox)
-        if place is None:
+        position = _free_position(centre, (width, height), taken, ax.bbox)
+        if position is None:
             continue
-        offset, box = place
+        offset, box = position
         taken.append(box.padded(1.5))
         ax.annotate(
             name,
@@ -208,12 +212,12 @@ def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCa
         )
 
 
-def _free_place(
+def _free_position(
     point: Array, size: tuple[float, float], taken: Sequence[Bbox], inside: Bbox
 ) -> tuple[Array, Bbox] | None:
-    """The nearest place for a name that is free, as offset and box, pixels; None if none is."""
-    for distance in _DISTANCES:
-        for direction in _DIRECTIONS:
+    """Return the offset and box of the nearest free position for a name [pixels], if any."""
+    for distance in _LABEL_DISTANCES:
+        for direction in _LABEL_DIRECTIONS:
             offset = direction * distance + np.sign(direction) * np.array(size) / 2
             left, bottom = point + offset - np.array(size) / 2
             box = Bbox.from_bounds(left, bottom, *size)

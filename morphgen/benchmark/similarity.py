@@ -1,4 +1,4 @@
-"""How alike two bodies are, measured in three ways."""
+"""Three measures of the similarity of two robots, and maps of robots from their distances."""
 
 from __future__ import annotations
 
@@ -21,39 +21,42 @@ from morphgen.typing import Array
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """All of a robot that comparing needs."""
+    """The properties of a robot that the measures compare."""
 
     name: str
+    """Name of the robot."""
     tokens: Array
-    """Without the encoding of q, shape (n_links, 32)."""
+    """Tokens without the joint positions, shape (n_links, 32)."""
     tree: LabelledTree
     workspace: Workspace
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A way to compare two robots."""
+    """A measure of the similarity of two robots."""
 
     name: str
+    """Name in ``MEASURES``."""
     function: Callable[[Features, Features], float]
-    """Symmetric."""
+    """Symmetric function of two robots."""
     larger_is_more_alike: bool
+    """True for a similarity, False for a distance."""
     meaning: str
+    """Description for users."""
 
 
 def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS) -> Features:
-    """What comparing needs of a robot.
+    """Compute the properties of a robot that the measures compare.
 
     Args:
-        robot: The body.
-        shapes: The primitive of every link that has geometry, as ``token_shapes`` gives them.
-        max_links: What indices of tokens are divided by, less one: the same for all robots that are
-            compared.
+        robot: The robot.
+        shapes: One primitive per link with geometry, by link name, as from ``token_shapes``.
+        max_links: Normalization of link indices in tokens, the same for all compared robots.
 
     Raises:
-        BenchmarkError: If the robot has no tool or no joint that moves it, no tokens, or more links
-            than ``max_links``.
-        RobotError: If an axis is zero.
+        BenchmarkError: If the robot has no movable tool, no tokens, or more than ``max_links``
+            links.
+        RobotError: If a joint axis is zero.
     """
     table = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
     space = workspace(robot)
@@ -61,10 +64,10 @@ def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_
 
 
 def cosine(a: Features, b: Features) -> float:
-    """Cosine of the angle between the tokens, laid end to end, in [-1, 1]; 1 is the same body.
+    """Return the cosine similarity of the concatenated tokens, in [-1, 1]; 1 for equal robots.
 
-    As in AnyBody (arXiv 2505.14986, section 4): the encoding of q left out, the smaller body
-    filled up with zeros.
+    As in AnyBody (arXiv 2505.14986, section 4), joint positions are left out and the smaller robot
+    is padded with zeros.
     """
     n = min(len(a.tokens), len(b.tokens))
     product = float((a.tokens[:n] * b.tokens[:n]).sum())
@@ -73,14 +76,14 @@ def cosine(a: Features, b: Features) -> float:
 
 
 def tree_distance(a: Features, b: Features) -> float:
-    """Normalised edit distance of the kinematic trees, in [0, 1]; 0 is the same body."""
+    """Return the normalised edit distance of the kinematic trees, in [0, 1]; 0 for equal robots."""
     return normalised_distance(a.tree, b.tree)
 
 
 def workspace_overlap(a: Features, b: Features) -> float:
-    """Share of configurations whose tools are in the same place, in [0, 1]; 1 is the same body.
+    """Return the overlap of the tool position densities, in [0, 1]; 1 for equal robots.
 
-    Places are about the shoulder and in units of reach.
+    Tool positions are relative to the shoulder and in units of reach.
     """
     return density_overlap(a.workspace, b.workspace)
 
@@ -95,7 +98,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         )
     }
 )
-"""Every measure by its name."""
+"""The measures by name."""
 
 
 def similarity_matrix(
@@ -103,18 +106,18 @@ def similarity_matrix(
     measure: str,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> Array:
-    """Compare all robots with each other, every pair once.
+    """Compare all pairs of robots.
 
     Args:
-        robots: Their features.
+        robots: Features of n robots.
         measure: A name in ``MEASURES``.
-        progress: Told how many pairs were compared since it was last told.
+        progress: Called with the number of pairs compared since the last call.
 
     Returns:
-        Symmetric, shape (n, n).
+        Symmetric matrix, shape (n, n).
 
     Raises:
-        BenchmarkError: If there is no such measure.
+        BenchmarkError: If the measure is unknown.
     """
     function = get_measure(measure).function
     values = np.empty((len(robots), len(robots)))
@@ -126,56 +129,56 @@ def similarity_matrix(
 
 
 def to_distances(values: Array, measure: str) -> Array:
-    """A matrix of a measure as distances: 1 minus it where larger is more alike, (n, n).
+    """Convert a matrix of a measure to distances, shape (n, n): 1 - x for similarities.
 
     Raises:
-        BenchmarkError: If there is no such measure.
+        BenchmarkError: If the measure is unknown.
     """
-    apart = 1 - values if get_measure(measure).larger_is_more_alike else values.copy()
-    np.fill_diagonal(apart, 0.0)
-    return np.asarray(np.maximum(apart, 0.0))
+    distances = 1 - values if get_measure(measure).larger_is_more_alike else values.copy()
+    np.fill_diagonal(distances, 0.0)
+    return np.asarray(np.maximum(distances, 0.0))
 
 
 def get_measure(name: str) -> Measure:
-    """The measure of that name.
+    """Return a measure by name.
 
     Raises:
-        BenchmarkError: If there is none.
+        BenchmarkError: If the measure is unknown.
     """
     if name not in MEASURES:
         raise BenchmarkError(f"no measure {name!r}{nearest(name, MEASURES)}")
     return MEASURES[name]
 
 
-_NOTHING = 1e-12
-"""Eigenvalues are nothing below this share of the largest squared distance."""
-_EQUAL = 1e-9
-"""Relative difference within which points are equally far."""
+_ZERO_EIGENVALUE = 1e-12
+"""Sum of eigenvalues, relative to the largest squared distance, that counts as zero."""
+_TIE_TOLERANCE = 1e-9
+"""Relative difference within which two points count as equally far from the centre."""
 
 
 @dataclass(frozen=True, eq=False)
 class MdsMap:
-    """Points in the plane."""
+    """A map of robots in the plane whose distances approximate given ones."""
 
     points: Array
-    """Shape (n, 2), in units of the distances, centred; the first axis varies most."""
+    """Centred points in units of the distances, shape (n, 2); the first axis varies most."""
     kept: float
-    """Share of the variation that two dimensions show, in [0, 1]."""
+    """Share of the total variation that the two dimensions show, in [0, 1]."""
 
 
 def classical_mds(distances: ArrayLike) -> MdsMap:
-    """Classical multidimensional scaling: Torgerson, Multidimensional scaling, 1952.
+    """Embed distances in the plane by classical multidimensional scaling (Torgerson, 1952).
 
-    The two largest eigenvectors of the squared distances, centred twice. Their share is that of
-    the sum of all eigenvalues' magnitudes (Mardia, Kent and Bibby, Multivariate analysis, 1979,
-    section 14.4), because distances that fit into no Euclidean space give negative ones, too. Each
-    axis is turned so that the point farthest from its middle, the first of equals, is on the right.
+    The axes are the two largest eigenvectors of the doubly centred squared distances. ``kept`` is
+    their share of the sum of all eigenvalues' magnitudes (Mardia, Kent and Bibby, Multivariate
+    analysis, 1979, section 14.4), because non-Euclidean distances give negative eigenvalues. The
+    sign of each axis is chosen so that the farthest point, or the first of several, is positive.
 
     Args:
-        distances: Symmetric, zeros on the diagonal, shape (n, n).
+        distances: Symmetric distances with a zero diagonal, shape (n, n).
 
     Raises:
-        ValueError: If they are no distances.
+        ValueError: If the matrix is not one of distances.
     """
     d = np.asarray(distances, dtype=np.float64)
     if d.ndim != 2 or d.shape[0] != d.shape[1] or not len(d):
@@ -189,14 +192,10 @@ def classical_mds(distances: ArrayLike) -> MdsMap:
     largest = np.maximum(values[::-1][:2], 0.0)
     points = np.zeros((len(d), 2))
     points[:, : len(largest)] = vectors[:, ::-1][:, :2] * np.sqrt(largest)
-    if total <= _NOTHING * len(d) * squared.max(initial=0.0):
+    if total <= _ZERO_EIGENVALUE * len(d) * squared.max(initial=0.0):
         return MdsMap(np.zeros_like(points), 1.0)
-    return MdsMap(_turned(points), float(largest.sum() / total))
-
-
-def _turned(points: Array) -> Array:
-    """Points with the sign of each axis settled; adds 0.0 so that there is no -0."""
     size = np.abs(points)
-    farthest = (size >= size.max(axis=0) * (1 - _EQUAL)).argmax(axis=0)
+    farthest = (size >= size.max(axis=0) * (1 - _TIE_TOLERANCE)).argmax(axis=0)
     sign = np.where(points[farthest, [0, 1]] < 0, -1.0, 1.0)
-    return np.asarray(points * sign + 0.0)
+    # Adding 0.0 turns -0.0 into 0.0.
+    return MdsMap(points * sign + 0.0, float(largest.sum() / total))

@@ -1,4 +1,4 @@
-"""A split in numbers: how large and movable its robots are, and how alike test and train."""
+"""Statistics of a split: sizes of its robots, and similarity of test and train robots."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress
 
 DIGITS = 4
-"""Decimals of the figures."""
+"""Decimals of the statistics."""
 COUNTED = ("links", "movable", "movable_to_tool")
 MEASURED = ("mass", "reach")
 COSINE = "cosine"
@@ -28,71 +28,71 @@ def statistics(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> dict[str, object]:
-    """Figures of a split, as its file holds them.
+    """Compute the statistics that the file of a split contains.
 
     Args:
         split: The split.
-        library: Where its parts are.
-        jobs: Processes.
-        progress: As ``survey_split`` tells it.
+        library: Library of its parts.
+        jobs: Number of processes.
+        progress: Called as by ``survey_split``.
 
     Returns:
-        Plain data, see ``summarize_survey``.
+        Plain data; see ``summarize_survey``.
 
     Raises:
-        BenchmarkError: If a robot cannot be composed, or a side is empty.
+        BenchmarkError: If a robot cannot be composed, or train or test is empty.
     """
     return summarize_survey(survey_split(split, library, jobs=jobs, progress=progress))
 
 
-def summarize_survey(found: SplitSurvey) -> dict[str, object]:
-    """Figures of a split that was surveyed.
+def summarize_survey(survey: SplitSurvey) -> dict[str, object]:
+    """Compute the statistics of a surveyed split.
 
     Returns:
-        For ``train`` and ``test``: the number of ``robots`` and of different ``bodies``, mean
-        ``links``, ``movable`` joints and those on the way from the root to the tool
-        (``movable_to_tool``); mean, least and largest ``mass`` (kg) and ``reach`` (m). Mimic joints
-        are movable; a body that has two tasks counts twice. ``cosine``: mean, least and largest
-        cosine similarity over all pairs of a test and a train robot.
+        For ``train`` and ``test``: the number of ``robots`` and of distinct ``bodies``; the means
+        of ``links``, ``movable`` joints (mimic joints included) and movable joints between root and
+        tool (``movable_to_tool``); mean, minimum and maximum of ``mass`` [kg] and ``reach`` [m]. A
+        robot with two tasks counts twice. For ``cosine``: mean, minimum and maximum of the cosine
+        similarity over all pairs of a test and a train robot.
 
     Raises:
-        BenchmarkError: If a robot could not be composed, or a side is empty.
+        BenchmarkError: If a robot could not be composed, or train or test is empty.
     """
-    split = found.split
+    split = survey.split
     return {
-        "train": _side(split, split.train, found.train),
-        "test": _side(split, split.test, found.test),
-        COSINE: mean_and_range(found.by_measure(COSINE).ravel().tolist()),
+        "train": _side(split, split.train, survey.train),
+        "test": _side(split, split.test, survey.test),
+        COSINE: mean_and_range(survey.by_measure(COSINE).ravel().tolist()),
     }
 
 
 def mean_and_range(values: Sequence[float]) -> dict[str, float]:
-    """Mean, least and largest of values."""
+    """Return mean, minimum and maximum of values, rounded to ``DIGITS``."""
     numbers = {"mean": float(np.mean(values)), "min": min(values), "max": max(values)}
     return {key: round(value, DIGITS) for key, value in numbers.items()}
 
 
 def _side(
-    split: Split, members: Sequence[Member], found: Iterable[SurveyedRobot | Fault]
+    split: Split, members: Sequence[Member], surveyed: Iterable[SurveyedRobot | Fault]
 ) -> dict[str, object]:
     if not members:
         raise BenchmarkError(f"split {split.name!r} has a side without robots")
     robots = []
-    for member, robot in zip(members, found, strict=True):
+    for member, robot in zip(members, surveyed, strict=True):
         if isinstance(robot, Fault):
             raise BenchmarkError(f"split {split.name!r}: robot {member.name!r}: {robot.why}")
         robots.append(robot)
-    facts = [robot.stats for robot in robots]
+    stats = [robot.stats for robot in robots]
     return {
         "robots": len(robots),
         "bodies": len({robot.robot_hash for robot in robots}),
-        **{key: round(float(np.mean(_column(facts, key))), DIGITS) for key in COUNTED},
-        **{key: mean_and_range(_column(facts, key)) for key in MEASURED},
+        **{key: round(float(np.mean(_column(stats, key))), DIGITS) for key in COUNTED},
+        **{key: mean_and_range(_column(stats, key)) for key in MEASURED},
     }
 
 
-def _column(facts: Sequence[RobotStats], key: str) -> list[float]:
-    return [float(getattr(fact, key)) for fact in facts]
+def _column(stats: Sequence[RobotStats], key: str) -> list[float]:
+    return [float(getattr(robot, key)) for robot in stats]
 
 
 PAPER_TABLE = "AnyBody (arXiv 2505.14986), table 'Statistics about benchmark tasks'"
@@ -103,13 +103,15 @@ class PaperRow:
     """A row of the paper's table: means over the train robots."""
 
     title: str
-    """As the paper calls the set."""
+    """Name of the set of robots in the paper."""
     links: float
+    """Mean number of links."""
     movable: float
+    """Mean number of movable joints."""
     movable_to_tool: float | None
-    """None where the paper has a dash."""
+    """Mean number of movable joints between root and tool; None for the paper's dash."""
     cosine: float
-    """Mean over test and train robots."""
+    """Mean cosine similarity over pairs of a test and a train robot."""
 
 
 PAPER: Mapping[str, PaperRow] = MappingProxyType(
@@ -122,14 +124,14 @@ PAPER: Mapping[str, PaperRow] = MappingProxyType(
         "extrapolation/arms": PaperRow("Robot Arms", 14.70, 8.5, 6.6, 0.42),
     }
 )
-"""The paper's figures by the set of robots: a scenario's name without its task."""
+"""Rows of the paper's table by set of robots, which is a scenario's name without its task."""
 
 
 def paper_row(split: str) -> PaperRow | None:
-    """The paper's figures for a scenario, such as ``extrapolation/arms/reach``; None if none."""
+    """Return the paper's row for a scenario such as ``extrapolation/arms/reach``, if it has one."""
     return PAPER.get(robot_set(split))
 
 
 def robot_set(split: str) -> str:
-    """The robots of a scenario: its name without the task, which other tasks share."""
+    """Return the name of a scenario's set of robots: the scenario's name without the task."""
     return "/".join(split.split("/")[:2])

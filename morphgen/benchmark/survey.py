@@ -1,6 +1,6 @@
-"""Every robot of a split composed and measured, and each test robot compared with each train robot.
+"""Compose and measure all robots of a split, and compare each test robot with each train robot.
 
-What the audit and the statistics are made of.
+The audit and the statistics of a split are computed from this survey.
 """
 
 from __future__ import annotations
@@ -29,46 +29,49 @@ from morphgen.typing import Array
 
 @dataclass(frozen=True)
 class RobotStats:
-    """What tables say of a robot."""
+    """Size and mobility of a robot."""
 
     links: int
+    """Number of links."""
     movable: int
-    """Joints that move, mimic joints among them."""
+    """Number of movable joints, mimic joints included."""
     movable_to_tool: int
-    """Those between the root and the tool's link."""
+    """Number of movable joints between the root and the tool's link."""
     dof: int
+    """Number of independent joints."""
     reach: float
-    """Largest distance of the tool from the root's origin, metres."""
+    """Largest distance of the tool from the root's origin [m]."""
     mass: float
-    """Kilograms."""
+    """Total mass [kg]."""
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data for JSON."""
+        """Return the fields as plain data for JSON."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a robot of a split cannot be had."""
+    """Reason why a robot of a split cannot be composed or measured."""
 
     code: str
-    """``part-missing`` if the library lacks a part, ``links-many`` if the robot has more than its
-    split allows, else ``body-broken``."""
+    """``part-missing`` if the library lacks a part, ``links-many`` if the robot has more links than
+    its split allows, else ``body-broken``."""
     why: str
+    """Error message."""
 
 
 @dataclass(frozen=True)
 class SurveyedRobot:
-    """A robot of a split as it is composed today."""
+    """A robot of a split, composed with the current library."""
 
     robot_hash: str
-    """Its hash."""
+    """Hash of the robot; see ``morphgen.benchmark.robot_hash``."""
     stats: RobotStats
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRobot:
-    """What is known of a robot of a split."""
+    """A composed robot with the features that the similarity measures compare."""
 
     surveyed: SurveyedRobot
     features: Features
@@ -76,30 +79,33 @@ class MeasuredRobot:
 
 @dataclass(frozen=True, eq=False)
 class SplitSurvey:
-    """What was found of a split's robots, in the order of the split."""
+    """Results for all robots of a split."""
 
     split: Split
+    """The split."""
     train: tuple[SurveyedRobot | Fault, ...]
+    """Train robots, in the order of the split."""
     test: tuple[SurveyedRobot | Fault, ...]
+    """Test robots, in the order of the split."""
     similarity: Array
-    """Of every train robot to every test robot by every measure, in the order of ``MEASURES``,
-    shape (n_train, n_test, n_measures); NaN where one of the two has a fault."""
+    """Similarity of train and test robots by each of ``MEASURES``, shape (n_train, n_test,
+    n_measures); NaN where one of the two robots has a fault."""
 
     def by_measure(self, measure: str) -> Array:
-        """Likeness by one measure, shape (n_train, n_test)."""
+        """Return the similarity by one measure, shape (n_train, n_test)."""
         return self.similarity[:, :, tuple(MEASURES).index(measure)]
 
 
 def robot_stats(robot: Robot) -> RobotStats:
-    """Count and measure a robot."""
-    known = RobotProperties(robot)
+    """Measure the size and mobility of a robot."""
+    properties = RobotProperties(robot)
     return RobotStats(
         len(robot.links),
         len(robot.movable_joints),
-        int(known.movable_to_tool),
+        int(properties.movable_to_tool),
         robot.dof,
-        float(rounded(known.reach) or 0.0),
-        float(rounded(known.mass) or 0.0),
+        float(rounded(properties.reach) or 0.0),
+        float(rounded(properties.mass) or 0.0),
     )
 
 
@@ -107,12 +113,12 @@ def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> Meas
     """Measure a robot, unless it has more links than its split allows.
 
     Args:
-        robot: The body.
+        robot: The robot.
         folders: Folders of parts, for their stored fits.
-        max_links: Of the split.
+        max_links: Largest number of links in the split.
 
     Raises:
-        MorphgenError: If it has no tokens, or no tool that moves.
+        MorphgenError: If the robot has no tokens or no movable tool.
     """
     if len(robot.links) > max_links:
         why = f"it has {len(robot.links)} links, more than max_links {max_links}"
@@ -126,50 +132,55 @@ def measure_robot(robot: Robot, folders: Sequence[Path], max_links: int) -> Meas
 def survey_split(
     split: Split, library: Library, *, jobs: int = 1, progress: Progress = no_progress
 ) -> SplitSurvey:
-    """Compose, measure and compare a split's robots; what is named twice is composed once a side.
+    """Compose, measure and compare the robots of a split; equal ones once in train and test each.
 
     Args:
         split: The split.
-        library: Where its parts are.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        library: Library of its parts.
+        jobs: Number of processes.
+        progress: Called repeatedly with the numbers of finished and of all robots.
 
     Raises:
-        BenchmarkError: If ``jobs`` is below 1, or what the split says of its making is malformed.
+        BenchmarkError: If ``jobs`` is below 1, or the split's provenance is malformed.
     """
     trains, tests = _firsts(split.train), _firsts(split.test)
     total = len(trains) + len(tests)
-    examination = _Examination(library.folders, split.max_links)
-    tested = list(parallel_map(examination, tests, jobs, lambda done, _: progress(done, total)))
-    look = _Comparison(examination, tuple(map(_features_of, tested)))
-    trained = list(
-        parallel_map(look, trains, jobs, lambda done, _: progress(len(tests) + done, total))
+    measurement = _Measurement(library.folders, split.max_links)
+    tested = list(parallel_map(measurement, tests, jobs, lambda done, _: progress(done, total)))
+    compare = _Comparison(
+        measurement, tuple(None if isinstance(robot, Fault) else robot.features for robot in tested)
     )
-    rows, columns = _places(split.train, trains), _places(split.test, tests)
+    trained = list(
+        parallel_map(compare, trains, jobs, lambda done, _: progress(len(tests) + done, total))
+    )
+    rows, columns = _first_indices(split.train, trains), _first_indices(split.test, tests)
     shape = (len(trains), len(tests), len(MEASURES))
-    likeness = np.array([values for _, values in trained]).reshape(shape)
+    similarity = np.array([values for _, values in trained]).reshape(shape)
     return SplitSurvey(
         split,
         tuple(trained[row][0] for row in rows),
-        tuple(_surveyed(tested[column]) for column in columns),
-        likeness[rows][:, columns],
+        tuple(
+            robot if isinstance(robot, Fault) else robot.surveyed
+            for robot in (tested[column] for column in columns)
+        ),
+        similarity[rows][:, columns],
     )
 
 
 def _firsts(members: Sequence[Member]) -> list[Member]:
-    """The first member of every derivation."""
+    """Return the first member with each derivation."""
     return list({member.derivation: member for member in reversed(members)}.values())[::-1]
 
 
-def _places(members: Sequence[Member], firsts: Sequence[Member]) -> list[int]:
-    """For every member the index of the first one of its derivation."""
-    place = {member.derivation: i for i, member in enumerate(firsts)}
-    return [place[member.derivation] for member in members]
+def _first_indices(members: Sequence[Member], firsts: Sequence[Member]) -> list[int]:
+    """Return, for every member, the index in ``firsts`` of the one with the same derivation."""
+    index = {member.derivation: i for i, member in enumerate(firsts)}
+    return [index[member.derivation] for member in members]
 
 
 @dataclass(frozen=True, eq=False)
-class _Examination:
-    """How a worker sees to a robot."""
+class _Measurement:
+    """Picklable function that composes and measures a member; caches the library per worker."""
 
     folders: tuple[Path, ...]
     max_links: int
@@ -193,25 +204,19 @@ class _Examination:
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """How a worker compares a robot with the test robots."""
+    """Picklable function that measures a train robot and compares it with all test robots."""
 
-    examination: _Examination
+    measurement: _Measurement
     tests: tuple[Features | None, ...]
 
     def __call__(self, member: Member) -> tuple[SurveyedRobot | Fault, Array]:
-        found = self.examination(member)
+        measured = self.measurement(member)
         values = np.full((len(self.tests), len(MEASURES)), np.nan)
-        if isinstance(found, Fault):
-            return found, values
+        if isinstance(measured, Fault):
+            return measured, values
         for row, test in zip(values, self.tests, strict=True):
             if test is not None:
-                row[:] = [each.function(test, found.features) for each in MEASURES.values()]
-        return found.surveyed, values
-
-
-def _surveyed(found: MeasuredRobot | Fault) -> SurveyedRobot | Fault:
-    return found.surveyed if isinstance(found, MeasuredRobot) else found
-
-
-def _features_of(found: MeasuredRobot | Fault) -> Features | None:
-    return found.features if isinstance(found, MeasuredRobot) else None
+                row[:] = [
+                    measure.function(test, measured.features) for measure in MEASURES.values()
+                ]
+        return measured.surveyed, values

@@ -1,7 +1,7 @@
-"""What the 48 numbers of a link's token mean, field by field, both ways.
+"""Fields of the 48-number token of a link: encoding and decoding.
 
-Order and sizes are those of the table of the robot's state in AnyBody (arXiv 2505.14986, appendix
-on the state space); ``LAYOUT`` says how what it leaves open is meant.
+Order and sizes follow the robot state table in AnyBody (arXiv 2505.14986, appendix on the state
+space). ``LAYOUT`` documents the choices that the paper leaves open.
 """
 
 from __future__ import annotations
@@ -23,30 +23,33 @@ from morphgen.typing import Array
 
 TOKEN_SIZE = 48
 MAX_LINKS = 23
-"""The paper's largest robot: 22 links and the base."""
+"""Number of links of the paper's largest robot: 22 and the base."""
 TOLERANCE = 1e-4
-"""How far a number may be off and still be read; tokens in single precision are within it."""
+"""Largest error of a number that is still decoded; single-precision tokens are within it."""
 
 SHAPES = ("sphere", "cylinder", "box")
-"""What the one-hot of a geometry says, in order."""
+"""Order of the one-hot encoding of a geometry."""
 KINDS: tuple[JointKind, ...] = ("prismatic", "revolute", "fixed")
-"""What the one-hot of a joint says, in order."""
+"""Order of the one-hot encoding of a joint type."""
 FREQUENCIES: Array = np.array([math.pi / 2 * 2**k for k in range(8)])
-"""Angular frequencies of the encoding of a position, rad."""
+"""Angular frequencies of the position encoding [rad], shape (8,)."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """Consecutive numbers of a token that mean one thing."""
+    """A field of a token: consecutive numbers with one meaning."""
 
     name: str
     start: int
+    """Index of the first number."""
     size: int
+    """Count of numbers."""
     content: str
+    """Description for users."""
 
     @property
     def columns(self) -> slice:
-        """Where it is on the last axis of tokens."""
+        """Slice of the field on the last axis of tokens."""
         return slice(self.start, self.start + self.size)
 
 
@@ -76,10 +79,10 @@ LAYOUT = (INDEX, PARENT, TOOL, GEOMETRY, SHAPE_POSE, AXIS, ORIGIN, KIND, POSITIO
 
 
 def require_max_links(n_links: int, what: str, max_links: int) -> None:
-    """Require that so many links can be told apart.
+    """Require at most ``max_links`` links, and a ``max_links`` of at least 2.
 
     Raises:
-        BenchmarkError: If they are more than ``max_links``, or ``max_links`` is below 2.
+        BenchmarkError: If one of the two is violated; ``what`` names the robot in the message.
     """
     if max_links < 2:
         raise BenchmarkError(f"max_links {max_links}: expected 2 or more, such as {MAX_LINKS}")
@@ -94,28 +97,28 @@ def require_finite(tokens: Array, what: str, links: Sequence[str]) -> None:
     """Require that tokens (n_links, 48) are finite.
 
     Raises:
-        BenchmarkError: If a number is not; the message names its link and field.
+        BenchmarkError: If a number is not finite; the message names its link and field.
     """
-    lost = np.argwhere(~np.isfinite(tokens))
-    if len(lost):
-        row, column = lost[0].tolist()
+    invalid = np.argwhere(~np.isfinite(tokens))
+    if len(invalid):
+        row, column = invalid[0].tolist()
         field = next(field for field in LAYOUT if column < field.columns.stop)
-        numbers = _listed(tokens[row, field.columns].tolist())
+        numbers = _format(tokens[row, field.columns].tolist())
         raise BenchmarkError(f"{what}: link {links[row]}: {field.name}: {numbers} is not finite")
 
 
 def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Tokens with rows of zeros below, so that robots of several sizes share a batch.
+    """Pad tokens with rows of zeros, so that robots of different sizes share a batch.
 
     Args:
-        tokens: Shape (..., n_links, 48).
-        max_links: Rows that are wanted.
+        tokens: Tokens of one robot, shape (..., n_links, 48).
+        max_links: Number of rows after padding.
 
     Returns:
-        Tokens (..., max_links, 48), and a mask (max_links,): True where there is a link.
+        Tokens (..., max_links, 48), and a mask (max_links,) that is True for links.
 
     Raises:
-        BenchmarkError: If there are more links than that.
+        BenchmarkError: If there are more links than ``max_links``.
     """
     n_links = tokens.shape[-2]
     require_max_links(n_links, "the robot", max_links)
@@ -124,10 +127,11 @@ def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]
 
 
 def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = MAX_LINKS) -> bytes:
-    """A file for ``numpy.load``: a robot's tokens and what is needed to understand them.
+    """Return an npz file of a robot's tokens and their description.
 
-    Arrays: ``tokens`` (..., n_links, 48), names of ``links`` (n_links,), names of the fields in
-    ``layout`` (9,), where these start and end in ``columns`` (9, 2), ``name`` and ``max_links``.
+    Arrays: ``tokens`` (..., n_links, 48), names of the ``links`` (n_links,), names of the fields
+    in ``layout`` (9,), first and end index of each field in ``columns`` (9, 2), ``name`` and
+    ``max_links``.
     """
     content = io.BytesIO()
     np.savez(
@@ -143,10 +147,10 @@ def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = 
 
 
 def encode_position(x: Array) -> Array:
-    """The numbers of ``joint position``.
+    """Encode normalized joint positions as sines and cosines of doubling frequencies.
 
-    Sines and cosines of doubling frequencies, as in NeRF (Mildenhall et al. 2020, equation 4), but
-    from pi/2 on: from pi on, as there, both ends of a range would have the same code.
+    As in NeRF (Mildenhall et al. 2020, equation 4), but the lowest frequency is pi/2 instead of pi,
+    with which both limits would have the same code.
 
     Args:
         x: Positions, -1 at the lower and 1 at the upper limit, shape (...).
@@ -159,7 +163,7 @@ def encode_position(x: Array) -> Array:
 
 
 def decode_position(numbers: Array) -> float:
-    """The scaled position, in [-2, 2], that the 16 numbers of ``joint position`` say.
+    """Decode the 16 numbers of ``joint position`` to a normalized position in [-2, 2].
 
     Raises:
         ValueError: If the frequencies contradict each other.
@@ -175,10 +179,10 @@ def decode_position(numbers: Array) -> float:
 
 
 def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
-    """The numbers of ``geometry``; a capsule counts as the cylinder of its whole length.
+    """Encode a primitive; a capsule becomes the cylinder of its total length.
 
     Raises:
-        ValueError: If the geometry is a mesh or has no size.
+        ValueError: If the geometry is a mesh, or a size is not positive.
     """
     match geometry:
         case Sphere(radius):
@@ -198,40 +202,40 @@ def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
 
 
 def decode_primitive(numbers: Array) -> Primitive | None:
-    """The primitive that the 6 numbers of ``geometry`` say; None if they are zeros.
+    """Decode the 6 numbers of ``geometry``; None if they are zeros.
 
     Raises:
-        ValueError: If they say none.
+        ValueError: If they are not the code of a primitive.
     """
     if not numbers.any():
         return None
-    kind = SHAPES[_hot(numbers[:3], SHAPES)]
+    kind = SHAPES[_hot_index(numbers[:3], SHAPES)]
     x, y, z = sizes = numbers[3:].tolist()
     _require_sizes(sizes)
     if kind == "box":
         return Box((x, y, z))
     equal = sizes if kind == "sphere" else sizes[:2]
     if max(equal) - min(equal) > TOLERANCE * max(equal):
-        raise ValueError(f"a {kind} has {len(equal)} times its radius, not {_listed(equal)}")
+        raise ValueError(f"a {kind} has {len(equal)} times its radius, not {_format(equal)}")
     return Sphere(x) if kind == "sphere" else Cylinder(x, z)
 
 
 def encode_kind(kind: JointKind) -> tuple[float, ...]:
-    """The numbers of ``joint type``; a continuous joint is revolute."""
+    """Encode a joint type; a continuous joint counts as revolute."""
     return _one_hot("revolute" if kind == "continuous" else kind, KINDS)
 
 
 def decode_kind(numbers: Array) -> JointKind:
-    """The kind that the 3 numbers of ``joint type`` say.
+    """Decode the 3 numbers of ``joint type``.
 
     Raises:
-        ValueError: If they say none.
+        ValueError: If they are not a one-hot code.
     """
-    return KINDS[_hot(numbers, KINDS)]
+    return KINDS[_hot_index(numbers, KINDS)]
 
 
 def encode_pose(pose: Pose) -> tuple[float, ...]:
-    """The numbers of a pose: position, then quaternion with w >= 0.
+    """Encode a pose as its position [m] and its quaternion (w, x, y, z) with w >= 0.
 
     Raises:
         ValueError: If the quaternion is zero or not finite.
@@ -240,7 +244,7 @@ def encode_pose(pose: Pose) -> tuple[float, ...]:
 
 
 def decode_pose(numbers: Array) -> Pose:
-    """The pose that 7 numbers say.
+    """Decode the 7 numbers of a pose.
 
     Raises:
         ValueError: If the quaternion is not of unit length.
@@ -248,51 +252,51 @@ def decode_pose(numbers: Array) -> Pose:
     x, y, z, w, a, b, c = numbers.tolist()
     norm = math.hypot(w, a, b, c)
     if abs(norm - 1) > TOLERANCE:
-        raise ValueError(f"the quaternion {_listed((w, a, b, c))} is of length {norm:g}, not 1")
+        raise ValueError(f"the quaternion {_format((w, a, b, c))} is of length {norm:g}, not 1")
     return Pose((x, y, z), rotation.normalize((w, a, b, c)))
 
 
 def decode_axis(numbers: Array) -> Vec3:
-    """The axis that 3 numbers say.
+    """Decode the 3 numbers of ``joint axis``.
 
     Raises:
-        ValueError: If it is not of unit length.
+        ValueError: If the axis is not of unit length.
     """
     x, y, z = numbers.tolist()
     length = math.hypot(x, y, z)
     if abs(length - 1) > TOLERANCE:
-        raise ValueError(f"the axis {_listed((x, y, z))} is of length {length:g}, not 1")
+        raise ValueError(f"the axis {_format((x, y, z))} is of length {length:g}, not 1")
     return (x, y, z)
 
 
 def decode_flag(numbers: Array) -> bool:
-    """Whether ``end-effector`` is set.
+    """Decode the 4 numbers of ``end-effector``.
 
     Raises:
         ValueError: If its four numbers are neither all 0 nor all 1.
     """
     flag = numbers[0] > 0.5
     if np.abs(numbers - flag).max() > TOLERANCE:
-        raise ValueError(f"{_listed(numbers.tolist())} is neither four times 0 nor four times 1")
+        raise ValueError(f"{_format(numbers.tolist())} is neither four times 0 nor four times 1")
     return bool(flag)
 
 
 def _one_hot(name: str, names: Sequence[str]) -> tuple[float, ...]:
-    return tuple(float(name == each) for each in names)
+    return tuple(float(name == other) for other in names)
 
 
-def _hot(numbers: Array, names: Sequence[str]) -> int:
-    """Which name a one-hot says."""
+def _hot_index(numbers: Array, names: Sequence[str]) -> int:
+    """Return the index that a one-hot code selects."""
     hot = int(numbers.argmax())
     if np.abs(numbers - np.eye(len(names))[hot]).max() > TOLERANCE:
-        raise ValueError(f"{_listed(numbers.tolist())} is no one-hot of [{', '.join(names)}]")
+        raise ValueError(f"{_format(numbers.tolist())} is not one-hot over [{', '.join(names)}]")
     return hot
 
 
 def _require_sizes(sizes: Sequence[float]) -> None:
     if not all(0 < size < math.inf for size in sizes):
-        raise ValueError(f"sizes {_listed(sizes)} are not all positive and finite")
+        raise ValueError(f"sizes {_format(sizes)} are not all positive and finite")
 
 
-def _listed(numbers: Sequence[float]) -> str:
+def _format(numbers: Sequence[float]) -> str:
     return f"[{', '.join(f'{number:g}' for number in numbers)}]"

@@ -1,4 +1,4 @@
-"""Tokens: a robot as 48 numbers a link, and back."""
+"""Tokens: encode a robot as 48 numbers per link, and decode it."""
 
 from __future__ import annotations
 
@@ -49,20 +49,21 @@ def tokens(
     *,
     max_links: int = MAX_LINKS,
 ) -> Array:
-    """Tokens of a robot's links, the base first; ``LAYOUT`` names their fields.
+    """Return the tokens of a robot's links, root first; ``LAYOUT`` describes their fields.
 
     Args:
-        robot: The body.
-        shapes: The one primitive that stands for each link; links without geometry are absent.
-        q: Independent joint positions, shape (..., dof), rad or m; by default the home.
-        max_links: The most links that a robot of the study has; indices are divided by one less.
+        robot: The robot.
+        shapes: One primitive per link, by link name; links without geometry are absent.
+        q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
+        max_links: Largest number of links among all compared robots; link indices are divided by
+            ``max_links - 1``.
 
     Returns:
-        Shape (..., n_links, 48).
+        Tokens, shape (..., n_links, 48).
 
     Raises:
-        BenchmarkError: If the robot has more links than ``max_links``, a shape belongs to no link,
-            is a mesh or has no size, a joint has no range, or a number is not finite.
+        BenchmarkError: If the robot has more links than ``max_links``, a shape is a mesh, has no
+            size or names an unknown link, a joint has no range, or a number is not finite.
         RobotError: If a joint's axis is zero.
         ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
     """
@@ -70,16 +71,16 @@ def tokens(
     for name in shapes:
         if name not in robot.link_index:
             raise BenchmarkError(
-                f"robot {robot.name!r}: a shape is for {name!r}, no link"
+                f"robot {robot.name!r}: a shape is for the unknown link {name!r}"
                 + nearest(name, robot.link_index)
             )
-    robot = as_written(robot)  # one robot has one token matrix, composed or read back
+    robot = as_written(robot)  # rounded as in its file: composed and read back, the same tokens
     codes = encode_joint_positions(robot, robot.home if q is None else q)
     tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
-    body = np.zeros((len(robot.links), TOKEN_SIZE))
-    body[:, layout.INDEX.start] = np.arange(len(robot.links)) / (max_links - 1)
-    body[:, layout.PARENT.start] = np.array(robot.parents) / (max_links - 1)
-    for row, link, joint in zip(body, robot.links, (None, *robot.joints), strict=True):
+    static = np.zeros((len(robot.links), TOKEN_SIZE))  # all fields but the joint position
+    static[:, layout.INDEX.start] = np.arange(len(robot.links)) / (max_links - 1)
+    static[:, layout.PARENT.start] = np.array(robot.parents) / (max_links - 1)
+    for row, link, joint in zip(static, robot.links, (None, *robot.joints), strict=True):
         row[layout.TOOL.columns] = link.name == tool
         try:
             _write_shape(row, shapes.get(link.name))
@@ -87,21 +88,21 @@ def tokens(
         except ValueError as error:
             raise BenchmarkError(f"robot {robot.name!r}: link {link.name!r}: {error}") from error
     names = [repr(link.name) for link in robot.links]
-    layout.require_finite(body, f"robot {robot.name!r}", names)
-    made = np.broadcast_to(body, (*codes.shape[:-2], *body.shape)).copy()
-    made[..., layout.POSITION.columns] = codes
-    return made
+    layout.require_finite(static, f"robot {robot.name!r}", names)
+    result = np.broadcast_to(static, (*codes.shape[:-2], *static.shape)).copy()
+    result[..., layout.POSITION.columns] = codes
+    return result
 
 
 def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
-    """What changes of the tokens as a robot moves: the numbers of ``joint position``.
+    """Return the field ``joint position``, the only part of the tokens that changes with ``q``.
 
     Args:
-        robot: The body.
-        q: Independent joint positions, shape (..., dof), rad or m.
+        robot: The robot.
+        q: Independent joint positions, shape (..., dof) [rad or m].
 
     Returns:
-        Shape (..., n_links, 16); zeros for the base and for fixed joints.
+        Codes, shape (..., n_links, 16); zeros for the root and for fixed joints.
 
     Raises:
         BenchmarkError: If a position is not finite or a joint has no range.
@@ -114,17 +115,18 @@ def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
 
 
 def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
-    """Positions of the movable joints: -1 at the lower limit, 1 at the upper, outside beyond.
+    """Scale the positions of the movable joints to -1 at the lower and 1 at the upper limit.
 
-    Continuous joints, and revolute ones without limits, are wrapped to (-pi, pi] and divided by
-    pi; prismatic ones without limits count in metres. Mimic joints follow their leaders.
+    Positions of continuous joints, and of revolute ones without limits, are wrapped to (-pi, pi]
+    and divided by pi. Those of prismatic joints without limits stay in metres. Mimic joints follow
+    their leaders.
 
     Args:
-        robot: The body.
-        q: Independent joint positions, shape (..., dof), rad or m.
+        robot: The robot.
+        q: Independent joint positions, shape (..., dof) [rad or m].
 
     Returns:
-        In the order of ``robot.movable_joints``, shape (..., n_movable).
+        Normalized positions in the order of ``robot.movable_joints``, shape (..., n_movable).
 
     Raises:
         BenchmarkError: If a position is not finite or a joint has no range.
@@ -139,38 +141,45 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
                 "range to scale q by; morphgen check says how to mend them"
             )
     positions = movable_positions(robot, q)
-    lost = np.argwhere(~np.isfinite(positions))
-    if len(lost):
+    invalid = np.argwhere(~np.isfinite(positions))
+    if len(invalid):
         raise BenchmarkError(
-            f"robot {robot.name!r}: joint {joints[lost[0, -1]].name!r}: q is not finite"
+            f"robot {robot.name!r}: joint {joints[invalid[0, -1]].name!r}: q is not finite"
         )
-    bounds = np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
-    turns = np.array([_turns_freely(joint) for joint in joints], dtype=bool)
+    limits = np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
+    unlimited = np.array(
+        [
+            joint.kind == "continuous" or (joint.kind == "revolute" and joint.limits is None)
+            for joint in joints
+        ],
+        dtype=bool,
+    )
     wrapped = positions - math.tau * np.ceil((positions - math.pi) / math.tau)
-    half = (bounds[:, 1] - bounds[:, 0]) / 2
-    return np.asarray((np.where(turns, wrapped, positions) - bounds.mean(axis=1)) / half)
+    half_range = (limits[:, 1] - limits[:, 0]) / 2
+    centred = np.where(unlimited, wrapped, positions) - limits.mean(axis=1)
+    return np.asarray(centred / half_range)
 
 
 def robot_from_tokens(
     tokens: ArrayLike, name: str, *, max_links: int = MAX_LINKS
 ) -> tuple[Robot, dict[str, Shape]]:
-    """The robot that tokens describe; the inverse of ``tokens``.
+    """Decode tokens to a robot; the inverse of ``tokens``.
 
-    Links are called ``link0``, ``link1`` ..., each joint after its child: ``joint1`` ... Shapes
-    are collision shapes, too. Movable joints are independent and have limits (-1, 1), so that q
-    is the scaled position; the home is what the tokens were made at. The tool frame is that of
-    its link. ``docs/tokens.md`` lists what tokens do not say.
+    Links are named ``link0``, ``link1`` ..., and joints ``joint1`` ... after their child links.
+    The primitives become collision shapes. Movable joints are independent and have limits (-1, 1),
+    so that q is the normalized position. The home is the configuration of the tokens, and the tool
+    frame is its link's frame. ``docs/tokens.md`` lists what tokens do not contain.
 
     Args:
-        tokens: Of one robot in one configuration, without padding, shape (n_links, 48).
-        name: The robot's name.
-        max_links: As the tokens were made with.
+        tokens: Tokens of one robot in one configuration, without padding, shape (n_links, 48).
+        name: Name of the robot.
+        max_links: The value with which the tokens were encoded.
 
     Returns:
-        The robot, and its shapes by link, as ``tokens`` takes them.
+        The robot, and its primitives by link name, as ``tokens`` takes them.
 
     Raises:
-        BenchmarkError: If these are no robot's tokens; the message names link and field.
+        BenchmarkError: If the tokens are invalid; the message names link and field.
     """
     table = np.asarray(tokens, dtype=np.float64)
     what = f"tokens of {name!r}"
@@ -178,29 +187,25 @@ def robot_from_tokens(
         raise BenchmarkError(f"{what}: shape {table.shape}; expected (n_links, {TOKEN_SIZE})")
     layout.require_max_links(len(table), what, max_links)
     layout.require_finite(table, what, [str(i) for i in range(len(table))])
-    rows = [_Row(what, i, numbers) for i, numbers in enumerate(table)]
+    rows = [_Token(what, i, numbers) for i, numbers in enumerate(table)]
     for row in rows:
         _require_index(row, max_links - 1)
     parents = [_read_parent(row, max_links - 1) for row in rows]
     shapes = {f"link{row.index}": shape for row in rows if (shape := _read_shape(row))}
-    tools = [row for row in rows if row.read(layout.TOOL, layout.decode_flag)]
+    tools = [row for row in rows if row.decode(layout.TOOL, layout.decode_flag)]
     if len(tools) > 1:
-        raise tools[1].refusal(layout.TOOL, f"link {tools[0].index} is flagged, too; only one can")
+        raise tools[1].error(layout.TOOL, f"link {tools[0].index} is flagged, too; only one can")
     _require_base(rows[0])
-    read = [_read_joint(row, parents[row.index]) for row in rows[1:]]
+    joints = [_read_joint(row, parents[row.index]) for row in rows[1:]]
     names = [f"link{row.index}" for row in rows]
     robot = Robot(
         name,
         tuple(Link(n, collisions=(shapes[n],) if n in shapes else ()) for n in names),
-        tuple(joint for joint, _ in read),
+        tuple(joint for joint, _ in joints),
         tuple(Frame(TOOL, names[row.index]) for row in tools),
-        tuple(q for joint, q in read if joint.is_movable),
+        tuple(q for joint, q in joints if joint.is_movable),
     )
     return robot, shapes
-
-
-def _turns_freely(joint: Joint) -> bool:
-    return joint.kind == "continuous" or (joint.kind == "revolute" and joint.limits is None)
 
 
 def _write_shape(row: Array, shape: Shape | None) -> None:
@@ -210,7 +215,7 @@ def _write_shape(row: Array, shape: Shape | None) -> None:
 
 
 def _write_joint(row: Array, joint: Joint | None) -> None:
-    """Write all but the position; the base is fixed where it stands."""
+    """Write all joint fields but the position; the root counts as fixed at the identity."""
     row[layout.KIND.columns] = layout.encode_kind(joint.kind if joint else "fixed")
     row[layout.ORIGIN.columns] = layout.encode_pose(joint.T_parent_joint if joint else IDENTITY)
     if joint is not None and joint.is_movable:
@@ -218,74 +223,78 @@ def _write_joint(row: Array, joint: Joint | None) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Row:
-    """The token of one link, and how its faults are told."""
+class _Token:
+    """The token of one link, with what its error messages name."""
 
     what: str
     index: int
     numbers: Array
 
-    def read(self, field: Field, decode: Callable[[Array], T]) -> T:
-        """What a field says."""
+    def decode(self, field: Field, decode: Callable[[Array], T]) -> T:
+        """Decode a field.
+
+        Raises:
+            BenchmarkError: If its numbers are invalid.
+        """
         try:
             return decode(self.numbers[field.columns])
         except ValueError as error:
-            raise self.refusal(field, str(error)) from error
+            raise self.error(field, str(error)) from error
 
-    def refusal(self, field: Field, why: str) -> BenchmarkError:
+    def error(self, field: Field, why: str) -> BenchmarkError:
         return BenchmarkError(f"{self.what}: link {self.index}: {field.name}: {why}")
 
     def require_zeros(self, *fields: Field, of: str) -> None:
         for field in fields:
             if np.abs(self.numbers[field.columns]).max() > layout.TOLERANCE:
-                raise self.refusal(field, f"it is not zero, but {of}")
+                raise self.error(field, f"it is not zero, but {of}")
 
 
-def _require_index(row: _Row, scale: int) -> None:
+def _require_index(row: _Token, scale: int) -> None:
     index = float(row.numbers[layout.INDEX.start])
     if abs(index * scale - row.index) > layout.TOLERANCE:
-        raise row.refusal(
+        raise row.error(
             layout.INDEX,
             f"{index:g}, not {row.index}/{scale}: made with another max_links than {scale + 1}, "
             "padded, or out of order",
         )
 
 
-def _read_parent(row: _Row, scale: int) -> int:
-    """Index of a link's parent; parents come before their children."""
+def _read_parent(row: _Token, scale: int) -> int:
+    """Decode the index of a link's parent, which precedes the link."""
     value = float(row.numbers[layout.PARENT.start])
     parent = round(value * scale)
     first, last = (0, row.index - 1) if row.index else (-1, -1)
     if abs(value * scale - parent) > layout.TOLERANCE or not first <= parent <= last:
         valid = f"k/{scale}, k = {first} ... {last}" if first < last else f"{first}/{scale}"
-        raise row.refusal(layout.PARENT, f"{value:g} makes no tree; expected {valid}")
+        raise row.error(layout.PARENT, f"{value:g} makes no tree; expected {valid}")
     return parent
 
 
-def _read_shape(row: _Row) -> Shape | None:
-    primitive = row.read(layout.GEOMETRY, layout.decode_primitive)
+def _read_shape(row: _Token) -> Shape | None:
+    primitive = row.decode(layout.GEOMETRY, layout.decode_primitive)
     if primitive is None:
         row.require_zeros(layout.SHAPE_POSE, of="the link has no geometry")
         return None
-    return Shape(primitive, row.read(layout.SHAPE_POSE, layout.decode_pose))
+    return Shape(primitive, row.decode(layout.SHAPE_POSE, layout.decode_pose))
 
 
-def _require_base(row: _Row) -> None:
+def _require_base(row: _Token) -> None:
     joint, _ = _read_joint(row, -1)
     if joint.is_movable:
-        raise row.refusal(layout.KIND, f"{joint.kind}, but the base is fixed")
+        raise row.error(layout.KIND, f"{joint.kind}, but the base is fixed")
     if not np.allclose(joint.T_parent_joint.matrix, np.eye(4), rtol=0, atol=layout.TOLERANCE):
-        raise row.refusal(layout.ORIGIN, "the base has no parent; expected [0, 0, 0, 1, 0, 0, 0]")
+        raise row.error(layout.ORIGIN, "the base has no parent; expected [0, 0, 0, 1, 0, 0, 0]")
 
 
-def _read_joint(row: _Row, parent: int) -> tuple[Joint, float]:
-    """The joint that attaches a link, and its position."""
-    kind = row.read(layout.KIND, layout.decode_kind)
+def _read_joint(row: _Token, parent: int) -> tuple[Joint, float]:
+    """Decode the joint that attaches a link, and its position."""
+    kind = row.decode(layout.KIND, layout.decode_kind)
     name, child = f"joint{row.index}", f"link{row.index}"
-    origin = row.read(layout.ORIGIN, layout.decode_pose)
+    origin = row.decode(layout.ORIGIN, layout.decode_pose)
     if kind == "fixed":
         row.require_zeros(layout.AXIS, layout.POSITION, of="the joint is fixed")
         return Joint(name, kind, f"link{parent}", child, origin), 0.0
-    axis = row.read(layout.AXIS, layout.decode_axis)
-    q = row.read(layout.POSITION, layout.decode_position)
+    axis = row.decode(layout.AXIS, layout.decode_axis)
+    q = row.decode(layout.POSITION, layout.decode_position)
     return Joint(name, kind, f"link{parent}", child, origin, axis, (-1.0, 1.0)), q

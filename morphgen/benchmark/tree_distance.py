@@ -1,4 +1,4 @@
-"""Edit distance of kinematic trees: how much of one body must be changed to get another."""
+"""Edit distance of kinematic trees: the cost to edit one robot into another."""
 
 from __future__ import annotations
 
@@ -17,90 +17,91 @@ from morphgen.model.robot import Joint, Robot
 from morphgen.typing import Array
 
 KIND, AXIS, LENGTH, SHAPE, SIZE = 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 16
-"""What two matched joints and their links can differ in, and what each difference costs at most."""
+"""Largest cost of each difference between two matched joints and their links; they sum to 1."""
 MOVABLE, FIXED = 1.0, 1 / 4
-"""Cost to insert or delete a link on a joint that moves, and on one that does not."""
+"""Cost to insert or delete a link on a movable joint, and on a fixed one."""
 SOFTENING = 0.05
-"""Lengths are compared by their ratio, but below this share of reach by their difference."""
+"""Length, relative to the reach, below which lengths differ by their difference instead of their
+ratio."""
 
-_GROUND, _FIXED, _PRISMATIC, _TURNING = range(4)
+_GROUND, _FIXED, _PRISMATIC, _ROTATIONAL = range(4)
 _WEIGHTS = (0.0, FIXED, MOVABLE, MOVABLE)
 _DIGITS = 6
-"""Children are ordered by numbers of so many decimals, so that rounding does not shuffle them."""
+"""Decimals of the numbers that order children, so that rounding does not change their order."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledTree:
-    """A robot as an ordered tree of labelled nodes, in postorder; lengths over its reach.
+    """A robot as an ordered tree of n labelled nodes in postorder; lengths are over its reach.
 
     A node is a link with the joint that attaches it. The last node is the ground, which every tree
-    has, and which costs nothing.
+    has and which costs nothing.
     """
 
     kinds: NDArray[np.int64]
-    """Ground, fixed, prismatic or turning, shape (n,)."""
+    """Kind of joint: ground, fixed, prismatic or rotational, shape (n,)."""
     axes: Array
-    """Unit axis in the root frame at home, zeros where nothing moves, shape (n, 3)."""
+    """Unit axis in the root frame at home, zeros for fixed joints, shape (n, 3)."""
     lengths: Array
-    """Distance from the frame of the link before to the joint, shape (n,)."""
+    """Distance between the parent link's frame and the joint, shape (n,)."""
     shapes: NDArray[np.int64]
-    """None, box, cylinder (a capsule, too) or sphere, shape (n,)."""
+    """Kind of primitive: none, box, cylinder or capsule, or sphere, shape (n,)."""
     extents: Array
-    """Edges of the box around that primitive, ascending, shape (n, 3)."""
+    """Edge lengths of the primitive's bounding box, ascending, shape (n, 3)."""
     leftmost: tuple[int, ...]
-    """The first leaf below every node."""
+    """Leftmost leaf below each node, as an index, shape (n,)."""
 
     @cached_property
     def weights(self) -> Array:
-        """Cost to insert or delete every node, shape (n,)."""
+        """Cost to insert or delete each node, shape (n,)."""
         return np.array(_WEIGHTS)[self.kinds]
 
     @cached_property
     def keyroots(self) -> tuple[int, ...]:
-        """For every leaf the highest node of which it is the first leaf, ascending."""
+        """For each leaf, the highest node of which it is the leftmost leaf, ascending."""
         return tuple(sorted({leaf: node for node, leaf in enumerate(self.leftmost)}.values()))
 
 
 def labelled_tree(robot: Robot, shapes: Mapping[str, Shape], reach: float) -> LabelledTree:
-    """A robot as a tree for ``normalised_distance``.
+    """Convert a robot to a tree for ``normalised_distance``.
 
-    Links without a shape on fixed joints are frames, no bodies: what hangs on them hangs on the
-    link before. The order of children does not depend on the file: heavier subtrees come first,
-    those of the same weight by what their nodes are.
+    Links without a shape on fixed joints count as frames: their children are attached to their
+    parent. The order of children does not depend on the file: subtrees are sorted by their cost,
+    descending, and then by the labels of their nodes.
 
     Args:
-        robot: The body.
-        shapes: The primitive of every link that has geometry.
-        reach: What lengths are divided by, metres.
+        robot: The robot.
+        shapes: One primitive per link with geometry, by link name.
+        reach: Length by which all lengths are divided [m].
 
     Raises:
-        RobotError: If an axis is zero.
+        RobotError: If a joint axis is zero.
         ValueError: If a shape is a mesh.
     """
-    nodes, above = [_Node(_GROUND)], [-1]
+    nodes, parents = [_Node(_GROUND)], [-1]
     T_root_link = forward_kinematics(robot, robot.home)
-    place: list[tuple[int, Pose]] = []
-    """Of every link its node, or that of the link before, and the link's frame in that one's."""
+    # For each link, its node or that of the nearest ancestor with one, and its pose in that node.
+    node_of: list[tuple[int, Pose]] = []
     for k, link in enumerate(robot.links):
         joint = robot.joints[k - 1] if k else None
-        node, T_node_link = place[robot.parents[k]] if k else (0, IDENTITY)
+        node, T_node_link = node_of[robot.parents[k]] if k else (0, IDENTITY)
         if joint is not None:
             T_node_link = T_node_link @ joint.T_parent_joint
         shape = shapes.get(link.name)
         moves = joint is not None and joint.is_movable
         if shape is None and not moves:
-            place.append((node, T_node_link))
+            node_of.append((node, T_node_link))
             continue
-        place.append((len(nodes), IDENTITY))
-        above.append(node)
+        node_of.append((len(nodes), IDENTITY))
+        parents.append(node)
         length = math.hypot(*T_node_link.position)
         nodes.append(_node(joint, T_root_link[k, :3, :3], length, shape, reach))
-    return _in_postorder(nodes, above)
+    return _in_postorder(nodes, parents)
 
 
 @dataclass(frozen=True, eq=False)
 class _Node:
-    """What is compared of a link and its joint."""
+    """Label of a link and its joint."""
 
     kind: int
     axis: Array = field(default_factory=lambda: np.zeros(3))
@@ -110,7 +111,7 @@ class _Node:
 
     @property
     def key(self) -> tuple[float, ...]:
-        """What nodes are sorted by."""
+        """Sort key, rounded and independent of the sign of the axis."""
         axis = self.axis.round(_DIGITS) + 0.0
         sign = np.sign(axis[axis.nonzero()][:1]).sum()
         numbers = np.array([*(sign * axis), self.length, *self.extents])
@@ -122,12 +123,11 @@ def _node(
 ) -> _Node:
     kind, axis = _FIXED, np.zeros(3)
     if joint is not None and joint.is_movable:
-        kind = _PRISMATIC if joint.kind == "prismatic" else _TURNING
-        # A joint's motion leaves its own axis where it is.
+        kind = _PRISMATIC if joint.kind == "prismatic" else _ROTATIONAL
+        # A joint's motion does not change its own axis, so the child link's rotation serves.
         axis = R_root_link @ np.array(joint.unit_axis)
-    form = _shape_kind(shape)
     extents = np.zeros(3) if shape is None else _extents(shape)
-    return _Node(kind, axis, length / reach, form, extents / reach)
+    return _Node(kind, axis, length / reach, _shape_kind(shape), extents / reach)
 
 
 def _shape_kind(shape: Shape | None) -> int:
@@ -140,23 +140,22 @@ def _shape_kind(shape: Shape | None) -> int:
             return 3
         case None:
             return 0
-    raise ValueError("a mesh is no primitive; morphgen.fitting.token_shapes.token_shapes gives one")
+    raise ValueError("a mesh has no label; morphgen.fitting.token_shapes.token_shapes gives one")
 
 
-def _in_postorder(nodes: list[_Node], above: list[int]) -> LabelledTree:
-    """The tree of nodes, each of which comes after the one above it; the first is the ground."""
+def _in_postorder(nodes: list[_Node], parents: list[int]) -> LabelledTree:
+    """Sort nodes, the ground first and parents before children, into a tree in postorder."""
     children: list[list[int]] = [[] for _ in nodes]
     keys: list[tuple[object, ...]] = [()] * len(nodes)
-    below: list[list[int]] = [[] for _ in nodes]
-    """Nodes of every subtree, in postorder."""
+    subtrees: list[list[int]] = [[] for _ in nodes]  # in postorder
     for node in reversed(range(len(nodes))):
         children[node].sort(key=lambda child: keys[child])
-        below[node] = [each for child in children[node] for each in below[child]] + [node]
-        weight = math.fsum(_WEIGHTS[nodes[each].kind] for each in below[node])
+        subtrees[node] = [n for child in children[node] for n in subtrees[child]] + [node]
+        weight = math.fsum(_WEIGHTS[nodes[n].kind] for n in subtrees[node])
         keys[node] = (-weight, nodes[node].key, *(keys[child] for child in children[node]))
         if node:
-            children[above[node]].append(node)
-    order = below[0]
+            children[parents[node]].append(node)
+    order = subtrees[0]
     ordered = [nodes[node] for node in order]
     return LabelledTree(
         np.array([node.kind for node in ordered]),
@@ -164,22 +163,22 @@ def _in_postorder(nodes: list[_Node], above: list[int]) -> LabelledTree:
         np.array([node.length for node in ordered]),
         np.array([node.shape for node in ordered]),
         np.array([node.extents for node in ordered]),
-        tuple(order.index(below[node][0]) for node in order),
+        tuple(order.index(subtrees[node][0]) for node in order),
     )
 
 
 def normalised_distance(a: LabelledTree, b: LabelledTree) -> float:
-    """How different two bodies are, in [0, 1].
+    """Return the normalised edit distance of two trees, in [0, 1]; 0 for equal trees.
 
-    With the edit distance d and the costs |a| and |b| to insert all of a tree,
+    With the edit distance d and the costs |a| and |b| to insert a whole tree, it is
     2 d / (|a| + |b| + d): Li and Chenguang, A metric normalization of tree edit distance, 2011.
-    0 for the same body, 1 where nothing of one can be kept for the other.
+    1 means that no part of one tree can be kept for the other.
 
-    It is a metric of trees. Li and Chenguang prove the triangle inequality where all insertions
-    cost the same. Ours do not, but the formula is the Steinhaus transform of the metric d with
-    respect to the empty tree, from which |a| and |b| are the distances, and that is a metric for
-    every metric d (Deza and Deza, Encyclopedia of Distances, chapter 4). Two robots that differ in
-    what is not compared, such as limits, have the same tree.
+    It is a metric of trees. Li and Chenguang prove the triangle inequality for equal costs of all
+    insertions, which differ here. But the formula is the Steinhaus transform of the metric d with
+    respect to the empty tree, at the distances |a| and |b|, which is a metric for every metric d
+    (Deza and Deza, Encyclopedia of Distances, chapter 4). Properties that are not compared, such as
+    joint limits, do not change the tree.
     """
     distance = edit_distance(a, b)
     total = math.fsum(a.weights) + math.fsum(b.weights) + distance
@@ -187,10 +186,10 @@ def normalised_distance(a: LabelledTree, b: LabelledTree) -> float:
 
 
 def edit_distance(a: LabelledTree, b: LabelledTree) -> float:
-    """The least cost to insert, delete and change nodes until one tree is the other.
+    """Return the minimum cost to turn one tree into another by inserting, deleting, changing nodes.
 
     Zhang and Shasha, Simple fast algorithms for the editing distance between trees and related
-    problems, 1989: nodes keep their order, and who is below whom.
+    problems, 1989. Matched nodes keep their order and ancestry.
     """
     change = change_costs(a, b).tolist()
     delete, insert = a.weights.tolist(), b.weights.tolist()
@@ -198,7 +197,7 @@ def edit_distance(a: LabelledTree, b: LabelledTree) -> float:
     for root_a in a.keyroots:
         for root_b in b.keyroots:
             first_a, first_b = a.leftmost[root_a], b.leftmost[root_b]
-            # forest[x][y]: from the first x nodes below root_a to the first y below root_b
+            # forest[x][y]: distance of the first x nodes below root_a to the first y below root_b
             row = [0.0]
             for j in range(first_b, root_b + 1):
                 row.append(row[-1] + insert[j])
@@ -219,11 +218,11 @@ def edit_distance(a: LabelledTree, b: LabelledTree) -> float:
 
 
 def change_costs(a: LabelledTree, b: LabelledTree) -> Array:
-    """Cost to make every node of one tree any node of the other, in [0, 1], shape (n_a, n_b).
+    """Return the cost to change each node of one tree to each of the other, (n_a, n_b), in [0, 1].
 
-    A sum of metrics, so itself one: whether the kind of joint is another; the angle between the
-    axes, whichever way they point, over a right angle (in full if only one has an axis); the
-    relative difference of the lengths; whether the shape is another, and the mean relative
+    It is a sum of metrics, and therefore a metric, of these differences: the kind of joint; the
+    angle between the axes regardless of their sign, relative to a right angle (1 if only one joint
+    is fixed); the relative difference of the lengths; the kind of primitive; and the mean relative
     difference of its extents.
     """
     kind = a.kinds[:, None] != b.kinds
@@ -243,11 +242,11 @@ def change_costs(a: LabelledTree, b: LabelledTree) -> Array:
 
 
 def _relative(a: Array, b: Array) -> Array:
-    """Difference over the sum, in [0, 1): the Canberra metric, shifted to be smooth at zero."""
+    """Return |a - b| / (a + b + s), in [0, 1): the Canberra metric, with s to be smooth at zero."""
     return np.asarray(np.abs(a - b) / (a + b + SOFTENING))
 
 
 def _extents(shape: Shape) -> Array:
-    """Edges of the box around a shape along its own axes, ascending, metres."""
+    """Return the edge lengths of a shape's bounding box in its own frame, ascending [m]."""
     low, high = bounding_box([Shape(shape.geometry)])
     return np.asarray(np.sort(high - low))

@@ -1,4 +1,4 @@
-"""Where a body's tool can go, as a density about its shoulder, and how much two of them share."""
+"""Workspaces: the density of a robot's tool positions around its shoulder, and their overlap."""
 
 from __future__ import annotations
 
@@ -21,60 +21,61 @@ from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
 SAMPLES = 65_536
+"""Number of random configurations."""
 CELLS = 10
-"""Cells from the shoulder to the farthest point."""
+"""Number of grid cells between the shoulder and the farthest tool position."""
 
 _PARALLEL = 0.5
-"""Axes whose angle has a smaller sine do not cross anywhere that means much."""
-_STILL = 1e-9
-"""A tool that never comes farther from its shoulder does not move, metres."""
+"""Sine of the angle below which two axes count as parallel."""
+_IMMOBILE = 1e-9
+"""Distance from the shoulder below which a tool counts as immobile [m]."""
 _SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Where the tool of a robot is when its joints are anywhere within their limits."""
+    """Density of a robot's tool positions over uniformly distributed joint positions."""
 
     density: Array
-    """Share of configurations by cell: nodes of a cubic grid on [-1, 1]^3, shape (21, 21, 21)."""
+    """Share of configurations at each node of a grid on [-1, 1]^3, shape (21, 21, 21)."""
     shoulder: Vec3
-    """Where the grid is centred, in the root frame, metres."""
+    """Centre of the grid in the root frame [m]."""
     reach: float
-    """Largest distance of the tool from the shoulder, metres; 1 in the grid."""
+    """Largest distance of the tool from the shoulder, the unit of the grid [m]."""
 
 
 def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
-    """Sample where the tool can go.
+    """Sample the tool positions of a robot.
 
-    Configurations are drawn uniformly within the limits of the joints that move the tool, always
-    with the same seed and from the base on, so that the same arm with another hand is drawn in the
-    same poses. Each sample is shared between the eight nodes around it by its distance from them.
+    Configurations are drawn uniformly within the limits of the joints that move the tool. The seed
+    is fixed and joints are drawn from the base on, so that one arm with different grippers gets the
+    same arm configurations. Each sample is distributed over the eight nodes around it by trilinear
+    weights.
 
     Args:
-        robot: The body.
-        samples: How many configurations.
+        robot: The robot.
+        samples: Number of configurations.
 
     Raises:
-        BenchmarkError: If it has no frame ``tool``, or one that no joint moves, or a joint
-            without a range.
+        BenchmarkError: If the robot has no frame ``tool``, no joint moves it, or a joint has no
+            range.
     """
-    path = _tool_path(robot)
+    chain = _tool_chain(robot)
     centre = shoulder(robot)
-    x, y, z = centre
-    to_shoulder = Pose((-x, -y, -z))
+    T_shoulder_root = Pose(centre).inverse()
     root = robot.root.name
-    about = replace(
+    centred = replace(
         robot,
         joints=tuple(
-            replace(joint, T_parent_joint=to_shoulder @ joint.T_parent_joint)
+            replace(joint, T_parent_joint=T_shoulder_root @ joint.T_parent_joint)
             if joint.parent == root
             else joint
             for joint in robot.joints
         ),
     )
-    points = frame_positions(about, _configurations(about, path, samples))
-    farthest = max(reach(about, TOOL), float(np.sqrt((points * points).sum(axis=0).max())))
-    if farthest < _STILL:
+    points = frame_positions(centred, _configurations(centred, chain, samples))
+    farthest = max(reach(centred, TOOL), float(np.sqrt((points * points).sum(axis=0).max())))
+    if farthest < _IMMOBILE:
         raise BenchmarkError(
             f"robot {robot.name!r}: its tool only turns about its own origin, so it has no "
             "workspace; place the frame 'tool' at the working point"
@@ -83,60 +84,61 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
 
 
 def density_overlap(a: Workspace, b: Workspace) -> float:
-    """Share of configurations whose tools are in the same place, in [0, 1].
+    """Return the overlap of two densities, in [0, 1]; 1 for equal robots.
 
-    The sum over all cells of the smaller density (histogram intersection: Swain and Ballard, Color
-    indexing, 1991); 1 minus half the L1 distance of the two. The same body has 1.
+    The sum of the smaller density over all nodes (histogram intersection: Swain and Ballard, Color
+    indexing, 1991), which is 1 minus half the L1 distance.
     """
     return float(min(np.minimum(a.density, b.density).sum(), 1.0))
 
 
 def shoulder(robot: Robot) -> Vec3:
-    """The point of a body about which its tool goes round, in the root frame, metres.
+    """Return the point of a robot around which its tool moves, in the root frame [m].
 
-    Not the root's origin, because a pedestal or a rail would move the whole workspace away from
-    that of the same arm on the floor. Nor the origin of the first joint, which may lie anywhere
-    along its axis. It is the point of the first turning axis on the way from the root to the tool
-    that is nearest to the next axis across it, as in Denavit and Hartenberg's convention; where
-    all axes are parallel, nearest to the tool; and the tool where nothing turns. Joints are in the
-    middle of their range, which hardly matters but for slides.
+    The root's origin would not do, because a pedestal or a rail would shift the workspace against
+    that of the same arm on the floor; nor the origin of the first joint, which may be anywhere on
+    its axis. The shoulder is the point on the first rotational axis between root and tool that is
+    nearest to the next axis not parallel to it, as in the Denavit-Hartenberg convention. If all
+    axes are parallel, it is the point nearest to the tool; without rotational joints, the tool
+    itself. Joints are in the middle of their range, which matters for prismatic joints only.
 
     Raises:
-        BenchmarkError: If there is no frame ``tool``, or one that no joint moves, or a joint
-            without a range.
+        BenchmarkError: If the robot has no frame ``tool``, no joint moves it, or a joint has no
+            range.
     """
-    path = _tool_path(robot)
+    chain = _tool_chain(robot)
     T_root_link = forward_kinematics(robot, joint_limits(robot).mean(axis=1))
     tool = robot.frame(TOOL)
     T_root_tool = T_root_link[robot.link_index[tool.link]] @ tool.T_link_frame.matrix
     anchors, directions = joint_axes(robot, T_root_link)
     axes = [
         (anchors[k + 1], directions[k + 1])
-        for k in path
+        for k in chain
         if robot.joints[k].kind in ("revolute", "continuous")
     ]
     if not axes:
         return _vec3(T_root_tool[:3, 3])
     origin, direction = axes[0]
-    towards, across = T_root_tool[:3, 3], direction
+    target, normal = T_root_tool[:3, 3], direction
     for point, axis in axes[1:]:
         if np.linalg.norm(np.cross(direction, axis)) > _PARALLEL:
-            # Perpendicular to the other axis, in the plane of both.
-            towards, across = point, direction - (direction @ axis) * axis
+            # The normal is perpendicular to the other axis, in the plane of both directions.
+            target, normal = point, direction - (direction @ axis) * axis
             break
-    along = (towards - origin) @ across / (direction @ across)
+    along = (target - origin) @ normal / (direction @ normal)
     return _vec3(origin + along * direction)
 
 
-def _tool_path(robot: Robot) -> tuple[int, ...]:
+def _tool_chain(robot: Robot) -> tuple[int, ...]:
+    """Return the indices of the joints between root and tool, after checking tool and limits."""
     names = [frame.name for frame in robot.frames]
     if TOOL not in names:
         raise BenchmarkError(
             f"robot {robot.name!r} has no frame {TOOL!r}{nearest(TOOL, names)}; name the link at "
             "its working point: morphgen import FILE --tool LINK"
         )
-    path = robot.joint_chain(robot.frame(TOOL).link)
-    if not _moving(robot, path):
+    chain = robot.joint_chain(robot.frame(TOOL).link)
+    if not _moving(robot, chain):
         raise BenchmarkError(
             f"robot {robot.name!r}: no joint moves its tool, which is on link "
             f"{robot.frame(TOOL).link!r}; place the frame on a link that moves"
@@ -148,20 +150,20 @@ def _tool_path(robot: Robot) -> tuple[int, ...]:
                 f"robot {robot.name!r}: joint {robot.joints[k].name!r}: limits ({low:g}, {high:g}) "
                 "are no range to draw from; morphgen check says how to mend them"
             )
-    return path
+    return chain
 
 
-def _moving(robot: Robot, path: Sequence[int]) -> list[int]:
-    """Positions in q of the joints that move the tool, the nearest to the root first."""
+def _moving(robot: Robot, chain: Sequence[int]) -> list[int]:
+    """Return the columns of q that move the joints of a chain, nearest to the root first."""
     row = {k: i for i, k in enumerate(robot.movable_joints)}
     gains, _ = robot.mimic_map
-    found = [int(column) for k in path if k in row for column in gains[row[k]].nonzero()[0]]
-    return list(dict.fromkeys(found))
+    columns = [int(column) for k in chain if k in row for column in gains[row[k]].nonzero()[0]]
+    return list(dict.fromkeys(columns))
 
 
-def _configurations(robot: Robot, path: tuple[int, ...], samples: int) -> Array:
-    """Uniform draws for the joints that move the tool, any for the others, shape (dof, n)."""
-    moving = _moving(robot, path)
+def _configurations(robot: Robot, chain: tuple[int, ...], samples: int) -> Array:
+    """Draw uniform positions of the joints that move the tool, (dof, n); zeros for others."""
+    moving = _moving(robot, chain)
     low, high = joint_limits(robot)[moving].T[..., None]
     q = np.zeros((robot.dof, samples))
     q[moving] = low + (high - low) * np.random.default_rng(_SEED).random((len(moving), samples))
@@ -169,15 +171,15 @@ def _configurations(robot: Robot, path: tuple[int, ...], samples: int) -> Array:
 
 
 def _density(points: Array) -> Array:
-    """Points (3, n) of [-1, 1]^3, each shared between the nodes around it; sums to 1."""
+    """Return the density of points (3, n) in [-1, 1]^3 on the grid, with trilinear weights."""
     side = 2 * CELLS + 1
     scaled = (points + 1) * CELLS
     low = np.minimum(scaled.astype(np.int64), side - 2)
-    share = np.stack([1 - (scaled - low), scaled - low])
+    weights = np.stack([1 - (scaled - low), scaled - low])
     total = np.zeros(side**3)
-    for far in np.ndindex(2, 2, 2):
-        x, y, z = low + np.array(far)[:, None]
-        weight = share[far[0], 0] * share[far[1], 1] * share[far[2], 2]
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = low + np.array(corner)[:, None]
+        weight = weights[corner[0], 0] * weights[corner[1], 1] * weights[corner[2], 2]
         total += np.bincount((x * side + y) * side + z, weight, side**3)
     return np.asarray(total.reshape(side, side, side) / points.shape[1])
 

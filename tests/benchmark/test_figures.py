@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from morphgen.benchmark.figures import NAMED, WRITTEN, MapPanel, Panel, heatmap_png, map_png
+from morphgen.benchmark.figures import (
+    MAX_NAMED,
+    MAX_WITH_VALUES,
+    MapPanel,
+    Panel,
+    heatmap_png,
+    map_png,
+)
 from morphgen.benchmark.similarity import classical_mds
 
 
@@ -43,14 +50,14 @@ def chunks(png):
     return found
 
 
-@pytest.mark.parametrize("n", [1, WRITTEN, NAMED, NAMED + 1])
+@pytest.mark.parametrize("n", [1, MAX_WITH_VALUES, MAX_NAMED, MAX_NAMED + 1])
 def test_every_number_of_robots_can_be_drawn(n):
     for png in drawings(n):
         assert pixels(png).std() > 5
         assert max(pixels(png).shape) < 2000
 
 
-@pytest.mark.parametrize("n", [2, NAMED + 1])
+@pytest.mark.parametrize("n", [2, MAX_NAMED + 1])
 def test_drawn_twice_it_is_the_same_picture(n):
     assert drawings(n) == drawings(n)
 
@@ -69,7 +76,7 @@ def test_the_users_settings_change_no_picture():
 
 
 def test_bright_is_alike_whichever_way_a_measure_counts():
-    n = NAMED + 20
+    n = MAX_NAMED + 20
     half = np.arange(n) < n / 2
     apart = (half[:, None] != half).astype(float)
     for values, larger in ((apart, False), (1 - apart, True)):
@@ -85,16 +92,16 @@ def test_names_are_written_up_to_a_number_of_robots():
     short = pixels(heatmap_png(["a"] * 20, [panel(20)]))
     assert few.shape[0] > short.shape[0] + 50
     assert few.shape[1] > short.shape[1] + 50
-    many = NAMED + 1
+    many = MAX_NAMED + 1
     assert heatmap_png(["a" * 20] * many, [panel(many)]) == heatmap_png(["b"] * many, [panel(many)])
 
 
 def test_names_of_a_map_are_written_up_to_a_number_of_robots():
-    some = [f"robot{i}" for i in range(NAMED)]
-    others = [f"other{i}" for i in range(NAMED)]
-    assert map_png(some, [map_panel(NAMED)]) != map_png(others, [map_panel(NAMED)])
+    some = [f"robot{i}" for i in range(MAX_NAMED)]
+    others = [f"other{i}" for i in range(MAX_NAMED)]
+    assert map_png(some, [map_panel(MAX_NAMED)]) != map_png(others, [map_panel(MAX_NAMED)])
     some, others = [*some, "robot"], [*others, "other"]
-    assert map_png(some, [map_panel(NAMED + 1)]) == map_png(others, [map_panel(NAMED + 1)])
+    assert map_png(some, [map_panel(MAX_NAMED + 1)]) == map_png(others, [map_panel(MAX_NAMED + 1)])
 
 
 def test_names_are_no_formulas():

@@ -173,7 +173,12 @@ def test_a_robot_of_one_link_has_one_token():
     [
         (arm(), {}, {"max_links": 5}, "robot 'arm' has 6 links, more than max_links 5"),
         (hinge(), {}, {"max_links": 1}, "max_links 1: expected 2 or more"),
-        (arm(), {"uper": Shape(Sphere(1.0))}, {}, "for 'uper', no link; did you mean 'upper'?"),
+        (
+            arm(),
+            {"uper": Shape(Sphere(1.0))},
+            {},
+            "unknown link 'uper'; did you mean 'upper'?",
+        ),
         (hinge(), {"b": Shape(Mesh(Path("x.stl")))}, {}, "link 'b': a mesh has no token"),
         (hinge(), {"b": Shape(Sphere(0.0))}, {}, "link 'b': sizes [0, 0, 0] are not all positive"),
         (hinge(), {"b": Shape(Box((1.0, math.inf, 1.0)))}, {}, "link 'b': sizes [1, inf, 1]"),

@@ -180,8 +180,11 @@ def spoilt(row, column, value):
         (spoilt(3, 3, 0.0), "link 3: end-effector: [1, 0, 1, 1] is neither four times 0 nor"),
         (spoilt(1, slice(2, 6), 2.0), "link 1: end-effector: [2, 2, 2, 2] is neither"),
         (spoilt(5, slice(2, 6), 1.0), "link 5: end-effector: link 3 is flagged, too"),
-        (spoilt(0, 6, 1.0), "link 0: geometry: [1, 0, 1] is no one-hot of [sphere, cylinder, box]"),
-        (spoilt(0, 8, 0.0), "link 0: geometry: [0, 0, 0] is no one-hot"),
+        (
+            spoilt(0, 6, 1.0),
+            "geometry: [1, 0, 1] is not one-hot over [sphere, cylinder, box]",
+        ),
+        (spoilt(0, 8, 0.0), "link 0: geometry: [0, 0, 0] is not one-hot"),
         (spoilt(0, 9, -0.1), "link 0: geometry: sizes [-0.1, 0.1, 0.04] are not all positive"),
         (
             spoilt(1, 9, 0.03),
@@ -205,11 +208,11 @@ def spoilt(row, column, value):
         (spoilt(1, 19, 1.0), "link 1: joint axis: the axis [1, 1, 0] is of length 1.41421, not 1"),
         (
             spoilt(1, slice(29, 32), 0.0),
-            "link 1: joint type: [0, 0, 0] is no one-hot of [prismatic,",
+            "link 1: joint type: [0, 0, 0] is not one-hot over [prismatic,",
         ),
         (
             spoilt(1, slice(29, 32), (0, 0.5, 0.5)),
-            "link 1: joint type: [0, 0.5, 0.5] is no one-hot",
+            "link 1: joint type: [0, 0.5, 0.5] is not one-hot",
         ),
         (
             spoilt(1, slice(29, 32), (0, 0, 1)),

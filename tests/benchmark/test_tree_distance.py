@@ -171,7 +171,7 @@ def test_a_capsule_counts_as_a_cylinder_and_a_shape_as_more_than_none():
 
 
 def test_a_mesh_is_refused():
-    with pytest.raises(ValueError, match="a mesh is no primitive"):
+    with pytest.raises(ValueError, match="a mesh has no label"):
         labelled_tree(body(), {"link0": Shape(Mesh(Path("a.stl")))}, 1.0)
 
 
