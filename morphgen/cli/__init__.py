@@ -30,7 +30,7 @@ EXTRAS = {
 
 
 def build_parser() -> Parser:
-    """Return the parser of every command; each sets ``run``, which returns the exit code."""
+    """Return the parser of every command; each sets ``run``, which may return an exit code."""
     from morphgen.cli.command import Parser, add_commands
     from morphgen.cli.commands import COMMANDS
 
@@ -85,7 +85,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return 2
     with _record_ctrl_c() as interrupts:
         try:
-            return int(args.run(args))
+            return int(args.run(args) or 0)
         except Exception as error:
             if interrupts:  # a package that was being imported turned Ctrl-C into another error
                 raise KeyboardInterrupt from error

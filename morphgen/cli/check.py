@@ -29,9 +29,7 @@ SEVERITIES = ("error", "warning", "info")
     opt.ROBOTS,
     flag("--strict", "fail on warnings, too"),
     path_option("--fix", "DIR", "make the safe repairs and write bundles to DIR"),
-    opt.ROOT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.ROOT_LIBRARY_JSON,
     details="The exit code is 1 if there is an error, or a warning with --strict.",
     examples=("check my_arm.urdf", "check robots/ --strict", "check my_arm.urdf --fix repaired"),
 )
@@ -106,9 +104,7 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
         help="number of random configurations",
     ),
     opt.SEED,
-    opt.ROOT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.ROOT_LIBRARY_JSON,
     details="The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. The exit "
     "code is 1 if one disagrees.",
     examples=("conform ur5-plane", "conform robots/ --samples 1000"),

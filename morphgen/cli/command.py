@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TypeAlias
 
 from morphgen.errors import MorphgenError, nearest
 
-Run: TypeAlias = Callable[[argparse.Namespace], int]
+Run: TypeAlias = Callable[[argparse.Namespace], "int | None"]
 
 
 class UsageError(MorphgenError):
@@ -107,7 +107,7 @@ class Command:
     options: Options = ()
     """Options and positional arguments."""
     run: Run | None = None
-    """Function that runs the command and returns the exit code; None for a group."""
+    """Function that runs the command; it may return an exit code. None for a group."""
     details: str = ""
     """Sentences that follow the summary in the command's own help."""
     examples: Sequence[str] = ()

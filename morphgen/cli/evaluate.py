@@ -56,8 +56,7 @@ if TYPE_CHECKING:
     opt.SEED,
     number("--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0),
     path_option("--out", "FILE", "write a table: .csv, .json or .md"),
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="Scores have 95% bootstrap intervals over episodes. The score of reach is relative to "
     "the random policy; that of push is the success rate.",
     examples=(
@@ -65,7 +64,7 @@ if TYPE_CHECKING:
         "eval ik --split interpolation/arm3/reach",
     ),
 )
-def evaluate(args: argparse.Namespace) -> int:
+def evaluate(args: argparse.Namespace) -> None:
     """Evaluate and print the scores."""
     from morphgen.rl.eval_report import require_table, score_table, summary, write_scores
     from morphgen.rl.scores import scores_to_json
@@ -79,7 +78,6 @@ def evaluate(args: argparse.Namespace) -> int:
     opt.print_result(args, data, lambda: f"{score_table(scores)}\n{summary(scores)}")
     if args.out is not None:
         write_scores(args.out, scores)
-    return 0
 
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:

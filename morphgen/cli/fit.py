@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option
-from morphgen.cli.progress import bar, status, track
+from morphgen.cli.progress import bar, print_line, status, track
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
@@ -82,9 +82,7 @@ class Target:
     ),
     opt.JOBS,
     opt.SEED,
-    opt.ROOT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.ROOT_LIBRARY_JSON,
     details="With --out, the robot is written with the primitives as its collision shapes.",
     examples=(
         "fit panda",
@@ -92,7 +90,7 @@ class Target:
         "fit link.stl --max-primitives 3",
     ),
 )
-def fit(args: argparse.Namespace) -> int:
+def fit(args: argparse.Namespace) -> None:
     """Fit, print the table and write bundles."""
     from morphgen.errors import MorphgenError
     from morphgen.fitting.link_fit import FitOptions
@@ -106,14 +104,16 @@ def fit(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise MorphgenError(str(error)) from error
     if args.all:
-        return _fit_all_parts(args)
+        _fit_all_parts(args)
+        return
     opt.reject_idle({"--missing": args.missing}, "only with --all")
     if not args.out:
         opt.reject_idle(
             {"--visual": args.visual, "--no-picture": args.no_picture}, "only with --out"
         )
     if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
-        return _fit_mesh(args, options)
+        _fit_mesh(args, options)
+        return
     targets = _targets(args)
     results = []
     for target in targets:
@@ -123,10 +123,9 @@ def fit(args: argparse.Namespace) -> int:
         results.append(_fit_robot(target, folder, options, args))
     if args.json:
         print(json.dumps(results if len(results) > 1 else results[0]))
-    return 0
 
 
-def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> int:
+def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> None:
     from morphgen.errors import FitError, MorphgenError
     from morphgen.fitting.link_fit import fit_shapes
     from morphgen.model.geometry import Mesh, Shape
@@ -149,7 +148,6 @@ def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> int:
         return "\n".join([_table([_row(path.name, fit)]), *primitives])
 
     opt.print_result(args, {"mesh": str(path), **fit.as_dict()}, text)
-    return 0
 
 
 def _targets(args: argparse.Namespace) -> list[Target]:
@@ -232,18 +230,11 @@ def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) ->
     total = sum(1 for link in target.robot.links if shapes_to_fit(link))
     if not total:
         raise FitError(f"{target.label}: no link has a shape")
-    done = 0
-    with bar(args, f"fitting {target.label}", "link", total) as update:
-
-        def count(link: str) -> None:
-            nonlocal done
-            done += 1
-            update(done)
-
-        return fit_links(target.robot, options, jobs=args.jobs, progress=count)
+    with bar(args, f"fitting {target.label}", "link", total) as shown:
+        return fit_links(target.robot, options, jobs=args.jobs, progress=lambda link: shown.add())
 
 
-def _fit_all_parts(args: argparse.Namespace) -> int:
+def _fit_all_parts(args: argparse.Namespace) -> None:
     from morphgen.errors import MorphgenError
     from morphgen.fitting.part_fits import parts_with_meshes, store_parts
 
@@ -266,8 +257,7 @@ def _fit_all_parts(args: argparse.Namespace) -> int:
         )
     parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
     for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
-        print(path)
-    return 0
+        print_line(str(path))
 
 
 def _report_text(report: FitReport) -> str:

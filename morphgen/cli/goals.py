@@ -33,9 +33,7 @@ HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certifi
     opt.OBSTACLES,
     opt.SEED,
     flag("--certify", "verify every goal with the configuration that it was sampled from"),
-    opt.JOBS,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.JOBS_LIBRARY_JSON,
     details="Goals of reach and starts of push are kept in the cache. Run the command again to "
     "continue an interrupted one. The exit code is 1 if a robot has too few goals, or if a goal "
     "fails --certify.",
@@ -148,12 +146,7 @@ def _data(made: Sequence[GoalResult], seed: int) -> dict[str, object]:
         if result.goals
     ]
     failures = [
-        {
-            "robot": result.robot,
-            "side": result.side,
-            "task": result.task,
-            "why": result.error,
-        }
+        {"robot": result.robot, "side": result.side, "task": result.task, "why": result.error}
         for result in made
         if result.goals is None
     ]

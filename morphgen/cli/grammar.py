@@ -14,7 +14,7 @@ GRAMMAR = option("grammar", help="name of a grammar (see: morphgen grammar list)
 
 
 @command("list", "list the grammars that come with morphgen", opt.JSON)
-def list_grammars(args: argparse.Namespace) -> int:
+def list_grammars(args: argparse.Namespace) -> None:
     """Print the names and summaries."""
     from tabulate import tabulate
 
@@ -22,15 +22,13 @@ def list_grammars(args: argparse.Namespace) -> int:
 
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
     opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
-    return 0
 
 
 @command(
     "check",
     "check a grammar for faults",
     GRAMMAR,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="The exit code is 1 if it has any.",
 )
 def check(args: argparse.Namespace) -> int:
@@ -48,10 +46,9 @@ def check(args: argparse.Namespace) -> int:
     "count",
     "count the structures of a grammar, and list the values that are sampled",
     GRAMMAR,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
 )
-def count(args: argparse.Namespace) -> int:
+def count(args: argparse.Namespace) -> None:
     """Print the number of structures and the sampled values."""
     from morphgen.grammar.analysis import variables
     from morphgen.grammar.limits import COUNT_DIGITS, MAX_COUNT
@@ -78,7 +75,6 @@ def count(args: argparse.Namespace) -> int:
         return "\n".join(lines)
 
     opt.print_result(args, data, text)
-    return 0
 
 
 @command(
@@ -86,10 +82,9 @@ def count(args: argparse.Namespace) -> int:
     "print every structure of a grammar, with typical values",
     GRAMMAR,
     number("--limit", "largest number of structures", default=50, least=0),
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
 )
-def enumerate_structures(args: argparse.Namespace) -> int:
+def enumerate_structures(args: argparse.Namespace) -> None:
     """Print a derivation per line."""
     from morphgen.grammar.structures import enumerate_structures
 
@@ -98,20 +93,18 @@ def enumerate_structures(args: argparse.Namespace) -> int:
     texts = map(str, itertools.islice(structures, args.limit))
     if args.json:
         print(json.dumps(list(texts)))
-        return 0
+        return
     for text in texts:
         print(text)
-    return 0
 
 
-@command("print", "print a grammar and its includes as one text", GRAMMAR, opt.LIBRARY, opt.JSON)
-def print_grammar(args: argparse.Namespace) -> int:
+@command("print", "print a grammar and its includes as one text", GRAMMAR, *opt.LIBRARY_JSON)
+def print_grammar(args: argparse.Namespace) -> None:
     """Print the text of the grammar."""
     from morphgen.grammar.grammar_file import grammar_text
 
     text = grammar_text(opt.load_grammar_named(args.grammar, opt.library_of(args)))
     opt.print_result(args, text, lambda: text.removesuffix("\n"))
-    return 0
 
 
 grammar = Command(

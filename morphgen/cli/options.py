@@ -45,6 +45,9 @@ JOBS = number("--jobs", "number of processes", default=1)
 SEED = number("--seed", "random seed", default=0, least=0)
 OBSTACLES = flag("--obstacles", "one robot: among obstacles")
 NO_PICTURE = flag("--no-picture", "do not draw preview.png")
+LIBRARY_JSON = (LIBRARY, JSON)
+JOBS_LIBRARY_JSON = (JOBS, *LIBRARY_JSON)
+ROOT_LIBRARY_JSON = (ROOT, *LIBRARY_JSON)
 BUNDLE_OUT = (
     path_option("--out", "DIR", "output folder", default=Path("robots")),
     option("--name", help="name of the robot and of its folder (default: from its parts)"),

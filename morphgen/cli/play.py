@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections import deque
+from contextlib import closing
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, positive
-from morphgen.cli.progress import status
+from morphgen.cli.progress import print_line, status
 from morphgen.rl.baselines import BASELINES
 
 if TYPE_CHECKING:
@@ -57,18 +59,28 @@ def _policy(text: str) -> str:
         "play push prims --policy scripted --episodes 3 --sim mujoco",
     ),
 )
-def play(args: argparse.Namespace) -> int:
+def play(args: argparse.Namespace) -> None:
     """Run the episodes, print a line for each, and write the video."""
-    from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
-    from morphgen.tasks.gym_env import TaskEnv
-    from morphgen.tasks.registry import TASKS
-    from morphgen.tasks.renderer import require_video_path, write_video
+    with status(args, "loading"):
+        from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
+        from morphgen.tasks.gym_env import TaskEnv
+        from morphgen.tasks.registry import TASKS
+        from morphgen.tasks.renderer import require_video_path, write_video
 
     require_policy(args.policy, args.task)
     if args.out is not None:
         require_video_path(args.out)
     interface = interface_of(args.policy)
-    robot = " ".join(args.words)
+    robot, target = " ".join(args.words), TASKS[args.task].target
+    episodes = itertools.count(1)
+
+    def report(episode: Episode) -> None:
+        print_line(
+            f"episode {next(episodes)}: {'success' if episode.success else 'failure'}, "
+            f"{episode.distance:.3f} m from the {target}, score {episode.score:.2f}, "
+            f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}"
+        )
+
     with status(args, f"preparing {robot} and its goals"):
         env = TaskEnv(
             args.task,
@@ -81,31 +93,14 @@ def play(args: argparse.Namespace) -> int:
             library=args.library,
             render_mode=None if args.out is None else "rgb_array",
         )
-    number, target = 0, TASKS[args.task].target
-
-    def report(episode: Episode) -> None:
-        nonlocal number
-        number += 1
-        print(
-            f"episode {number}: {'success' if episode.success else 'failure'}, "
-            f"{episode.distance:.3f} m from the {target}, score {episode.score:.2f}, "
-            f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}",
-            flush=True,
-        )
-
-    try:
+    with closing(env), status(args, "running the episodes"):
         controller = make_controller(args.policy, env, args.seed)
         frames = play(env, controller, args.episodes, args.seed, report)
-        with status(args, f"running {args.episodes} episodes"):
-            if args.out is None:
-                deque(frames, maxlen=0)
-            else:
-                write_video(frames, args.out, FPS)
-        if args.out is not None:
-            print(args.out)
-    finally:
-        env.close()
-    return 0
+        if args.out is None:
+            deque(frames, maxlen=0)
+        else:
+            write_video(frames, args.out, FPS)
+            print_line(str(args.out))
 
 
 @command(
@@ -124,8 +119,7 @@ def play(args: argparse.Namespace) -> int:
         metavar="S",
         help="least duration of the measurement",
     ),
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="Environments of one robot are stepped with random actions. Environment steps are at "
     "50 Hz, physics steps at 200 Hz. The share of the simulator is its own step alone, if it runs "
     "in one process or thread.",
@@ -134,13 +128,14 @@ def play(args: argparse.Namespace) -> int:
         "speed push arm=panda ee=panda_hand --workers 2",
     ),
 )
-def speed(args: argparse.Namespace) -> int:
+def speed(args: argparse.Namespace) -> None:
     """Measure the speed and print it."""
     from tabulate import tabulate
 
-    from morphgen.tasks.make import make_batch
-    from morphgen.tasks.registry import SIMULATORS
-    from morphgen.tasks.speed import measure_speed
+    with status(args, "loading"):
+        from morphgen.tasks.make import make_batch
+        from morphgen.tasks.registry import SIMULATORS
+        from morphgen.tasks.speed import measure_speed
 
     robot = " ".join(args.words)
     with status(args, f"preparing {robot} and its goals"):
@@ -154,13 +149,10 @@ def speed(args: argparse.Namespace) -> int:
             max_links=None,
             library=args.library,
         )
-    try:
+    with closing(batch), status(args, "measuring"):
         module, step = SIMULATORS[args.sim].native_step
         own = [(import_module(module), step)] if args.workers == 1 else []
-        with status(args, "measuring"):
-            result = measure_speed(batch, args.seconds, own=own)
-    finally:
-        batch.close()
+        result = measure_speed(batch, args.seconds, own=own)
 
     def text() -> str:
         shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
@@ -174,4 +166,3 @@ def speed(args: argparse.Namespace) -> int:
 
     data = {"steps_per_second": result.steps_per_second, "shares": result.shares}
     opt.print_result(args, data, text)
-    return 0

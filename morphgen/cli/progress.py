@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -27,11 +27,21 @@ TRAINING_LINES = 20
 """Number of lines about a training where there is no terminal."""
 
 
-class Update(Protocol):
-    """Sets a bar to the number of finished items, and their number if it was unknown."""
+class Bar:
+    """A bar of tqdm that is set to the number of finished items."""
+
+    def __init__(self, shown: tqdm[NoReturn]) -> None:
+        self._shown = shown
 
     def __call__(self, done: float, total: int | None = None) -> None:
-        """Redraw the bar."""
+        """Show the number of finished items, and of all items if it was unknown."""
+        if total is not None:
+            self._shown.total = total
+        self._shown.update(done - self._shown.n)
+
+    def add(self, count: int = 1) -> None:
+        """Show that more items are finished."""
+        self._shown.update(count)
 
 
 @contextmanager
@@ -41,8 +51,8 @@ def bar(
     unit: str = "robot",
     total: int | None = None,
     layout: str | None = None,
-) -> Iterator[Update]:
-    """Yield a function that updates a bar, which disappears at the end.
+) -> Iterator[Bar]:
+    """Yield a bar, which disappears at the end.
 
     Nothing is shown without a terminal or with ``--json``.
 
@@ -56,24 +66,20 @@ def bar(
     from tqdm import tqdm
 
     hidden = getattr(args, "json", False) or None  # None: shown on a terminal only
-    with tqdm(
-        desc=title,
-        unit=unit,
-        total=total,
-        bar_format=layout,
-        file=sys.stderr,
-        disable=hidden,
-        delay=REDRAW_INTERVAL,
-        leave=False,
-    ) as shown:
-
-        def update(done: float, total: int | None = None) -> None:
-            if total is not None:
-                shown.total = total
-            shown.update(done - shown.n)
-
-        with _redrawn(shown):
-            yield update
+    with (
+        tqdm(
+            desc=title,
+            unit=unit,
+            total=total,
+            bar_format=layout,
+            file=sys.stderr,
+            disable=hidden,
+            delay=REDRAW_INTERVAL,
+            leave=False,
+        ) as shown,
+        _redrawn(shown),
+    ):
+        yield Bar(shown)
 
 
 @contextmanager
@@ -95,16 +101,25 @@ def _redrawn(shown: tqdm[NoReturn]) -> Iterator[None]:
     finally:
         finished.set()
         thread.join()
+        shown.clear()  # closing it would not: tqdm takes a bar for hidden that others redrew
 
 
 def track(
     items: Iterable[T], args: argparse.Namespace, title: str, unit: str, total: int
 ) -> Iterator[T]:
     """Yield the items, and show in a bar how many of them are finished."""
-    with bar(args, title, unit, total) as update:
-        for done, item in enumerate(items):
-            update(done)
+    with bar(args, title, unit, total) as shown:
+        for item in items:
             yield item
+            shown.add()
+
+
+def print_line(line: str) -> None:
+    """Print a line above the bars that are shown."""
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode():
+        print(line, flush=True)
 
 
 @contextmanager
@@ -159,7 +174,7 @@ class TrainingProgress:
         self.close()
         if not sys.stderr.isatty():
             return _print_each_minute(name)
-        shown = self._bar = tqdm(
+        self._bar = tqdm(
             desc=name,
             unit="episode",
             file=sys.stderr,
@@ -168,11 +183,7 @@ class TrainingProgress:
             bar_format="{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]",
         )
 
-        def update(done: float, total: int) -> None:
-            shown.total = total
-            shown.update(done - shown.n)
-
-        return update
+        return Bar(self._bar)
 
     def close(self) -> None:
         """Finish the bar, if there is one."""

@@ -32,8 +32,7 @@ PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment"
         help="collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres",
     ),
     *opt.BUNDLE_OUT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="The bundle is a folder with the robot as URDF and MJCF. If the first word is a "
     "grammar (see: morphgen grammar list), the robot follows its first alternatives and typical "
     "values, except for those that KEY=VALUE sets.",
@@ -144,12 +143,11 @@ def _write_and_report(robot: Robot, args: argparse.Namespace) -> int:
     "list",
     "list the parts that morphgen compose joins",
     option("kind", nargs="?", choices=list(PART_KINDS), help="list only this kind"),
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="The columns are degrees of freedom, reach (m), mass (kg), source and licence.",
     examples=("list arms",),
 )
-def list_parts(args: argparse.Namespace) -> int:
+def list_parts(args: argparse.Namespace) -> None:
     """Print a table with a row per part."""
     from tabulate import tabulate
 
@@ -157,19 +155,16 @@ def list_parts(args: argparse.Namespace) -> int:
 
     rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
     opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
-    return 0
 
 
 @command(
     "show",
     "print the link tree of a robot with joints, limits, masses and frames",
     opt.ROBOT,
-    opt.ROOT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.ROOT_LIBRARY_JSON,
     examples=("show ur5-plane", "show my_arm.urdf"),
 )
-def show(args: argparse.Namespace) -> int:
+def show(args: argparse.Namespace) -> None:
     """Print the link tree of one robot."""
     from morphgen.errors import CompositionError
     from morphgen.grammar.robot_source import read_source
@@ -181,7 +176,6 @@ def show(args: argparse.Namespace) -> int:
         )
     robot = read_source(sources[0], opt.library_of(args), args.root)
     opt.print_result(args, _facts(robot), lambda: _tree(robot))
-    return 0
 
 
 def _tree(robot: Robot) -> str:

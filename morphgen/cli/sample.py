@@ -32,13 +32,12 @@ NUMBER = number("-n", "number of robots", default=10)
     opt.NO_PICTURE,
     opt.JOBS,
     opt.RAY,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="The same seed gives the same robots, with any number of jobs. Run the command again "
     "to continue an interrupted one.",
     examples=("sample chain -n 100 --jobs 4", "sample arm5 --where 'reach > 0.4'"),
 )
-def sample(args: argparse.Namespace) -> int:
+def sample(args: argparse.Namespace) -> None:
     """Sample a set of robots and print how many were written and rejected."""
     from morphgen.grammar.conditions import require_condition
     from morphgen.grammar.grammar_file import grammar_text
@@ -76,7 +75,6 @@ def sample(args: argparse.Namespace) -> int:
         return "\n".join(lines)
 
     opt.print_result(args, {"folder": str(folder), **asdict(report)}, summary)
-    return 0
 
 
 @command(
@@ -87,8 +85,7 @@ def sample(args: argparse.Namespace) -> int:
     path_option(
         "--diff", "OTHER", "compare with another robot's; the exit code is 1 if they differ"
     ),
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     details="The derivation lists the parts of a robot, its grammar's choices and all parameters.",
     examples=("derive robots/chain/chain-000001 --replay",),
 )
@@ -124,11 +121,10 @@ def derive(args: argparse.Namespace) -> int:
     opt.SEED,
     path_option("--out", "DIR", "output folder (default: SET-mutants)"),
     opt.NO_PICTURE,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.LIBRARY_JSON,
     examples=("mutate robots/chain/chain-000001 -n 20",),
 )
-def mutate(args: argparse.Namespace) -> int:
+def mutate(args: argparse.Namespace) -> None:
     """Write neighbours as bundles and print what differs."""
     from morphgen.errors import FormatError
     from morphgen.formats.bundle import write_bundle
@@ -167,7 +163,6 @@ def mutate(args: argparse.Namespace) -> int:
         changes,
         lambda: "\n".join(f"{path}: {'; '.join(lines)}" for path, lines in changes.items()),
     )
-    return 0
 
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:

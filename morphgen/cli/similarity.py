@@ -30,9 +30,7 @@ LARGEST_MATRIX = 20
     path_option("--map", "FILE.png", "draw the robots by their distances"),
     path_option("--csv", "FILE", "write a row per pair of robots"),
     opt.MAX_LINKS,
-    opt.ROOT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.ROOT_LIBRARY_JSON,
     details="The whole matrix is printed for up to 20 robots; beyond that, the nearest robot of "
     "each.",
     examples=(
@@ -40,7 +38,7 @@ LARGEST_MATRIX = 20
         "similarity robots/arm3 --measure all --heatmap arm3.png",
     ),
 )
-def similarity(args: argparse.Namespace) -> int:
+def similarity(args: argparse.Namespace) -> None:
     """Compare the robots, print the result and write the files."""
     from morphgen.benchmark.similarity import get_measure
     from morphgen.formats.files import write_file
@@ -67,7 +65,6 @@ def similarity(args: argparse.Namespace) -> int:
         return "\n".join([tables, *files])
 
     opt.print_result(args, {"robots": names, "measures": results, "files": files}, text)
-    return 0
 
 
 def _require_writable(args: argparse.Namespace) -> None:
@@ -115,16 +112,9 @@ def _matrices(
 ) -> dict[str, Array]:
     from morphgen.benchmark.similarity import similarity_matrix
 
-    done = 0
     pairs = len(measures) * len(robots) * (len(robots) + 1) // 2
-    with bar(args, "comparing", "pair", pairs) as update:
-
-        def count(new: int) -> None:
-            nonlocal done
-            done += new
-            update(done)
-
-        return {name: similarity_matrix(robots, name, count) for name in measures}
+    with bar(args, "comparing", "pair", pairs) as shown:
+        return {name: similarity_matrix(robots, name, shown.add) for name in measures}
 
 
 def _text(names: Sequence[str], measure: str, values: Array) -> str:

@@ -25,7 +25,7 @@ SHORT_DERIVATION = 60
 
 
 @command("list", "list the splits that come with morphgen", opt.JSON)
-def list_splits(args: argparse.Namespace) -> int:
+def list_splits(args: argparse.Namespace) -> None:
     """Print a row per split."""
     from tabulate import tabulate
 
@@ -60,7 +60,6 @@ def list_splits(args: argparse.Namespace) -> int:
         for split in splits
     ]
     opt.print_result(args, data, lambda: tabulate(rows, headers))
-    return 0
 
 
 @command(
@@ -71,7 +70,7 @@ def list_splits(args: argparse.Namespace) -> int:
     opt.JSON,
     examples=("split show interpolation/panda/reach",),
 )
-def show(args: argparse.Namespace) -> int:
+def show(args: argparse.Namespace) -> None:
     """Print a split."""
     from morphgen.benchmark.split import split_id
     from morphgen.benchmark.split_file import read_split
@@ -79,7 +78,6 @@ def show(args: argparse.Namespace) -> int:
     split = read_split(args.split)
     data = {"id": split_id(split), **split.as_dict()}
     opt.print_result(args, data, lambda: _split_text(split, full=args.full))
-    return 0
 
 
 def _split_text(split: Split, *, full: bool) -> str:
@@ -131,14 +129,12 @@ def _categories(members: Sequence[Member]) -> Counter[str]:
         "splits", nargs="*", metavar="SPLIT", help="names or files (default: all shipped splits)"
     ),
     flag("--markdown", "print the table as Markdown"),
-    opt.JOBS,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.JOBS_LIBRARY_JSON,
     details="The columns are the mean numbers of links, of movable joints and of movable joints "
     "between base and tool of the train robots, and the cosine similarity of test and train "
     "robots; the paper's numbers are in parentheses. Splits with the same robots share a row.",
 )
-def stats(args: argparse.Namespace) -> int:
+def stats(args: argparse.Namespace) -> None:
     """Print a table with a row per set of robots."""
     from tabulate import tabulate
 
@@ -171,7 +167,6 @@ def stats(args: argparse.Namespace) -> int:
         )
 
     opt.print_result(args, {"rows": data, "paper": PAPER_TABLE}, text)
-    return 0
 
 
 def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:

@@ -41,9 +41,7 @@ def _goal_seed(help: str) -> Option:
     flag("--strict", "fail on warnings, too"),
     flag("--goals", "audit goal sets even if the split ships none"),
     _goal_seed("seed that the goal sets must have (default: as shipped, else 0)"),
-    opt.JOBS,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.JOBS_LIBRARY_JSON,
     details="The audit checks the rules of the split's regime, and names the nearest train robot "
     "of each test robot. If a built split ships goal sets, it also looks for goals that are on "
     "both sides, or out of reach. The exit code is 1 if there is an error that the split does not "
@@ -164,14 +162,12 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
     flag("--picture", "draw preview.png of every robot"),
     flag("--goals", "ship the goal set of every robot"),
     _goal_seed("with --goals: seed of the goal sets (default: 0)"),
-    opt.JOBS,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.JOBS_LIBRARY_JSON,
     details="The same split gives the same bytes, with any number of jobs. Run the command again "
     "to continue an interrupted one.",
     examples=("split build interpolation/panda/reach --out data --goals --jobs 4",),
 )
-def build(args: argparse.Namespace) -> int:
+def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
     from morphgen.benchmark.split_build import build_split, split_folder_path
     from morphgen.benchmark.split_file import read_split
@@ -216,16 +212,13 @@ def build(args: argparse.Namespace) -> int:
         lines.append(f"{len(goals)} goal sets, seed {config.seed}")
     lines.append(f"verify it anywhere: morphgen split verify {report.folder}")
     opt.print_result(args, data, lambda: "\n".join(lines))
-    return 0
 
 
 @command(
     "verify",
     "verify that a split or its built folder has the robots that it claims",
     option("path", metavar="PATH", help="name of a split, its file, or its built folder"),
-    opt.JOBS,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.JOBS_LIBRARY_JSON,
     details="Every robot is composed anew and compared: with the hashes of the split, or with all "
     "files of a built folder. The exit code is 1 if something differs.",
 )

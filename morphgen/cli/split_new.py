@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int], None]
 
 
-def new_split(args: argparse.Namespace) -> int:
+def new_split(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
     from morphgen.benchmark.split import split_id
     from morphgen.benchmark.split_file import require_split_name
@@ -50,7 +50,6 @@ def new_split(args: argparse.Namespace) -> int:
     lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
     lines.append(f"next: morphgen split audit {paths[-1]}")
     opt.print_result(args, data, lambda: "\n".join(lines))
-    return 0
 
 
 def _regime_options(train: str, train_default: str = "") -> tuple[Option, ...]:
@@ -82,9 +81,7 @@ def _regime_options(train: str, train_default: str = "") -> tuple[Option, ...]:
             default=Path(),
         ),
         flag("--statistics", "add the statistics of morphgen split stats to the file"),
-        opt.JOBS,
-        opt.LIBRARY,
-        opt.JSON,
+        *opt.JOBS_LIBRARY_JSON,
     )
 
 

@@ -30,9 +30,7 @@ HEADERS = (
     flag("--layout", "print the fields of a token"),
     path_option("--out", "FILE.npz", "write the tokens to this file"),
     opt.MAX_LINKS,
-    opt.ROOT,
-    opt.LIBRARY,
-    opt.JSON,
+    *opt.ROOT_LIBRARY_JSON,
     details="The table shows the tokens decoded, at the home configuration. The token of a link "
     "holds the one primitive that overlaps the link most.",
     examples=(
@@ -41,7 +39,7 @@ HEADERS = (
         "tokens --layout",
     ),
 )
-def tokens(args: argparse.Namespace) -> int:
+def tokens(args: argparse.Namespace) -> None:
     """Print the tokens of the robots, or write those of one."""
     from morphgen.benchmark.tokens import tokens, tokens_npz
     from morphgen.errors import BenchmarkError
@@ -52,7 +50,7 @@ def tokens(args: argparse.Namespace) -> int:
         if not args.layout or args.out or args.max_links is not None:
             raise BenchmarkError("name a robot, such as arm=ur5 ee=plane, or say --layout alone")
         opt.print_result(args, _layout_data(), _layout_text)
-        return 0
+        return
     if args.out and args.out.suffix != ".npz":
         raise BenchmarkError(f"--out {args.out}: expected a name that ends in .npz")
     robots, folders = [robot for _, robot in opt.read_robots(args)], opt.library_of(args).folders
@@ -73,7 +71,6 @@ def tokens(args: argparse.Namespace) -> int:
         data[0]["file"] = str(args.out)
         lines.append(str(args.out))
     opt.print_result(args, data[0] if len(data) == 1 else data, lambda: "\n".join(lines))
-    return 0
 
 
 def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:

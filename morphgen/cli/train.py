@@ -112,7 +112,7 @@ SIDES = ["train", "test"]
         "train arm=ur5 ee=stick task=reach --agent se",
     ),
 )
-def train(args: argparse.Namespace) -> int:
+def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""
     from morphgen.rl.robot_source import other_side
 
@@ -122,7 +122,6 @@ def train(args: argparse.Namespace) -> int:
     _require_used(config, args)
     folder = args.out or Path("runs") / _folder_name(source) / str(spec) / f"seed{args.seed}"
     _train(folder, config, args)
-    return 0
 
 
 @command(
@@ -161,7 +160,7 @@ def train(args: argparse.Namespace) -> int:
     "schedule. Agent and hyperparameters are the checkpoint's unless given.",
     examples=("finetune runs/interpolation/arm3/reach/me-tf/seed0 --on test --steps 30000",),
 )
-def finetune(args: argparse.Namespace) -> int:
+def finetune(args: argparse.Namespace) -> None:
     """Train and print the path of the checkpoint."""
     from morphgen.errors import TaskError
     from morphgen.rl.training import checkpoint_files
@@ -174,7 +173,6 @@ def finetune(args: argparse.Namespace) -> int:
         )
     folder = args.out or files[0].parent / "finetuned" / f"{args.on}-seed{args.seed}"
     _train(folder, _finetuning_config(files[0], args), args)
-    return 0
 
 
 def _train(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:

@@ -54,7 +54,7 @@ LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
         "view episode.npz",
     ),
 )
-def view(args: argparse.Namespace) -> int:
+def view(args: argparse.Namespace) -> None:
     """Serve until interrupted."""
     from morphgen.viewer.app import serve
 
@@ -65,7 +65,6 @@ def view(args: argparse.Namespace) -> int:
         _wait(args.host, viewer)
     except KeyboardInterrupt:
         pass
-    return 0
 
 
 def _wait(host: str, viewer: Viewer) -> None:

@@ -11,6 +11,7 @@ import pytest
 from helpers.commands import start, tree
 from helpers.parts import write_part
 from helpers.robots import arm
+from morphgen import cli
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar import library
@@ -197,6 +198,31 @@ def test_an_interrupted_run_leaves_no_half_bundle(run, tmp_path, monkeypatch, st
     assert (code, out) == (130, "")
     assert err == "morphgen: interrupted; nothing half-written is left\n"
     assert tree(tmp_path / "out") == {}
+
+
+def test_ctrl_c_while_the_commands_are_imported_is_one_line(run, monkeypatch):
+    monkeypatch.setattr(cli, "build_parser", interrupt)
+    assert run("list") == (130, "", "morphgen: interrupted; nothing half-written is left\n")
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("trian", "argument COMMAND: invalid choice: 'trian'; did you mean 'train'?"),
+        ("split shw", "argument COMMAND: invalid choice: 'shw'; did you mean 'show'?"),
+        ("split new interpolatoin", "'interpolatoin'; did you mean 'interpolation'? valid: "),
+        ("similarity a b --measure cosin", "argument --measure: invalid choice: 'cosin'; did you"),
+        ("check a --strct", "unknown option '--strct'; did you mean '--strict'?"),
+        ("check a --strct", "; see morphgen check --help"),
+        ("list arms legs", "unknown arguments: legs; see morphgen list --help"),
+        ("train --envs x", "argument --envs: x: expected a whole number, 1 or more; see morphgen"),
+        ("sample chain -n -3", "argument -n: -3: expected a whole number, 1 or more; see morphgen"),
+        ("sample chain -n 2.5", "argument -n: 2.5: expected a whole number, 1 or more"),
+        ("compose foo=bar", "foo=bar: unknown key 'foo'; expected base, arm, ee, a limb such as"),
+    ],
+)
+def test_a_misspelt_word_names_the_nearest_valid_one(refused, argv, message):
+    assert message in refused(*argv.split())
 
 
 def test_ctrl_c_that_a_package_makes_another_error_of_is_ctrl_c(run, monkeypatch):
