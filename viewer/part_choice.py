@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from morphgen.errors import CompositionError, nearest
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest, PartKind
@@ -31,7 +31,9 @@ class PartChoice:
     def words(self) -> str:
         """The words of ``morphgen compose`` for the same robot."""
         parts = [f"{slot}={part}" for slot, part in self.parts.items() if part]
-        return " ".join([*parts, *(f"{key}={number(value)}" for key, value in self.values.items())])
+        return " ".join(
+            [*parts, *(f"{key}={format_number(value)}" for key, value in self.values.items())]
+        )
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ def with_value(choice: PartChoice, control: Control, value: float) -> PartChoice
     """Return the choice with another value of a parameter; default values are left out."""
     values = {key: other for key, other in choice.values.items() if key != control.key}
     if abs(value - control.default) > 1e-9:
-        values[control.key] = float(number(value))
+        values[control.key] = float(format_number(value))
     return replace(choice, values=values)
 
 

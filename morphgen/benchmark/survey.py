@@ -17,7 +17,7 @@ from morphgen.benchmark.similarity import MEASURES, Features, features
 from morphgen.benchmark.split import Member, Split
 from morphgen.errors import MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.formats.card import rounded
+from morphgen.formats.rounding import round_number
 from morphgen.grammar.compose import compose
 from morphgen.grammar.conditions import RobotProperties
 from morphgen.grammar.derivation import parse_derivation
@@ -104,8 +104,8 @@ def robot_stats(robot: Robot) -> RobotStats:
         len(robot.movable_joints),
         int(properties.movable_to_tool),
         robot.dof,
-        float(rounded(properties.reach) or 0.0),
-        float(rounded(properties.mass) or 0.0),
+        round_number(properties.reach),
+        round_number(properties.mass),
     )
 
 

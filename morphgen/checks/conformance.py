@@ -11,7 +11,7 @@ import numpy as np
 from morphgen.checks.readers import LOADERS, Loader
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_bundle
-from morphgen.formats.mujoco_urdf import BOUND_MASS
+from morphgen.formats.urdf_text import BOUND_MASS
 from morphgen.model.kinematics import frame_pose, movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Frame, Robot
 from morphgen.typing import Array

@@ -16,7 +16,7 @@ from lxml import etree
 from numpy.typing import ArrayLike
 
 from morphgen.errors import RobotError
-from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
+from morphgen.formats.mjcf import MJCF_COMPILER
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
 from morphgen.model.tree import RigidGroup, rigid_groups
@@ -258,7 +258,7 @@ def _compile(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
 
     meshes = Meshes(None)
     root = etree.Element("mujoco")
-    etree.SubElement(root, "compiler", MJCF_COMPILER_ATTRIBUTES)
+    etree.SubElement(root, "compiler", MJCF_COMPILER)
     etree.SubElement(root, "size", memory=_MUJOCO_MEMORY)
     etree.SubElement(etree.SubElement(root, "option"), "flag", filterparent="disable")
     asset = etree.SubElement(root, "asset")

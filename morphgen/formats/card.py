@@ -11,8 +11,8 @@ from msgspec import field
 
 from morphgen.errors import FormatError
 from morphgen.formats.records import FiniteNumber, Record, read_record
+from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf import with_frames
-from morphgen.formats.urdf_text import number
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
 from morphgen.model.kinematics import reach
@@ -77,21 +77,23 @@ def robot_card(
         "links": len(robot.links),
         "movable": len(robot.movable_joints),
         "dof": robot.dof,
-        "mass": rounded(robot.mass),
-        "reach": rounded(reach(robot)) if has_tool and robot.dof else None,
-        "home": {joint.name: rounded(q) for joint, q in zip(joints, robot.home, strict=True)},
+        "mass": round_number(robot.mass),
+        "reach": round_number(reach(robot)) if has_tool and robot.dof else None,
+        "home": {joint.name: round_number(q) for joint, q in zip(joints, robot.home, strict=True)},
         "frames": {
             frame.name: {
                 "link": frame.link,
-                "position": [rounded(v) for v in frame.T_link_frame.position],
-                "quaternion": [rounded(v) for v in frame.T_link_frame.quaternion],
+                "position": [round_number(v) for v in frame.T_link_frame.position],
+                "quaternion": [round_number(v) for v in frame.T_link_frame.quaternion],
             }
             for frame in robot.frames
         },
         "ignore_pairs": [list(pair) for pair in robot.ignore_pairs],
         "actuation": {
             gains.joint: {
-                key: rounded(value) for key, value in asdict(gains).items() if key != "joint"
+                key: None if value is None else round_number(value)
+                for key, value in asdict(gains).items()
+                if key != "joint"
             }
             for gains in actuation(robot)
         },
@@ -134,8 +136,3 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
         raise FormatError(f"{origin}: home: missing joint {error}") from error
     provenance = {key: card[key] for key in _PROVENANCE if key in card}
     return replace(robot, home=home, ignore_pairs=record.ignore_pairs, provenance=provenance)
-
-
-def rounded(value: float | None) -> float | None:
-    """A number as files hold it: 12 significant digits."""
-    return None if value is None else float(number(value))

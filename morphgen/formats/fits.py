@@ -22,7 +22,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_json
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.resolve import file_stamp
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 from morphgen.model.geometry import (
     Box,
     Capsule,
@@ -249,22 +249,22 @@ def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
 
 def _shape_text(shape: Shape) -> str:
     pose = shape.T_link_shape
-    placed = [number(value) for value in (*pose.position, *pose.quaternion)]
+    placed = [format_number(value) for value in (*pose.position, *pose.quaternion)]
     return " ".join([_geometry_text(shape.geometry), *placed])
 
 
 def _geometry_text(geometry: Geometry) -> str:
     match geometry:
         case Mesh(path, scale, part):
-            return " ".join(["mesh", _digest(path), *(number(s) for s in scale), str(part)])
+            return " ".join(["mesh", _digest(path), *(format_number(s) for s in scale), str(part)])
         case Box(edges):
-            return " ".join(["box", *(number(edge) for edge in edges)])
+            return " ".join(["box", *(format_number(edge) for edge in edges)])
         case Sphere(radius):
-            return f"sphere {number(radius)}"
+            return f"sphere {format_number(radius)}"
         case Cylinder(radius, length):
-            return f"cylinder {number(radius)} {number(length)}"
+            return f"cylinder {format_number(radius)} {format_number(length)}"
         case Capsule(radius, length):
-            return f"capsule {number(radius)} {number(length)}"
+            return f"capsule {format_number(radius)} {format_number(length)}"
 
 
 def _digest(path: Path) -> str:

@@ -15,7 +15,7 @@ from morphgen.formats.mjcf_elements import (
     joint_attributes,
     pose_attributes,
 )
-from morphgen.formats.mujoco_urdf import MJCF_COMPILER_ATTRIBUTES
+from morphgen.formats.urdf_text import MUJOCO_BOUNDS
 from morphgen.model.dynamics import Actuation, actuation
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Joint, Link, Robot
@@ -25,6 +25,8 @@ TIMESTEP = 0.005
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 """Geom groups; MuJoCo's viewers show groups 0 to 2."""
 _SITE_GROUP = 4
+MJCF_COMPILER = {"angle": "radian", "inertiafromgeom": "false", **MUJOCO_BOUNDS}
+"""Attributes of ``<compiler/>``: inertias as written, massless links allowed."""
 
 
 def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
@@ -82,7 +84,7 @@ def to_spec(robot: Robot, mesh_file: MeshFile | None = None) -> mujoco.MjSpec:
 
 def _document(robot: Robot, meshes: Meshes) -> etree._Element:
     root = etree.Element("mujoco", model=robot.name)
-    etree.SubElement(root, "compiler", MJCF_COMPILER_ATTRIBUTES)
+    etree.SubElement(root, "compiler", MJCF_COMPILER)
     etree.SubElement(root, "option", timestep=f"{TIMESTEP:g}", integrator="implicitfast")
     default = etree.SubElement(root, "default")
     visual = etree.SubElement(default, "default", {"class": "visual"})

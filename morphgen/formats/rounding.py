@@ -39,14 +39,19 @@ _UNIT = 1e-9
 """How far the length of a unit axis may be from 1 once it was rounded."""
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """A number with 12 significant digits; what is smaller than 1e-12 is zero."""
     return "0" if abs(value) < 1e-12 else f"{value:.12g}"
 
 
-def inertia_number(value: float) -> str:
+def format_inertia(value: float) -> str:
     """Inertias of finger-sized bodies are far below ``number``'s zero."""
     return f"{value:.12g}" if abs(value) > 1e-18 else "0"
+
+
+def round_number(value: float) -> float:
+    """Return a number as files hold it: with 12 significant digits."""
+    return float(format_number(value))
 
 
 def rounded_pose(pose: Pose) -> Pose:
@@ -100,7 +105,7 @@ def as_written(robot: Robot) -> Robot:
         links=tuple(_link(link) for link in robot.links),
         joints=tuple(_joint(joint) for joint in robot.joints),
         frames=tuple(replace(f, T_link_frame=rounded_pose(f.T_link_frame)) for f in robot.frames),
-        home=tuple(map(_rounded, robot.home)),
+        home=tuple(map(round_number, robot.home)),
     )
 
 
@@ -126,8 +131,8 @@ def _link(link: Link) -> Link:
 def _inertial(body: Inertial | None) -> Inertial | None:
     if body is None or body.mass == 0:
         return None
-    xx, xy, xz, yy, yz, zz = (float(inertia_number(value)) for value in body.inertia)
-    return Inertial(_rounded(body.mass), _vector(body.com), (xx, xy, xz, yy, yz, zz))
+    xx, xy, xz, yy, yz, zz = (float(format_inertia(value)) for value in body.inertia)
+    return Inertial(round_number(body.mass), _vector(body.com), (xx, xy, xz, yy, yz, zz))
 
 
 def _geometry(geometry: Geometry) -> Geometry:
@@ -135,9 +140,9 @@ def _geometry(geometry: Geometry) -> Geometry:
         case Box(size):
             return Box(_vector(size))
         case Sphere(radius):
-            return Sphere(_rounded(radius))
+            return Sphere(round_number(radius))
         case Cylinder(radius, length):
-            return Cylinder(_rounded(radius), _rounded(length))
+            return Cylinder(round_number(radius), round_number(length))
         case Capsule() | Mesh():
             return geometry
 
@@ -155,23 +160,19 @@ def _joint(joint: Joint) -> Joint:
         joint.child,
         placed,
         rounded_axis(joint),
-        limits and (_rounded(limits[0]), _rounded(limits[1])),
-        DEFAULT_EFFORT if joint.effort is None else _rounded(joint.effort),
-        DEFAULT_VELOCITY if joint.velocity is None else _rounded(joint.velocity),
-        _rounded(joint.damping),
-        _rounded(joint.friction),
+        limits and (round_number(limits[0]), round_number(limits[1])),
+        DEFAULT_EFFORT if joint.effort is None else round_number(joint.effort),
+        DEFAULT_VELOCITY if joint.velocity is None else round_number(joint.velocity),
+        round_number(joint.damping),
+        round_number(joint.friction),
         joint.mimic and _mimic(joint.mimic),
     )
 
 
 def _mimic(mimic: Mimic) -> Mimic:
-    return Mimic(mimic.joint, _rounded(mimic.multiplier), _rounded(mimic.offset))
+    return Mimic(mimic.joint, round_number(mimic.multiplier), round_number(mimic.offset))
 
 
 def _vector(vector: Vec3) -> Vec3:
-    x, y, z = map(_rounded, vector)
+    x, y, z = map(round_number, vector)
     return (x, y, z)
-
-
-def _rounded(value: float) -> float:
-    return float(number(value))

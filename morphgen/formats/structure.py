@@ -1,4 +1,4 @@
-"""Faults in the structure of a URDF, found on its XML, with line numbers."""
+"""Check the structure of a URDF on its XML, so that findings have line numbers."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from collections.abc import Iterator, Sequence
 from lxml import etree
 
 from morphgen.errors import nearest
-from morphgen.formats.structure_place import Place, place_of
-from morphgen.formats.structure_values import content_findings
+from morphgen.formats.urdf_schema import SourceLocation, content_findings
 from morphgen.model.findings import Finding
 from morphgen.model.robot import JOINT_KINDS
 
-MOST_LINKS = 1000
-"""Links of the largest robot that is read."""
-MOST_SHAPES = 10_000
-"""Visual and collision shapes of the largest robot that is read."""
-MOST_ERRORS = 50
-"""Errors after which no more are looked for."""
+MAX_LINKS = 1000
+"""Largest number of links, and of joints, that is read."""
+MAX_SHAPES = 10_000
+"""Largest number of visual and collision shapes that is read."""
+MAX_ERRORS = 50
+"""Number of errors after which the check stops."""
 _REPLACEMENT = {
     "floating": "fix the body to the world, or use three prismatic and three revolute joints",
     "planar": "use two prismatic joints and a revolute one",
@@ -25,14 +24,14 @@ _REPLACEMENT = {
 
 
 def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]:
-    """What keeps a URDF from being a kinematic tree with readable numbers.
+    """Check that a URDF is a kinematic tree with valid numbers.
 
     Args:
-        root: The document's root element; ``sourceline`` of its elements is reported.
-        origin: What to call the document, usually its path.
+        root: The document's root element; findings report ``sourceline`` of its elements.
+        origin: Name of the document in messages, usually its path.
 
     Returns:
-        Findings in the order found; with none of severity ``error``, the document converts.
+        Findings in the order of detection. A document without errors can be converted.
     """
     if root.tag != "robot":
         return (_wrong_root(root, origin),)
@@ -43,9 +42,10 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
     unexpanded = _first_xacro(root)
     if unexpanded is None:
         return tuple(findings)
-    # A forgotten call only adds what no loader reads; with faults around it, it explains them.
+    # Loaders ignore an unexpanded xacro call, so alone it is a warning. Next to other errors it is
+    # their likely cause, and reported alone.
     broken = any(finding.severity == "error" for finding in findings)
-    left = place_of(root, origin).finding(
+    left = SourceLocation.of(root, origin).finding(
         unexpanded,
         "xacro-unexpanded",
         f"<xacro:{etree.QName(unexpanded).localname}> is left in the document",
@@ -56,38 +56,39 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
 
 
 def _size_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
-    """What would keep a computer busy without end, asked before anything else is."""
+    """Check the number of elements first: later checks would take too long on a huge document."""
     for tag, elements, most in (
-        ("link", root.iterfind("link"), MOST_LINKS),
-        ("joint", root.iterfind("joint"), MOST_LINKS),
-        ("visual and collision", root.iter("visual", "collision"), MOST_SHAPES),
+        ("link", root.iterfind("link"), MAX_LINKS),
+        ("joint", root.iterfind("joint"), MAX_LINKS),
+        ("visual and collision", root.iter("visual", "collision"), MAX_SHAPES),
     ):
         count = sum(1 for _ in elements)
         if count > most:
-            yield place_of(root, origin).finding(
+            yield SourceLocation.of(root, origin).finding(
                 root,
                 "robot-too-large",
                 f"it has {count} <{tag}> elements; at most {most} are read",
-                "leave out what is not the robot",
+                "leave out everything that is not part of the robot",
             )
 
 
 def _first(findings: Iterator[Finding]) -> list[Finding]:
-    """Findings up to ``MOST_ERRORS`` errors: nobody reads more, and each takes its time."""
-    found, errors = [], 0
+    """Return findings up to ``MAX_ERRORS`` errors."""
+    kept: list[Finding] = []
+    num_errors = 0
     for finding in findings:
-        found.append(finding)
-        errors += finding.severity == "error"
-        if errors == MOST_ERRORS:
+        kept.append(finding)
+        num_errors += finding.severity == "error"
+        if num_errors == MAX_ERRORS:
             break
-    return found
+    return kept
 
 
 def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     links, joints = root.findall("link"), root.findall("joint")
-    yield from content_findings(root, place_of(root, origin))
+    yield from content_findings(root, SourceLocation.of(root, origin))
     if not links:
-        yield place_of(root, origin).finding(
+        yield SourceLocation.of(root, origin).finding(
             root, "link-missing", "<robot> has no <link>", "add at least one link"
         )
     yield from _duplicates(links, origin)
@@ -96,7 +97,7 @@ def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     yield from _kinds(joints, origin)
     yield from _mimics(joints, origin)
     for element in [*links, *joints, *root.findall("material")]:
-        yield from content_findings(element, place_of(element, origin))
+        yield from content_findings(element, SourceLocation.of(element, origin))
 
 
 def _wrong_root(root: etree._Element, origin: str) -> Finding:
@@ -105,7 +106,7 @@ def _wrong_root(root: etree._Element, origin: str) -> Finding:
     if name.localname == "robot":
         fix = f"remove the default namespace {name.namespace!r}"
     why = f"the root element is <{name.localname}>, not <robot>"
-    return Place(origin, f"<{name.localname}>").finding(root, "root-not-robot", why, fix)
+    return SourceLocation(origin, f"<{name.localname}>").finding(root, "root-not-robot", why, fix)
 
 
 def _first_xacro(root: etree._Element) -> etree._Element | None:
@@ -121,7 +122,7 @@ def _duplicates(elements: Sequence[etree._Element], origin: str) -> Iterator[Fin
     for element in elements:
         name = element.get("name")
         if name in first:
-            yield place_of(element, origin).finding(
+            yield SourceLocation.of(element, origin).finding(
                 element,
                 f"{element.tag}-duplicate",
                 f"the name is taken by the {element.tag} on line {first[name].sourceline}",
@@ -146,23 +147,23 @@ def _tree(
     parent_of: dict[str, str] = {}
     above: dict[str, etree._Element] = {}
     for joint in joints:
-        place = place_of(joint, origin)
+        location = SourceLocation.of(joint, origin)
         parent, child = _ends(joint)
         for role, name in (("parent", parent), ("child", child)):
             if name and name not in by_name:
-                yield place.finding(
+                yield location.finding(
                     joint,
                     "joint-link-unknown",
-                    f"its {role} {name!r} is no link",
+                    f"its {role} {name!r} is not a link",
                     f"name a link{nearest(name, by_name)}",
                 )
         if not child or child not in by_name:
             continue
         if child in above:
-            yield place.finding(
+            yield location.finding(
                 joint,
                 "link-two-parents",
-                f"link {child!r} already hangs on joint {above[child].get('name')!r} "
+                f"link {child!r} is already the child of joint {above[child].get('name')!r} "
                 f"(line {above[child].sourceline})",
                 "remove one joint: a robot is a tree, loops are not supported",
             )
@@ -171,15 +172,15 @@ def _tree(
         if parent in by_name:
             parent_of[child] = parent
     for cycle in _cycles(parent_of):
-        yield place_of(above[cycle[0]], origin).finding(
+        yield SourceLocation.of(above[cycle[0]], origin).finding(
             above[cycle[0]],
             "cycle",
-            "links hang on each other: " + " -> ".join([*cycle, cycle[0]]),
+            "links form a loop: " + " -> ".join([*cycle, cycle[0]]),
             "remove one of the joints",
         )
     roots = [name for name in by_name if name not in above]
     for name in roots[1:]:
-        yield place_of(by_name[name], origin).finding(
+        yield SourceLocation.of(by_name[name], origin).finding(
             by_name[name],
             "disconnected",
             f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root",
@@ -188,7 +189,7 @@ def _tree(
 
 
 def _cycles(above: dict[str, str]) -> Iterator[list[str]]:
-    """Cycles of a map from each name to the one above it, each once, in order of going down."""
+    """Yield each cycle of a map from child to parent once, from the top down."""
     done: set[str] = set()
     for start in above:
         path: list[str] = []
@@ -205,17 +206,17 @@ def _kinds(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
     for joint in joints:
         kind = joint.get("type")
         if kind in _REPLACEMENT:
-            yield place_of(joint, origin).finding(
+            yield SourceLocation.of(joint, origin).finding(
                 joint,
                 "joint-type-unsupported",
                 f"joints of type {kind!r} are not supported",
                 _REPLACEMENT[kind],
             )
         elif kind and kind not in JOINT_KINDS:
-            yield place_of(joint, origin).finding(
+            yield SourceLocation.of(joint, origin).finding(
                 joint,
                 "joint-type-unknown",
-                f"{kind!r} is no joint type",
+                f"{kind!r} is not a joint type",
                 f"use one{nearest(kind, JOINT_KINDS)}",
             )
 
@@ -231,17 +232,18 @@ def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
         if leader in by_name:
             leader_of[name] = leader
         else:
-            yield place_of(joint, origin).finding(
+            yield SourceLocation.of(joint, origin).finding(
                 mimic,
                 "mimic-unknown",
-                f"it mimics {leader!r}, which is no joint",
+                f"it mimics {leader!r}, which is not a joint",
                 f"name a joint{nearest(leader, by_name)}",
-                f"its <mimic> of {leader!r}, which is no joint, was left out: it moves by itself",
+                f"its <mimic> of {leader!r}, which is not a joint, was left out: "
+                "it moves independently",
             )
     for cycle in _cycles(leader_of):
-        yield place_of(by_name[cycle[0]], origin).finding(
+        yield SourceLocation.of(by_name[cycle[0]], origin).finding(
             by_name[cycle[0]],
             "mimic-cycle",
             "joints mimic each other: " + " -> ".join([*cycle, cycle[0]]),
-            "let one of them move by itself",
+            "let one of them move independently",
         )

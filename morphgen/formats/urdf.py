@@ -6,26 +6,44 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 from lxml import etree
 
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.structure import structure_findings
-from morphgen.formats.urdf_elements import read_colour, read_joint, read_link
+from morphgen.formats.urdf_schema import CHILDREN
 from morphgen.formats.urdf_text import OWN
 from morphgen.formats.xacro import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding
-from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.model.geometry import (
+    IDENTITY,
+    Box,
+    Capsule,
+    Cylinder,
+    Geometry,
+    Mesh,
+    Pose,
+    Primitive,
+    Rgba,
+    Shape,
+    Sphere,
+    dimensions,
+)
+from morphgen.model.robot import Frame, Inertial, Joint, JointKind, Link, Mimic, Robot
+from morphgen.model.rotation import Vec3
 
-LARGEST_DESCRIPTION = 8 * 2**20
-"""Bytes of the largest URDF that is read."""
+MAX_URDF_BYTES = 8 * 2**20
+"""Largest URDF that is read [bytes]."""
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class UnsoundError(FormatError):
-    """A URDF whose structure is broken; ``findings`` says where and how."""
+    """The structure of a URDF is invalid; ``findings`` lists the faults and their locations."""
 
     def __init__(self, origin: str, findings: Sequence[Finding]) -> None:
         first = findings[0]
@@ -47,12 +65,12 @@ def read_urdf(
 
     Args:
         path: The file.
-        args: xacro arguments.
-        finder: Where ROS packages are looked for; by default around ``path``, in ROS's own
-            environment and in the installed data packages.
-        keep_order: Whether links stay in the order of the file's joints, if parents are first
-            there; otherwise the tree is walked depth first.
-        written_frames: Whether links that ``urdf_text`` wrote for frames become frames again.
+        args: Values of the xacro's arguments.
+        finder: Finds ROS packages; by default around ``path``, in the environment of ROS and in
+            the installed data packages.
+        keep_order: Whether to keep the order of the file's joints if parents precede children;
+            otherwise links are ordered depth first.
+        written_frames: Whether to turn links that ``urdf_text`` wrote for frames into frames.
 
     Returns:
         The robot, without frames unless ``written_frames``. Its home is the one that
@@ -64,17 +82,19 @@ def read_urdf(
         FormatError: If the file cannot be read, is not XML or does not expand.
     """
     if not path.is_file():
-        why = "is no regular file" if path.exists() else "no such file"
+        why = "not a regular file" if path.exists() else "no such file"
         raise FormatError(f"{path}: {why}")
     if str(path).encode(errors="replace").decode() != str(path):
-        raise FormatError(f"{str(path)!a}: the file's name is no UTF-8 text")
+        raise FormatError(f"{str(path)!a}: the file's name is not UTF-8 text")
     finder = finder or default_finder()
     if path.suffix == ".xacro":
         data = expand(path, args or {}, finder)
     elif args:
-        raise FormatError(f"{path}: xacro arguments {', '.join(args)} for a file that is no xacro")
+        raise FormatError(
+            f"{path}: xacro arguments {', '.join(args)} for a file that is not a xacro"
+        )
     else:
-        data = read_bytes(path, LARGEST_DESCRIPTION)
+        data = read_bytes(path, MAX_URDF_BYTES)
     return robot_from_xml(data, path, finder, keep_order=keep_order, written_frames=written_frames)
 
 
@@ -91,9 +111,10 @@ def robot_from_xml(
 
     Args:
         data: The XML.
-        path: Where it comes from, for messages and relative mesh paths.
-        finder: Where ``package://`` is looked for.
-        trusted: Whether a document of the same structure has been examined before.
+        path: Origin of the text, for messages and relative mesh paths.
+        finder: Finds the packages of ``package://`` URIs.
+        trusted: Whether to skip the check of the structure, because a document of the same
+            structure was checked before.
         keep_order: See ``read_urdf``.
         written_frames: See ``read_urdf``.
 
@@ -101,38 +122,47 @@ def robot_from_xml(
         UnsoundError: If the tree is broken or a mesh is not found.
         FormatError: If it is not XML.
     """
-    root, mended = parse_description(data, str(path))
+    root, repairs = parse_description(data, str(path))
     findings = () if trusted else structure_findings(root, str(path))
     errors = tuple(finding for finding in findings if finding.severity == "error")
     if errors:
         raise UnsoundError(str(path), errors)
-    missing: list[Finding] = []
-    meshes = _resolved_meshes(root, path, finder, missing)
-    if missing:
-        raise UnsoundError(str(path), missing)
-    colours = {m.get("name", ""): read_colour(m) for m in root.iterfind("material")}
-    found = (read_link(element, meshes, colours) for element in root.iterfind("link"))
-    links = {link.name: link for link in found}
-    joints = _joints(root)
+    meshes = _resolved_meshes(root, path, finder)
+    colours = {m.get("name", ""): _colour(m) for m in root.iterfind("material")}
+    link_list = [_link(element, meshes, colours) for element in root.iterfind("link")]
+    links = {link.name: link for link in link_list}
+    joints = [_joint(element) for element in root.iterfind("joint")]
+    joint_names = {joint.name for joint in joints}
+    joints = [  # a joint that mimics an unknown joint moves independently
+        replace(joint, mimic=None)
+        if joint.mimic and joint.mimic.joint not in joint_names
+        else joint
+        for joint in joints
+    ]
     if not (keep_order and _parents_first(joints, links)):
         joints = _topological(joints, links)
     order = [_root_name(links, joints), *(joint.child for joint in joints)]
-    positions = _told_home(root, str(path))
-    home = tuple(positions.get(j.name, _rest(j)) for j in joints if j.is_independent)
-    bodies = tuple(links[name] for name in order)
-    # Without the folder, a card that lists them is the same on every machine.
-    told = tuple(
+    positions = _written_home(root, str(path))
+    home = tuple(positions.get(j.name, _default_position(j)) for j in joints if j.is_independent)
+    # Locations without the folder make the card the same on every machine.
+    source_findings = tuple(
         replace(finding, where=f"{path.name}{finding.where.removeprefix(str(path))}")
-        for finding in (*mended, *findings)
+        for finding in (*repairs, *findings)
     )
     name = root.get("name", "")
-    robot = Robot(name, bodies, tuple(joints), home=home, source_findings=told)
+    robot = Robot(
+        name,
+        tuple(links[link] for link in order),
+        tuple(joints),
+        home=home,
+        source_findings=source_findings,
+    )
     frames = [frame.get("name", "") for frame in root.iterfind(f"{OWN}/frame")]
     return with_frames(robot, frames) if written_frames else robot
 
 
 def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
-    """Turn links that ``urdf_text`` wrote for frames back into frames.
+    """Turn links that ``urdf_text`` wrote for frames into frames.
 
     Raises:
         FormatError: If the robot has no such link on a fixed joint.
@@ -149,8 +179,8 @@ def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
     )
 
 
-def _told_home(root: etree._Element, origin: str) -> dict[str, float]:
-    """Positions at home by joint, as ``urdf_text`` wrote them."""
+def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
+    """Return the home positions by joint that ``urdf_text`` wrote."""
     home = {}
     for element in root.iterfind(f"{OWN}/home"):
         text = element.get("position", "")
@@ -159,38 +189,35 @@ def _told_home(root: etree._Element, origin: str) -> dict[str, float]:
         except ValueError:
             position = math.nan
         if not math.isfinite(position):
-            raise FormatError(f"{origin}:{element.sourceline}: home position {text!r} is no number")
+            raise FormatError(
+                f"{origin}:{element.sourceline}: home position {text!r} is not a number"
+            )
         home[element.get("joint", "")] = position
     return home
 
 
-def _resolved_meshes(
-    root: etree._Element, path: Path, finder: PackageFinder, missing: list[Finding]
-) -> dict[str, Path]:
+def _resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> dict[str, Path]:
+    """Return the files of all meshes by URI.
+
+    Raises:
+        UnsoundError: If a file is missing; it lists all of them.
+    """
     meshes: dict[str, Path] = {}
+    missing: dict[str, Finding] = {}
     for element in root.iter("mesh"):
         uri = element.get("filename", "")
-        if uri in meshes:
+        if uri in meshes or uri in missing:
             continue
         try:
             meshes[uri] = resolve_uri(uri, path, finder)
         except FormatError as error:
-            meshes[uri] = Path(uri)
             where = f"{path}:{element.sourceline}"
-            missing.append(
-                Finding("mesh-unresolved", "error", where, str(error), "correct the mesh path")
+            missing[uri] = Finding(
+                "mesh-unresolved", "error", where, str(error), "correct the mesh path"
             )
+    if missing:
+        raise UnsoundError(str(path), list(missing.values()))
     return meshes
-
-
-def _joints(root: etree._Element) -> list[Joint]:
-    """The joints; one that mimics what is no joint moves by itself."""
-    joints = [read_joint(element) for element in root.iterfind("joint")]
-    names = {joint.name for joint in joints}
-    return [
-        joint if joint.mimic is None or joint.mimic.joint in names else replace(joint, mimic=None)
-        for joint in joints
-    ]
 
 
 def _parents_first(joints: Sequence[Joint], links: Mapping[str, Link]) -> bool:
@@ -220,8 +247,135 @@ def _root_name(links: Mapping[str, Link], joints: Sequence[Joint]) -> str:
     return next(name for name in links if name not in attached)
 
 
-def _rest(joint: Joint) -> float:
+def _default_position(joint: Joint) -> float:
     lower, upper = joint.limits or (-math.inf, math.inf)
     if joint.kind == "continuous" or lower <= 0 <= upper or lower > upper:
         return 0.0
     return (lower + upper) / 2
+
+
+def _link(
+    element: etree._Element, meshes: Mapping[str, Path], colours: Mapping[str, Rgba | None]
+) -> Link:
+    """Convert a ``<link>``; meshes are the files by URI, colours the robot's named materials."""
+    return Link(
+        element.get("name", ""),
+        _inertial(element.find("inertial")),
+        tuple(
+            Shape(geometry, _origin(visual), _visual_rgba(visual, colours))
+            for visual in element.iterfind("visual")
+            if (geometry := _geometry(visual, meshes)) is not None
+        ),
+        tuple(
+            Shape(geometry, _origin(collision))
+            for collision in element.iterfind("collision")
+            if (geometry := _geometry(collision, meshes)) is not None
+        ),
+    )
+
+
+def _joint(element: etree._Element) -> Joint:
+    """Convert a ``<joint>``; a missing value is None, except that half a range ends at zero."""
+    limit, dynamics = element.find("limit"), element.find("dynamics")
+    lower, upper = _number(limit, "lower"), _number(limit, "upper")
+    parent, child = element.find("parent"), element.find("child")
+    axis = element.find("axis")
+    return Joint(
+        element.get("name", ""),
+        cast(JointKind, element.get("type")),
+        "" if parent is None else parent.get("link", ""),
+        "" if child is None else child.get("link", ""),
+        _origin(element),
+        (1.0, 0.0, 0.0) if axis is None else _vector(axis.get("xyz", "1 0 0")),
+        None if lower is None and upper is None else (lower or 0.0, upper or 0.0),
+        _number(limit, "effort"),
+        _number(limit, "velocity"),
+        _number(dynamics, "damping") or 0.0,
+        _number(dynamics, "friction") or 0.0,
+        _mimic(element.find("mimic")),
+    )
+
+
+def _colour(material: etree._Element) -> Rgba | None:
+    """Return the colour of a ``<material>``, clipped to [0, 1]; None without ``<color>``."""
+    colour = material.find("color")
+    if colour is None:
+        return None
+    r, g, b, a = (min(max(value, 0.0), 1.0) for value in _numbers(colour.get("rgba", "1 1 1 1")))
+    return (r, g, b, a)
+
+
+def _inertial(element: etree._Element | None) -> Inertial | None:
+    if element is None:
+        return None
+    mass = _number(element.find("mass"), "value")
+    if mass is None:
+        return None
+    T = _origin(element)
+    inertia = element.find("inertia")
+    xx, xy, xz, yy, yz, zz = (_number(inertia, name) or 0.0 for name in _INERTIA)
+    inertial = Inertial(mass, T.position, (xx, xy, xz, yy, yz, zz))
+    if T.quaternion == IDENTITY.quaternion:
+        return inertial
+    R = T.matrix[:3, :3]
+    return Inertial.from_matrix(mass, T.position, np.asarray(R @ inertial.matrix @ R.T))
+
+
+def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry | None:
+    """Return the first shape of a ``<geometry>``; None if there is no shape or its size is 0."""
+    shapes = holder.iterfind("geometry[1]/*")
+    element = next((shape for shape in shapes if shape.tag in CHILDREN["geometry"]), None)
+    if element is None:
+        return None
+    geometry: Primitive
+    match element.tag:
+        case "box":
+            geometry = Box(_vector(element.get("size", "")))
+        case "sphere":
+            geometry = Sphere(float(element.get("radius", "")))
+        case "capsule":
+            geometry = Capsule(float(element.get("radius", "")), float(element.get("length", "")))
+        case "cylinder":
+            geometry = Cylinder(float(element.get("radius", "")), float(element.get("length", "")))
+        case _:
+            x, *rest = _numbers(element.get("scale", "")) or [1.0]
+            y, z = rest[:2] or (x, x)
+            return Mesh(meshes[element.get("filename", "")], (x, y, z))
+    return None if 0.0 in dimensions(geometry) else geometry
+
+
+def _origin(holder: etree._Element) -> Pose:
+    origin = holder.find("origin")
+    if origin is None:
+        return IDENTITY
+    return Pose.from_xyz_rpy(
+        _vector(origin.get("xyz", "0 0 0")), _vector(origin.get("rpy", "0 0 0"))
+    )
+
+
+def _visual_rgba(visual: etree._Element, colours: Mapping[str, Rgba | None]) -> Rgba | None:
+    material = visual.find("material")
+    if material is None:
+        return None
+    return _colour(material) or colours.get(material.get("name", ""))
+
+
+def _mimic(element: etree._Element | None) -> Mimic | None:
+    if element is None:
+        return None
+    multiplier, offset = _number(element, "multiplier"), _number(element, "offset")
+    return Mimic(element.get("joint", ""), 1.0 if multiplier is None else multiplier, offset or 0.0)
+
+
+def _number(element: etree._Element | None, name: str) -> float | None:
+    text = None if element is None else element.get(name)
+    return None if text is None or not text.strip() else float(text)
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.replace(",", " ").split()]
+
+
+def _vector(text: str) -> Vec3:
+    x, y, z = _numbers(text)
+    return (x, y, z)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from lxml import etree
 
 from morphgen.errors import FormatError
-from morphgen.formats.mujoco_urdf import MUJOCO_COMPILER_ATTRIBUTES
 from morphgen.formats.rounding import (
-    inertia_number,
-    number,
+    format_inertia,
+    format_number,
     rounded_axis,
     rounded_pose,
     urdf_pieces,
@@ -25,12 +24,23 @@ from morphgen.model.robot import (
     Robot,
 )
 
-__all__ = ["OWN", "MeshUri", "number", "urdf_text"]
-
 OWN = "morphgen"
-"""Element of a URDF with what only morphgen reads."""
+"""Tag of the URDF element for data that only morphgen reads."""
+BOUND_MASS = 1e-12
+"""Mass that MuJoCo gives a massless link [kg]; it refuses moving bodies without mass."""
+BOUND_INERTIA = 1e-14
+"""Smallest principal inertia that MuJoCo gives a link [kg m^2]."""
+MUJOCO_BOUNDS = {"boundmass": f"{BOUND_MASS:g}", "boundinertia": f"{BOUND_INERTIA:g}"}
+_MUJOCO_COMPILER = {
+    "strippath": "false",  # mesh paths stay relative to the URDF
+    "fusestatic": "false",  # links on fixed joints, such as the tool, stay bodies with a name
+    "discardvisual": "true",  # a flat visual mesh stops MuJoCo's URDF reader
+    **MUJOCO_BOUNDS,
+}
+"""Attributes of ``<mujoco><compiler/></mujoco>``, so that MuJoCo reads a URDF as others do."""
 
 MeshUri = Callable[[Mesh], str]
+"""Maps a mesh to the file name to write for it."""
 
 
 def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
@@ -54,7 +64,7 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
         FormatError: If a slide has no limits.
     """
     root = etree.Element("robot", name=robot.name)
-    etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", MUJOCO_COMPILER_ATTRIBUTES)
+    etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", _MUJOCO_COMPILER)
     for link in robot.links:
         _write_link(root, link, mesh_uri)
     for frame in robot.frames:
@@ -74,7 +84,7 @@ def _write_own(root: etree._Element, robot: Robot) -> None:
         return
     own = etree.SubElement(root, OWN)
     for row, position in zip(robot.independent_joints, robot.home, strict=True):
-        home = {"joint": robot.joints[row].name, "position": number(position)}
+        home = {"joint": robot.joints[row].name, "position": format_number(position)}
         etree.SubElement(own, "home", home)
     for frame in robot.frames:
         etree.SubElement(own, "frame", name=frame.name)
@@ -85,9 +95,9 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     body = link.inertial or Inertial(0.0)
     inertial = etree.SubElement(element, "inertial")
     _write_origin(inertial, Pose(body.com))
-    etree.SubElement(inertial, "mass", value=number(body.mass))
+    etree.SubElement(inertial, "mass", value=format_number(body.mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    values = {name: inertia_number(v) for name, v in zip(names, body.inertia, strict=True)}
+    values = {name: format_inertia(v) for name, v in zip(names, body.inertia, strict=True)}
     etree.SubElement(inertial, "inertia", values)
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
         for i, shape in enumerate(piece for whole in shapes for piece in urdf_pieces(whole)):
@@ -95,14 +105,14 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
             _write_origin(holder, shape.T_link_shape)
             _write_geometry(etree.SubElement(holder, "geometry"), shape.geometry, mesh_uri)
             if shape.rgba is not None and kind == "visual":
-                colour = " ".join(number(value) for value in shape.rgba)
+                colour = _join(shape.rgba)
                 material = etree.SubElement(holder, "material", name=f"{link.name}_material_{i}")
                 etree.SubElement(material, "color", rgba=colour)
 
 
 def _write_origin(element: etree._Element, pose: Pose) -> None:
-    xyz = " ".join(number(value) for value in pose.position)
-    rpy = " ".join(number(value) for value in rounded_pose(pose).rpy)
+    xyz = _join(pose.position)
+    rpy = _join(rounded_pose(pose).rpy)
     if (xyz, rpy) != ("0 0 0", "0 0 0"):
         etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
 
@@ -110,11 +120,13 @@ def _write_origin(element: etree._Element, pose: Pose) -> None:
 def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshUri) -> None:
     match geometry:
         case Box(size):
-            etree.SubElement(element, "box", size=" ".join(number(value) for value in size))
+            etree.SubElement(element, "box", size=_join(size))
         case Sphere(radius):
-            etree.SubElement(element, "sphere", radius=number(radius))
+            etree.SubElement(element, "sphere", radius=format_number(radius))
         case Cylinder(radius, length):
-            etree.SubElement(element, "cylinder", radius=number(radius), length=number(length))
+            etree.SubElement(
+                element, "cylinder", radius=format_number(radius), length=format_number(length)
+            )
         case Mesh():
             etree.SubElement(element, "mesh", filename=mesh_uri(geometry))
         case Capsule():
@@ -129,24 +141,31 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     etree.SubElement(element, "child", link=joint.child)
     if not joint.is_movable:
         return
-    etree.SubElement(element, "axis", xyz=" ".join(number(value) for value in rounded_axis(joint)))
+    etree.SubElement(element, "axis", xyz=_join(rounded_axis(joint)))
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
-    limit = {"effort": number(effort), "velocity": number(velocity)}
+    limit = {"effort": format_number(effort), "velocity": format_number(velocity)}
     if kind != "continuous":
         if joint.limits is None:
             raise FormatError(f"joint {joint.name!r} slides without limits; a URDF must name them")
         lower, upper = joint.limits
-        limit = {"lower": number(lower), "upper": number(upper)} | limit
+        limit = {"lower": format_number(lower), "upper": format_number(upper)} | limit
     etree.SubElement(element, "limit", limit)
     if joint.damping or joint.friction:
-        values = {"damping": number(joint.damping), "friction": number(joint.friction)}
+        values = {
+            "damping": format_number(joint.damping),
+            "friction": format_number(joint.friction),
+        }
         etree.SubElement(element, "dynamics", values)
     if joint.mimic is not None:
         etree.SubElement(
             element,
             "mimic",
             joint=joint.mimic.joint,
-            multiplier=number(joint.mimic.multiplier),
-            offset=number(joint.mimic.offset),
+            multiplier=format_number(joint.mimic.multiplier),
+            offset=format_number(joint.mimic.offset),
         )
+
+
+def _join(values: Iterable[float]) -> str:
+    return " ".join(map(format_number, values))

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from morphgen.errors import GrammarError
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 from morphgen.grammar.values import Distribution, no_draw
 
 Choices = Mapping[str, float]
@@ -93,7 +93,7 @@ class RecordedChooser:
         given = distribution.nearest(self.given[key]) if key in self.given else None
         if given is None:
             given = self.other.value(key, distribution)
-        return self._note(key, float(number(given)))
+        return self._note(key, float(format_number(given)))
 
     def _note(self, key: str, value: float) -> float:
         if key in self.choices:

@@ -17,7 +17,7 @@ from lark.exceptions import VisitError
 from lark.visitors import Transformer_NonRecursive
 
 from morphgen.errors import GrammarError
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 from morphgen.grammar.limits import MAX_DERIVATION_TEXT, MAX_PARTS
 
 _SYNTAX = r"""
@@ -43,7 +43,7 @@ class Derivation:
     """(port, what is attached to it)."""
 
     def __str__(self) -> str:
-        values = ", ".join(f"{name}={number(value)}" for name, value in self.parameters)
+        values = ", ".join(f"{name}={format_number(value)}" for name, value in self.parameters)
         ports = ", ".join(f"{port}: {child}" for port, child in self.children)
         return (
             f"{self.label}={self.part}"
@@ -109,7 +109,7 @@ def _flat(derivation: Derivation) -> dict[str, str]:
     facts: dict[str, str] = {derivation.label: derivation.part}
     for node in derivation.walk():
         for name, value in node.parameters:
-            facts[f"{node.label}.{name}"] = number(value)
+            facts[f"{node.label}.{name}"] = format_number(value)
         for port, child in node.children:
             facts[child.label] = f"{child.part} on {node.label}:{port}"
     return facts

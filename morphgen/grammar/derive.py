@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from morphgen.errors import GrammarError, PartError, nearest
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 from morphgen.grammar.choosers import Chooser
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.grammar_file import Grammar
@@ -290,7 +290,7 @@ def argument(
             f"{expression} in {unit}"
         )
     try:
-        return require_range(float(number(value)), parameter, f"{item.name}.{name}")
+        return require_range(float(format_number(value)), parameter, f"{item.name}.{name}")
     except PartError as error:
         raise GrammarError(f"{expression.location}: {error}") from error
 

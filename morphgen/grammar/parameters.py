@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from morphgen.errors import PartError, nearest
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 
 _SCALES: dict[str, dict[str, float]] = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},
@@ -78,7 +78,7 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
         if unit not in scales:
             raise PartError(f"{where}={text}: wrong unit {unit!r}{_expected(parameter)}")
         value *= scales[unit]
-    return require_range(float(number(value)), parameter, where)
+    return require_range(float(format_number(value)), parameter, where)
 
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
@@ -87,8 +87,8 @@ def require_range(value: float, parameter: Parameter, where: str) -> float:
     Raises:
         PartError: If it does not.
     """
-    low = min(parameter.minimum, float(number(parameter.minimum)))
-    high = max(parameter.maximum, float(number(parameter.maximum)))
+    low = min(parameter.minimum, float(format_number(parameter.minimum)))
+    high = max(parameter.maximum, float(format_number(parameter.maximum)))
     if not low <= value <= high:
         raise PartError(f"{where}={value:g}: out of range{_expected(parameter)}")
     if parameter.integer and value != int(value):

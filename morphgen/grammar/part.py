@@ -12,8 +12,8 @@ from weakref import WeakSet
 from morphgen.checks.names import safe_names
 from morphgen.errors import FormatError, MorphgenError, PartError, RobotError, nearest
 from morphgen.formats.resolve import PackageFinder, distribution_file, file_stamp
+from morphgen.formats.rounding import format_number
 from morphgen.formats.urdf import read_urdf, robot_from_xml
-from morphgen.formats.urdf_text import number
 from morphgen.formats.xacro import evaluate, expand
 from morphgen.formats.xacro_compile import CompiledXacro, compile_xacro
 from morphgen.grammar.manifest import FrameSpec, Manifest, Number, PackageSource
@@ -143,7 +143,7 @@ def _read_template(path: Path, manifest: Manifest, values: Mapping[str, float]) 
     numbers: dict[str, str] = {}
     for name, value in values.items():
         kind = constants if manifest.parameters[name].integer else numbers
-        kind[name] = number(value)
+        kind[name] = format_number(value)
     finder = PackageFinder()
     compiled = compile_xacro(path, constants, numbers, finder)
     if compiled is None:

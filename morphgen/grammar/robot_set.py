@@ -22,10 +22,10 @@ from typing import Any
 
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import URDF, write_bundle
-from morphgen.formats.card import rounded
 from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import locked_folder, partial_path, replacing_folder, write_atomic
 from morphgen.formats.resolve import portable_uri
+from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.grammar.grammar_file import Grammar, grammar_from_text
 from morphgen.grammar.library import Library, default_library
@@ -211,11 +211,11 @@ def _record(drawn: Sample) -> Record:
         "dof": robot.dof,
         "links": len(robot.links),
         "movable": len(robot.movable_joints),
-        "reach": rounded(drawn.properties.reach),
-        "mass": rounded(robot.mass),
+        "reach": round_number(drawn.properties.reach),
+        "mass": round_number(robot.mass),
         "findings": sorted({finding.code for finding in drawn.findings}),
         "rejected": dict(sorted(drawn.rejected.items())),
-        "choices": {key: rounded(value) for key, value in drawn.choices.items()},
+        "choices": {key: round_number(value) for key, value in drawn.choices.items()},
     }
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from morphgen.checks import check
 from morphgen.errors import GrammarError, MorphgenError
-from morphgen.formats.card import rounded
 from morphgen.formats.fits import with_stored_fits
+from morphgen.formats.rounding import round_number
 from morphgen.grammar.choosers import Choices, RandomChooser, RecordedChooser
 from morphgen.grammar.compose import MAX_HOME_OVERLAP, join, survey_contacts
 from morphgen.grammar.conditions import RobotProperties, clauses, holds
@@ -209,7 +209,7 @@ def _build_if_valid(
 ) -> tuple[Robot, RobotProperties, tuple[Finding, ...]] | str:
     """Compose a robot; return the reason as text if it breaks a condition or fails a check."""
     robot = join(derivation, library, name)
-    provenance = {**robot.provenance, "choices": {k: rounded(v) for k, v in choices.items()}}
+    provenance = {**robot.provenance, "choices": {k: round_number(v) for k, v in choices.items()}}
     robot = replace(robot, provenance=provenance)
     properties = RobotProperties(robot)
     # Cheap tests first: conditions, then overlaps at home, then all checks.

@@ -9,8 +9,7 @@ import pytest
 import morphgen
 from helpers.robots import arm
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.rounding import as_written, rounded_pose
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import as_written, format_number, rounded_pose
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Robot
 from morphgen.model.rotation import to_matrix
@@ -30,7 +29,9 @@ RANDOM = RNG.uniform(-math.pi, math.pi, (200, 3)).tolist()
 
 def from_file(pose):
     """A pose as a URDF gives it back."""
-    xyz, rpy = ([float(number(value)) for value in triple] for triple in (pose.position, pose.rpy))
+    xyz, rpy = (
+        [float(format_number(value)) for value in triple] for triple in (pose.position, pose.rpy)
+    )
     return Pose.from_xyz_rpy(xyz, rpy)
 
 

@@ -8,8 +8,9 @@ import pytest
 from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_robot
+from morphgen.formats.rounding import format_number
 from morphgen.formats.urdf import UnsoundError, read_urdf, with_frames
-from morphgen.formats.urdf_text import number, urdf_text
+from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.geometry import Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.kinematics import frame_pose, random_configurations
 from morphgen.model.robot import Joint, Link, Robot
@@ -142,7 +143,7 @@ def test_a_missing_mesh_is_named(tmp_path):
 def test_a_missing_file_and_arguments_for_no_xacro(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         read_urdf(tmp_path / "none.urdf")
-    with pytest.raises(FormatError, match="no xacro"):
+    with pytest.raises(FormatError, match="not a xacro"):
         read_urdf(written(arm(), tmp_path), {"a": "1"})
 
 
@@ -157,4 +158,4 @@ def test_a_missing_file_and_arguments_for_no_xacro(tmp_path):
     ],
 )
 def test_numbers_have_twelve_digits_and_no_negative_zero(value, text):
-    assert number(value) == text
+    assert format_number(value) == text

@@ -7,7 +7,7 @@ import pytest
 
 from morphgen.errors import FormatError
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.urdf_text import number
+from morphgen.formats.rounding import format_number
 from morphgen.formats.xacro import expand
 from morphgen.formats.xacro_compile import compile_xacro, trace
 from morphgen.grammar.library import default_library
@@ -38,9 +38,9 @@ def values_of(manifest, rng):
     for name, parameter in manifest.parameters.items():
         if parameter.integer:
             drawn = rng.integers(int(parameter.minimum), int(parameter.maximum) + 1)
-            constants[name] = number(float(drawn))
+            constants[name] = format_number(float(drawn))
         else:
-            numbers[name] = number(rng.uniform(parameter.minimum, parameter.maximum))
+            numbers[name] = format_number(rng.uniform(parameter.minimum, parameter.maximum))
     return constants, numbers
 
 
@@ -60,7 +60,7 @@ def test_ends_and_whole_numbers_are_filled_in_alike(manifest):
     constants, _ = values_of(manifest, np.random.default_rng(1))
     for pick in (min, max):
         numbers = {
-            name: number(pick(p.minimum, p.maximum))
+            name: format_number(pick(p.minimum, p.maximum))
             for name, p in manifest.parameters.items()
             if not p.integer
         }

@@ -6,7 +6,7 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError
-from morphgen.formats.card import rounded
+from morphgen.formats.rounding import round_number
 from morphgen.grammar import sampling
 from morphgen.grammar.derivation import difference
 from morphgen.grammar.sampling import SamplingError, mutate, sample_robot
@@ -14,7 +14,7 @@ from morphgen.grammar.sampling import SamplingError, mutate, sample_robot
 
 def as_in_index(choices):
     """Choices as they come back from a file."""
-    return json.loads(json.dumps({key: rounded(value) for key, value in choices.items()}))
+    return json.loads(json.dumps({key: round_number(value) for key, value in choices.items()}))
 
 
 def neighbours(found, origin, n, seed=0):

@@ -1,4 +1,4 @@
-"""What a URDF's elements must contain: children, attributes, numbers."""
+"""The URDF elements that are read, with checks of their children, attributes and numbers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,48 @@ from dataclasses import dataclass
 
 from lxml import etree
 
-from morphgen.formats.structure_place import Place, shortened
 from morphgen.model.findings import Finding
 
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+MAX_NUMBER = 1e20
+"""Largest number that a URDF may hold; simulators overflow above it."""
+MIN_LENGTH = 1e-6
+"""Smallest length of a primitive [m]; simulators round smaller ones to zero."""
+MAX_TEXT = 1000
+"""Longest name or file name in a URDF [characters]."""
+SHOWN_TEXT = 80
+"""Longest excerpt of a text in a message [characters]."""
+
+
+@dataclass(frozen=True)
+class SourceLocation:
+    """The link, joint or robot of a URDF that an element belongs to."""
+
+    origin: str
+    """Name of the file."""
+    owner: str
+    """Kind and name of the top-level element, such as ``link 'base'``."""
+
+    @classmethod
+    def of(cls, element: etree._Element, origin: str) -> SourceLocation:
+        """Return the location named after a link, joint or other top-level element."""
+        name = element.get("name")
+        owner = f"{element.tag} {shortened(name)!r}" if name else f"{element.tag} without a name"
+        return cls(origin, owner)
+
+    def finding(
+        self, element: etree._Element, code: str, why: str, fix: str, repair: str = ""
+    ) -> Finding:
+        """Return a finding at an element's line: a warning if reading repairs it, else an error."""
+        where = f"{self.origin}:{element.sourceline} {self.owner}"
+        return Finding(code, "warning" if repair else "error", where, why, fix, repair)
+
+
+def shortened(text: str) -> str:
+    """Return the beginning of a text, for a message."""
+    return text if len(text) <= SHOWN_TEXT else f"{text[: SHOWN_TEXT - 3]}..."
 
 
 @dataclass(frozen=True)
@@ -21,22 +59,16 @@ class Numbers:
 
     attribute: str
     counts: tuple[int, ...] = (1,)
-    """How many numbers it may hold."""
+    """Valid counts of numbers."""
     required: bool = False
     positive: bool = False
     nonzero: bool = False
-    commas_read: bool = False
-    """Whether commas between the numbers are understood all the same."""
-    surplus_read: bool = False
-    """Whether more numbers are understood all the same: the first ones count."""
+    accepts_commas: bool = False
+    """Whether commas between the numbers are repaired instead of refused."""
+    accepts_surplus: bool = False
+    """Whether surplus numbers are ignored instead of refused."""
 
 
-LARGEST = 1e20
-"""Largest number that a URDF may hold: beyond, simulators overflow."""
-SMALLEST = 1e-6
-"""Smallest length of a primitive, metres: below, simulators round it to nothing."""
-LONGEST_TEXT = 1000
-"""Characters of the longest name or file name of a URDF."""
 CHILDREN = {
     "link": ("inertial", "visual", "collision"),
     "inertial": ("origin", "mass", "inertia"),
@@ -56,13 +88,11 @@ CHILDREN = {
         "safety_controller",
     ),
 }
-"""The elements that are read, by the element around them."""
+"""Child elements that are read, by parent element."""
 
 _REPEATABLE = ("visual", "collision")
-_REQUIRED_CHILDREN = {
-    "joint": ("parent", "child"),
-}
-_EXPECTED_CHILDREN = {
+_EXPECTED_CHILDREN: dict[str, dict[str, str]] = {
+    "joint": {"parent": "", "child": ""},
     "inertial": {
         "mass": "its <inertial> without <mass> was left out",
         "inertia": "the missing <inertia> was read as zero",
@@ -70,7 +100,7 @@ _EXPECTED_CHILDREN = {
     "visual": {"geometry": "a <visual> without <geometry> was left out"},
     "collision": {"geometry": "a <collision> without <geometry> was left out"},
 }
-"""Children that ROS reads a robot without, and what becomes of what holds them."""
+"""Children that an element should have, with the repair if one is missing; empty: an error."""
 _REQUIRED_TEXT = {
     "robot": ("name",),
     "link": ("name",),
@@ -95,7 +125,7 @@ _NUMBERS = {
     "inertia": tuple(
         Numbers(name, required=True) for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     ),
-    "box": (Numbers("size", (3,), required=True, positive=True, commas_read=True),),
+    "box": (Numbers("size", (3,), required=True, positive=True, accepts_commas=True),),
     "sphere": (Numbers("radius", required=True, positive=True),),
     "capsule": (
         Numbers("radius", required=True, positive=True),
@@ -105,29 +135,29 @@ _NUMBERS = {
         Numbers("radius", required=True, positive=True),
         Numbers("length", required=True, positive=True),
     ),
-    "mesh": (Numbers("scale", (1, 3), nonzero=True, commas_read=True, surplus_read=True),),
+    "mesh": (Numbers("scale", (1, 3), nonzero=True, accepts_commas=True, accepts_surplus=True),),
     "color": (Numbers("rgba", (4,)),),
 }
 
 
-def content_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
-    """Look at an element and everything read inside it.
+def content_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
+    """Check an element and everything that is read inside it.
 
     Args:
         element: A ``<link>``, ``<joint>``, ``<material>`` or ``<robot>`` (its attributes only).
-        place: The place to name in findings.
+        location: The location that findings name.
     """
     tag = element.tag
-    yield from _text_findings(element, place)
+    yield from _text_findings(element, location)
     for numbers in _NUMBERS.get(tag, ()):
-        yield from _number_findings(element, numbers, place)
-    yield from _missing_findings(element, place)
+        yield from _number_findings(element, numbers, location)
+    yield from _missing_findings(element, location)
     if tag == "geometry":
-        yield from _geometry_findings(element, place)
+        yield from _geometry_findings(element, location)
     for name in CHILDREN.get(tag, ()):
         children = element.findall(name)
         if len(children) > 1 and name not in _REPEATABLE:
-            yield place.finding(
+            yield location.finding(
                 children[1],
                 "element-repeated",
                 f"<{tag}> has {len(children)} <{name}>; the first one counts",
@@ -135,23 +165,23 @@ def content_findings(element: etree._Element, place: Place) -> Iterator[Finding]
                 f"of {len(children)} <{name}> the first one was taken",
             )
         for child in children:
-            yield from content_findings(child, place)
+            yield from content_findings(child, location)
 
 
-def _text_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+def _text_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
     tag = element.tag
     for name in _REQUIRED_TEXT.get(tag, ()):
         value = element.get(name, "")
-        if len(value) > LONGEST_TEXT or not value.isprintable():
-            yield place.finding(
+        if len(value) > MAX_TEXT or not value.isprintable():
+            yield location.finding(
                 element,
                 "text-invalid",
                 f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
-                f"cannot be printed, or more than {LONGEST_TEXT} characters",
+                f"cannot be printed, or more than {MAX_TEXT} characters",
                 "write a shorter text of printable characters",
             )
         if not value.strip():
-            yield place.finding(
+            yield location.finding(
                 element,
                 "attribute-missing",
                 f"<{tag}> has no {name}",
@@ -159,19 +189,11 @@ def _text_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
             )
 
 
-def _missing_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+def _missing_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
     tag = element.tag
-    for name in _REQUIRED_CHILDREN.get(tag, ()):
-        if element.find(name) is None:
-            yield place.finding(
-                element,
-                "element-missing",
-                f"<{tag}> has no <{name}>",
-                f"add <{name}> or drop <{tag}>",
-            )
     for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
         if element.find(name) is None:
-            yield place.finding(
+            yield location.finding(
                 element,
                 "element-missing",
                 f"<{tag}> has no <{name}>",
@@ -180,11 +202,11 @@ def _missing_findings(element: etree._Element, place: Place) -> Iterator[Finding
             )
 
 
-def _geometry_findings(element: etree._Element, place: Place) -> Iterator[Finding]:
+def _geometry_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
     kinds = CHILDREN["geometry"]
     shapes = [child for child in element if isinstance(child.tag, str)]
     if not shapes:
-        yield place.finding(
+        yield location.finding(
             element,
             "geometry-missing",
             "<geometry> is empty",
@@ -195,15 +217,15 @@ def _geometry_findings(element: etree._Element, place: Place) -> Iterator[Findin
     known = [shape for shape in shapes if shape.tag in kinds]
     for shape in shapes:
         if shape not in known:
-            yield place.finding(
+            yield location.finding(
                 shape,
                 "geometry-unknown",
-                f"<{shortened(shape.tag)}> is no geometry that URDF knows",
+                f"<{shortened(shape.tag)}> is not a geometry of URDF",
                 f"use one of {_tags(kinds)}",
                 f"the geometry <{shortened(shape.tag)}> was left out",
             )
     if len(known) > 1:
-        yield place.finding(
+        yield location.finding(
             known[1],
             "element-repeated",
             f"<geometry> holds {len(known)} shapes; the first one counts",
@@ -212,12 +234,14 @@ def _geometry_findings(element: etree._Element, place: Place) -> Iterator[Findin
         )
 
 
-def _number_findings(element: etree._Element, numbers: Numbers, place: Place) -> Iterator[Finding]:
+def _number_findings(
+    element: etree._Element, numbers: Numbers, location: SourceLocation
+) -> Iterator[Finding]:
     name = numbers.attribute
     text = element.get(name)
     if text is None:
         if numbers.required:
-            yield place.finding(
+            yield location.finding(
                 element,
                 "attribute-missing",
                 f"<{element.tag}> has no {name}",
@@ -230,16 +254,16 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
     words = text.replace(",", " ").split() if vector else text.split()
     wrong = [word for word in words if not _is_number(word)]
     if wrong:
-        yield place.finding(
+        yield location.finding(
             element,
             "number-malformed",
-            f"{shown}: {shortened(wrong[0])!r} is no finite decimal number",
+            f"{shown}: {shortened(wrong[0])!r} is not a finite decimal number",
             "write decimal numbers with a point, separated by spaces",
         )
         return
     if len(words) not in numbers.counts:
-        surplus = numbers.surplus_read and len(words) > max(numbers.counts)
-        yield place.finding(
+        surplus = numbers.accepts_surplus and len(words) > max(numbers.counts)
+        yield location.finding(
             element,
             "number-count",
             f"{shown} holds {len(words)} numbers",
@@ -250,23 +274,23 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
             return
         words = words[: max(numbers.counts)]
     if "," in text:
-        yield place.finding(
+        yield location.finding(
             element,
             "number-commas",
             f"{shown} separates numbers by commas, which MuJoCo refuses",
             "separate them by spaces",
-            f"the commas of {shown} were read as spaces" if numbers.commas_read else "",
+            f"the commas of {shown} were read as spaces" if numbers.accepts_commas else "",
         )
     values = [float(word) for word in words]
-    if max(map(abs, values)) > LARGEST or (numbers.positive and 0 < min(values) < SMALLEST):
-        yield place.finding(
+    if max(map(abs, values)) > MAX_NUMBER or (numbers.positive and 0 < min(values) < MIN_LENGTH):
+        yield location.finding(
             element,
             "number-absurd",
-            f"{shown} is no number of a robot",
-            f"write numbers up to {LARGEST:g} and lengths from {SMALLEST:g}, in SI units",
+            f"{shown} is out of range",
+            f"write numbers up to {MAX_NUMBER:g} and lengths from {MIN_LENGTH:g}, in SI units",
         )
     if numbers.positive and min(values) <= 0:
-        yield place.finding(
+        yield location.finding(
             element,
             "size-not-positive",
             f"{shown} is not positive",
@@ -274,7 +298,7 @@ def _number_findings(element: etree._Element, numbers: Numbers, place: Place) ->
             f"the shape {shown} was left out" if min(values) == 0 else "",
         )
     if numbers.nonzero and 0.0 in values:
-        yield place.finding(
+        yield location.finding(
             element,
             "mesh-scale-invalid",
             f"{shown} flattens the mesh",
