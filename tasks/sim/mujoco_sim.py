@@ -13,7 +13,6 @@ from morphgen.checks.self_collision import capture_mujoco_warnings
 from morphgen.errors import DivergedError, SimulationError
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
-from morphgen.tasks.sim.mujoco_clock import unclocked
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_state import State
@@ -152,8 +151,7 @@ class MujocoSimulation:
             self._control.controls(
                 self._targets, *self._state.joints(), self._state.velocities, out=self._controls
             )
-            with unclocked():
-                refused = self._advance()
+            refused = self._advance()
             self._state.read()
         faults = self._state.faults() | refused
         if faults:
