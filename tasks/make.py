@@ -11,6 +11,7 @@ from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.model.robot import Robot
+from morphgen.processes import Progress, unseen
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
@@ -50,6 +51,7 @@ def make_batch(
     configs: Sequence[TaskConfig] = (),
     cache: Path | None = None,
     library: Iterable[Path] = (),
+    progress: Progress = unseen,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
     """Make environments of robots at tasks; environment i has robot i modulo their number.
@@ -64,6 +66,8 @@ def make_batch(
         configs: Constants of tasks, such as a ``ReachConfig``; other tasks have their defaults.
         cache: Folder of stored goal sets; by default one in the user's cache.
         library: Folders of your own parts.
+        progress: Called with the number of robots whose goal set is ready, and their total;
+            sampling a set that is not in the cache takes seconds.
         **options: Arguments of ``batch_from_specs``.
 
     Raises:
@@ -81,10 +85,12 @@ def make_batch(
     with_obstacles: list[bool] = _one_for_each("obstacles", obstacles, robots)
     config = GoalConfig(goal_seed, tuple(configs))
     loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
-    specs = [
-        env_spec(loaded[source], name, config, obstacles=has_obstacles, cache=cache)
-        for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True)
-    ]
+    specs = []
+    for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True):
+        progress(len(specs), len(robots))
+        robot = loaded[source]
+        specs.append(env_spec(robot, name, config, obstacles=has_obstacles, cache=cache))
+    progress(len(specs), len(robots))
     return batch_from_specs(specs, num_envs, library=folders, **options)
 
 
@@ -98,6 +104,7 @@ def make_split_batch(
     goals: Path | None = None,
     cache: Path | None = None,
     library: Iterable[Path] = (),
+    progress: Progress = unseen,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
     """Make environments of a split's robots, at the tasks and with the obstacles of the split.
@@ -111,6 +118,8 @@ def make_split_batch(
         goals: Folder of a split built with goals, whose goal sets are used.
         cache: Folder of stored goal sets; by default one in the user's cache.
         library: Folders of your own parts.
+        progress: Called with the number of robots whose goal set is ready, and their total;
+            sampling a set that is not in the cache takes seconds.
         **options: Arguments of ``batch_from_specs``.
 
     Raises:
@@ -122,16 +131,12 @@ def make_split_batch(
     members = split.side(side)
     _require_env_for_each(num_envs, len(members))
     sets = read_goals(goals, side) if goals is not None else None
-    specs = [
-        member_spec(
-            member,
-            parts,
-            config,
-            cache=cache,
-            shipped=shipped_goal_set(sets, member.name, goals),
-        )
-        for member in members
-    ]
+    specs = []
+    for member in members:
+        progress(len(specs), len(members))
+        shipped = shipped_goal_set(sets, member.name, goals)
+        specs.append(member_spec(member, parts, config, cache=cache, shipped=shipped))
+    progress(len(specs), len(members))
     return batch_from_specs(specs, num_envs, library=folders, **options)
 
 

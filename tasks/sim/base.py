@@ -104,8 +104,8 @@ class Simulation(Protocol):
             targets: Target positions of the independent joints, shape (n, J).
 
         Raises:
-            DivergedError: If simulations became unstable; it names them, and each must be reset
-                before the next step. All others have moved.
+            DivergedError: If environments diverged; it names them, and each must be reset before
+                the next step. All others have moved.
             SimulationError: If a worker died.
         """
 

@@ -1,4 +1,4 @@
-"""PyBullet behind the protocol of simulators, in this process and others beside it."""
+"""PyBullet as a simulator: environments divided among this process and workers."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from morphgen.errors import DivergedError, SimulationError
+from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator
-from morphgen.tasks.sim.bullet_batch import BulletBatch, most_joints
-from morphgen.tasks.sim.bullet_files import export_robots
+from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32
 from morphgen.tasks.sim.bullet_workers import (
     STEP,
     Share,
-    SharedArrays,
+    SharedBuffers,
     Worker,
     end,
     gather,
@@ -26,24 +27,23 @@ from morphgen.tasks.sim.bullet_workers import (
     send,
     start,
 )
-from morphgen.tasks.sim.row_tensors import RowTensors
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 _BASE_LOAD = 5
-"""What a step costs without joints, in joints."""
+"""Cost of stepping an environment without joints, in joints."""
 
 
-class BulletSimulation(RowTensors):
-    """Environments in PyBullet, divided among processes of which this is one; see ``Simulation``.
+class BulletSimulation:
+    """Environments in PyBullet, divided among processes of which this is one; a ``Simulation``.
 
-    Each has a client of its own, so that none can influence another, and the bits are the same with
-    any number of processes. PyBullet gives a client 36 MB and some 25 ms to start, whatever is in
-    it, and a process 1024 of them.
+    Every environment has its own client, so that none can influence another, and the bits are the
+    same for any number of processes. A client takes 36 MB and some 25 ms to start, whatever is in
+    it; a process can have 1024.
 
-    A step is a few bytes through a pipe to every other process and back, while this one steps its
-    own share; targets and states are in memory that all share. That memory has no name, so that
-    nothing is left of it whatever happens to the processes, and a worker ends when its pipe does.
-    Workers are started afresh ("spawn"): a script that makes them needs
-    ``if __name__ == "__main__":``.
+    A step sends a few bytes through a pipe to every worker and back, while this process steps its
+    own share; targets and states are in shared memory. That memory has no name, so that nothing is
+    left of it whatever happens to the processes, and a worker ends when its pipe does. Workers are
+    started afresh ("spawn"): a script that makes them needs ``if __name__ == "__main__":``.
     """
 
     def __init__(
@@ -52,9 +52,9 @@ class BulletSimulation(RowTensors):
         """Load every scene; its robot is at zero until the first reset.
 
         Args:
-            scenes: One for each environment.
-            contacts: What may touch what; by default all.
-            processes: With this one; no more than scenes are used.
+            scenes: Scene of each environment.
+            contacts: Pairs of things that collide; by default everything.
+            processes: Number of processes, this one included; at most one per scene is used.
 
         Raises:
             SimulationError: If PyBullet cannot hold a scene, or a worker dies.
@@ -66,10 +66,17 @@ class BulletSimulation(RowTensors):
             raise ValueError(
                 f"{processes} processes for {len(scenes)} scenes; both must be at least 1"
             )
-        n, joints = len(scenes), most_joints(scenes)
-        arrays = SharedArrays.zeros(n, joints)
-        rows, self._targets = arrays.split()
-        super().__init__(scenes, rows)
+        self.scenes = tuple(scenes)
+        self.device = torch.device("cpu")
+        dofs = np.array([scene.robot.dof for scene in scenes], np.int64)
+        num_joints = int(dofs.max())
+        shared = SharedBuffers.zeros(len(scenes), num_joints)
+        buffers, self._targets = shared.split()
+        self.q, self.qd = torch.from_numpy(buffers.q), torch.from_numpy(buffers.qd)
+        self.block_pose = torch.from_numpy(buffers.block_pose)
+        self.block_velocity = torch.from_numpy(buffers.block_velocity)
+        self._is_joint = np.arange(num_joints) < dofs[:, None]
+        self._has_block = np.array([scene.block is not None for scene in scenes], bool)
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
         self._workers: list[Worker] = []
         self._own: list[BulletBatch] = []
@@ -86,8 +93,8 @@ class BulletSimulation(RowTensors):
                 for envs in divide(scenes, processes)
             )
             for number, share in enumerate(others, start=1):
-                self._workers.append(start(number, share, arrays))
-            self._own.append(load(first, rows))
+                self._workers.append(start(number, share, shared))
+            self._own.append(load(first, buffers))
             self._envs = np.array(first.envs)
             failures = gather(self._workers)
             if failures:
@@ -104,44 +111,44 @@ class BulletSimulation(RowTensors):
             SimulationError: If the simulation is closed, or a worker died.
         """
         self._require_open()
-        chosen, positions, poses = self._checked_state(envs, q, block_pose)
-        busy = []
+        indices, positions, poses = self._checked_state(envs, q, block_pose)
+        messages = []
         for worker in self._workers:
-            mine = np.isin(chosen, worker.envs)
+            mine = np.isin(indices, worker.envs)
             if mine.any():
-                busy.append((worker, pickle.dumps((chosen[mine], positions[mine], poses[mine]))))
-        mine = np.isin(chosen, self._envs)
-        own = chosen[mine], positions[mine], poses[mine]
-        self._together(busy, lambda batch: batch.reset(*own))
+                message = pickle.dumps((indices[mine], positions[mine], poses[mine]))
+                messages.append((worker, message))
+        mine = np.isin(indices, self._envs)
+        own = indices[mine], positions[mine], poses[mine]
+        self._run(messages, lambda batch: batch.reset(*own))
 
     def step(self, targets: torch.Tensor) -> None:
-        """Move all by one control step; see ``Simulation.step``.
+        """Advance all environments by one control step; see ``Simulation.step``.
 
         Raises:
             ValueError: If the shape is wrong, or a target is not finite.
-            DivergedError: If environments became unstable.
-            SimulationError: If the simulation is closed, or a worker died; in the last case it is
-                closed thereby.
+            DivergedError: If environments diverged.
+            SimulationError: If the simulation is closed, or a worker died, which closes it.
         """
         self._require_open()
         self._targets[:] = self._checked_targets(targets)
         messages = [(worker, STEP) for worker in self._workers]
-        self._together(messages, lambda batch: batch.step(self._targets))
+        self._run(messages, lambda batch: batch.step(self._targets))
 
     def close(self) -> None:
-        """Free the clients and end the workers; a second time does nothing."""
+        """Free the clients and end the workers; a second call does nothing."""
         self._free()
 
     def _require_open(self) -> None:
         if not self._free.alive:
             raise SimulationError("the simulation is closed")
 
-    def _together(
+    def _run(
         self, messages: Sequence[tuple[Worker, bytes]], own: Callable[[BulletBatch], None]
     ) -> None:
-        """Tell workers what to do, do this process's own, and wait until all is done.
+        """Send messages to workers, do this process's share, and wait for all answers.
 
-        Whatever interrupts this leaves answers behind that nobody reads, so it closes.
+        An interruption closes the simulation: it leaves answers in the pipes that nobody reads.
         """
         failures: list[Exception] = []
         try:
@@ -155,15 +162,74 @@ class BulletSimulation(RowTensors):
         except BaseException:
             self.close()
             raise
-        if failures:
-            raise _as_one(failures)
+        reasons: dict[int, str] = {}
+        for failure in failures:
+            if not isinstance(failure, DivergedError):
+                raise failure
+            reasons |= failure.reasons
+        if reasons:
+            raise DivergedError(reasons)
+
+    def _checked_targets(self, targets: torch.Tensor) -> Float32:
+        """Return valid targets of ``step`` as a contiguous array; padding may be anything."""
+        array = np.ascontiguousarray(targets.numpy(), np.float32)
+        if array.shape != self._is_joint.shape:
+            raise ValueError(f"targets have shape {array.shape}, not {self._is_joint.shape}")
+        invalid = self._is_joint & ~np.isfinite(array)
+        if invalid.any():
+            env = int(invalid.any(axis=1).argmax())
+            raise ValueError(f"{self._name(env)}: targets {array[env].tolist()}")
+        return array
+
+    def _checked_state(
+        self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor
+    ) -> tuple[NDArray[np.int64], Float32, Float32]:
+        """Return valid arguments of ``reset`` as arrays."""
+        n, joints = self._is_joint.shape
+        indices, positions, poses = envs.numpy(), q.numpy(), block_pose.numpy()
+        if positions.shape != (len(indices), joints) or poses.shape != (len(indices), 7):
+            raise ValueError(
+                f"reset of {len(indices)} environments with q of shape {positions.shape} and "
+                f"blocks of shape {poses.shape}; they need ({len(indices)}, {joints}) and (.., 7)"
+            )
+        if ((indices < 0) | (indices >= n)).any():
+            raise ValueError(f"reset of environments {indices.tolist()}; there are {n}")
+        invalid = (self._is_joint[indices] & ~np.isfinite(positions)).any(axis=1)
+        invalid |= self._has_block[indices] & ~np.isfinite(poses).all(axis=1)
+        if invalid.any():
+            k = int(invalid.argmax())
+            raise ValueError(
+                f"{self._name(int(indices[k]))}: reset to q {positions[k].tolist()}, "
+                f"block {poses[k].tolist()}"
+            )
+        return indices, positions, poses
+
+    def _name(self, env: int) -> str:
+        return f"environment {env} ({self.scenes[env].robot.name!r})"
+
+
+def export_robots(scenes: Sequence[Scene], folder: Path) -> list[ExportedRobot]:
+    """Write the URDF of every robot in the scenes once; return what each scene loads.
+
+    Raises:
+        FormatError: If a robot cannot be written.
+        MeshError: If a collision mesh cannot be read.
+    """
+    written: dict[int, ExportedRobot] = {}
+    for scene in scenes:
+        key = id(scene.robot)
+        if key not in written:
+            merged = merge_rigid_links(scene.robot)
+            bundle = write_bundle(merged, folder / f"robot{len(written)}", picture=False)
+            written[key] = bundle / URDF, merged
+    return [written[id(scene.robot)] for scene in scenes]
 
 
 def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
-    """Share environments out so that all processes have about as many joints to move.
+    """Divide environments among processes so that all have about as many joints to simulate.
 
     Returns:
-        The environments of each process, ascending; none is without.
+        The environments of each process, ascending; none is empty.
     """
     shares: list[list[int]] = [[] for _ in range(min(processes, len(scenes)))]
     loads = [0] * len(shares)
@@ -173,16 +239,6 @@ def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
         shares[lightest].append(env)
         loads[lightest] += weights[env]
     return [sorted(share) for share in shares]
-
-
-def _as_one(failures: Sequence[Exception]) -> Exception:
-    """What processes found unstable is one error, if nothing else failed."""
-    reasons: dict[int, str] = {}
-    for failure in failures:
-        if not isinstance(failure, DivergedError):
-            return failure
-        reasons |= failure.reasons
-    return DivergedError(reasons)
 
 
 def _free(
@@ -198,5 +254,5 @@ SIMULATOR = Simulator(
     "pybullet",
     lambda scenes, contacts, workers: BulletSimulation(scenes, contacts, processes=workers),
     native_step=("pybullet", "stepSimulation"),
-    max_envs=128,  # one takes 36 MB
+    max_envs=128,  # an environment takes 36 MB
 )

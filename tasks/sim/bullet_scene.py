@@ -13,7 +13,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.level_links import level_links
+from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 try:
     with quiet():
@@ -85,7 +85,7 @@ class BulletScene:
         Args:
             scene: What to load.
             urdf: The file of ``body``, as ``export_robots`` writes it.
-            body: The scene's robot as ``rigid_bodies``.
+            body: The scene's robot as ``merge_rigid_links``.
             contacts: What may touch what.
 
         Raises:
@@ -147,7 +147,7 @@ class BulletScene:
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
             )
         held = {link.name for link in rigid_groups(body)[0].links}
-        level = level_links(body, self._scene.T_world_root)
+        level = ground_contact_links(body, self._scene.T_world_root)
         self._level = [link for name, link in links.items() if name in level]
         for name, link in links.items():
             pybullet.changeDynamics(

@@ -1,4 +1,4 @@
-"""Processes that hold a share of the environments in PyBullet, in memory that all share."""
+"""Worker processes with a share of the environments in PyBullet, and the memory that they share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from morphgen.errors import SimulationError
 from morphgen.processes import sigint_blocked
 from morphgen.tasks.sim.base import Contacts, Scene
-from morphgen.tasks.sim.bullet_batch import BulletBatch, Exported, Float32, Rows
+from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32, StateBuffers
 
 if TYPE_CHECKING:
     from ctypes import Array, c_float
@@ -25,27 +25,27 @@ if TYPE_CHECKING:
     Memory = Array[c_float]
 
 STEP = b"step"
-"""The message to a worker that it is to step; any other is pickled."""
+"""Message that makes a worker step; any other message is pickled."""
 _DONE = b"done"
 _EXIT_CODE_WAIT = 0.5
-"""Seconds in which a worker whose pipe has ended is expected to be gone."""
+"""Time for a worker whose pipe has ended to exit [s]."""
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True)
 class Share:
-    """What a process has of the environments."""
+    """The environments of one process."""
 
     scenes: Sequence[Scene]
     contacts: Contacts
-    exported: Sequence[Exported]
+    exported: Sequence[ExportedRobot]
     envs: Sequence[int]
-    """Which they are of all."""
+    """Indices of the environments."""
 
 
 @dataclass(frozen=True, eq=False)
 class Worker:
-    """A process, and the way to talk to it."""
+    """A worker process and its pipe."""
 
     process: SpawnProcess
     pipe: Connection
@@ -56,45 +56,45 @@ class Worker:
 
 
 @dataclass(frozen=True, eq=False)
-class SharedArrays:
-    """What n environments of J joints report, and their targets, in memory of all processes."""
+class SharedBuffers:
+    """States and targets of n environments with J joints, in memory of all processes."""
 
     memory: Memory
     n: int
     joints: int
 
     @classmethod
-    def zeros(cls, n: int, joints: int) -> SharedArrays:
-        """Make room."""
+    def zeros(cls, n: int, joints: int) -> SharedBuffers:
+        """Allocate the memory, filled with zeros."""
         return cls(_CONTEXT.RawArray("f", n * (3 * joints + 7 + 6)), n, joints)
 
-    def split(self) -> tuple[Rows, Float32]:
-        """What a simulation reports, and its targets (n, J)."""
+    def split(self) -> tuple[StateBuffers, Float32]:
+        """Return views of the states, and of the targets (n, J)."""
         n, joints = self.n, self.joints
         flat = np.ctypeslib.as_array(self.memory)
         ends = np.cumsum([n * joints, n * joints, n * 7, n * 6])
         q, qd, pose, velocity, targets = (part.reshape(n, -1) for part in np.split(flat, ends))
-        return Rows(q, qd, pose, velocity), targets
+        return StateBuffers(q, qd, pose, velocity), targets
 
 
-def load(share: Share, rows: Rows) -> BulletBatch:
+def load(share: Share, buffers: StateBuffers) -> BulletBatch:
     """Load a share's scenes into this process; errors as of ``BulletBatch``."""
-    return BulletBatch(share.scenes, share.contacts, share.exported, rows, share.envs)
+    return BulletBatch(share.scenes, share.contacts, share.exported, buffers, share.envs)
 
 
-def start(number: int, share: Share, arrays: SharedArrays) -> Worker:
+def start(number: int, share: Share, shared: SharedBuffers) -> Worker:
     """Start a worker, which loads its share and then answers.
 
     Args:
-        number: Its name.
-        share: What it holds.
-        arrays: Of all processes.
+        number: Name of the worker.
+        share: Environments of the worker.
+        shared: Memory of all processes.
 
     Raises:
-        SimulationError: If it died already.
+        SimulationError: If the worker died already.
     """
     ours, theirs = _CONTEXT.Pipe()
-    process = _CONTEXT.Process(target=_serve, args=(theirs, arrays), name=str(number), daemon=True)
+    process = _CONTEXT.Process(target=_serve, args=(theirs, shared), name=str(number), daemon=True)
     worker = Worker(process, ours, np.array(share.envs))
     try:
         with sigint_blocked():
@@ -108,10 +108,10 @@ def start(number: int, share: Share, arrays: SharedArrays) -> Worker:
 
 
 def send(worker: Worker, message: bytes) -> None:
-    """Tell a worker what to do.
+    """Send a message to a worker.
 
     Raises:
-        SimulationError: If it is dead.
+        SimulationError: If the worker is dead.
     """
     try:
         worker.pipe.send_bytes(message)
@@ -120,10 +120,10 @@ def send(worker: Worker, message: bytes) -> None:
 
 
 def gather(workers: Sequence[Worker]) -> list[Exception]:
-    """Wait for an answer of each; return what was raised there.
+    """Wait for the answer of each worker; return the exceptions raised there.
 
     Raises:
-        SimulationError: If one died.
+        SimulationError: If a worker died.
     """
     failures: list[Exception] = []
     for worker in workers:
@@ -137,7 +137,7 @@ def gather(workers: Sequence[Worker]) -> list[Exception]:
 
 
 def end(workers: Sequence[Worker]) -> None:
-    """Kill workers, which hold nothing that they would have to put in order."""
+    """Kill workers; they hold nothing that needs an orderly shutdown."""
     for worker in workers:
         worker.pipe.close()
         if worker.process.pid is not None:
@@ -155,17 +155,17 @@ def _death(worker: Worker) -> SimulationError:
     )
 
 
-def _serve(pipe: Connection, arrays: SharedArrays) -> None:
-    """What a worker does until its pipe ends; Ctrl-C is for the parent, which then closes it."""
+def _serve(pipe: Connection, shared: SharedBuffers) -> None:
+    """Serve messages until the pipe ends; the parent handles Ctrl-C and closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    rows, targets = arrays.split()
+    buffers, targets = shared.split()
     batch: BulletBatch | None = None
     try:
         while True:
             message = pipe.recv_bytes()
             try:
                 if batch is None:
-                    batch = load(pickle.loads(message), rows)
+                    batch = load(pickle.loads(message), buffers)
                 elif message == STEP:
                     batch.step(targets)
                 else:
@@ -173,8 +173,8 @@ def _serve(pipe: Connection, arrays: SharedArrays) -> None:
             except (SimulationError, ValueError) as error:
                 answer = pickle.dumps(error)
             except BaseException as error:
-                unforeseen = SimulationError(f"a worker failed: {type(error).__name__}: {error}")
-                pipe.send_bytes(pickle.dumps(unforeseen))
+                unexpected = SimulationError(f"a worker failed: {type(error).__name__}: {error}")
+                pipe.send_bytes(pickle.dumps(unexpected))
                 raise
             else:
                 answer = _DONE

@@ -1,4 +1,4 @@
-"""The law of position control in MuJoCo: its actuators, and the torques they lack."""
+"""Position control in MuJoCo: the targets of actuators, and torques that they cannot exert."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.tasks.sim.motor_law import GAIN, LAG, speed_limit
-from morphgen.tasks.sim.mujoco_gather import Gathered
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World
+from morphgen.tasks.sim.mujoco_state import GatheredArrays
 from morphgen.typing import Array
 
 
 def _mean_acceleration() -> tuple[float, float]:
-    """Mean over a control step, per unit of error and of velocity at its begin."""
+    """Return the mean acceleration over a control step per unit of initial error and velocity."""
     keep, pull = 1 - 2 * BANDWIDTH * TIMESTEP, BANDWIDTH**2 * TIMESTEP
     step = np.array([[1 - TIMESTEP * pull, -TIMESTEP * keep], [pull, keep]])
     _, (by_error, by_velocity) = np.linalg.matrix_power(step, SUBSTEPS).tolist()
@@ -30,44 +30,42 @@ BY_ERROR, BY_VELOCITY = _mean_acceleration()
 class PositionControl:
     """Controls that make every joint follow the law of ``morphgen.model.dynamics``.
 
-    An actuator with the gains of the joint's own inertia at home follows the law at home, and
-    as long as nothing else moves. What is missing, M(q) a - I a + c(q, v), with a the law's
-    acceleration, M the joint-space inertia, I what the gains assume and c Coriolis forces, is
-    added through the targets (inverse dynamics control; Siciliano et al. 2009, 8.5.2). It is
-    reckoned once a control step, with the mean of a over it; the actuator does the rest in
-    every physics step. The actuator's effort limits the sum.
+    An actuator whose gains assume the joint's own inertia at home follows the law at home, as long
+    as nothing else moves. The missing force M(q) a - I a + c(q, v), with the law's acceleration a,
+    the joint-space inertia M, the inertia I that the gains assume and Coriolis forces c, is added
+    through the targets (inverse dynamics control; Siciliano et al. 2009, 8.5.2). It is computed
+    once per control step, with the mean of a over the step; the actuator does the rest in every
+    physics step. The actuator's effort limits the sum. With the gains alone, arms would leave the
+    path of the law by centimetres within a second.
 
-    A joint's speed limit v keeps its target within ``LAG`` v of where it is. A target that does not
-    move faster is never farther away; one that is, because something holds the joint, pulls no
-    harder for it.
+    A joint's speed limit v keeps its target within ``LAG`` v of its position. A target that moves
+    no faster is never farther away; one that is, because something holds the joint, does not pull
+    harder.
 
-    Where a tool goes does then not depend on the simulator: with the gains alone, arms leave
-    the path of the law by centimetres within a second.
-
-    MuJoCo forgets the implicit damping of an actuator that is at its limit of effort. Light
-    links at the end of a long chain, on which a strong motor acts, then explode at 5 ms. So
-    ``PASSIVE`` of the damping belongs to the joints, where no limit touches it, and a torque makes
-    up for it at the velocity with which the control step began.
+    MuJoCo drops the implicit damping of an actuator at its effort limit. Light links at the end of
+    a long chain with a strong motor then diverge at a time step of 5 ms. So the fraction
+    ``PASSIVE`` of the damping belongs to the joints, which have no limit, and a torque compensates
+    it at the velocity with which the control step began.
     """
 
     def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData], joints: int) -> None:
         """Prepare.
 
         Args:
-            worlds: Model of every environment, n of them.
-            data: Its data.
-            joints: J, the width of targets.
+            worlds: Model of each environment, n of them.
+            data: Data of each environment.
+            joints: Number of independent joints with padding, J.
         """
         self._shape = (len(worlds), joints)
-        self._bias = Gathered([one.qfrc_bias for one in data])
-        self._weight = Gathered([one.qfrc_gravcomp for one in data])
+        self._bias = GatheredArrays([one.qfrc_bias for one in data])
+        self._weight = GatheredArrays([one.qfrc_gravcomp for one in data])
         self._applied = np.zeros(len(self._bias.flat))
         self._acceleration = np.zeros(len(self._bias.flat))
         self._force = np.zeros(len(self._bias.flat))
         self._products: list[tuple[mujoco.MjModel, mujoco.MjData, Array, Array]] = []
         self._compliance = np.zeros(self._shape)
         self._farthest = np.zeros(self._shape)
-        self._damping = Gathered([world.model.dof_damping for world in worlds])
+        self._damping = GatheredArrays([world.model.dof_damping for world in worlds])
         self._damping.read()
         slots, leaders, gains = [], [], []
         for i, (world, one) in enumerate(zip(worlds, data, strict=True)):
@@ -87,19 +85,19 @@ class PositionControl:
         self._gains = np.concatenate(gains)
 
     def applied_to(self, env: int) -> Array:
-        """Forces on the degrees of freedom of an environment, beside its actuators'; a view."""
+        """Return the extra forces on an environment's degrees of freedom, shape (nv,); a view."""
         begin, end = self._bias.begin[env : env + 2].tolist()
         return self._applied[begin:end]
 
     def controls(self, targets: Array, q: Array, qd: Array, velocities: Array, out: Array) -> None:
-        """Reckon the controls of all actuators; the data must be where the last step left them.
+        """Compute the controls of all actuators from the data as the last step left them.
 
         Args:
-            targets: Of the independent joints, shape (n, J), zero where there is none.
-            q: Their positions, likewise.
-            qd: Their velocities, likewise.
-            velocities: All of ``qvel`` of all environments, one after the other, and a zero.
-            out: Gets the controls, likewise.
+            targets: Targets of the independent joints, shape (n, J); padding is zero.
+            q: Positions of the independent joints, shape (n, J).
+            qd: Velocities of the independent joints, shape (n, J).
+            velocities: ``qvel`` of all environments, concatenated, and a zero.
+            out: Receives the controls, shape (n, J).
         """
         error = np.clip(targets - q, -self._farthest, self._farthest)
         wanted = BY_ERROR * error + BY_VELOCITY * qd
@@ -116,7 +114,7 @@ class PositionControl:
         out += q + error - PASSIVE * 2 / BANDWIDTH * qd - wanted / (GAIN * BANDWIDTH**2)
         np.multiply(self._damping.flat, velocities, out=self._applied)
 
-    def forget(self) -> None:
-        """Let go of the environments' data."""
+    def release(self) -> None:
+        """Release the environments' data."""
         self._products = []
-        self._bias, self._weight = Gathered(()), Gathered(())
+        self._bias, self._weight = GatheredArrays(()), GatheredArrays(())

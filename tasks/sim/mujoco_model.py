@@ -14,9 +14,8 @@ from morphgen.formats.mjcf import to_spec
 from morphgen.model.geometry import IDENTITY
 from morphgen.model.robot import Robot, sorted_pair
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.level_links import level_links
 from morphgen.tasks.sim.motor_law import GAIN
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.tasks.sim.rigid_bodies import ground_contact_links, merge_rigid_links
 from morphgen.typing import Array
 
 Indices = NDArray[np.int64]
@@ -128,11 +127,11 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
 
 
 def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]:
-    """The robot as ``rigid_bodies``, with a root that can be moved, and its spec.
+    """The robot as ``merge_rigid_links``, with a root that can be moved, and its spec.
 
     Joints have no friction of their own: the law of the position control says how they move.
     """
-    robot = _with_own_root(rigid_bodies(robot))
+    robot = _with_own_root(merge_rigid_links(robot))
     bare = replace(
         robot,
         joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints),
@@ -184,7 +183,7 @@ def _with_own_root(robot: Robot) -> Robot:
 def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
     held = spec.body(robot.root.name)
     held.pos, held.quat = scene.T_world_root.position, scene.T_world_root.quaternion
-    for name in level_links(robot, scene.T_world_root) - {robot.root.name}:
+    for name in ground_contact_links(robot, scene.T_world_root) - {robot.root.name}:
         for geom in spec.body(name).geoms:
             geom.conaffinity &= ~_BY_GROUND
     if scene.ground is not None:

@@ -1,4 +1,4 @@
-"""Scenes in MuJoCo that step together: data of its own for every environment, threads."""
+"""MuJoCo as a simulator: one ``MjData`` for every environment, stepped by threads."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
-from morphgen.tasks.sim.mujoco_state import State
+from morphgen.tasks.sim.mujoco_state import MujocoState
 from morphgen.typing import Array
 
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 
 
 class MujocoSimulation:
-    """Scenes in MuJoCo, on the CPU; implements ``Simulation``.
+    """Environments in MuJoCo, on the CPU; a ``Simulation``.
 
-    Every environment has data of its own, which one thread steps at a time and nothing else
-    touches: its numbers depend neither on the batch nor on the number of threads. MuJoCo steps
-    without Python's lock, so threads run side by side; they take the next environment when they
-    are done with one, so that bodies of different cost keep all busy.
+    Every environment has its own data, which one thread steps at a time and nothing else touches:
+    its numbers depend neither on the batch nor on the number of threads. MuJoCo steps without
+    Python's lock, so threads run in parallel; each takes the next environment when it has finished
+    one, so that robots of different cost keep all threads busy.
 
-    ``mujoco.rollout`` has native threads, but wants a call for every size of model, forgets the
+    ``mujoco.rollout`` has native threads, but needs a call for every size of model, forgets the
     solver's warm start between calls, and leaves no joint-space inertia for ``PositionControl``.
 
-    MuJoCo knows no speed limit of a joint; ``PositionControl`` keeps joints from going faster, but
-    for a third while they catch up.
+    MuJoCo has no speed limits of joints. ``PositionControl`` keeps joints below them, except for
+    up to a third more while they catch up.
     """
 
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, threads: int = 1
     ) -> None:
-        """Compile; every robot is at home, every block where its scene has it.
+        """Compile; every robot is at home, every block at its pose in the scene.
 
         Args:
-            scenes: One for every environment; equal robots are read once if they are one object.
-            contacts: What may touch what; by default everything.
-            threads: Threads that step, the caller's among them.
+            scenes: Scene of each environment; a robot that several share is compiled once.
+            contacts: Pairs of things that collide; by default everything.
+            threads: Number of threads that step, the caller's included.
 
         Raises:
             SimulationError: If MuJoCo refuses a scene.
             FormatError: If MJCF cannot express a robot.
             MeshError: If a mesh cannot be read.
-            ValueError: If there is no scene or no thread.
+            ValueError: If there are no scenes or no threads.
         """
         if not scenes or threads < 1:
             raise ValueError(f"{len(scenes)} scenes, {threads} threads; there must be one of each")
@@ -58,8 +58,10 @@ class MujocoSimulation:
         self.device = torch.device("cpu")
         self._worlds = worlds(self.scenes, contacts or Contacts())
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
-        self._state = State(self._worlds, self._data)
-        shape = self._state.q.shape
+        self._state = state = MujocoState(self._worlds, self._data)
+        self.q, self.qd = state.q, state.qd
+        self.block_pose, self.block_velocity = state.block_pose, state.block_velocity
+        shape = self.q.shape
         self._control = PositionControl(self._worlds, self._data, shape[1])
         self._controls, self._targets = np.zeros(shape), np.zeros(shape)
         self._has_target = np.zeros(shape, dtype=bool)
@@ -72,45 +74,20 @@ class MujocoSimulation:
             )
             block = self.scenes[i].block
             pose = (*block.pose.position, *block.pose.quaternion) if block is not None else ()
-            # As a reset to what the tensors say would: their digits, not more.
-            self._place(
+            # In float32, as a reset to the values of the tensors would do.
+            self._put(
                 i, *(np.array(each, np.float32).tolist() for each in (world.robot.home, pose))
             )
         self._state.read()
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
-    @property
-    def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J), rad or m."""
-        return self._state.q
-
-    @property
-    def qd(self) -> torch.Tensor:
-        """Their velocities, shape (n, J)."""
-        return self._state.qd
-
-    @property
-    def block_pose(self) -> torch.Tensor:
-        """Pose of the block in the world, (x, y, z, qw, qx, qy, qz), (n, 7); zeros if none."""
-        return self._state.block_pose
-
-    @property
-    def block_velocity(self) -> torch.Tensor:
-        """Linear and angular velocity of the block in the world, shape (n, 6); zeros if none."""
-        return self._state.block_velocity
-
     def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
-        """Put some environments at rest; nothing of their past has an influence any more.
-
-        Args:
-            envs: Indices, shape (k,), int64.
-            q: Positions of their independent joints, which become the targets, shape (k, J).
-            block_pose: Poses of their blocks, shape (k, 7); ignored where there is none.
+        """Put some environments at rest, without a past; see ``Simulation.reset``.
 
         Raises:
-            ValueError: If a shape is wrong, an environment does not exist, or what matters of a
-                position is not finite; the environments before that one have been reset.
+            ValueError: If a shape is wrong, an environment does not exist, or a position is not
+                finite; the environments before that one have been reset.
         """
         self._require_open()
         k, (n, joints) = len(envs), self._targets.shape
@@ -123,19 +100,16 @@ class MujocoSimulation:
             raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
         rows = zip(envs.tolist(), q.tolist(), block_pose.tolist(), strict=True)
         for env, positions, pose in rows:
-            self._place(env, positions[: self._worlds[env].robot.dof], pose)
+            self._put(env, positions[: self._worlds[env].robot.dof], pose)
         self._state.read()
 
     def step(self, targets: torch.Tensor) -> None:
-        """Move all by one control step.
-
-        Args:
-            targets: Target positions of the independent joints, shape (n, J).
+        """Advance all environments by one control step; see ``Simulation.step``.
 
         Raises:
             ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
-            DivergedError: If environments became unstable, or their contacts do not fit into
-                MuJoCo's memory; all others have moved, and these remain so until they are reset.
+            DivergedError: If environments diverged, or their contacts do not fit into MuJoCo's
+                memory; all others have moved, and these must be reset.
             SimulationError: If the simulation is closed.
         """
         self._require_open()
@@ -158,15 +132,15 @@ class MujocoSimulation:
             raise DivergedError({env: f"{self._where(env)}: {why}" for env, why in faults.items()})
 
     def close(self) -> None:
-        """Free everything; a second time does nothing."""
+        """Free everything; a second call does nothing."""
         if self._pool is not None:
             self._pool.shutdown()
         self._pool = None
-        self._state.forget()
-        self._control.forget()
+        self._state.release()
+        self._control.release()
         self._work, self._data, self._worlds = [], [], []
 
-    def _place(self, env: int, q: Sequence[float], pose: Sequence[float]) -> None:
+    def _put(self, env: int, q: Sequence[float], pose: Sequence[float]) -> None:
         world, data = self._worlds[env], self._data[env]
         if not np.isfinite(q).all() or (world.block is not None and not np.isfinite(pose).all()):
             raise ValueError(f"{self._where(env)}: reset to q {list(q)}, block {list(pose)}")
@@ -179,10 +153,10 @@ class MujocoSimulation:
             position, quaternion = world.block_pose_in(data)
             position[:], quaternion[:] = pose[:3], pose[3:]
             if mujoco.mju_normalize4(quaternion) < 0.5:
-                raise ValueError(f"{self._where(env)}: {list(pose)} is no pose of a block")
+                raise ValueError(f"{self._where(env)}: {list(pose)} is not a pose of a block")
 
     def _advance(self) -> dict[int, str]:
-        """Step all environments; return those that MuJoCo could not step, with its reasons."""
+        """Step all environments; return the ones that MuJoCo could not step, with its reasons."""
         work, refused = iter(self._work), dict[int, str]()
         helpers = []
         if self._pool is not None:
@@ -210,7 +184,7 @@ def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
 
     Args:
         work: Environments to step.
-        refused: Where to put those that MuJoCo could not step, with its reason.
+        refused: Receives the environments that MuJoCo could not step, with its reasons.
     """
     for env, model, data, actuators, controls, torques, applied in work:
         actuators[:] = controls
@@ -218,7 +192,7 @@ def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
         try:
             mujoco.mj_step(model, data, nstep=SUBSTEPS)
         except mujoco.FatalError as error:  # its stack is full
-            refused[env] = f"unstable: MuJoCo: {str(error).splitlines()[0]}"
+            refused[env] = f"diverged: MuJoCo: {str(error).splitlines()[0]}"
 
 
 SIMULATOR = Simulator(

@@ -1,4 +1,4 @@
-"""What a task reads of MuJoCo: joints and blocks of all environments as tensors."""
+"""State of MuJoCo environments as tensors: joints and blocks."""
 
 from __future__ import annotations
 
@@ -9,38 +9,61 @@ import mujoco
 import numpy as np
 import torch
 
-from morphgen.tasks.sim.mujoco_gather import Gathered
 from morphgen.tasks.sim.mujoco_model import World
 from morphgen.typing import Array
 
 MAX_SPEED = 1e4
-"""Velocity from which a simulation counts as exploded, SI units."""
-_TOO_FAST = f"unstable: a velocity is not finite or beyond {MAX_SPEED:g}"
-_NO_MEMORY = "unstable: its contacts do not fit into MuJoCo's memory"
+"""Speed above which a simulation counts as diverged [rad/s or m/s]."""
+_TOO_FAST = f"diverged: a velocity is not finite or beyond {MAX_SPEED:g}"
+_NO_MEMORY = "diverged: its contacts do not fit into MuJoCo's memory"
 _FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
 
 
-class State:
-    """The tensors that a task reads, gathered from the data of all environments at once."""
+class GatheredArrays:
+    """Arrays of all environments, copied one after the other into one array.
 
-    def __init__(self, found: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
+    One call copies them all: a call for every environment would take a tenth of its physics. The
+    last element is a zero, for padding.
+    """
+
+    def __init__(self, arrays: Sequence[Array]) -> None:
+        """Allocate the memory; ``read`` copies.
+
+        Args:
+            arrays: One-dimensional arrays to copy at every ``read``.
+        """
+        self._arrays = [*arrays, np.zeros(1)]
+        ends = np.cumsum([len(array) for array in self._arrays])
+        self.begin = np.concatenate([[0], ends[:-1]])
+        """Index in ``flat`` where each array begins."""
+        self.flat = np.zeros(ends[-1])
+
+    def read(self) -> None:
+        """Copy the arrays into ``flat``."""
+        np.concatenate(self._arrays, out=self.flat)
+
+
+class MujocoState:
+    """Tensors of joints and blocks, gathered from the data of all environments at once."""
+
+    def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
         """Prepare; ``read`` fills the tensors.
 
         Args:
-            found: Model of every environment, n of them.
-            data: Its data.
+            worlds: Model of each environment, n of them.
+            data: Data of each environment.
         """
-        n, joints = len(found), max(world.robot.dof for world in found)
-        blocks = [i for i, world in enumerate(found) if world.block is not None]
-        poses = [view for i in blocks for view in found[i].block_pose_in(data[i])]
-        self._positions = Gathered([*(one.qpos for one in data), *poses])
-        self._velocities = Gathered([one.qvel for one in data])
+        n, joints = len(worlds), max(world.robot.dof for world in worlds)
+        blocks = [i for i, world in enumerate(worlds) if world.block is not None]
+        poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
+        self._positions = GatheredArrays([*(one.qpos for one in data), *poses])
+        self._velocities = GatheredArrays([one.qvel for one in data])
         self._warnings = [one.warning.number for one in data]
         self._q_at = np.full((n, joints), -1)
         self._qd_at = np.full((n, joints), -1)
         self._pose_at = np.full((n, 7), -1)
         self._velocity_at = np.full((n, 6), -1)
-        for i, world in enumerate(found):
+        for i, world in enumerate(worlds):
             dof = world.robot.dof
             self._q_at[i, :dof] = self._positions.begin[i] + world.q_at
             self._qd_at[i, :dof] = self._velocities.begin[i] + world.qd_at
@@ -55,15 +78,15 @@ class State:
 
     @property
     def velocities(self) -> Array:
-        """All of ``qvel`` of all environments as it was read, and a zero."""
+        """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
         return self._velocities.flat
 
     def joints(self) -> tuple[Array, Array]:
-        """Positions and velocities of the independent joints as they were read, (n, J)."""
+        """Return joint positions and velocities at the last ``read``, shape (n, J) each."""
         return self._positions.flat[self._q_at], self._velocities.flat[self._qd_at]
 
     def read(self) -> None:
-        """Bring the tensors up to date."""
+        """Update the tensors from the data."""
         self._positions.read()
         self._velocities.read()
         self.q.numpy()[:], self.qd.numpy()[:] = self.joints()
@@ -90,19 +113,23 @@ class State:
         begin = self._velocities.begin
         slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
         full = np.asarray(warnings[:, _FULL].any(axis=1))
-        unstable = ~np.array(slow) | warnings.any(axis=1)
+        diverged = ~np.array(slow) | warnings.any(axis=1)
         return {
             env: _NO_MEMORY if full[env] else _TOO_FAST
-            for env in np.flatnonzero(full | unstable).tolist()
+            for env in np.flatnonzero(full | diverged).tolist()
         }
 
-    def forget(self) -> None:
-        """Let go of the environments' data."""
-        self._positions, self._velocities, self._warnings = Gathered(()), Gathered(()), []
+    def release(self) -> None:
+        """Release the environments' data."""
+        self._positions, self._velocities, self._warnings = (
+            GatheredArrays(()),
+            GatheredArrays(()),
+            [],
+        )
 
 
 def _rotated(quaternions: Array, vectors: Array) -> Array:
-    """Vectors (n, 3) turned by quaternions (w, x, y, z), shape (n, 4)."""
+    """Return vectors (n, 3) rotated by quaternions (w, x, y, z), shape (n, 4)."""
     w, axis = quaternions[:, :1], quaternions[:, 1:]
     turn = 2 * np.cross(axis, vectors)
     return np.asarray(vectors + w * turn + np.cross(axis, turn))

@@ -10,7 +10,7 @@ import torch
 from helpers.pybullet_states import PUSHING, client_of, reset, starts, state, touching, wander
 from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 from morphgen.errors import DivergedError, SimulationError
-from morphgen.tasks.sim import bullet_files
+from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation
 
 
@@ -120,13 +120,13 @@ def test_a_reset_reports_the_state(simulate):
 
 def test_a_robot_is_written_once(simulate, monkeypatch):
     written = []
-    original = bullet_files.write_bundle
+    original = bullet.write_bundle
 
     def counted(body, *args, **options):
         written.append(body)
         return original(body, *args, **options)
 
-    monkeypatch.setattr(bullet_files, "write_bundle", counted)
+    monkeypatch.setattr(bullet, "write_bundle", counted)
     simulate(*mixed_scenes(), *mixed_scenes())
     assert len(written) == 3
 

@@ -13,7 +13,7 @@ from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, Block, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import FRICTION
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 
 def block_scene(friction=1.0, height=0.5, mass=0.1):
@@ -139,7 +139,7 @@ def test_links_touch_each_other_unless_ignored(simulate):
     body = overlapping()
     touched = self_contact(simulate, body)
     assert touched
-    merged = rigid_bodies(body)
+    merged = merge_rigid_links(body)
     names = {-1: merged.root.name} | {k: joint.child for k, joint in enumerate(merged.joints)}
     pairs = {tuple(sorted((names[a], names[b]))) for (_, a), (_, b) in touched}
     assert ("base", "slider") in pairs or ("slider", "upper") in pairs

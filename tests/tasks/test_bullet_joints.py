@@ -20,7 +20,7 @@ from morphgen.model.kinematics import (
 )
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import OVERSPEED
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])
@@ -31,7 +31,7 @@ def test_links_are_where_the_kinematics_put_them(simulate, request_):
     q = np.array(body.home) + 0.1
     reset(simulation, q)
     loaded = client_of(simulation)
-    merged = rigid_bodies(body)
+    merged = merge_rigid_links(body)
     T_world_link = T.matrix @ forward_kinematics(body, q)
     for k in merged.movable_joints:
         name = merged.joints[k].child

@@ -16,7 +16,7 @@ from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks import free_space as module
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.sim.level_links import level_links
+from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 DEEP, SHALLOW = 2 * PENETRATION, PENETRATION / 2
 HALF_TURN = Pose.from_xyz_rpy((0.0, 0.0, 1.0), (np.pi, 0.0, 0.0))
@@ -172,7 +172,7 @@ def plane_hits(scene, q):
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     model = spec.compile()
     data = mujoco.MjData(model)
-    level = {f"robot/{name}" for name in level_links(robot, scene.T_world_root)}
+    level = {f"robot/{name}" for name in ground_contact_links(robot, scene.T_world_root)}
     turntable = np.array([model.body(i).name in level for i in model.geom_bodyid])
     flat = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     at = [model.joint(f"robot/{robot.joints[k].name}").qposadr[0] for k in robot.movable_joints]

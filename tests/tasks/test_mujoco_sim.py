@@ -19,7 +19,7 @@ from morphgen.model.robot import Frame
 from morphgen.tasks.sim import mujoco_model
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
 OUTPUTS = ("q", "qd", "block_pose", "block_velocity")
@@ -139,7 +139,7 @@ def test_mimic_joints_follow_and_root_poses_and_orders_are_kept():
 
 def test_a_model_has_a_body_for_each_rigid_part():
     scene = real_arm_scene()
-    parts = rigid_bodies(scene.robot).links
+    parts = merge_rigid_links(scene.robot).links
     assert len(parts) < len(scene.robot.links)
     world = MujocoSimulation([scene])._worlds[0]
     assert world.model.nbody == 1 + len(parts)
@@ -360,7 +360,7 @@ def test_what_mujoco_refuses_is_one_line():
 @pytest.mark.parametrize(
     ("envs", "q", "pose", "words"),
     [
-        ([0], (1, 5), torch.zeros(1, 7), "no pose of a block"),
+        ([0], (1, 5), torch.zeros(1, 7), "not a pose of a block"),
         ([0], (1, 5), torch.full((1, 7), math.nan), "reset to"),
         ([0], (1, 4), torch.zeros(1, 7), r"\(1, 5\)"),
         ([0, 0], (1, 5), torch.zeros(1, 7), r"\(2, 5\)"),

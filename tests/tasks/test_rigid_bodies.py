@@ -12,13 +12,13 @@ from morphgen.model.dynamics import mass_matrix
 from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Scene
-from morphgen.tasks.sim.rigid_bodies import rigid_bodies
+from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain"])
 def test_fewer_bodies_move_alike(request_):
     body = robot(request_)
-    merged = rigid_bodies(body)
+    merged = merge_rigid_links(body)
     rng = np.random.default_rng(0)
     for q in rng.normal(size=(3, body.dof)):
         np.testing.assert_allclose(mass_matrix(merged, q), mass_matrix(body, q), atol=1e-9)
@@ -35,8 +35,8 @@ def test_links_that_ignore_others_are_not_joined():
     moving = replace(body.joints[4], mimic=None)
     joints = (*body.joints[:3], fixed, moving)
     body = replace(body, joints=joints, ignore_pairs=(("base", "left"),))
-    assert {"left", "slider"} <= {link.name for link in rigid_bodies(body).links}
-    joined = rigid_bodies(replace(body, ignore_pairs=()))
+    assert {"left", "slider"} <= {link.name for link in merge_rigid_links(body).links}
+    joined = merge_rigid_links(replace(body, ignore_pairs=()))
     assert "left" not in {link.name for link in joined.links}
     assert joined.mass == pytest.approx(body.mass)
 

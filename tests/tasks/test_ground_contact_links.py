@@ -8,8 +8,8 @@ from helpers.scenes import robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.tasks.sim.base import Block, Contacts, Scene
-from morphgen.tasks.sim.level_links import level_links
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 from morphgen.tasks.sim.bullet import BulletSimulation
@@ -27,7 +27,7 @@ def test_links_are_level_whose_height_and_tilt_no_joint_changes(request_, roll, 
     T_world_link = T_world_root.matrix @ np.array([forward_kinematics(body, q) for q in drawn])
     moved = np.ptp(T_world_link[:, :, 2], axis=0).max(axis=1)
     steady = {link.name for link, by in zip(body.links, moved, strict=True) if by < 1e-9}
-    assert level_links(body, T_world_root) == steady
+    assert ground_contact_links(body, T_world_root) == steady
     assert count is None or len(steady) == count
 
 
