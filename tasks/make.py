@@ -11,7 +11,7 @@ from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.model.robot import Robot
-from morphgen.processes import Progress, unseen
+from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
@@ -51,7 +51,7 @@ def make_batch(
     configs: Sequence[TaskConfig] = (),
     cache: Path | None = None,
     library: Iterable[Path] = (),
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
     """Make environments of robots at tasks; environment i has robot i modulo their number.
@@ -104,7 +104,7 @@ def make_split_batch(
     goals: Path | None = None,
     cache: Path | None = None,
     library: Iterable[Path] = (),
-    progress: Progress = unseen,
+    progress: Progress = no_progress,
     **options: Unpack[BatchOptions],
 ) -> TaskBatch:
     """Make environments of a split's robots, at the tasks and with the obstacles of the split.
