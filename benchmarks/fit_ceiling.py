@@ -314,13 +314,13 @@ def _drawn(words: Sequence[str], jobs: int) -> list[Target]:
 
 
 def _target(names: list[str], shapes: tuple[Shape, ...]) -> Target:
-    from morphgen.fitting.search import best_single, sampled
+    from morphgen.fitting.search import best_single, sample_solid
     from morphgen.fitting.solid import solid_of
 
     solid = solid_of(shapes)
-    seen = sampled(solid, 0)
+    seen = sample_solid(solid, 0)
     fit = best_single(seen).candidate
-    fresh = [sampled(solid, seed) for seed in FRESH_SEEDS]
+    fresh = [sample_solid(solid, seed) for seed in FRESH_SEEDS]
     return Target(
         np.array(names),
         seen.points.astype(np.float32),

@@ -227,11 +227,10 @@ def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) ->
     from morphgen.fitting.robot_fit import fit_links
     from morphgen.formats.fits import shapes_to_fit
 
-    total = sum(1 for link in target.robot.links if shapes_to_fit(link))
-    if not total:
+    if not any(map(shapes_to_fit, target.robot.links)):
         raise FitError(f"{target.label}: no link has a shape")
-    with bar(args, f"fitting {target.label}", "link", total) as shown:
-        return fit_links(target.robot, options, jobs=args.jobs, progress=lambda link: shown.add())
+    with bar(args, f"fitting {target.label}", "link") as shown:
+        return fit_links(target.robot, options, jobs=args.jobs, progress=shown)
 
 
 def _fit_all_parts(args: argparse.Namespace) -> None:

@@ -1,1 +1,1 @@
-"""Boxes, cylinders and spheres in place of a link's meshes, and how well they stand for them."""
+"""Fit boxes, cylinders and spheres to the meshes of a robot, and measure how well they fit."""

@@ -1,12 +1,13 @@
-"""Do a robot's meshes and the primitives in their place collide in the same configurations?
+"""Compare the self-collisions of a robot's meshes with those of the primitives that replace them.
 
-The truth is the meshes themselves, triangle against triangle. Beside the primitives stands what a
-simulator makes of the meshes: it takes each for its convex hull.
+The reference is the meshes themselves, triangle against triangle. The convex hulls of the meshes,
+which simulators use, are compared with the same reference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import cast
@@ -26,31 +27,31 @@ from morphgen.model.robot import Pair, Robot, sorted_pair
 
 @dataclass(frozen=True)
 class Agreement:
-    """Counts of configurations; what is compared against the meshes themselves."""
+    """Numbers of configurations in which meshes and a substitute (primitives, hulls) collide."""
 
     both: int
-    """Both collide."""
+    """Both the meshes and the substitute collide."""
     neither: int
     only_meshes: int
     only_other: int
 
     @property
     def precision(self) -> float:
-        """Share of the configurations where the other collides in which meshes do, too."""
+        """Share of the substitute's collisions that are collisions of the meshes."""
         return _share(self.both, self.only_other)
 
     @property
     def recall(self) -> float:
-        """Share of the configurations where meshes collide in which the other does, too."""
+        """Share of the meshes' collisions that are collisions of the substitute."""
         return _share(self.both, self.only_meshes)
 
     @property
     def accuracy(self) -> float:
-        """Share of configurations on which the two agree."""
+        """Share of configurations in which both collide or neither does."""
         return _share(self.both + self.neither, self.only_meshes + self.only_other)
 
     def as_dict(self) -> dict[str, float]:
-        """Plain data for JSON."""
+        """Return plain data for JSON."""
         shares = {name: round(getattr(self, name), 4) for name in ("precision", "recall")}
         return {**asdict(self), **shares, "accuracy": round(self.accuracy, 4)}
 
@@ -58,36 +59,31 @@ class Agreement:
 def agreement(
     meshes: Robot, primitives: Robot, n: int = 1000, seed: int = 0
 ) -> tuple[Agreement, Agreement]:
-    """Compare collisions over random configurations.
+    """Compare self-collisions over random configurations.
 
-    Pairs of links that either robot ignores are tested on neither.
+    Pairs of links that one of the robots ignores are ignored on both.
 
     Args:
-        meshes: The robot that is right.
-        primitives: The same robot with other collision shapes.
-        n: Random configurations, within the limits.
-        seed: Their seed.
+        meshes: The robot with its meshes, the reference.
+        primitives: The same robot with primitives as collision shapes.
+        n: Number of random configurations within the joint limits.
+        seed: Seed of the configurations.
 
     Returns:
-        How the primitives agree with the meshes, and how the meshes' convex hulls do.
+        The agreement of the primitives, and that of the convex hulls, with the meshes.
     """
     ignored = {*untested_pairs(meshes), *primitives.ignore_pairs}
     q = random_configurations(meshes, n, np.random.default_rng(seed))
-    truth = np.array(list(_mesh_collisions(meshes, ignored, q)))
-    first, second = (
-        _counts(
-            truth,
-            np.array(
-                [bool(pairs) for pairs in SelfCollisionChecker(robot, ignored).penetrations(q)]
-            ),
-        )
-        for robot in (primitives, meshes)
-    )
-    return first, second
+    truth = list(_mesh_collisions(meshes, ignored, q))
+    agreements = []
+    for robot in (primitives, meshes):
+        penetrations = SelfCollisionChecker(robot, ignored).penetrations(q)
+        agreements.append(_counts(truth, [bool(pairs) for pairs in penetrations]))
+    return agreements[0], agreements[1]
 
 
 def _mesh_collisions(robot: Robot, ignored: set[Pair], q: NDArray[np.float64]) -> Iterator[bool]:
-    """Whether any two links' triangles meet, by configuration."""
+    """Yield for each configuration if triangles of two links intersect."""
     names = [link.name for link in robot.links if link.collisions]
     pairs = [pair for pair in combinations(names, 2) if sorted_pair(*pair) not in ignored]
     models = {link.name: _model(link.collisions) for link in robot.links if link.collisions}
@@ -95,11 +91,10 @@ def _mesh_collisions(robot: Robot, ignored: set[Pair], q: NDArray[np.float64]) -
         for name, collider in models.items():
             T = T_root_link[robot.link_index[name]]
             collider.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
-        yield any(_meet(models[a], models[b]) for a, b in pairs)
-
-
-def _meet(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:
-    return bool(fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()))
+        yield any(
+            fcl.collide(models[a], models[b], fcl.CollisionRequest(), fcl.CollisionResult())
+            for a, b in pairs
+        )
 
 
 def _model(shapes: tuple[Shape, ...]) -> fcl.CollisionObject:
@@ -116,15 +111,12 @@ def _model(shapes: tuple[Shape, ...]) -> fcl.CollisionObject:
     return fcl.CollisionObject(model)
 
 
-def _counts(truth: NDArray[np.bool_], other: NDArray[np.bool_]) -> Agreement:
-    return Agreement(
-        int((truth & other).sum()),
-        int((~truth & ~other).sum()),
-        int((truth & ~other).sum()),
-        int((~truth & other).sum()),
-    )
+def _counts(meshes: Sequence[bool], other: Sequence[bool]) -> Agreement:
+    counts = Counter(zip(meshes, other, strict=True))
+    cases = ((True, True), (False, False), (True, False), (False, True))
+    return Agreement(*(counts[case] for case in cases))
 
 
 def _share(hits: int, misses: int) -> float:
-    """1 where there is nothing to hit or miss."""
+    """Return the share of hits; 1 if there are neither hits nor misses."""
     return hits / (hits + misses) if hits + misses else 1.0

@@ -1,4 +1,7 @@
-"""One pose for each primitive: symmetry allows for many, and tokens should not differ by it."""
+"""The canonical pose of a primitive: of all poses that symmetry makes equal, the least rotated.
+
+Tokens contain poses, so equal primitives must have equal poses.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,24 @@ from morphgen.model.rotation import IDENTITY, Quat, normalize
 from morphgen.typing import Array
 
 Kind = Literal["box", "cylinder", "sphere"]
-"""A primitive that the fitter chooses from."""
+"""A kind of primitive that the fitter chooses from."""
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "sphere")
 
 _DECIMALS = 9
-"""Decimals beyond which rotations turn alike far."""
-_QUATERNION_DECIMALS = 9
-_QUARTER_TURNS = np.array(
+"""Decimals of rotations; fits differ beyond them from machine to machine."""
+_BOX_SYMMETRIES = np.array(
     [
-        turn
+        symmetry
         for order in itertools.permutations(np.eye(3))
         for signs in itertools.product((1, -1), repeat=3)
-        if np.linalg.det(turn := np.transpose(order) * signs) > 0
+        if np.linalg.det(symmetry := np.transpose(order) * signs) > 0
     ]
 )
-"""The rotations of a box onto itself, shape (24, 3, 3)."""
+"""The rotations that map a box onto itself, up to the order of its edges, shape (24, 3, 3)."""
 
 
 def canonical(shape: Shape) -> Shape:
-    """The same body in the pose that turns least; meshes stay as they are."""
+    """Return the same primitive in its canonical pose; a mesh is returned unchanged."""
     geometry, pose = shape.geometry, shape.T_link_shape
     R = pose.matrix[:3, :3]
     match geometry:
@@ -42,8 +44,8 @@ def canonical(shape: Shape) -> Shape:
             quaternion = least_rotation("cylinder", R)
         case Box(edges):
             quaternion = least_rotation("box", R)
-            turn = Pose(quaternion=quaternion).matrix[:3, :3].T @ R
-            x, y, z = (np.abs(turn.round()) @ edges).tolist()
+            R_canonical_old = Pose(quaternion=quaternion).matrix[:3, :3].T @ R
+            x, y, z = (np.abs(R_canonical_old.round()) @ edges).tolist()
             geometry = Box((x, y, z))
         case _:
             return shape
@@ -51,21 +53,23 @@ def canonical(shape: Shape) -> Shape:
 
 
 def least_rotation(kind: Kind, R: Array) -> Quat:
-    """The rotation, of all that show a primitive alike, that turns least.
+    """Return the rotation of the smallest angle among those that leave a primitive the same.
 
-    A sphere is not turned at all; a cylinder goes from z to its axis, of which the end above the xy
-    plane counts; a box takes the one of its 24 rotations that is nearest to the axes of the link.
+    A sphere has the identity. A cylinder has the rotation that takes z to its axis, where the axis
+    points above the xy plane. A box has the one of its 24 rotations nearest to the link's axes.
 
     Args:
-        kind: What is turned.
-        R: A rotation, shape (3, 3).
+        kind: The kind of primitive.
+        R: Any of the rotations, shape (3, 3).
     """
     if kind == "sphere":
         return IDENTITY
     if kind == "box":
-        alike = R @ _QUARTER_TURNS
-        best = alike[np.argmax(np.trace(alike, axis1=1, axis2=2).round(_DECIMALS))]
-        w, x, y, z = Rotation.from_matrix(best).as_quat(scalar_first=True).tolist()
+        rotations = R @ _BOX_SYMMETRIES
+        # The trace of a rotation is 1 + 2 cos(angle).
+        traces = np.trace(rotations, axis1=1, axis2=2).round(_DECIMALS)
+        best = Rotation.from_matrix(rotations[np.argmax(traces)])
+        w, x, y, z = best.as_quat(scalar_first=True).tolist()
         return normalize((w, x, y, z))
     x, y, z = R[:, 2].tolist()
     if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
@@ -74,6 +78,6 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
 
 
 def rounded(quaternion: Quat) -> Quat:
-    """The same rotation to nine decimals, beyond which fits differ from machine to machine."""
-    w, x, y, z = (round(value, _QUATERNION_DECIMALS) for value in normalize(quaternion))
+    """Round a quaternion to nine decimals, beyond which fits differ between machines."""
+    w, x, y, z = (round(value, _DECIMALS) for value in normalize(quaternion))
     return normalize((w, x, y, z))

@@ -1,8 +1,9 @@
-"""Meshes that are the same up to a rigid motion or a mirroring, so that one fit serves all of them.
+"""Find meshes that are equal up to a rigid motion or a mirroring, so that they can share one fit.
 
-Two vertices that stand out by their distance from the mean of all are looked for in the other mesh.
-Every pair there that lies alike gives a rotation and a mirroring, which all vertices then refine
-and confirm. Unlike principal axes such landmarks settle bodies of revolution too.
+Two landmarks are chosen among the vertices of a mesh: vertices whose distance from the mean is
+rare. Each pair of vertices of the other mesh at the same distances gives a candidate rotation and a
+candidate mirroring, which all vertices then refine and confirm. Unlike principal axes, landmarks
+determine the pose of bodies of revolution, too.
 """
 
 from __future__ import annotations
@@ -19,64 +20,64 @@ from morphgen.fitting.canonical import canonical
 from morphgen.model.geometry import Mesh, Pose, Shape
 from morphgen.typing import Array
 
-_TRIES = 2000
-"""Pairs of landmarks that are tried, each as a rotation and as a mirroring."""
-_SAMPLE = 32
-"""Vertices that a pair is tried on before all are."""
-_ROUGH = 30.0
-"""Error that a pair may leave before it is refined, in tolerances."""
+_MAX_PAIRS = 2000
+"""Largest number of landmark pairs that are tried, each as a rotation and as a mirroring."""
+_NUM_SAMPLES = 32
+"""Number of vertices that a candidate is tested on before all are."""
+_ROUGH_TOLERANCE = 30.0
+"""Largest error of a candidate before it is refined, relative to the tolerance."""
 
 
 def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) -> Array | None:
-    """Find the motion or mirroring that turns a mesh into another one.
+    """Return the rigid motion or mirroring that maps one mesh to another.
 
-    Both must have as many vertices and faces. A body of very high symmetry, such as a sphere, may
-    be missed if it is also turned.
+    Both must have the same numbers of vertices and faces. The transform of a rotated body of very
+    high symmetry, such as a sphere, may not be found.
 
     Args:
         a: Triangles, coincident vertices merged.
         b: Triangles, coincident vertices merged.
-        tolerance: How far a vertex may be from its partner, relative to the size, which is twice
-            the distance of the farthest vertex from the mean of all.
+        tolerance: Largest distance of a vertex from its counterpart, relative to the size: twice
+            the distance of the farthest vertex from the mean.
 
     Returns:
         ``T_b_a``, shape (4, 4), which maps coordinates of ``a`` to ``b``: the identity for equal
-        arrays, of determinant 1 rather than -1 where both would do; None if none was found.
+        arrays, a motion rather than a mirroring if both fit; None if there is none.
     """
     if a.vertices.shape != b.vertices.shape or a.faces.shape != b.faces.shape:
         return None
     if np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces):
         return np.eye(4)
     ours, theirs = _centred(a), _centred(b)
-    radii, others = (np.linalg.norm(points, axis=1) for points in (ours, theirs))
+    radii, other_radii = (np.linalg.norm(points, axis=1) for points in (ours, theirs))
     error = tolerance * 2 * float(radii.max())
-    # A mean of vertices moves at most as far as they do, so distances from it by twice as much.
-    if np.abs(np.sort(radii) - np.sort(others)).max() > 2 * error:
+    # If vertices move by the error, their mean moves by at most as much, and distances by twice.
+    if np.abs(np.sort(radii) - np.sort(other_radii)).max() > 2 * error:
         return None
-    for R in _rotations(ours, theirs, 2 * error):
-        some = ours[:: max(len(ours) // _SAMPLE, 1)] @ R.T + b.vertices.mean(axis=0)
-        if b.kdtree.query(some)[0].max() > _ROUGH * error:
+    for R in _candidate_rotations(ours, theirs, 2 * error):
+        sample = ours[:: max(len(ours) // _NUM_SAMPLES, 1)] @ R.T + b.vertices.mean(axis=0)
+        if b.kdtree.query(sample)[0].max() > _ROUGH_TOLERANCE * error:
             continue
-        for T_b_a in (_transform(a, b, R), _refined(a, b, R)):
+        for T_b_a in (_transform(a, b, R), _refine(a, b, R)):
             if _maps(a, b, T_b_a, error):
                 return T_b_a
     return None
 
 
 def moved(shape: Shape, T_b_a: Array) -> Shape:
-    """A primitive after a rigid motion or a mirroring.
+    """Return a primitive after a rigid motion or a mirroring.
 
-    Every primitive is its own mirror image, so a mirrored one is the same in another pose.
+    Every primitive is its own mirror image, so mirroring only changes its pose.
 
     Args:
-        shape: Placed in frame a.
-        T_b_a: Shape (4, 4), its upper left part orthogonal.
+        shape: A primitive in frame a.
+        T_b_a: Transform with an orthogonal upper left part, shape (4, 4).
 
     Raises:
         ValueError: If the shape is a mesh, or the transform scales or shears.
     """
     if isinstance(shape.geometry, Mesh):
-        raise ValueError(f"{shape.geometry} is no primitive")
+        raise ValueError(f"{shape.geometry} is not a primitive")
     R = T_b_a[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-6):
         raise ValueError(f"{R.tolist()} is neither a rotation nor a mirroring")
@@ -86,19 +87,19 @@ def moved(shape: Shape, T_b_a: Array) -> Shape:
 
 
 def representatives(meshes: Sequence[trimesh.Trimesh]) -> list[tuple[int, Array]]:
-    """Whose fit each mesh can share.
+    """Return for each mesh the congruent mesh whose fit it can share.
 
     Returns:
-        For every mesh the index of the first one that is congruent to it, its own if there is no
-        earlier one, and the transform, shape (4, 4), from that one to it.
+        For each mesh the index of the first mesh that is congruent to it (its own if no earlier one
+        is) and the transform from that mesh to it, shape (4, 4).
     """
-    found: list[tuple[int, Array]] = []
+    shared: list[tuple[int, Array]] = []
     for index, mesh in enumerate(meshes):
-        firsts = [first for first in range(index) if found[first][0] == first]
+        firsts = [first for first in range(index) if shared[first][0] == first]
         matches = ((first, congruence(meshes[first], mesh)) for first in firsts)
-        shared = next(((first, T) for first, T in matches if T is not None), None)
-        found.append(shared or (index, np.eye(4)))
-    return found
+        match = next(((first, T) for first, T in matches if T is not None), None)
+        shared.append(match or (index, np.eye(4)))
+    return shared
 
 
 def _centred(mesh: trimesh.Trimesh) -> Array:
@@ -106,39 +107,41 @@ def _centred(mesh: trimesh.Trimesh) -> Array:
     return np.asarray(vertices - vertices.mean(axis=0))
 
 
-def _rotations(a: Array, b: Array, slack: float) -> Iterator[Array]:
-    """Matrices, (3, 3), that may map points about their mean to others: proper ones first."""
+def _candidate_rotations(a: Array, b: Array, slack: float) -> Iterator[Array]:
+    """Yield matrices (3, 3) that may map centred points to others: rotations, then mirrorings."""
     yield np.eye(3)
-    radii, others = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
-    ordered = np.sort(others)
+    radii, other_radii = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+    ordered = np.sort(other_radii)
+    # Number of points of b at the distance of each point of a.
     alike = np.searchsorted(ordered, radii + slack) - np.searchsorted(ordered, radii - slack)
     first = _landmark(alike, radii)
-    across = np.linalg.norm(np.cross(a, a[first]), axis=1) / radii[first]
-    second = _landmark(alike, across)
+    off_axis = np.linalg.norm(np.cross(a, a[first]), axis=1) / radii[first]
+    second = _landmark(alike, off_axis)
     apart = np.linalg.norm(a[first] - a[second])
     firsts, seconds = (
-        np.flatnonzero(np.abs(others - radii[landmark]) <= slack) for landmark in (first, second)
+        np.flatnonzero(np.abs(other_radii - radii[landmark]) <= slack)
+        for landmark in (first, second)
     )
     pairs = []
     for i in firsts:
-        off = np.abs(np.linalg.norm(b[seconds] - b[i], axis=1) - apart)
-        pairs += [(i, j) for j in seconds[off <= slack] if np.cross(b[i], b[j]).any()]
-        if len(pairs) >= _TRIES:
+        errors = np.abs(np.linalg.norm(b[seconds] - b[i], axis=1) - apart)
+        pairs += [(i, j) for j in seconds[errors <= slack] if np.cross(b[i], b[j]).any()]
+        if len(pairs) >= _MAX_PAIRS:
             break
     frame = _frame(a[first], a[second])
-    for hand in (1.0, -1.0):
-        for i, j in pairs[:_TRIES]:
-            yield _frame(b[i], b[j]) @ np.diag([1.0, 1.0, hand]) @ frame.T
+    for handedness in (1.0, -1.0):
+        for i, j in pairs[:_MAX_PAIRS]:
+            yield _frame(b[i], b[j]) @ np.diag([1.0, 1.0, handedness]) @ frame.T
 
 
 def _landmark(alike: NDArray[np.intp], distance: Array) -> int:
-    """The point with the fewest that are alike; not a near one, which would fix angles badly."""
+    """Return the point with the fewest counterparts; near points would fix angles badly."""
     score = np.where(distance >= distance.max() / 2, alike, len(alike) + 1)
     return int(np.lexsort((-distance, score))[0])
 
 
 def _frame(first: Array, second: Array) -> Array:
-    """A right-handed frame, columns its axes: x to the first point, z normal to both."""
+    """Return a right-handed frame, axes as columns: x to the first point, z normal to both."""
     x = first / np.linalg.norm(first)
     z = np.cross(first, second)
     z = z / np.linalg.norm(z)
@@ -146,15 +149,15 @@ def _frame(first: Array, second: Array) -> Array:
 
 
 def _transform(a: trimesh.Trimesh, b: trimesh.Trimesh, R: Array) -> Array:
-    """The transform that rotates and takes the mean of the vertices to the mean."""
+    """Return the transform that rotates and maps the mean of the vertices to the mean."""
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = R
     T_b_a[:3, 3] = b.vertices.mean(axis=0) - R @ a.vertices.mean(axis=0)
     return T_b_a
 
 
-def _refined(a: trimesh.Trimesh, b: trimesh.Trimesh, R: Array) -> Array:
-    """The transform of least squares between nearest vertices, of the same handedness.
+def _refine(a: trimesh.Trimesh, b: trimesh.Trimesh, R: Array) -> Array:
+    """Return the least-squares transform between nearest vertices, of the same handedness.
 
     Orthogonal Procrustes: Umeyama, "Least-squares estimation of transformation parameters between
     two point patterns", 1991.
@@ -162,12 +165,12 @@ def _refined(a: trimesh.Trimesh, b: trimesh.Trimesh, R: Array) -> Array:
     ours, theirs = _centred(a), _centred(b)
     _, nearest = b.kdtree.query(ours @ R.T + b.vertices.mean(axis=0))
     U, _, Vt = np.linalg.svd(theirs[nearest].T @ ours)
-    hand = np.sign(np.linalg.det(R) * np.linalg.det(U @ Vt))
-    return _transform(a, b, U @ np.diag([1.0, 1.0, hand]) @ Vt)
+    handedness = np.sign(np.linalg.det(R) * np.linalg.det(U @ Vt))
+    return _transform(a, b, U @ np.diag([1.0, 1.0, handedness]) @ Vt)
 
 
 def _maps(a: trimesh.Trimesh, b: trimesh.Trimesh, T_b_a: Array, error: float) -> bool:
-    """Whether vertices meet vertices both ways, and the triangles' centres the other triangles."""
+    """Test that vertices map to vertices, both ways, and triangle centres to triangles."""
     onto = trimesh.transform_points(a.vertices, T_b_a)
     if b.kdtree.query(onto)[0].max() > error:
         return False

@@ -1,4 +1,4 @@
-"""Where the search for primitives begins: boxes and cylinders around clouds of points."""
+"""Initial guesses for the search for primitives: boxes and cylinders around point clouds."""
 
 from __future__ import annotations
 
@@ -12,33 +12,37 @@ from morphgen.fitting.soft_iou import Candidates, covered, overlaps
 from morphgen.typing import Array
 
 TRIM = 0.03
-"""Share of a cloud's points that a guess leaves out at either end of an axis."""
-FEWEST = 8
-"""Points that a piece must have."""
-_CUTS = (1, 2, 3)
-"""Numbers of clusters of what is left out that are tried as one primitive more."""
-_THINNEST = 1e-3
-"""Half extent of the thinnest guess; points are in units of the solid's size."""
+"""Share of a cloud's points outside of a guess at either end of an axis."""
+MIN_POINTS = 8
+"""Smallest number of points of a cluster."""
+_NUM_CLUSTERS = (1, 2, 3)
+"""Numbers of clusters of the uncovered points, each of which may get a further primitive."""
+_MIN_HALF_EXTENT = 1e-3
+"""Smallest half extent of a guess, relative to the solid's size."""
 _BOX, _CYLINDER, _SPHERE = (KINDS.index(kind) for kind in ("box", "cylinder", "sphere"))
-_TURNS = (
+_AXES_TO_Z = (
     np.eye(3),
     np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
     np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
 )
-"""Rotations that bring each axis in turn to z."""
+"""Rotations whose z axis is the z, x and y axis."""
 
 
 def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candidates:
-    """Guesses of one primitive each around a cloud of points, shape (n, 3).
+    """Return guesses of one primitive each around a point cloud.
 
-    Boxes and cylinders along the principal axes and along those given, each of shape (3, 3); and
-    a sphere on request.
+    Args:
+        points: Points, shape (n, 3).
+        axes: Rotations, shape (3, 3) each, whose axes boxes and cylinders follow, besides the
+            principal axes of the points.
+        sphere: Add a sphere.
     """
     guesses = [guess for R in (*axes, _principal_axes(points)) for guess in _along(points, R)]
     if sphere:
-        middle = points.mean(axis=0)
-        radius = np.sqrt(5 / 3 * np.square(points - middle).sum(axis=1).mean())
-        guesses.append((_SPHERE, middle, np.eye(3), np.full(3, radius)))
+        centre = points.mean(axis=0)
+        # The mean squared distance from the centre of a ball is 3/5 of its squared radius.
+        radius = np.sqrt(5 / 3 * np.square(points - centre).sum(axis=1).mean())
+        guesses.append((_SPHERE, centre, np.eye(3), np.full(3, radius)))
     kinds, centres, rotations, halves = zip(*guesses, strict=True)
     quaternions = Rotation.from_matrix(np.array(rotations)).as_quat(scalar_first=True)
     return Candidates(
@@ -52,24 +56,24 @@ def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candida
 def by_pieces(
     points: Array, inside: NDArray[np.bool_], weights: Array, k: int, seeds: list[int]
 ) -> Candidates | None:
-    """Guesses of ``k`` primitives: the solid is cut into ``k`` clusters, each with its best guess.
+    """Return guesses of ``k`` primitives: the best guess around each of ``k`` clusters.
 
     Args:
-        points: Shape (n, 3), over the solid and around it.
-        inside: Whether each lies in the solid.
-        weights: What each point counts.
-        k: How many primitives.
-        seeds: One clustering each; every one gives three guesses: the best kinds, only boxes, only
-            cylinders.
+        points: Points over the solid and its surroundings, shape (n, 3).
+        inside: Points that are inside the solid, shape (n,).
+        weights: Weights of the points, shape (n,).
+        k: Number of primitives.
+        seeds: Seeds of one clustering each. A clustering gives three guesses: the best kind for
+            each cluster, only boxes, and only cylinders.
 
     Returns:
-        The guesses; None if the solid has too few points to be cut.
+        The guesses; None if a cluster has too few points in every clustering.
     """
     cloud, outside = points[inside], (points[~inside], weights[~inside])
     rows: list[Candidates] = []
     for seed in seeds:
         _, label = kmeans2(cloud, k, minit="++", seed=seed, iter=10)
-        if np.bincount(label, minlength=k).min() < FEWEST:
+        if np.bincount(label, minlength=k).min() < MIN_POINTS:
             continue
         pieces = [
             _best_of_each_kind(cloud[label == j], weights[inside][label == j], *outside)
@@ -80,44 +84,44 @@ def by_pieces(
 
 
 def by_growth(
-    found: Candidates, points: Array, inside: NDArray[np.bool_], weights: Array, seed: int
+    fewer: Candidates, points: Array, inside: NDArray[np.bool_], weights: Array, seed: int
 ) -> Candidates | None:
-    """Guesses of one primitive more than found: where it leaves out a part of the solid.
+    """Return guesses with one more primitive, around a part of the solid that is not covered.
 
     Args:
-        found: One guess of ``k - 1`` primitives.
-        points: Shape (n, 3), over the solid and around it.
-        inside: Whether each lies in the solid.
-        weights: What each point counts.
-        seed: Of the clusterings of what is left out.
+        fewer: One candidate of ``k - 1`` primitives.
+        points: Points over the solid and its surroundings, shape (n, 3).
+        inside: Points that are inside the solid, shape (n,).
+        weights: Weights of the points, shape (n,).
+        seed: Seed of the clusterings of the uncovered points.
 
     Returns:
-        The guesses; None if too few points are left out.
+        The guesses; None if too few points are uncovered.
     """
-    missed = inside & ~covered(found, points)[0]
+    missed = inside & ~covered(fewer, points)[0]
     cloud, outside = points[missed], (points[~inside], weights[~inside])
     rows: list[Candidates] = []
-    for n in _CUTS:
-        if len(cloud) < n * FEWEST:
+    for n in _NUM_CLUSTERS:
+        if len(cloud) < n * MIN_POINTS:
             break
         _, label = kmeans2(cloud, n, minit="++", seed=seed, iter=10)
         for j in range(n):
-            if np.count_nonzero(label == j) >= FEWEST:
+            if np.count_nonzero(label == j) >= MIN_POINTS:
                 piece = cloud[label == j], weights[missed][label == j]
                 more = _best_of_each_kind(*piece, *outside)
-                rows.append(Candidates.join([found.take(np.zeros(3, np.intp)), more]))
+                rows.append(Candidates.join([fewer.take(np.zeros(3, np.intp)), more]))
     return Candidates.stack(rows) if rows else None
 
 
 def _best_of_each_kind(piece: Array, counts: Array, outside: Array, others: Array) -> Candidates:
-    """Three guesses around a piece: the best, the best box, the best cylinder."""
+    """Return three guesses around a cluster: the best, the best box, the best cylinder."""
     guesses = around(piece, [np.eye(3)])
     points = np.concatenate([piece, outside])
     weights = np.concatenate([counts, others])
-    score = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)
+    ious = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)
     kinds = guesses.kinds[:, 0]
     best = [
-        int(np.argmax(np.where(allowed, score, -1.0)))
+        int(np.argmax(np.where(allowed, ious, -1.0)))
         for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER)
     ]
     return guesses.take(np.array(best))
@@ -129,12 +133,15 @@ def _principal_axes(points: Array) -> Array:
 
 
 def _along(points: Array, R: Array) -> list[tuple[int, Array, Array, Array]]:
-    """A box with the axes of ``R`` and a cylinder along each: kind, centre, rotation, halves."""
+    """Return a box along the axes of ``R`` and a cylinder along each of them.
+
+    Each guess is a kind, a centre, a rotation and half extents.
+    """
     low, high = np.quantile(points @ R, (TRIM, 1 - TRIM), axis=0)
-    centre, halves = R @ (low + high) / 2, np.maximum((high - low) / 2, _THINNEST)
-    found = [(_BOX, centre, R, halves)]
-    for turn in _TURNS:
-        x, y, z = np.abs(turn.T @ halves)
+    centre, halves = R @ (low + high) / 2, np.maximum((high - low) / 2, _MIN_HALF_EXTENT)
+    guesses = [(_BOX, centre, R, halves)]
+    for to_z in _AXES_TO_Z:
+        x, y, z = np.abs(to_z.T @ halves)
         radius = np.sqrt(x * y)
-        found.append((_CYLINDER, centre, R @ turn, np.array([radius, radius, z])))
-    return found
+        guesses.append((_CYLINDER, centre, R @ to_z, np.array([radius, radius, z])))
+    return guesses

@@ -1,4 +1,4 @@
-"""Fit the shapes of one link: one primitive or a few, and what they are worth."""
+"""Fit one or several primitives to the shapes of one link, and measure the fit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 
 from morphgen.fitting.enclose_pieces import enclose_solid
 from morphgen.fitting.quality import Quality, quality
-from morphgen.fitting.search import best_several, best_single, sampled
+from morphgen.fitting.search import best_several, best_single, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
 from morphgen.model.geometry import Shape
@@ -16,15 +16,16 @@ from morphgen.model.geometry import Shape
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What is wanted of a fit."""
+    """Options of a fit."""
 
     max_primitives: int = 1
-    """The most primitives of a link."""
+    """Largest number of primitives per link."""
     iou: float = 0.9
-    """The number of primitives is the smallest that reaches this intersection over union."""
+    """Intersection over union at which no further primitive is added."""
     enclose: bool = False
-    """Whether every point of the solid must be inside; otherwise the overlap is largest."""
+    """Enclose every point of the solid, instead of maximising the intersection over union."""
     seed: int = 0
+    """Seed of the sample points and of the clusterings."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_primitives <= MAX_PRIMITIVES:
@@ -37,22 +38,22 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class LinkFit:
-    """Primitives that stand for a link's shapes."""
+    """Primitives that replace the shapes of a link, with their measured quality."""
 
     primitives: tuple[Shape, ...]
-    """Boxes, cylinders and spheres, in the link frame."""
+    """Boxes, cylinders and spheres in the link frame."""
     single: Shape | None
-    """The one that overlaps most; None if it was not looked for."""
+    """The single primitive of largest overlap; None if it was not searched for."""
     solid: str
-    """How the solid was made, see ``solid.Method``; ``primitives`` if the shapes were that."""
+    """How the solid was made, see ``solid.Method``; ``primitives`` if the shapes were kept."""
     quality: Quality
     seconds: float
-    """Time it took; 0 where another link's fit was taken over."""
+    """Duration of the fit [s]; 0 for a link that shares the fit of a congruent one."""
     decimated_from: int | None = None
-    """Triangles before decimation, None if there was none."""
+    """Number of triangles before decimation; None if the mesh was not decimated."""
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data for JSON: metres, (x, y, z) and (w, x, y, z)."""
+        """Return plain data for JSON: metres, (x, y, z) and (w, x, y, z)."""
         return {
             "primitives": [shape_to_data(shape) for shape in self.primitives],
             "solid": self.solid,
@@ -68,10 +69,10 @@ def fit_shapes(
     """Fit the shapes of one link.
 
     Args:
-        shapes: In the link frame. Boxes, cylinders and spheres that are not too many stay as they
-            are.
-        options: What is wanted.
-        solid: The solid of the shapes, if it is known.
+        shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
+            there are no more than ``max_primitives``.
+        options: Options of the fit.
+        solid: The solid of the shapes, if it is known already.
 
     Raises:
         FitError: If the shapes have no volume.
@@ -80,19 +81,19 @@ def fit_shapes(
     start = time.perf_counter()
     solid = solid or solid_of(shapes)
     if are_primitives(shapes) and len(shapes) <= options.max_primitives:
-        plain = tuple(replace(shape, rgba=None) for shape in shapes)
-        single = plain[0] if len(plain) == 1 else None
-        return _measured(plain, single, solid, start, method="primitives")
+        kept = tuple(replace(shape, rgba=None) for shape in shapes)
+        single = kept[0] if len(kept) == 1 else None
+        return _measure(kept, single, solid, start, method="primitives")
     return fit_solid(solid, options)
 
 
 def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     """Fit a solid; see ``fit_shapes``."""
     start = time.perf_counter()
-    target = sampled(solid, options.seed)
+    target = sample_solid(solid, options.seed)
     if options.enclose:
-        shapes, _ = enclose_solid(target, options.max_primitives, options.iou, options.seed)
-        return _measured(shapes, None, solid, start)
+        shapes = enclose_solid(target, options.max_primitives, options.iou, options.seed)
+        return _measure(shapes, None, solid, start)
     best = latest = best_single(target)
     (single,) = best.shapes
     for _ in range(1, options.max_primitives):
@@ -102,11 +103,11 @@ def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
         if more is None:
             break
         latest = more
-        best = max(best, latest, key=lambda found: found.iou)
-    return _measured(best.shapes, single, solid, start)
+        best = max(best, latest, key=lambda result: result.iou)
+    return _measure(best.shapes, single, solid, start)
 
 
-def _measured(
+def _measure(
     primitives: tuple[Shape, ...],
     single: Shape | None,
     solid: Solid,
@@ -114,5 +115,6 @@ def _measured(
     method: str | None = None,
 ) -> LinkFit:
     seconds = time.perf_counter() - start
-    worth = quality(solid, primitives)
-    return LinkFit(primitives, single, method or solid.method, worth, seconds, solid.decimated_from)
+    measured = quality(solid, primitives)
+    method = method or solid.method
+    return LinkFit(primitives, single, method, measured, seconds, solid.decimated_from)

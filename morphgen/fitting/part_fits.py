@@ -1,4 +1,4 @@
-"""Fit the real parts of a library and store the result beside their manifests."""
+"""Fit the parts of a library that have meshes, and store the fits beside their manifests."""
 
 from __future__ import annotations
 
@@ -29,30 +29,32 @@ from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 
 TOKEN_OPTIONS = FitOptions(max_primitives=1)
+"""Options of the primitive in a link's token."""
 COLLISION_OPTIONS = FitOptions(max_primitives=4, iou=0.9)
+"""Options of the primitives that replace a link's collision meshes."""
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
-    """Parts that have meshes, templates among them, but for those that are scaled ones of another.
+    """Return the parts that have meshes, except those that are another part at another scale.
 
     Args:
-        library: Where they are.
-        missing: Leave out those of which every link is stored.
+        library: The library of parts.
+        missing: Return only parts with a link that has no stored fit.
     """
     stored = read_stored_fits(library.folders) if missing else {}
     return [
         manifest
         for manifest in library.manifests()
-        if not manifest.scaling and _keys(manifest) - stored.keys()
+        if not manifest.scaling and _mesh_keys(manifest) - stored.keys()
     ]
 
 
 def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
-    """Fit and store several parts; gives every file that is done.
+    """Fit and store several parts; yield the path of each file when it is written.
 
     Args:
         manifests: The parts.
-        jobs: Processes, each of which takes a part at a time.
+        jobs: Number of processes; each fits one part at a time.
 
     Raises:
         FormatError: If a file cannot be written.
@@ -63,62 +65,57 @@ def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Pat
 
 
 def store_part(manifest: Manifest) -> Path:
-    """Fit a part's links and write them beside its manifest.
+    """Fit the links of a part, write the fits beside its manifest, and return the path.
 
     Raises:
         FormatError: If the file cannot be written.
         MeshError: If a mesh cannot be read.
     """
-    body = load_part(manifest).fragment
+    fragment = load_part(manifest).fragment
     fits = {}
-    for row in fit_links(body, COLLISION_OPTIONS).links:
-        shapes = shapes_to_fit(body.link(row.link))
-        fits[shapes_key(shapes)] = stored_of(row.link, shapes, row.fit).scaled(
-            1 / shapes_scale(shapes)
-        )
+    for report in fit_links(fragment, COLLISION_OPTIONS).links:
+        shapes = shapes_to_fit(fragment.link(report.link))
+        fit = _with_token(report.link, shapes, report.fit)
+        fits[shapes_key(shapes)] = fit.scaled(1 / shapes_scale(shapes))
     path = manifest.path.with_name(manifest.path.stem + SUFFIX)
     write_file(path, fits_text(fits))
     return path
 
 
 def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, StoredFit]:
-    """The fits of a report by link; tokens are those of the robot, if fits of it are known.
+    """Return the fits of a report by link name, each with the primitive of the link's token.
+
+    The token's primitive is the known one if the robot carries it or it is stored.
 
     Args:
         robot: The robot that was fitted.
         report: Its fits.
-        stored: What folders of parts store.
+        stored: The stored fits of a library.
 
     Raises:
         MeshError: If a mesh cannot be read.
     """
-    found = {}
+    fits = {}
     for row in report.links:
-        shapes, worth = shapes_to_fit(robot.link(row.link)), row.fit.quality.iou
-        known = find_fit(shapes, robot, stored)
-        found[row.link] = (
-            replace(known, collision=row.fit.primitives, collision_iou=worth)
-            if known
-            else stored_of(row.link, shapes, row.fit)
-        )
-    return found
+        shapes = shapes_to_fit(robot.link(row.link))
+        if known := find_fit(shapes, robot, stored):
+            fits[row.link] = replace(
+                known, collision=row.fit.primitives, collision_iou=row.fit.quality.iou
+            )
+        else:
+            fits[row.link] = _with_token(row.link, shapes, row.fit)
+    return fits
 
 
-def stored_of(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
-    """A link's fit with the one primitive for its token, which is sought if the fit has none.
-
-    Args:
-        link: The link.
-        shapes: What was fitted.
-        fit: The fit.
-    """
+def _with_token(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
+    """Return a link's fit with the primitive of its token, which is fitted if it is missing."""
     solid = solid_of(shapes)
     single = fit.single or fit_shapes(shapes, TOKEN_OPTIONS, solid=solid).primitives[0]
     token_iou = quality(solid, [single]).iou
     return StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)
 
 
-def _keys(manifest: Manifest) -> set[str]:
-    """Keys of links with meshes."""
+def _mesh_keys(manifest: Manifest) -> set[str]:
+    """Return the keys of the shapes of links with meshes."""
     links = (shapes_to_fit(link) for link in load_part(manifest).fragment.links)
     return {shapes_key(shapes) for shapes in links if has_meshes(shapes)}

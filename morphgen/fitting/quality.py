@@ -1,7 +1,8 @@
-"""How well primitives stand for a solid: shares of volume and distances of surfaces.
+"""Measure how well primitives approximate a solid: volume ratios and surface distances.
 
-Nothing here is shared with the search for primitives: fresh samples, exact distances, NumPy only.
-Volumes are counted on one set of scrambled Sobol points, so that their errors cancel in ratios.
+The measurement is independent of the search for primitives: it draws its own samples and computes
+exact distances. All volumes are counted on the same scrambled Sobol points, so that errors cancel
+in ratios.
 """
 
 from __future__ import annotations
@@ -21,34 +22,34 @@ from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Shape, Sphere, volume
 from morphgen.typing import Array
 
-Body = Box | Cylinder | Capsule
-"""A sphere is a capsule of no length."""
-Placed = tuple[Array, Array]
-"""Points and the outward normals there, both of shape (n, 3)."""
-Patch = tuple[float, Callable[[Array], Placed]]
-"""Area of a piece of surface, and its map of the unit square, (n, 2), that keeps areas."""
+SolidPrimitive = Box | Cylinder | Capsule
+"""A primitive; a sphere is a capsule of length 0."""
+SurfacePoints = tuple[Array, Array]
+"""Points and their outward normals, both of shape (n, 3)."""
+Patch = tuple[float, Callable[[Array], SurfacePoints]]
+"""Area of a patch of a surface, and its area-preserving map from the unit square (n, 2)."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How well primitives stand for a solid; where primitives overlap counts once."""
+    """Measured agreement of a union of primitives with a solid."""
 
     iou: float
-    """Volume of the intersection over that of the union."""
+    """Volume of the intersection over the volume of the union."""
     coverage: float
-    """Share of the solid's volume inside the primitives."""
+    """Share of the solid's volume that is inside the primitives."""
     volume_ratio: float
-    """Volume of the union of the primitives over the solid's."""
+    """Volume of the union of the primitives over the volume of the solid."""
     protrusion_mean: float
-    """How far the primitives' outer surface lies outside of the solid, 0 where inside, metres."""
+    """Mean distance of the primitives' outer surface from the solid, 0 where inside [m]."""
     protrusion_p95: float
-    """95th percentile of the same over the area."""
+    """95th percentile of that distance over the surface [m]."""
     gap_mean: float
-    """How far the solid's surface lies outside of the primitives, 0 where inside, metres."""
+    """Mean distance of the solid's surface from the primitives, 0 where inside [m]."""
     gap_p95: float
-    """95th percentile of the same over the area."""
+    """95th percentile of that distance over the surface [m]."""
     hausdorff: float
-    """Largest distance from a point of either surface to the other surface, metres."""
+    """Largest distance of a point of either surface to the other surface [m]."""
 
 
 def quality(
@@ -59,20 +60,20 @@ def quality(
     volume_points: int = 32768,
     surface_points: int = 8192,
 ) -> Quality:
-    """Measure primitives against the solid that they stand for.
+    """Measure how well primitives approximate a solid.
 
-    Where the solid's mesh has holes its surface is what triangles there are; triangles within it
-    count as its surface only for the distance to points inside of it.
+    The surface of a solid with holes consists of the triangles that exist. Triangles inside of the
+    solid count only for distances from points inside of it.
 
     Args:
-        solid: What is to be stood for, in the link frame.
-        primitives: Boxes, cylinders, spheres and capsules on the link, at least one.
-        seed: Of the sample points.
-        volume_points: How many in the bounding box of both, rounded up to a power of two.
-        surface_points: How many on each surface, on the primitives rounded up likewise.
+        solid: The solid in the link frame.
+        primitives: Boxes, cylinders, spheres and capsules in the link frame, at least one.
+        seed: Seed of the sample points.
+        volume_points: Number of points in the bounding box of both, rounded up to a power of two.
+        surface_points: Number of points on each surface; rounded up likewise on the primitives.
 
     Raises:
-        FitError: If no sample point lies in the solid: it is far too thin, or too far off.
+        FitError: If no sample point is in the solid: it is too thin, or far from the primitives.
         ValueError: If there are no primitives, one has no volume, or one is a mesh.
     """
     vertices = np.asarray(solid.mesh.vertices)[solid.mesh.referenced_vertices]
@@ -80,28 +81,28 @@ def quality(
     rng = np.random.default_rng(seed)
     R, low, high = _bounding_box(primitives, vertices)
     points = (low + (high - low) * _sobol(volume_points, rng)) @ R.T
-    ours, theirs = signed_distance(primitives, points) <= 0, solid.contains(points)
-    if not theirs.any():
+    in_primitives, in_solid = signed_distance(primitives, points) <= 0, solid.contains(points)
+    if not in_solid.any():
         raise FitError(f"none of {len(points)} sample points lies in the solid")
-    both = np.count_nonzero(ours & theirs)
+    intersection = np.count_nonzero(in_primitives & in_solid)
 
     outer = _outer_surface(primitives, surface_points, rng)
-    corners = [_outer(primitives, owner, *_corners(each)) for owner, each in enumerate(primitives)]
+    corners = [_outer(primitives, i, *_corners(shape)) for i, shape in enumerate(primitives)]
     to_solid = solid.distance(np.concatenate([outer, *corners]))
     protrusion = np.where(solid.contains(outer), 0.0, to_solid[: len(outer)])
 
     surface = solid.surface(surface_points, rng)
     signed = signed_distance(primitives, surface)
     gap = np.maximum(signed, 0.0)
-    # The distance to a convex body is largest in a corner of a triangle. Corners within the solid
-    # do no harm: from there some way out leads away from all primitives.
+    # The distance of a triangle to a convex primitive is largest at a vertex. Vertices inside of
+    # the solid do no harm: a surface point near them is at least as far from all primitives.
     farthest = [to_solid.max(), gap.max(), at_vertices.max()]
     if (signed < 0).any():
         farthest.append(_depth(primitives, surface[signed < 0], surface_points, rng).max())
     return Quality(
-        iou=float(both / np.count_nonzero(ours | theirs)),
-        coverage=float(both / np.count_nonzero(theirs)),
-        volume_ratio=float(np.count_nonzero(ours) / np.count_nonzero(theirs)),
+        iou=float(intersection / np.count_nonzero(in_primitives | in_solid)),
+        coverage=float(intersection / np.count_nonzero(in_solid)),
+        volume_ratio=float(np.count_nonzero(in_primitives) / np.count_nonzero(in_solid)),
         protrusion_mean=float(protrusion.mean()),
         protrusion_p95=float(np.percentile(protrusion, 95)),
         gap_mean=float(gap.mean()),
@@ -111,16 +112,17 @@ def quality(
 
 
 def signed_distance(primitives: Sequence[Shape], points: Array) -> Array:
-    """Signed distance of points to the union of primitives, negative inside.
+    """Return the signed distances of points to a union of primitives, negative inside.
 
-    It is exact outside, and inside of a single one; inside of several the surface may be farther.
+    They are exact outside, and inside of one primitive; inside of several overlapping primitives
+    the surface may be farther away.
 
     Args:
-        primitives: At least one, none of them a mesh.
-        points: Shape (n, 3), metres, in the link frame.
+        primitives: At least one primitive, no meshes.
+        points: Points in the link frame [m], shape (n, 3).
 
     Returns:
-        Distances, shape (n,), metres.
+        Distances [m], shape (n,).
 
     Raises:
         ValueError: If there are no primitives, one has no volume, or one is a mesh.
@@ -130,10 +132,10 @@ def signed_distance(primitives: Sequence[Shape], points: Array) -> Array:
     return np.asarray(np.min([_distance(shape, points) for shape in primitives], axis=0))
 
 
-def _body(shape: Shape) -> Body:
+def _body(shape: Shape) -> SolidPrimitive:
     geometry = shape.geometry
     if isinstance(geometry, Mesh) or not volume(geometry) > 0:
-        raise ValueError(f"{geometry} is no primitive with a volume")
+        raise ValueError(f"{geometry} is not a primitive with a volume")
     return Capsule(geometry.radius, 0.0) if isinstance(geometry, Sphere) else geometry
 
 
@@ -151,24 +153,27 @@ def _distance(shape: Shape, points: Array) -> Array:
 
 
 def _rounded(*beyond: Array) -> Array:
-    """Signed distance from how far points are beyond each pair of orthogonal faces."""
+    """Return signed distances from the distances beyond each pair of orthogonal faces."""
     squared = sum(np.maximum(part, 0.0) ** 2 for part in beyond)
     return np.asarray(np.sqrt(squared) + np.minimum(np.max(beyond, axis=0), 0.0))
 
 
 def _bounding_box(primitives: Sequence[Shape], points: Array) -> tuple[Array, Array, Array]:
-    """Axes of the link or of a primitive, as columns, and the bounds of all along them."""
+    """Return the smallest box around all, along the axes of the link or of a primitive.
+
+    The axes are the columns of the first array; the others are the bounds along them.
+    """
     boxes = []
     for R in (np.eye(3), *(shape.T_link_shape.matrix[:3, :3] for shape in primitives)):
-        middles = np.array([shape.T_link_shape.position for shape in primitives]) @ R
-        reaches = np.array([_reach(shape, R) for shape in primitives])
-        ends = np.concatenate([points @ R, middles - reaches, middles + reaches])
+        centres = np.array([shape.T_link_shape.position for shape in primitives]) @ R
+        halves = np.array([_half_extents(shape, R) for shape in primitives])
+        ends = np.concatenate([points @ R, centres - halves, centres + halves])
         boxes.append((R, ends.min(axis=0), ends.max(axis=0)))
     return min(boxes, key=lambda box: float(np.prod(box[2] - box[1])))
 
 
-def _reach(shape: Shape, R: Array) -> Array:
-    """Half the extents along the columns of a rotation, shape (3,)."""
+def _half_extents(shape: Shape, R: Array) -> Array:
+    """Return the half extents of a primitive along the columns of a rotation, shape (3,)."""
     axes = abs(R.T @ shape.T_link_shape.matrix[:3, :3])
     match _body(shape):
         case Box(size):
@@ -181,13 +186,13 @@ def _reach(shape: Shape, R: Array) -> Array:
 
 
 def _sobol(n: int, rng: np.random.Generator) -> Array:
-    """Scrambled Sobol points in the unit cube, at least ``n``: a power of two."""
+    """Return at least ``n`` scrambled Sobol points in the unit cube, a power of two."""
     sampler = qmc.Sobol(3, scramble=True, seed=rng)
     return np.asarray(sampler.random_base2(max(n - 1, 1).bit_length()))
 
 
 def _outer_surface(primitives: Sequence[Shape], n: int, rng: np.random.Generator) -> Array:
-    """Points spread evenly over the primitives, without those that lie within another one."""
+    """Sample the outer surface of the union of primitives evenly."""
     bodies = enumerate(map(_body, primitives))
     patches = [(owner, *patch) for owner, body in bodies for patch in _patches(body)]
     ends = np.cumsum([area for _, area, _ in patches])
@@ -198,9 +203,9 @@ def _outer_surface(primitives: Sequence[Shape], n: int, rng: np.random.Generator
 
 
 def _outer(primitives: Sequence[Shape], owner: int, points: Array, normals: Array) -> Array:
-    """Points of a primitive, given in its frame, without those that lie within another one.
+    """Return the surface points of a primitive that are outside of all others, in the link frame.
 
-    Of faces that coincide those of the first stay; of faces that face each other, none.
+    Of faces that coincide those of the first primitive are kept; of faces in contact, none.
     """
     T = primitives[owner].T_link_shape.matrix
     points, normals = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
@@ -215,12 +220,12 @@ def _outer(primitives: Sequence[Shape], owner: int, points: Array, normals: Arra
 
 
 def _step(primitives: Sequence[Shape]) -> float:
-    """How far beside a surface to look for another primitive, metres."""
+    """Return the offset from a surface at which other primitives are tested for [m]."""
     return 1e-6 * math.pow(min(volume(_body(shape)) for shape in primitives), 1 / 3)
 
 
-def _patches(body: Body) -> list[Patch]:
-    """The surface of a primitive, in pieces."""
+def _patches(body: SolidPrimitive) -> list[Patch]:
+    """Return the patches of a primitive's surface."""
     match body:
         case Box((a, b, c)):
             sides = itertools.product(enumerate((b * c, c * a, a * b)), (-1, 1))
@@ -233,38 +238,38 @@ def _patches(body: Body) -> list[Patch]:
             return [(math.tau * radius * length, partial(_on_tube, body)), ends]
 
 
-def _on_face(box: Box, axis: int, sign: int, unit: Array) -> Placed:
+def _on_face(box: Box, axis: int, sign: int, unit: Array) -> SurfacePoints:
     normals = np.zeros((len(unit), 3))
     normals[:, axis] = sign
     return np.insert(2 * unit - 1, axis, sign, axis=1) * box.size / 2, normals
 
 
-def _on_tube(body: Cylinder | Capsule, unit: Array) -> Placed:
+def _on_tube(body: Cylinder | Capsule, unit: Array) -> SurfacePoints:
     normals = _spun(np.ones(len(unit)), unit[:, 0], np.zeros(len(unit)))
     return normals * body.radius + np.outer(unit[:, 1] - 0.5, (0, 0, body.length)), normals
 
 
-def _on_caps(cylinder: Cylinder, unit: Array) -> Placed:
+def _on_caps(cylinder: Cylinder, unit: Array) -> SurfacePoints:
     side, away = np.copysign(1.0, unit[:, 1] - 0.5), np.sqrt(abs(2 * unit[:, 1] - 1))
     points = _spun(cylinder.radius * away, unit[:, 0], side * cylinder.length / 2)
     return points, np.outer(side, (0.0, 0.0, 1.0))
 
 
-def _on_ball(capsule: Capsule, unit: Array) -> Placed:
-    """On both caps; evenly along the axis, which is evenly over a sphere (Archimedes)."""
+def _on_ball(capsule: Capsule, unit: Array) -> SurfacePoints:
+    """Sample both caps: uniform along the axis is uniform over a sphere (Archimedes)."""
     z = 2 * unit[:, 1] - 1
     normals = _spun(np.sqrt(1 - z * z), unit[:, 0], z)
     return normals * capsule.radius + np.outer(np.sign(z), (0, 0, capsule.length / 2)), normals
 
 
 def _spun(radius: Array, turns: Array, z: Array) -> Array:
-    """Points from cylindrical coordinates, shape (n, 3)."""
+    """Return points from cylindrical coordinates, shape (n, 3)."""
     angle = math.tau * turns
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
-def _corners(shape: Shape) -> Placed:
-    """A box's corners, 64 points on each rim of a cylinder, none of a capsule."""
+def _corners(shape: Shape) -> SurfacePoints:
+    """Return a box's corners, 64 points on each rim of a cylinder, nothing of a capsule."""
     points = np.zeros((0, 3))
     match _body(shape):
         case Box(size):
@@ -277,18 +282,18 @@ def _corners(shape: Shape) -> Placed:
 
 
 def _depth(primitives: Sequence[Shape], points: Array, n: int, rng: np.random.Generator) -> Array:
-    """Distance of points inside of the primitives to the outer surface, shape (m,).
+    """Return the distances of points inside of the primitives to the outer surface, shape (m,).
 
-    The signed distance says how far it is at least. That is exact where the way to the surface of
-    the primitive, up the gradient, leads out of all others too; elsewhere a dense sample decides.
+    The signed distance is a lower bound. It is exact where the path along its gradient leaves all
+    primitives at once; elsewhere the distance to a dense sample of the surface is used.
     """
     depth = -signed_distance(primitives, points)
     if len(primitives) == 1:
         return depth
     step = _step(primitives)
     ahead = [signed_distance(primitives, points + step * axis) for axis in np.eye(3)]
-    up = (np.stack(ahead, axis=1) + depth[:, None]) / step
-    beyond = signed_distance(primitives, points + (depth + 10 * step)[:, None] * up)
+    gradient = (np.stack(ahead, axis=1) + depth[:, None]) / step
+    beyond = signed_distance(primitives, points + (depth + 10 * step)[:, None] * gradient)
     unsure = beyond < 5 * step
     if unsure.any():
         surface = _outer_surface(primitives, 4 * n, rng)

@@ -1,4 +1,7 @@
-"""The primitives that overlap a solid best: guesses, gradient ascent, and a choice by counting."""
+"""Search for the primitives of largest intersection over union (IoU) with a solid.
+
+Initial guesses are improved by gradient ascent on a soft IoU; counted sample points decide.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from scipy.stats import qmc
 
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS, canonical
-from morphgen.fitting.initial_guess import FEWEST, around, by_growth, by_pieces
+from morphgen.fitting.initial_guess import MIN_POINTS, around, by_growth, by_pieces
 from morphgen.fitting.soft_iou import Candidates, ascend, overlaps
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
@@ -24,50 +27,53 @@ from morphgen.model.rotation import normalize
 from morphgen.typing import Array
 
 COARSE_POINTS = 2**11
+"""Number of sample points of the first ascent."""
 NEAR_POINTS, FAR_POINTS = 2**14, 2**12
+"""Numbers of sample points close to the solid and further away."""
 NEAR, FAR = 0.02, 0.35
-"""How far beyond the bounding box these points are drawn, in sizes of it."""
-CLUSTERINGS = 4
-"""Ways of cutting a solid from which several primitives start."""
-KEPT = 2
-"""Candidates that are refined."""
+"""Margins of their boxes around the bounding box, relative to the solid's size."""
+NUM_CLUSTERINGS = 4
+"""Number of clusterings from which the search for several primitives starts."""
+NUM_REFINED = 2
+"""Number of candidates that are refined on all sample points."""
 DIGITS = 6
-"""Decimals of dimensions and positions, metres; quaternions have three more."""
+"""Decimals of dimensions and positions in metres; quaternions have three more."""
 
 
 @dataclass(frozen=True)
-class Sampled:
-    """A solid as points in a frame of its own: that of its smallest bounding box, in sizes of it.
+class SampledSolid:
+    """A solid as sample points in the frame and units of its smallest bounding box.
 
-    So a thin solid at an angle is met by as many points as one along the axes of the link.
+    In that frame a thin oblique solid is hit by as many points as one along the link's axes.
     """
 
     solid: Solid
     points: Array
-    """Shape (n, 3), spread over the solid and its surroundings, in no order."""
+    """Points over the solid and its surroundings [sizes of the solid], shape (n, 3), shuffled."""
     inside: NDArray[np.bool_]
+    """Points that are inside the solid, shape (n,)."""
     weights: Array
-    """The volume that each stands for, shape (n,); points far from the solid are sparse."""
+    """Volume that each point represents, mean 1, shape (n,); sparse points weigh more."""
 
     R_link_box: Array
-    """Axes of the smallest bounding box, shape (3, 3)."""
-    middle: Array
-    """Its middle, in the link frame, metres."""
+    """Axes of the smallest bounding box in the link frame, shape (3, 3)."""
+    centre: Array
+    """Centre of the smallest bounding box in the link frame [m], shape (3,)."""
 
     @cached_property
     def link_points(self) -> Array:
-        """The points in the link frame, metres."""
-        return np.asarray(self.points * self.solid.size @ self.R_link_box.T + self.middle)
+        """The points in the link frame [m]."""
+        return np.asarray(self.points * self.solid.size @ self.R_link_box.T + self.centre)
 
     def shapes(self, candidates: Candidates, row: int) -> tuple[Shape, ...]:
-        """One of the candidates as shapes in the link frame, rounded."""
+        """Return one candidate as rounded shapes in the link frame."""
         size = self.solid.size
         R_box_primitive = Rotation.from_quat(candidates.quaternions[row], scalar_first=True)
         R_link_primitive = Rotation.from_matrix(self.R_link_box) * R_box_primitive
-        found = []
+        shapes = []
         for kind, centre, quaternion, halves in zip(
             candidates.kinds[row],
-            candidates.centres[row] * size @ self.R_link_box.T + self.middle,
+            candidates.centres[row] * size @ self.R_link_box.T + self.centre,
             R_link_primitive.as_quat(scalar_first=True),
             np.round(candidates.halves[row] * size, DIGITS),
             strict=True,
@@ -84,100 +90,102 @@ class Sampled:
             a, b, c = np.round(centre, DIGITS).tolist()
             w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
             pose = Pose((a, b, c), normalize((w, i, j, k)))
-            found.append(canonical(Shape(geometry, pose)))
-        return tuple(found)
+            shapes.append(canonical(Shape(geometry, pose)))
+        return tuple(shapes)
 
 
 @dataclass(frozen=True)
-class Found:
-    """The end of a search."""
+class SearchResult:
+    """The best primitives of a search."""
 
     shapes: tuple[Shape, ...]
-    """In the link frame."""
+    """Primitives in the link frame."""
     iou: float
-    """As the search saw it."""
+    """Intersection over union on the sample points of the search."""
     candidate: Candidates
-    """The same in the frame of the search, one row."""
+    """The same primitives in the frame of the search, one row."""
 
 
-def sampled(solid: Solid, seed: int) -> Sampled:
-    """Draw the points that a search looks at.
+def sample_solid(solid: Solid, seed: int) -> SampledSolid:
+    """Draw the sample points of a search.
 
     Raises:
-        FitError: If next to none of them lie inside: the solid is too thin.
+        FitError: If almost no point is inside, because the solid is too thin.
     """
     T_box_link, extents = trimesh.bounds.oriented_bounds(solid.hull)
     T_link_box = np.linalg.inv(T_box_link)
-    R_link_box, middle, extents = T_link_box[:3, :3], T_link_box[:3, 3], extents / solid.size
+    R_link_box, centre, extents = T_link_box[:3, :3], T_link_box[:3, 3], extents / solid.size
     near, far = extents / 2 + NEAR, extents / 2 + FAR
     rng = np.random.default_rng(seed)
-    close = near * (2 * qmc.Sobol(3, rng=rng).random(NEAR_POINTS) - 1)
-    beyond = far * (2 * qmc.Sobol(3, rng=rng).random(FAR_POINTS) - 1)
-    beyond = beyond[np.any(np.abs(beyond) > near, axis=1)]
-    points = np.concatenate([close, beyond])
-    counts = np.repeat(
-        [np.prod(near) / NEAR_POINTS, np.prod(far) / FAR_POINTS], [len(close), len(beyond)]
+    near_points = near * (2 * qmc.Sobol(3, rng=rng).random(NEAR_POINTS) - 1)
+    far_points = far * (2 * qmc.Sobol(3, rng=rng).random(FAR_POINTS) - 1)
+    far_points = far_points[np.any(np.abs(far_points) > near, axis=1)]
+    points = np.concatenate([near_points, far_points])
+    volumes = np.repeat(
+        [np.prod(near) / NEAR_POINTS, np.prod(far) / FAR_POINTS],
+        [len(near_points), len(far_points)],
     )
     order = rng.permutation(len(points))
-    points, counts = points[order], counts[order]
-    inside = solid.contains(points * solid.size @ R_link_box.T + middle)
-    if inside[:COARSE_POINTS].sum() < 2 * FEWEST:
+    points, volumes = points[order], volumes[order]
+    inside = solid.contains(points * solid.size @ R_link_box.T + centre)
+    if inside[:COARSE_POINTS].sum() < 2 * MIN_POINTS:
         raise FitError(f"the solid is too thin: it fills {inside.mean():.2%} of its bounding box")
-    return Sampled(solid, points, inside, counts / counts.mean(), R_link_box, middle)
+    return SampledSolid(solid, points, inside, volumes / volumes.mean(), R_link_box, centre)
 
 
-def best_single(target: Sampled) -> Found:
-    """The one primitive that overlaps most."""
-    with _one_thread():
+def best_single(target: SampledSolid) -> SearchResult:
+    """Return the single primitive of largest IoU."""
+    with _one_torch_thread():
         cloud = target.points[target.inside]
         start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
         return _climb(target, start, (0.03, 0.008))
 
 
-def best_several(target: Sampled, fewer: Found, seed: int) -> Found | None:
-    """The primitives that overlap most together, one more than found before.
+def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
+    """Return the primitives of largest IoU, one more than in an earlier result.
 
-    None if the solid has too few points for them.
+    None if the solid has too few sample points for them.
     """
-    seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(CLUSTERINGS)]
-    some = slice(4 * COARSE_POINTS)
-    cloud = target.points[some], target.inside[some], target.weights[some]
+    seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(NUM_CLUSTERINGS)]
+    subset = slice(4 * COARSE_POINTS)
+    cloud = target.points[subset], target.inside[subset], target.weights[subset]
     k = len(fewer.shapes) + 1
-    with _one_thread():
+    with _one_torch_thread():
         starts = by_pieces(*cloud, k, seeds), by_growth(fewer.candidate, *cloud, seeds[0])
         start = [guesses for guesses in starts if guesses is not None]
         return _climb(target, Candidates.stack(start), (0.02, 0.006)) if start else None
 
 
-def _climb(target: Sampled, start: Candidates, tau: tuple[float, float]) -> Found:
+def _climb(target: SampledSolid, start: Candidates, tau: tuple[float, float]) -> SearchResult:
+    """Improve all candidates on few points, then the best ones on all points."""
     points, inside, weights = target.points, target.inside, target.weights
-    rough = ascend(
+    coarse = ascend(
         start,
         points[:COARSE_POINTS],
         inside[:COARSE_POINTS],
         weights=weights[:COARSE_POINTS],
-        steps=100,
+        num_steps=100,
         tau=tau,
         rate=(0.01, 0.003),
     )
-    kept = np.argsort(-overlaps(rough, points, inside, weights), kind="stable")[:KEPT]
+    best = np.argsort(-overlaps(coarse, points, inside, weights), kind="stable")[:NUM_REFINED]
     fine = ascend(
-        rough.take(kept),
+        coarse.take(best),
         points,
         inside,
         weights=weights,
-        steps=60,
+        num_steps=60,
         tau=(0.006, 0.0015),
         rate=(0.004, 0.0004),
     )
-    score = overlaps(fine, points, inside, weights)
-    best = int(np.argmax(score))
-    return Found(target.shapes(fine, best), float(score[best]), fine.take(np.array([best])))
+    ious = overlaps(fine, points, inside, weights)
+    row = int(np.argmax(ious))
+    return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """The order of a sum depends on the number of threads, and the result on the order."""
+def _one_torch_thread() -> Iterator[None]:
+    """Use one thread: the order of a sum, and so its last bits, depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

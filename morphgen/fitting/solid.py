@@ -1,11 +1,11 @@
-"""The solid of a link: which points lie inside of meshes that are open, nested or inside out.
+"""The solid of a link: which points are inside of meshes that may be open, nested or inside out.
 
-A point is inside where the generalised winding number of the triangles is above one half (Jacobson,
+A point is inside if the generalised winding number of the triangles is above one half (Jacobson,
 Kavan and Sorkine-Hornung, "Robust inside-outside segmentation using generalized winding numbers",
-2013; here libigl's fast evaluation of it). Every connected piece is first turned outwards, so a
-piece within another counts as filled: a link is a body, and nothing enters its cavities. Meshes of
-covers are shells, thin walls around a room that opens where the next link begins; this room counts
-as filled, too, where few directions lead out of it.
+2013; evaluated by libigl). The normals of every connected component are turned outwards first, so
+a component within another one counts as filled: nothing enters the cavities of a link. The meshes
+of covers are shells: thin walls around a cavity that is open where the next link begins. A point of
+such a cavity is inside, too, if few directions lead out of it.
 """
 
 from __future__ import annotations
@@ -29,43 +29,43 @@ from morphgen.model.mesh import FLATNESS_TOLERANCE, is_flat, load_mesh
 from morphgen.typing import Array
 
 Method = Literal["watertight", "repaired", "winding", "filled", "hull"]
-"""What made a solid of the triangles, from best to worst: nothing was needed; pieces were turned
-outwards, welded or their small holes filled; it is open, and the winding number decides; it is a
-hollow shell, and the room within was filled; it encloses next to nothing, and its convex hull is
-taken."""
+"""How a solid was made of triangles, from best to worst: unchanged; repaired (normals turned
+outwards, vertices welded, small holes filled); open, so that the winding number decides; a hollow
+shell whose cavity was filled; the convex hull of a mesh that encloses next to nothing."""
 METHODS: tuple[Method, ...] = ("watertight", "repaired", "winding", "filled", "hull")
 
 MAX_FACES = 200_000
-"""Triangles above which a mesh is decimated."""
-DECIMATED = 100_000
-"""Triangles that are left then."""
-HOLLOW = 0.02
+"""Number of triangles above which a mesh is decimated."""
+DECIMATED_FACES = 100_000
+"""Number of triangles after decimation."""
+MIN_ENCLOSED_SHARE = 0.02
 """Share of the convex hull's volume below which an open mesh encloses nothing."""
-ENCLOSED = 0.3
-"""Openness below which a point lies within a shell. Half-way down a cup as wide as deep: 0.15."""
-SHELL = 0.1
-"""Volume within a shell, relative to that of its walls, from which on it is filled."""
-DIRECTIONS = 64
-"""Rays from every point."""
-_WELD = 1e-5
+MAX_OPENNESS = 0.3
+"""Openness below which a point is in the cavity of a shell. Half-way down a cup that is as wide as
+deep the openness is 0.15."""
+MIN_CAVITY = 0.1
+"""Volume of a cavity, relative to that of the walls, from which a shell is filled."""
+NUM_RAYS = 64
+"""Number of rays from a point that its openness is measured with."""
+_WELD_DISTANCE = 1e-5
 """Distance below which vertices are welded, relative to the size of the mesh."""
-_PROBES = 4096
-"""Points that tell whether an open mesh encloses anything, and whether there is room in a shell."""
+_NUM_PROBES = 4096
+"""Number of sample points that measure enclosed volumes and cavities."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """What is inside of a link's shapes, in the link frame, metres."""
+    """The inside of a link's shapes, in the link frame [m]."""
 
     mesh: trimesh.Trimesh
-    """Triangles turned outwards, perhaps open or overlapping."""
+    """Triangles with outward normals, perhaps open or overlapping."""
     method: Method
-    """The worst that any of its shapes needed."""
+    """The worst method that any of the shapes needed."""
     decimated_from: int | None = None
-    """Number of triangles before decimation; None if there was none."""
+    """Number of triangles before decimation; None if the mesh was not decimated."""
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Whether points, shape (n, 3), lie inside."""
+        """Return which points, shape (n, 3), are inside."""
         low, high = self.mesh.bounds
         near = np.all((points >= low) & (points <= high), axis=1)
         inside = np.zeros(len(points), dtype=bool)
@@ -74,16 +74,16 @@ class Solid:
             inside[near] = winding > 0.5
         if self.method == "filled":
             unsure = near & ~inside
-            inside[unsure] = self._cavities.openness(points[unsure]) < ENCLOSED
+            inside[unsure] = self._cavities.openness(points[unsure]) < MAX_OPENNESS
         return inside
 
     def distance(self, points: Array) -> Array:
-        """Distance of points, shape (n, 3), to the triangles, metres."""
+        """Return the distances of points, shape (n, 3), to the triangles [m]."""
         squared, _, _ = igl.point_mesh_squared_distance(points, self._vertices, self._faces)
         return np.asarray(np.sqrt(squared))
 
     def surface(self, n: int, rng: np.random.Generator) -> Array:
-        """About ``n`` points of the outer surface: triangles inside of the solid are left out."""
+        """Sample about ``n`` points of the outer surface, without triangles inside of the solid."""
         points, faces = trimesh.sample.sample_surface(self.mesh, n, seed=rng)
         points = np.asarray(points)
         step = 1e-4 * self.size * self.mesh.face_normals[faces]
@@ -92,13 +92,13 @@ class Solid:
 
     @cached_property
     def hull(self) -> trimesh.Trimesh:
-        """The convex hull."""
+        """Convex hull of the triangles."""
         hull: trimesh.Trimesh = trimesh.convex.convex_hull(self.mesh)
         return hull
 
     @property
     def size(self) -> float:
-        """Diagonal of the bounding box, metres."""
+        """Diagonal of the bounding box [m]."""
         return float(np.linalg.norm(self.mesh.extents))
 
     @cached_property
@@ -115,10 +115,10 @@ class Solid:
 
 
 def solid_of(shapes: Sequence[Shape]) -> Solid:
-    """The solid of shapes that are fixed to each other.
+    """Return the solid of shapes that are fixed to each other.
 
     Args:
-        shapes: At least one.
+        shapes: At least one shape.
 
     Raises:
         FitError: If there are no shapes, or all are flat.
@@ -126,25 +126,22 @@ def solid_of(shapes: Sequence[Shape]) -> Solid:
     """
     if not shapes:
         raise FitError("there are no shapes")
-    solids = [_solid_of_shape(shape) for shape in shapes]
-    bulky = [solid for solid in solids if solid is not None]
-    if not bulky:
+    solids = [solid for shape in shapes if (solid := _solid_of_shape(shape)) is not None]
+    if not solids:
         raise FitError("the shapes are flat: they have no volume")
-    return _filled(bulky[0] if len(bulky) == 1 else _together(bulky))
-
-
-def _together(bulky: Sequence[Solid]) -> Solid:
-    counts = [solid.decimated_from or len(solid.mesh.faces) for solid in bulky]
-    together = trimesh.util.concatenate([solid.mesh for solid in bulky])
-    return Solid(
-        cast(trimesh.Trimesh, together),
-        max((solid.method for solid in bulky), key=METHODS.index),
-        sum(counts) if any(solid.decimated_from for solid in bulky) else None,
+    if len(solids) == 1:
+        return _fill_cavity(solids[0])
+    counts = [solid.decimated_from or len(solid.mesh.faces) for solid in solids]
+    union = Solid(
+        cast(trimesh.Trimesh, trimesh.util.concatenate([solid.mesh for solid in solids])),
+        max((solid.method for solid in solids), key=METHODS.index),
+        sum(counts) if any(solid.decimated_from for solid in solids) else None,
     )
+    return _fill_cavity(union)
 
 
 def solid_of_mesh(mesh: trimesh.Trimesh) -> Solid | None:
-    """The solid of triangles in metres; None if they are flat."""
+    """Return the solid of triangles in metres; None if they are flat."""
     if is_flat(np.asarray(mesh.vertices)):
         return None
     before = len(mesh.faces)
@@ -152,132 +149,129 @@ def solid_of_mesh(mesh: trimesh.Trimesh) -> Solid | None:
         vertices, faces = fast_simplification.simplify(
             np.asarray(mesh.vertices, np.float32),
             np.asarray(mesh.faces, np.int32),
-            target_count=DECIMATED,
+            target_count=DECIMATED_FACES,
         )
         mesh = trimesh.Trimesh(vertices, faces)
-    turned, was_turned = _turned_outwards(mesh)
-    method: Method = "repaired" if was_turned else "watertight"
-    if not turned.is_watertight:
-        turned = _closed(turned)
-        method = "repaired" if turned.is_watertight else "winding"
-    solid = Solid(turned, method, before if before > MAX_FACES else None)
-    if method == "winding" and _is_hollow(solid):
-        return Solid(solid.hull, "hull", solid.decimated_from)
+    oriented, changed = _orient_outwards(mesh)
+    method: Method = "repaired" if changed else "watertight"
+    if not oriented.is_watertight:
+        oriented = _close(oriented)
+        method = "repaired" if oriented.is_watertight else "winding"
+    solid = Solid(oriented, method, before if before > MAX_FACES else None)
+    if method == "winding":
+        low, high = oriented.bounds
+        enclosed = float(solid.contains(_probes(solid)).mean() * np.prod(high - low))
+        if enclosed < MIN_ENCLOSED_SHARE * float(solid.hull.volume):
+            return Solid(solid.hull, "hull", solid.decimated_from)
     return solid
 
 
 def _solid_of_shape(shape: Shape) -> Solid | None:
     geometry = shape.geometry
     mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
-    placed = mesh.copy()
-    placed.apply_transform(shape.T_link_shape.matrix)
-    return solid_of_mesh(placed)
+    return solid_of_mesh(mesh.copy().apply_transform(shape.T_link_shape.matrix))
 
 
-def _turned_outwards(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
-    """Every connected piece with its normals outwards, and whether anything had to be changed."""
-    turned = _without_repeats(mesh)
-    if not turned.is_winding_consistent:
-        turned = turned.copy()
-        trimesh.repair.fix_winding(turned)
-    corners = turned.triangles
-    piece = trimesh.graph.connected_component_labels(
-        turned.face_adjacency, node_count=len(turned.faces)
+def _orient_outwards(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
+    """Turn the normals of every connected component outwards; return also if anything changed."""
+    oriented = _without_duplicates(mesh)
+    if not oriented.is_winding_consistent:
+        oriented = oriented.copy()
+        trimesh.repair.fix_winding(oriented)
+    corners = oriented.triangles
+    label = trimesh.graph.connected_component_labels(
+        oriented.face_adjacency, node_count=len(oriented.faces)
     )
-    size = np.bincount(piece)
-    middle = np.stack(
-        [np.bincount(piece, corners[:, :, i].mean(axis=1)) / size for i in range(3)], axis=1
+    size = np.bincount(label)
+    centre = np.stack(
+        [np.bincount(label, corners[:, :, i].mean(axis=1)) / size for i in range(3)], axis=1
     )
-    local = corners - middle[piece][:, None]
+    # The signed volume of a component is the sum of the tetrahedra of its triangles and its centre.
+    local = corners - centre[label][:, None]
     volumes = np.einsum("ij,ij->i", local[:, 0], np.cross(local[:, 1], local[:, 2])) / 6
-    # A flat piece has no inside to turn away from.
-    least = FLATNESS_TOLERANCE * np.bincount(piece, turned.area_faces) ** 1.5
-    inverted = (np.bincount(piece, volumes) < -least)[piece]
+    # A flat component has no inside.
+    least = FLATNESS_TOLERANCE * np.bincount(label, oriented.area_faces) ** 1.5
+    inverted = (np.bincount(label, volumes) < -least)[label]
     if not inverted.any():
-        return turned, turned is not mesh
-    faces = np.where(inverted[:, None], turned.faces[:, ::-1], turned.faces)
-    return trimesh.Trimesh(turned.vertices, faces, process=False), True
+        return oriented, oriented is not mesh
+    faces = np.where(inverted[:, None], oriented.faces[:, ::-1], oriented.faces)
+    return trimesh.Trimesh(oriented.vertices, faces, process=False), True
 
 
-def _without_repeats(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Of triangles on the same corners one is left, none of two that face each other.
+def _without_duplicates(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Keep one of several triangles with the same corners, and none of two that face each other.
 
-    Two that face each other are a wall within a body, unless the whole mesh is there twice.
+    Two triangles that face each other are a wall within a body, unless the whole mesh is doubled.
     """
     corners = np.sort(mesh.faces, axis=1)
     _, first, group = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     if len(first) == len(corners):
         return mesh
+    # Triangles face each other if they go round their sorted corners in opposite directions.
     after_least = mesh.faces[np.arange(len(corners)), (np.argmin(mesh.faces, axis=1) + 1) % 3]
     facing = np.bincount(group, np.where(after_least == corners[:, 1], 1, -1))
     kept = first[facing != 0] if facing.any() else first
     return trimesh.Trimesh(mesh.vertices, mesh.faces[np.sort(kept)], process=False)
 
 
-def _closed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Weld what nearly touches and fill small holes; unchanged if that does not close it."""
+def _close(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Weld close vertices and fill small holes; return the same mesh if that does not close it."""
     welded = mesh.copy()
-    digits = -int(np.floor(np.log10(_WELD * np.linalg.norm(mesh.extents))))
+    digits = -int(np.floor(np.log10(_WELD_DISTANCE * np.linalg.norm(mesh.extents))))
     welded.merge_vertices(digits_vertex=digits)
     welded.update_faces(welded.nondegenerate_faces())
     trimesh.repair.fill_holes(welded)
-    return _turned_outwards(welded)[0] if welded.is_watertight else mesh
+    return _orient_outwards(welded)[0] if welded.is_watertight else mesh
 
 
-def _is_hollow(solid: Solid) -> bool:
-    low, high = solid.mesh.bounds
-    within = float(solid.contains(_probes(solid)).mean() * np.prod(high - low))
-    return within < HOLLOW * float(solid.hull.volume)
-
-
-def _filled(solid: Solid) -> Solid:
-    """The solid with the room within filled, if it is a shell."""
+def _fill_cavity(solid: Solid) -> Solid:
+    """Return the solid with its cavity filled, if it is a shell."""
     if solid.method == "hull":
         return solid
     filled = replace(solid, method="filled")
     points = _probes(solid)
     walls, body = solid.contains(points).sum(), filled.contains(points).sum()
-    return filled if body > (1 + SHELL) * walls else solid
+    return filled if body > (1 + MIN_CAVITY) * walls else solid
 
 
 def _probes(solid: Solid) -> Array:
     low, high = solid.mesh.bounds
-    return np.random.default_rng(0).uniform(low, high, (_PROBES, 3))
+    return np.random.default_rng(0).uniform(low, high, (_NUM_PROBES, 3))
 
 
 class Cavities:
-    """Triangles, and which points around them are mostly surrounded by them."""
+    """Measure how open to the outside points near a mesh are, by casting rays."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self._rays = RayMeshIntersector(mesh)
 
     def openness(self, points: Array) -> Array:
-        """Share of all directions in which no triangle is met.
+        """Return the share of directions in which a ray hits no triangle.
 
-        It is at least one half outside of the convex hull.
+        It is at least one half for a point outside of the convex hull.
 
         Args:
-            points: Shape (n, 3), in the frame of the mesh.
+            points: Points in the frame of the mesh, shape (n, 3).
 
         Returns:
-            Shape (n,), in steps of ``1 / DIRECTIONS``.
+            Shares, shape (n,), in steps of ``1 / NUM_RAYS``.
         """
         if not len(points):
             return np.zeros(0)
         directions = _directions()
-        meets = self._rays.intersects_any(
-            np.repeat(points, DIRECTIONS, axis=0), np.tile(directions, (len(points), 1))
+        hits = self._rays.intersects_any(
+            np.repeat(points, NUM_RAYS, axis=0), np.tile(directions, (len(points), 1))
         )
-        return np.asarray(1 - meets.reshape(len(points), DIRECTIONS).mean(axis=1))
+        return np.asarray(1 - hits.reshape(len(points), NUM_RAYS).mean(axis=1))
 
 
 def _directions() -> Array:
-    """Directions spread evenly, shape (DIRECTIONS, 3): the Fibonacci lattice on the sphere.
+    """Return evenly spread directions, shape (NUM_RAYS, 3): the Fibonacci lattice on the sphere.
 
-    Equal steps along the axis cut zones of equal area; the golden angle spreads them around it.
+    Equal steps along z cut zones of equal area; the golden angle spreads them around z.
     """
-    step = np.arange(DIRECTIONS) + 0.5
-    z = 1 - 2 * step / DIRECTIONS
+    step = np.arange(NUM_RAYS) + 0.5
+    z = 1 - 2 * step / NUM_RAYS
     turn = np.pi * (1 + np.sqrt(5)) * step
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)

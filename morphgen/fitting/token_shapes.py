@@ -1,4 +1,4 @@
-"""The one primitive that stands for each link in its token."""
+"""The single primitive that represents each link in its token."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from platformdirs import user_cache_path
 
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import canonical
-from morphgen.fitting.composite import composite
+from morphgen.fitting.composite import fit_composite
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import write_cache_file
 from morphgen.formats.fits import (
@@ -29,81 +29,74 @@ from morphgen.formats.rounding import rounded_shapes
 from morphgen.model.geometry import Shape, scale_shape
 from morphgen.model.inertia import union_integrals
 from morphgen.model.robot import Robot
+from morphgen.processes import Progress, no_progress
 
-_KEPT = "tokens-4"
-"""Folder in the user's cache; the number rises when the same shapes are given another primitive."""
-NEARLY = 0.95
-"""Share of a link's volume from which its largest primitive stands for it; this is the IoU, too."""
+_CACHE_DIR = "tokens-4"
+"""Folder in the user's cache; the number rises when the same shapes get another primitive."""
+DOMINANT_SHARE = 0.95
+"""Share of a link's volume from which its largest primitive represents it. The primitive lies in
+the union, so this is also their intersection over union."""
 
 
-def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]:
-    """The box, cylinder or sphere that overlaps the collision shapes of each link most.
+def token_shapes(
+    robot: Robot, folders: Sequence[Path] = (), *, progress: Progress = no_progress
+) -> dict[str, Shape]:
+    """Return the box, cylinder or sphere that overlaps the collision shapes of each link most.
 
-    A token describes what collides: a link that is only seen, such as a rail or a mast, has no
-    primitive. A fit that the robot brings or that is stored in the folders is taken. A link that is
-    a primitive, or nearly is (``NEARLY``), keeps it in its canonical pose; others are fitted,
-    about a second a link, and kept in the user's cache. What is fitted to primitives is the same on
-    every machine (``composite``); of meshes that nothing is stored for the last bits may differ,
-    and with them the fit.
+    A token describes collision geometry: a link with visuals only, such as a rail or a mast, has
+    no primitive. The primitive of a link comes from the first source that has one:
+
+    1. the fits that the robot carries, then those stored in the folders;
+    2. a primitive of the link that has most of its volume (``DOMINANT_SHARE``), in its canonical
+       pose;
+    3. the user's cache;
+    4. a new fit, about a second per link, which is then cached. A fit to primitives is the same on
+       every machine (``composite``). A fit to meshes depends on the last bits of floating-point
+       numbers, so it may differ between machines.
 
     Args:
-        robot: The body.
+        robot: The robot.
         folders: Folders of parts, for their stored fits.
+        progress: Receives the number of new fits that are done, and of all that are needed.
 
     Returns:
-        By link; links without collision shapes, and those without volume, are not in it.
+        Primitives by link name, without links that have no collision shapes or no volume.
 
     Raises:
-        FormatError: If a stored fit is malformed.
+        FormatError: If a stored or cached fit is malformed.
         MeshError: If a mesh cannot be read.
     """
     stored = read_stored_fits(folders)
-    found = {}
+    primitives: dict[str, Shape | None] = {}
+    missing: list[tuple[str, tuple[Shape, ...], Path]] = []
     for link in robot.links:
         if not link.collisions:
             continue
         shapes = rounded_shapes(link.collisions)
         if fit := find_fit(link.collisions, robot, stored):
-            found[link.name] = fit.token
-        elif main := _main_primitive(shapes):
-            found[link.name] = canonical(replace(main, rgba=None))
-        elif shape := _cached_fit(shapes):
-            found[link.name] = shape
-    return found
+            primitives[link.name] = fit.token
+        elif dominant := _dominant_primitive(shapes):
+            primitives[link.name] = canonical(replace(dominant, rgba=None))
+        else:
+            path = user_cache_path("morphgen") / _CACHE_DIR / f"{shapes_key(shapes)}.json"
+            if path.is_file():
+                primitives[link.name] = _read_cached(path, shapes_scale(shapes))
+            else:
+                primitives[link.name] = None  # keeps the order of the links
+                missing.append((link.name, shapes, path))
+    for done, (name, shapes, path) in enumerate(missing):
+        progress(done, len(missing))
+        primitives[name] = fit_primitive(shapes)
+        _write_cached(path, primitives[name], shapes_scale(shapes))
+    if missing:
+        progress(len(missing), len(missing))
+    return {name: shape for name, shape in primitives.items() if shape}
 
 
-def _main_primitive(shapes: Sequence[Shape]) -> Shape | None:
-    """The shape that the others hardly add to, if it is a primitive."""
-    if not are_primitives(shapes):
-        return None
-    largest = max(shapes, key=lambda shape: union_integrals([shape]).volume)
-    share = union_integrals([largest]).volume / union_integrals(shapes).volume
-    return largest if share >= NEARLY else None
-
-
-def _cached_fit(shapes: Sequence[Shape]) -> Shape | None:
-    """The fit of shapes that nothing is stored for; None if they have no volume."""
-    factor = shapes_scale(shapes)
-    path = user_cache_path("morphgen") / _KEPT / f"{shapes_key(shapes)}.json"
-    if path.is_file():
-        try:
-            data = read_json(path)
-            record = None if data is None else read_record(data, ShapeRecord, str(path))
-        except FormatError as error:
-            raise FormatError(f"{error}; delete the file") from error
-        return None if record is None else scale_shape(record.shape, factor)
-    shape = _fitted(shapes)
-    data = None if shape is None else shape_to_data(scale_shape(shape, 1 / factor))
-    try:
-        write_cache_file(path, json.dumps(data))
-    except OSError as error:
-        warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=3)
-    return shape
-
-
-def _fitted(shapes: Sequence[Shape]) -> Shape | None:
+def fit_primitive(shapes: Sequence[Shape]) -> Shape | None:
+    """Fit one primitive to shapes that are fixed to each other; None if they have no volume."""
     if are_primitives(shapes):
-        return composite(shapes)
+        return fit_composite(shapes)
     # The search needs torch, which takes seconds to load.
     from morphgen.fitting.link_fit import FitOptions, fit_shapes
 
@@ -111,3 +104,30 @@ def _fitted(shapes: Sequence[Shape]) -> Shape | None:
         return fit_shapes(shapes, FitOptions()).primitives[0]
     except FitError:
         return None
+
+
+def _dominant_primitive(shapes: Sequence[Shape]) -> Shape | None:
+    """Return the primitive to which the other primitives of a link add next to no volume."""
+    if not are_primitives(shapes):
+        return None
+    largest = max(shapes, key=lambda shape: union_integrals([shape]).volume)
+    share = union_integrals([largest]).volume / union_integrals(shapes).volume
+    return largest if share >= DOMINANT_SHARE else None
+
+
+def _read_cached(path: Path, scale: float) -> Shape | None:
+    """Read a cached fit, which has the scale 1."""
+    try:
+        data = read_json(path)
+        record = None if data is None else read_record(data, ShapeRecord, str(path))
+    except FormatError as error:
+        raise FormatError(f"{error}; delete the file") from error
+    return None if record is None else scale_shape(record.shape, scale)
+
+
+def _write_cached(path: Path, shape: Shape | None, scale: float) -> None:
+    data = None if shape is None else shape_to_data(scale_shape(shape, 1 / scale))
+    try:
+        write_cache_file(path, json.dumps(data))
+    except OSError as error:
+        warnings.warn(f"cannot keep a fit in {path}: {error.strerror}", stacklevel=3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from morphgen.fitting.solid import ENCLOSED, Cavities, solid_of
+from morphgen.fitting.solid import MAX_OPENNESS, Cavities, solid_of
 from morphgen.model.geometry import Mesh, Shape
 
 POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (4000, 3))
@@ -50,7 +50,7 @@ def test_openness_of_a_cup_is_the_solid_angle_of_its_mouth():
 def test_outside_of_the_hull_nothing_is_enclosed():
     mesh = tube()
     beyond = POINTS[~np.asarray(trimesh.convex.convex_hull(mesh).contains(POINTS))]
-    assert Cavities(mesh).openness(beyond).min() > ENCLOSED
+    assert Cavities(mesh).openness(beyond).min() > MAX_OPENNESS
 
 
 @pytest.mark.parametrize("closed", [False, True])

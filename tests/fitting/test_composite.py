@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morphgen.fitting.composite import composite
+from morphgen.fitting.composite import fit_composite
 from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import solid_of
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
@@ -36,30 +36,32 @@ def overlap(shapes, *found):
 def test_no_primitive_of_the_link_overlaps_more(seed):
     shapes = drawn(seed)
     own = max(overlap(shapes, shape) for shape in shapes)
-    assert overlap(shapes, composite(shapes)) > own - 0.01
+    assert overlap(shapes, fit_composite(shapes)) > own - 0.01
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_last_bits_change_nothing(seed):
-    assert composite(drawn(seed)) == composite(drawn(seed, noise=3e-16))
+    assert fit_composite(drawn(seed)) == fit_composite(drawn(seed, noise=3e-16))
 
 
 def test_of_two_rails_one_stands_for_the_link():
     rails = [Shape(Box((1.1, 0.03, 0.03)), Pose((0.0, y, 1.05))) for y in (0.6, -0.6)]
-    assert composite(rails) == rails[0]
+    assert fit_composite(rails) == rails[0]
 
 
 def test_sides_are_flush_with_those_of_the_link():
     prongs = [Shape(Box((0.02, 0.01, 0.04)), Pose((0.0, y, 0.02))) for y in (0.02, -0.02)]
     bridge = Shape(Box((0.02, 0.03, 0.01)), Pose((0.0, 0.0, 0.035)))
-    found = composite([*prongs, bridge])
+    found = fit_composite([*prongs, bridge])
     assert found == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
 
 
 def test_a_rod_in_two_parts_is_one_rod():
     turned = Pose.from_xyz_rpy((0.1, 0.0, 0.0), (0.0, math.pi / 2, 0.0))
     rod = Shape(Cylinder(0.02, 0.2), turned)
-    found = composite([rod, replace(rod, T_link_shape=replace(turned, position=(0.25, 0.0, 0.0)))])
+    found = fit_composite(
+        [rod, replace(rod, T_link_shape=replace(turned, position=(0.25, 0.0, 0.0)))]
+    )
     assert found.geometry == Cylinder(0.02, pytest.approx(0.35, abs=1e-5))
     assert found.T_link_shape.position == pytest.approx((0.175, 0.0, 0.0), abs=1e-5)
     assert np.abs(found.T_link_shape.matrix[:3, 2]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
@@ -75,7 +77,7 @@ def test_mirrored_fingers_have_mirrored_primitives():
             for size, (x, y, z), roll in blocks
         ]
 
-    left, right = (composite(finger(side)) for side in (1, -1))
+    left, right = (fit_composite(finger(side)) for side in (1, -1))
     assert right.geometry.size == pytest.approx(left.geometry.size, abs=3e-4)
     mirror = np.array([1, -1, 1])
     assert mirror * right.T_link_shape.position == pytest.approx(
@@ -85,10 +87,10 @@ def test_mirrored_fingers_have_mirrored_primitives():
 
 
 def test_nothing_stands_for_nothing():
-    assert composite([]) is None
-    assert composite([Shape(Box((0.1, 0.1, 0.0)))]) is None
+    assert fit_composite([]) is None
+    assert fit_composite([Shape(Box((0.1, 0.1, 0.0)))]) is None
 
 
 def test_other_shapes_are_refused():
     with pytest.raises(TypeError, match="Capsule"):
-        composite([Shape(Capsule(0.1, 0.2))])
+        fit_composite([Shape(Capsule(0.1, 0.2))])

@@ -261,7 +261,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
     stored = own_parts / f"my_wedge{SUFFIX}"
     assert [path.name for path in own_parts.glob(f"*{SUFFIX}")] == [stored.name]
     monkeypatch.setattr(
-        token_shapes_module, "_fitted", lambda shapes: pytest.fail("a fit was searched for")
+        token_shapes_module, "fit_primitive", lambda shapes: pytest.fail("a fit was searched for")
     )
     robot = morphgen.compose("base=fixed ee=my_wedge", library=[own_parts])
     (token,) = token_shapes(robot).values()

@@ -10,9 +10,9 @@ import trimesh
 
 from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS
-from morphgen.fitting.initial_guess import FEWEST, around, by_growth, by_pieces
+from morphgen.fitting.initial_guess import MIN_POINTS, around, by_growth, by_pieces
 from morphgen.fitting.quality import quality
-from morphgen.fitting.search import DIGITS, best_several, best_single, sampled
+from morphgen.fitting.search import DIGITS, best_several, best_single, sample_solid
 from morphgen.fitting.soft_iou import covered, overlaps
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, dimensions
@@ -26,7 +26,7 @@ ANGLE = (
 
 
 def target_of(*shapes, seed=0):
-    return sampled(solid_of(shapes), seed)
+    return sample_solid(solid_of(shapes), seed)
 
 
 def fitted(geometry, pose=TILTED, seed=0):
@@ -188,7 +188,7 @@ def test_a_solid_that_fills_next_to_nothing_of_its_bounds_is_refused():
         trimesh.creation.box((1.0, 0.001, 0.001)),
     ]
     with pytest.raises(FitError, match="too thin") as caught:
-        sampled(solid_of_mesh(trimesh.util.concatenate(frame)), 0)
+        sample_solid(solid_of_mesh(trimesh.util.concatenate(frame)), 0)
     assert "%" in str(caught.value)
     assert "\n" not in str(caught.value)
     with pytest.raises(FitError, match="too thin"):
@@ -257,14 +257,14 @@ def test_pieces_give_three_guesses_a_clustering_and_the_same_seeds_the_same():
 
 def test_a_solid_of_few_points_is_not_cut():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
-    few = np.arange(500) < 3 * FEWEST
+    few = np.arange(500) < 3 * MIN_POINTS
     assert by_pieces(points, few, np.ones(500), 4, [0, 1, 2]) is None
 
 
 def test_more_primitives_than_points_allow_are_none():
     target = target_of(Shape(Cylinder(0.02, 0.5), TILTED))
     one = best_single(target)
-    few = replace(target, inside=target.inside & (np.cumsum(target.inside) < FEWEST))
+    few = replace(target, inside=target.inside & (np.cumsum(target.inside) < MIN_POINTS))
     assert best_several(few, one, 0) is None
 
 

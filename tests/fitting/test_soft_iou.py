@@ -18,7 +18,7 @@ EDGE = (np.arange(40) + 0.5) / 40 - 0.5
 GRID = np.stack(np.meshgrid(EDGE, EDGE, EDGE, indexing="ij"), axis=-1).reshape(-1, 3)
 """Middles of cells of 0.025 in the unit cube; boxes of whole cells are counted exactly."""
 POINTS = qmc.Sobol(3, rng=np.random.default_rng(0)).random(2**11) - 0.5
-CLIMB = {"steps": 80, "tau": (0.03, 0.002), "rate": (0.01, 0.0005)}
+CLIMB = {"num_steps": 80, "tau": (0.03, 0.002), "rate": (0.01, 0.0005)}
 
 
 def primitive(kind, centre=(0.0, 0.0, 0.0), quaternion=UPRIGHT, halves=HALVES):
@@ -264,7 +264,7 @@ def test_the_start_is_left_alone_and_the_same_start_ends_the_same():
 @pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE])
 def test_a_point_in_the_very_middle_spoils_no_gradient(kind):
     points = np.concatenate([np.zeros((1, 3)), POINTS[:500]])
-    moved = ascend(primitive(kind), points, within(BOX, points, TRUE), **(CLIMB | {"steps": 5}))
+    moved = ascend(primitive(kind), points, within(BOX, points, TRUE), **(CLIMB | {"num_steps": 5}))
     assert all(
         np.isfinite(array).all() for array in (moved.centres, moved.quaternions, moved.halves)
     )

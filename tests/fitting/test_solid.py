@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from morphgen.errors import FitError, MeshError
-from morphgen.fitting.solid import DECIMATED, MAX_FACES, solid_of, solid_of_mesh
+from morphgen.fitting.solid import DECIMATED_FACES, MAX_FACES, solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
 
 SIZE = (0.2, 0.3, 0.4)
@@ -299,7 +299,7 @@ def test_an_enormous_mesh_is_decimated_and_says_from_what(tmp_path):
     solid = solid_of_mesh(ball)
     assert solid.method == "watertight"
     assert solid.decimated_from == len(ball.faces)
-    assert len(solid.mesh.faces) <= 1.01 * DECIMATED
+    assert len(solid.mesh.faces) <= 1.01 * DECIMATED_FACES
     assert solid.mesh.volume == pytest.approx(ball.volume, rel=0.01)
     assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.01)
     several = solid_of([write(ball, tmp_path / "ball.stl"), Shape(Box(SIZE))])

@@ -28,7 +28,7 @@ def no_search(monkeypatch):
     def search(shapes):
         raise AssertionError("a fit was searched for")
 
-    monkeypatch.setattr(module, "_fitted", search)
+    monkeypatch.setattr(module, "fit_primitive", search)
 
 
 def robot_of(*shapes):
@@ -84,7 +84,7 @@ def test_what_is_stored_nowhere_is_searched_once(monkeypatch, cache):
     first = token_shapes(robot_of(*shapes))
     assert isinstance(first["body"].geometry, Box)
     assert max(first["body"].geometry.size) == pytest.approx(0.405, abs=0.01)
-    monkeypatch.setattr(module, "_fitted", lambda shapes: pytest.fail("searched again"))
+    monkeypatch.setattr(module, "fit_primitive", lambda shapes: pytest.fail("searched again"))
     assert token_shapes(robot_of(*shapes)) == first
 
 
@@ -93,7 +93,7 @@ def test_a_flat_link_has_no_primitive_and_that_is_remembered(tmp_path, monkeypat
     flat.export(tmp_path / "flat.stl")
     robot = robot_of(Shape(Mesh(tmp_path / "flat.stl")))
     assert token_shapes(robot) == {}
-    monkeypatch.setattr(module, "_fitted", lambda shapes: pytest.fail("searched again"))
+    monkeypatch.setattr(module, "fit_primitive", lambda shapes: pytest.fail("searched again"))
     assert token_shapes(robot) == {}
 
 

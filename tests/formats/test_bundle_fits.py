@@ -22,7 +22,9 @@ WORDS = "arm=ur5 ee=plane"
 @pytest.fixture(autouse=True)
 def no_search(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / "cache" / name)
-    monkeypatch.setattr(module, "_fitted", lambda shapes: pytest.fail("a fit was searched for"))
+    monkeypatch.setattr(
+        module, "fit_primitive", lambda shapes: pytest.fail("a fit was searched for")
+    )
 
 
 @pytest.fixture(scope="module")
