@@ -114,7 +114,7 @@ def load_robot(
         MorphgenError: If the words name something unknown.
     """
     parts = default_library(library)
-    robot = source if isinstance(source, Robot) else read_source(find_robot(source, parts), parts)
+    robot = source if isinstance(source, Robot) else read_source(find_robot(source), parts)
     return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 
 

@@ -28,13 +28,13 @@ def test_there_are_templates_of_every_kind():
 
 
 def extremes(manifest: Manifest) -> Iterator[dict[str, float]]:
-    parameters = manifest.parameters.values()
+    parameters = manifest.parameters.items()
     yield {}
-    yield {parameter.name: parameter.minimum for parameter in parameters}
-    yield {parameter.name: parameter.maximum for parameter in parameters}
-    for parameter in parameters:
-        yield {parameter.name: parameter.minimum}
-        yield {parameter.name: parameter.maximum}
+    yield {name: parameter.minimum for name, parameter in parameters}
+    yield {name: parameter.maximum for name, parameter in parameters}
+    for name, parameter in parameters:
+        yield {name: parameter.minimum}
+        yield {name: parameter.maximum}
 
 
 def troubles(robot: Robot, *, tool_required: bool = True) -> list[str]:

@@ -10,7 +10,7 @@ from morphgen.formats.rounding import format_number
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest, PartKind
-from morphgen.grammar.parameters import MOUNT_YAW, Parameter, parse_value
+from morphgen.grammar.parameters import Parameter, parse_value
 from morphgen.grammar.request import MAIN_PORTS, SLOTS
 from morphgen.viewer.robot_tables import slider_step
 
@@ -112,9 +112,9 @@ def part_options(slot: str, library: Library) -> list[str]:
 
 
 def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
-    """Return the parameters of a part in a slot: its own, and the yaw of its mount."""
-    parameters = dict(manifest.parameters)
-    return parameters if kind_of(slot) == "base" else {**parameters, MOUNT_YAW.name: MOUNT_YAW}
+    """The parameters of a part in a slot: its own, and the turn of its mount."""
+    is_base = kind_of(slot) == "base"
+    return dict(manifest.parameters if is_base else manifest.attached_parameters)
 
 
 def controls_of(slot: str, manifest: Manifest) -> list[Control]:

@@ -69,7 +69,7 @@ def parameters(derivation: Derivation, library: Library) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for place, node in enumerate(derivation.walk()):
-        turn = {MOUNT_YAW.name: 0.0} if place else {}
+        turn = {MOUNT_YAW: 0.0} if place else {}
         values = turn | _values(node, library)
         found |= {
             f"{place}.{name}": values[name]

@@ -1,52 +1,123 @@
-"""The catalogue: one row of facts a part."""
+"""The catalogue: one row of facts per part.
+
+Degrees of freedom, reach and mass of the parts that come with morphgen are stored in
+``part_facts.json``, so that ``morphgen list`` need not read their URDFs and meshes. A stored entry
+counts only as long as the part's files are the same. After a change of a part or of its package,
+regenerate the file:
+
+    python -m morphgen.grammar.catalogue
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import cast
+import hashlib
+import importlib.metadata
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
-from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import PackageSource, PartKind
-from morphgen.grammar.part import Part, load_part
-from morphgen.model.kinematics import reach
-from morphgen.model.robot import Frame, Joint, Link
+from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.manifest import Manifest, PackageSource, PartKind
+
+if TYPE_CHECKING:
+    from morphgen.grammar.part import Part
+
+FACTS_FILE = Path(__file__).with_name("part_facts.json")
 
 
 def catalogue(library: Library, kind: str | None = None) -> list[dict[str, object]]:
-    """Facts about every part, or those of one kind, at default parameters.
+    """Return facts about every part, or about those of one kind, at default parameters.
 
     Returns:
-        Rows with name, kind, dof, reach (m, to the farthest port or the tool), mass (kg),
-        source, licence and summary.
+        Rows with name, kind, dof, reach (from the mount to the farthest port or tool, the largest
+        over all configurations) [m], mass [kg], source, licence and summary.
     """
-    return [_row(load_part(manifest)) for manifest in library.manifests(cast(PartKind, kind))]
+    stored = _stored_facts()
+    rows: list[dict[str, object]] = []
+    for manifest in library.manifests(cast(PartKind, kind)):
+        facts = stored.get(manifest.name, {})
+        if facts.get("digest") != source_digest(manifest):
+            facts = compute_facts(manifest)
+        source = manifest.source
+        rows.append(
+            {
+                "name": manifest.name,
+                "kind": manifest.kind,
+                **{key: facts[key] for key in ("dof", "reach", "mass")},
+                "source": source.package if isinstance(source, PackageSource) else "template",
+                "licence": manifest.licence,
+                "summary": manifest.summary,
+            }
+        )
+    return rows
 
 
-def _row(part: Part) -> dict[str, object]:
-    manifest = part.manifest
-    source = manifest.source
+def compute_facts(manifest: Manifest) -> dict[str, Any]:
+    """Load a part and return its dof, reach [m], mass [kg] and the digest of its sources."""
+    from morphgen.grammar.part import load_part  # slow: reads URDFs and meshes
+
+    part = load_part(manifest)
     return {
-        "name": manifest.name,
-        "kind": manifest.kind,
+        "digest": source_digest(manifest),
         "dof": part.fragment.dof,
         "reach": round(_reach(part), 3),
         "mass": round(part.fragment.mass, 3),
-        "source": source.package if isinstance(source, PackageSource) else "template",
-        "licence": manifest.licence,
-        "summary": manifest.summary,
     }
 
 
+def source_digest(manifest: Manifest) -> str:
+    """Return a hash of a part's manifest and of its xacros or the version of its package."""
+    digest = hashlib.sha256(manifest.path.read_bytes())
+    if isinstance(manifest.source, PackageSource):
+        digest.update(_version(manifest.source.package).encode())
+    else:
+        for path in sorted(manifest.source.parent.glob("*.xacro")):  # includes lie in the folder
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@lru_cache(maxsize=16)
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"  # load_part explains what to install
+
+
+@lru_cache(maxsize=1)
+def _stored_facts() -> dict[str, dict[str, Any]]:
+    facts: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
+    return facts
+
+
 def _reach(part: Part) -> float:
-    """Distance from the mount to the farthest port or tool, the largest over configurations."""
+    """Return the largest distance from the mount to a port or tool over all configurations [m]."""
+    from dataclasses import replace
+
+    from morphgen.model.kinematics import reach
+    from morphgen.model.robot import Frame, Joint, Link
+
     ends = [*part.ports.values(), *([part.tool] if part.tool else [])]
-    body = part.fragment
+    fragment = part.fragment
     T_mount_root = part.T_root_mount.inverse()
-    stand = Joint("mount_joint", "fixed", "mount_frame", body.root.name, T_mount_root)
-    stood = replace(
-        body,
-        links=(Link("mount_frame"), *body.links),
-        joints=(stand, *body.joints),
+    mount_joint = Joint("mount_joint", "fixed", "mount_frame", fragment.root.name, T_mount_root)
+    rooted_at_mount = replace(
+        fragment,
+        links=(Link("mount_frame"), *fragment.links),
+        joints=(mount_joint, *fragment.joints),
         frames=tuple(Frame(f"end{i}", e.link, e.T_link_frame) for i, e in enumerate(ends)),
     )
-    return max((reach(stood, frame.name) for frame in stood.frames), default=0.0)
+    names = [frame.name for frame in rooted_at_mount.frames]
+    return max((reach(rooted_at_mount, name) for name in names), default=0.0)
+
+
+def main() -> None:
+    """Write ``part_facts.json`` again."""
+    manifests = sorted(default_library().manifests(), key=lambda manifest: manifest.name)
+    entries = [f"{json.dumps(m.name)}: {json.dumps(compute_facts(m))}" for m in manifests]
+    FACTS_FILE.write_text("{\n" + ",\n".join(entries) + "\n}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Ways to decide what a grammar leaves open: the first choice, a random one, or a recorded one."""
+"""Choosers make the choices that a grammar leaves open: first, random, or recorded ones."""
 
 from __future__ import annotations
 
@@ -10,92 +10,95 @@ import numpy as np
 
 from morphgen.errors import GrammarError
 from morphgen.formats.rounding import format_number
-from morphgen.grammar.values import Distribution, no_draw
+from morphgen.grammar.values import Distribution, typical_value
 
 Choices = Mapping[str, float]
-"""What was decided, by the place in the derivation: index, count or value."""
+"""Choices of a derivation by their keys: an alternative's index, a count or a value in SI units."""
 
 
 class Chooser(Protocol):
-    """Decides what a grammar leaves open."""
+    """Makes the choices that a grammar leaves open; the key names the choice."""
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """Index of an alternative."""
+        """Return the index of an alternative."""
 
     def count(self, key: str, low: int, high: int) -> int:
-        """Number of repetitions."""
+        """Return a number of repetitions from ``low`` to ``high``."""
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """Value of a distribution."""
+        """Return a value of a distribution."""
 
 
 class FirstChooser:
-    """Takes the first alternative, the smallest count and the typical value."""
+    """Chooses the first alternative, the smallest count and the typical value."""
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """The first with a positive weight."""
+        """Return the first index with a positive weight."""
         return next(i for i, weight in enumerate(weights) if weight > 0)
 
     def count(self, key: str, low: int, high: int) -> int:
-        """The smallest."""
+        """Return the smallest count."""
         return low
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """The typical one."""
-        return no_draw(key, distribution)
+        """Return the typical value."""
+        return typical_value(key, distribution)
 
 
 class RandomChooser:
-    """Draws from a generator."""
+    """Draws every choice from a random generator."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """In proportion to the weights."""
+        """Draw an index with probabilities proportional to the weights."""
         total = np.cumsum(weights)
-        drawn = int(np.searchsorted(total, self._rng.random() * total[-1], side="right"))
-        return min(drawn, int(np.flatnonzero(weights)[-1]))  # the product may round up to total
+        index = int(np.searchsorted(total, self._rng.random() * total[-1], side="right"))
+        # The product may round up to the total, which is beyond the last positive weight.
+        return min(index, int(np.flatnonzero(weights)[-1]))
 
     def count(self, key: str, low: int, high: int) -> int:
-        """Uniformly."""
+        """Draw a count uniformly."""
         return int(self._rng.integers(low, high + 1))
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """As the distribution says."""
+        """Draw a value from the distribution."""
         return distribution.draw(self._rng.random, self._rng.standard_normal)
 
 
 @dataclass
 class RecordedChooser:
-    """Takes given choices where they fit, others from another chooser, and notes all."""
+    """Repeats given choices where they are valid, and records all choices."""
 
-    other: Chooser
+    fallback: Chooser
+    """Makes the choices that are not given or not valid."""
     given: Choices = field(default_factory=dict)
     choices: dict[str, float] = field(default_factory=dict)
+    """All choices made so far."""
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """The given index if there is such an alternative."""
-        given = self.given.get(key)
-        if given is None or given not in range(len(weights)):
-            given = self.other.alternative(key, weights)
-        return int(self._note(key, given))
+        """Return the given index if it exists."""
+        index = self.given.get(key)
+        if index is None or index not in range(len(weights)):
+            index = self.fallback.alternative(key, weights)
+        return int(self._record(key, index))
 
     def count(self, key: str, low: int, high: int) -> int:
-        """The given count if it is in range."""
-        given = self.given.get(key)
-        if given is None or given not in range(low, high + 1):
-            given = self.other.count(key, low, high)
-        return int(self._note(key, given))
+        """Return the given count if it is in range."""
+        count = self.given.get(key)
+        if count is None or count not in range(low, high + 1):
+            count = self.fallback.count(key, low, high)
+        return int(self._record(key, count))
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """The given value if the distribution can give it."""
-        given = distribution.nearest(self.given[key]) if key in self.given else None
-        if given is None:
-            given = self.other.value(key, distribution)
-        return self._note(key, float(format_number(given)))
+        """Return the given value if the distribution contains it."""
+        value = distribution.closest(self.given[key]) if key in self.given else None
+        if value is None:
+            value = self.fallback.value(key, distribution)
+        return self._record(key, float(format_number(value)))
 
-    def _note(self, key: str, value: float) -> float:
+    def _record(self, key: str, value: float) -> float:
         if key in self.choices:
             raise GrammarError(f"two choices share the key {key!r}")
         self.choices[key] = value

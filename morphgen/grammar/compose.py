@@ -1,8 +1,8 @@
-"""Composition: a derivation to one robot, parts joined flange to mount."""
+"""Compose the robot of a derivation: attach the mount of each part to a port of its parent."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -18,33 +18,34 @@ from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_
 from morphgen.model.rotation import from_rpy
 
 MAX_HOME_OVERLAP = 2e-3
-"""Depth to which links that are not neighbours may touch at home, metres."""
+"""Largest penetration at home of links of different parts that counts as touching [m]."""
 
 
 @dataclass(frozen=True)
 class ScopedPart:
-    """A part under its scope in the tree."""
+    """A part whose names are prefixed with its label in the derivation."""
 
     label: str
     part: Part
     mount_yaw: float
+    """Rotation about the axis of the parent's port [rad]."""
 
     def scoped(self, name: str) -> str:
-        """A name of the part in the robot."""
+        """Return the robot's name for a link or joint of the part."""
         return f"{self.label}_{name}"
 
 
 def compose(derivation: Derivation, library: Library, name: str) -> Robot:
-    """Build the robot of a derivation, with its self-collision pairs to ignore and stored fits.
+    """Build the robot of a derivation, with its ignored collision pairs and its stored fits.
 
     Args:
         derivation: Parts, parameters and attachments.
-        library: Where the parts are.
-        name: The robot's name.
+        library: Library of the parts.
+        name: Name of the robot.
 
     Raises:
-        CompositionError: If a part has no such port, or names clash.
-        PartError: If a part or parameter is unknown or wrong.
+        CompositionError: If a part does not have the named port, or two parts have the same label.
+        PartError: If a part or parameter is unknown or invalid.
         FormatError: If a part's source or stored fits cannot be read.
     """
     robot = with_stored_fits(join(derivation, library, name), library.folders)
@@ -52,14 +53,15 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
 
 
 def join(derivation: Derivation, library: Library, name: str) -> Robot:
-    """Build the robot of a derivation without looking at collisions.
+    """Build the robot of a derivation without collision tests.
 
-    A part whose root is a bare frame dissolves it: what hangs on the root hangs on the parent.
-    The tool is that of the outermost part which has one, else the first port of the last part.
+    A part whose root is an empty link is merged with its parent: everything attached to the root is
+    attached to the parent. The tool is that of the outermost part with a tool, or the first port of
+    the last part.
     """
-    placed = load_parts(derivation, library)
-    assembly = _Assembly(placed)
-    assembly.add(derivation, None, IDENTITY, owns_tool=True)
+    parts = load_parts(derivation, library)
+    assembly = _Assembly(parts)
+    assembly.attach(derivation, None, IDENTITY, owns_tool=True)
     return Robot(
         name,
         tuple(assembly.links),
@@ -68,119 +70,134 @@ def join(derivation: Derivation, library: Library, name: str) -> Robot:
         tuple(assembly.home),
         provenance={
             "derivation": str(derivation),
-            "parts": _provenance(placed.values()),
+            "parts": [_part_provenance(scoped) for scoped in parts.values()],
             "accepted": {
-                here.scoped(link): dict(whys)
-                for here in placed.values()
-                for link, whys in here.part.manifest.accepted.items()
+                scoped.scoped(link): dict(reasons)
+                for scoped in parts.values()
+                for link, reasons in scoped.part.manifest.accepted.items()
             },
         },
     )
 
 
 class _Assembly:
-    """A robot being put together, parts appended parents first."""
+    """An unfinished robot; parts are appended after their parents."""
 
-    def __init__(self, placed: Mapping[str, ScopedPart]) -> None:
-        self._placed = placed
-        self._dissolved: dict[str, Frame] = {}
+    def __init__(self, parts: Mapping[str, ScopedPart]) -> None:
+        self._parts = parts
+        self._merged: dict[str, Frame] = {}
+        """Frames of roots that were merged with their parents, by the root's name."""
         self.links: list[Link] = []
         self.joints: list[Joint] = []
         self.home: list[float] = []
         self.tools: list[tuple[str, Frame]] = []
+        """Tool frames with the labels of their parts."""
 
-    def add(
+    def attach(
         self, node: Derivation, parent: str | None, T_parent_port: Pose, *, owns_tool: bool
     ) -> None:
-        """Attach a part, and then what is attached to it."""
-        here = self._placed[node.label]
-        part = here.part
-        self._add_root(here, parent, T_parent_port)
-        self.links.extend(
-            replace(link, name=here.scoped(link.name)) for link in part.fragment.links[1:]
+        """Attach a part to a port of a link, then the node's children to the part.
+
+        Args:
+            node: The part's node of the derivation.
+            parent: Link of the port; None for the first part.
+            T_parent_port: Pose of the port in the link's frame.
+            owns_tool: Whether no part above has a tool.
+        """
+        scoped = self._parts[node.label]
+        part = scoped.part
+        self._attach_root(scoped, parent, T_parent_port)
+        self.links += (
+            replace(link, name=scoped.scoped(link.name)) for link in part.fragment.links[1:]
         )
-        self.joints.extend(self._scoped(joint, here) for joint in part.fragment.joints)
-        self.home.extend(part.fragment.home)
+        self.joints += (self._scoped_joint(joint, scoped) for joint in part.fragment.joints)
+        self.home += part.fragment.home
         for port, child in node.children:
             if port not in part.ports:
                 raise CompositionError(
                     f"{part.manifest.name!r} has no port {port!r}{nearest(port, part.ports)}"
                 )
-            frame = self._frame(part.ports[port], here)
-            self.add(
-                child, frame.link, frame.T_link_frame, owns_tool=owns_tool and part.tool is None
-            )
+            frame = self._scoped_frame(part.ports[port], scoped)
+            child_owns_tool = owns_tool and part.tool is None
+            self.attach(child, frame.link, frame.T_link_frame, owns_tool=child_owns_tool)
         tool = part.tool or (None if node.children else next(iter(part.ports.values()), None))
         if owns_tool and tool is not None:
-            self.tools.append((node.label, self._frame(tool, here)))
+            self.tools.append((node.label, self._scoped_frame(tool, scoped)))
 
-    def _add_root(self, here: ScopedPart, parent: str | None, T_parent_port: Pose) -> None:
-        part = here.part
-        root = here.scoped(part.fragment.root.name)
+    def _attach_root(self, scoped: ScopedPart, parent: str | None, T_parent_port: Pose) -> None:
+        part, link = scoped.part, scoped.part.fragment.root
+        root = scoped.scoped(link.name)
         if parent is None:
             require_root(part)
-            self.links.append(replace(part.fragment.root, name=root))
+            self.links.append(replace(link, name=root))
             return
-        T_port_mount = Pose(quaternion=from_rpy((0.0, 0.0, here.mount_yaw)))
+        T_port_mount = Pose(quaternion=from_rpy((0.0, 0.0, scoped.mount_yaw)))
         T_parent_root = T_parent_port @ T_port_mount @ part.T_root_mount.inverse()
-        if part.fragment.root.is_empty:
-            self._dissolved[root] = Frame(root, parent, T_parent_root)
+        if link.is_empty:
+            self._merged[root] = Frame(root, parent, T_parent_root)
             return
-        self.links.append(replace(part.fragment.root, name=root))
-        self.joints.append(Joint(here.scoped("mount"), "fixed", parent, root, T_parent_root))
+        self.links.append(replace(link, name=root))
+        self.joints.append(Joint(scoped.scoped("mount"), "fixed", parent, root, T_parent_root))
 
-    def _frame(self, frame: Frame, here: ScopedPart) -> Frame:
-        """A part's frame on a link of the robot."""
-        link = here.scoped(frame.link)
-        if link not in self._dissolved:
+    def _scoped_frame(self, frame: Frame, scoped: ScopedPart) -> Frame:
+        """Return a part's frame on the robot's link, which is the parent of a merged root."""
+        link = scoped.scoped(frame.link)
+        if link not in self._merged:
             return replace(frame, link=link)
-        parent = self._dissolved[link]
-        return Frame(frame.name, parent.link, parent.T_link_frame @ frame.T_link_frame)
+        root = self._merged[link]
+        return Frame(frame.name, root.link, root.T_link_frame @ frame.T_link_frame)
 
-    def _scoped(self, joint: Joint, here: ScopedPart) -> Joint:
+    def _scoped_joint(self, joint: Joint, scoped: ScopedPart) -> Joint:
         mimic = joint.mimic
         if mimic is not None:
-            mimic = Mimic(here.scoped(mimic.joint), mimic.multiplier, mimic.offset)
-        on = self._frame(Frame(joint.name, joint.parent, joint.T_parent_joint), here)
+            mimic = Mimic(scoped.scoped(mimic.joint), mimic.multiplier, mimic.offset)
+        origin = self._scoped_frame(Frame(joint.name, joint.parent, joint.T_parent_joint), scoped)
         return replace(
             joint,
-            name=here.scoped(joint.name),
-            parent=on.link,
-            child=here.scoped(joint.child),
-            T_parent_joint=on.T_link_frame,
+            name=scoped.scoped(joint.name),
+            parent=origin.link,
+            child=scoped.scoped(joint.child),
+            T_parent_joint=origin.T_link_frame,
             mimic=mimic,
         )
 
 
 def require_root(part: Part) -> None:
-    """Require that a part can stand on its own.
+    """Require that a part can be the first of a robot.
 
     Raises:
-        CompositionError: If it hangs from its mount.
+        CompositionError: If its mount is not its root, so that it needs a base.
     """
     if not part.T_root_mount.is_identity:
         raise CompositionError(f"{part.manifest.name!r} needs a base: its mount is not its root")
 
 
 def load_parts(derivation: Derivation, library: Library) -> dict[str, ScopedPart]:
-    """Load every part of a derivation; by label, parents first."""
-    placed: dict[str, ScopedPart] = {}
+    """Load every part of a derivation.
+
+    Returns:
+        The parts by label, parents before their children.
+
+    Raises:
+        CompositionError: If two parts have the same label.
+    """
+    parts: dict[str, ScopedPart] = {}
     for node in derivation.walk():
-        if node.label in placed:
+        if node.label in parts:
             raise CompositionError(f"two parts are labelled {node.label!r}")
         part = load_part(library.manifest(node.part), part_values(node))
-        yaw = dict(node.parameters).get(MOUNT_YAW.name, 0.0)
-        placed[node.label] = ScopedPart(node.label, part, yaw)
-    return placed
+        yaw = dict(node.parameters).get(MOUNT_YAW, 0.0)
+        parts[node.label] = ScopedPart(node.label, part, yaw)
+    return parts
 
 
 def part_values(node: Derivation) -> dict[str, float]:
-    """The parameters of a part itself, without those of how it is mounted."""
-    return {name: value for name, value in node.parameters if name != MOUNT_YAW.name}
+    """Return the parameters of a node's part, without that of how it is attached."""
+    return {name: value for name, value in node.parameters if name != MOUNT_YAW}
 
 
 def _tool_frames(tools: list[tuple[str, Frame]]) -> tuple[Frame, ...]:
-    """``tool``, and with several limbs ``<limb>_tool`` each; ``tool`` is then the last limb's."""
+    """Return ``tool``; for several limbs also ``<limb>_tool`` each, and ``tool`` is the last."""
     if not tools:
         return ()
     if len(tools) == 1:
@@ -189,53 +206,54 @@ def _tool_frames(tools: list[tuple[str, Frame]]) -> tuple[Frame, ...]:
     return (replace(named[-1], name="tool"), *named)
 
 
-def _provenance(placed: Iterable[ScopedPart]) -> list[dict[str, object]]:
-    return [
-        {
-            "label": here.label,
-            "part": here.part.manifest.name,
-            "summary": here.part.manifest.summary,
-            "licence": here.part.manifest.licence,
-            "citation": here.part.manifest.citation,
-            **({"notes": here.part.manifest.notes} if here.part.manifest.notes else {}),
-        }
-        for here in placed
-    ]
+def _part_provenance(scoped: ScopedPart) -> dict[str, object]:
+    manifest = scoped.part.manifest
+    return {
+        "label": scoped.label,
+        "part": manifest.name,
+        "summary": manifest.summary,
+        "licence": manifest.licence,
+        "citation": manifest.citation,
+        **({"notes": manifest.notes} if manifest.notes else {}),
+    }
 
 
 def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> CollisionSurvey:
-    """Which contacts of a joined robot are no self-collision.
+    """Find the pairs of links of a joined robot whose contacts are ignored.
 
-    Those of each real part, as it is made, are known from before; all others are tested. Parts
-    that overlap at home by more than ``MAX_HOME_OVERLAP`` are not ignored: ``check`` reports such
-    a faulty composition.
+    Pairs within an unscaled real part are known from the part alone; all other pairs are tested.
+    Parts that penetrate each other at home by more than ``MAX_HOME_OVERLAP`` are not ignored:
+    ``check`` reports such a faulty composition.
     """
     owner: dict[str, str] = {}
+    """Label of the part of each link."""
     tested: set[str] = set()
+    """Links whose contacts within their own part are not known."""
     known: list[Pair] = []
-    for here in load_parts(derivation, library).values():
-        manifest = here.part.manifest
-        names = [here.scoped(link.name) for link in here.part.fragment.links]
-        owner |= dict.fromkeys(names, here.label)
+    for scoped in load_parts(derivation, library).values():
+        manifest = scoped.part.manifest
+        names = [scoped.scoped(link.name) for link in scoped.part.fragment.links]
+        owner |= dict.fromkeys(names, scoped.label)
         if manifest.is_template or manifest.scaling:
             tested.update(names)
         if not manifest.is_template:
-            pairs = [(here.scoped(a), here.scoped(b)) for a, b in part_pairs(load_part(manifest))]
-            known += [sorted_pair(a, b) for a, b in pairs if {a, b} <= robot.link_index.keys()]
-    found = survey_collisions(
+            for a, b in _ignored_in_part(load_part(manifest)):
+                pair = sorted_pair(scoped.scoped(a), scoped.scoped(b))
+                if robot.link_index.keys() >= set(pair):
+                    known.append(pair)
+    survey = survey_collisions(
         robot, known_pairs=known, should_test=lambda a, b: owner[a] != owner[b] or a in tested
     )
     faulty = {
         (a, b)
-        for (a, b), depth in found.home_penetrations.items()
+        for (a, b), depth in survey.home_penetrations.items()
         if owner[a] != owner[b] and depth > MAX_HOME_OVERLAP
     }
-    return CollisionSurvey(
-        tuple(pair for pair in found.ignore_pairs if pair not in faulty), found.home_penetrations
-    )
+    ignored = tuple(pair for pair in survey.ignore_pairs if pair not in faulty)
+    return CollisionSurvey(ignored, survey.home_penetrations)
 
 
 @lru_cache(maxsize=256)
-def part_pairs(part: Part) -> tuple[Pair, ...]:
-    """Pairs of a part's own links whose contact is no self-collision."""
+def _ignored_in_part(part: Part) -> tuple[Pair, ...]:
+    """Return the pairs of a part's own links whose contacts are ignored."""
     return survey_collisions(part.fragment).ignore_pairs

@@ -1,4 +1,4 @@
-"""Conditions over computed properties of a robot: ``where reach > 0.4 and dof >= 5``."""
+"""Conditions on computed properties of a robot, such as ``reach > 0.4 and dof >= 5``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from morphgen.errors import GrammarError
 from morphgen.grammar.syntax import Expression, unknown
-from morphgen.grammar.values import Scope, evaluate, no_draw
+from morphgen.grammar.values import Scope, evaluate, typical_value
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics, reach
 from morphgen.model.robot import TOOL, Robot
@@ -26,49 +26,48 @@ _COMPARATORS: Mapping[str, Callable[[float, float], bool]] = {
 
 
 class RobotProperties:
-    """Properties of a robot, each computed when first asked for."""
+    """Properties of a robot, each computed when first used."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance of the tool from the root's origin, metres; 0 without a tool."""
+        """Largest distance of the tool from the root's origin [m]; 0 without a tool."""
         robot = self._robot
         return reach(robot) if any(frame.name == TOOL for frame in robot.frames) else 0.0
 
     @cached_property
     def mass(self) -> float:
-        """Total mass, kg."""
+        """Total mass [kg]."""
         return self._robot.mass
 
     @cached_property
     def dof(self) -> float:
-        """Independent joints."""
+        """Number of independent joints."""
         return self._robot.dof
 
     @cached_property
     def links(self) -> float:
-        """Links, the root among them."""
+        """Number of links, including the root."""
         return len(self._robot.links)
 
     @cached_property
     def movable(self) -> float:
-        """Joints that move, mimic joints among them."""
+        """Number of movable joints, including mimic joints."""
         return len(self._robot.movable_joints)
 
     @cached_property
     def movable_to_tool(self) -> float:
-        """Movable joints between the root and the tool; 0 without a tool."""
+        """Number of movable joints between the root and the tool; 0 without a tool."""
         robot = self._robot
         link = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
-        return (
-            0 if link is None else sum(robot.joints[k].is_movable for k in robot.joint_chain(link))
-        )
+        chain = [] if link is None else robot.joint_chain(link)
+        return sum(robot.joints[k].is_movable for k in chain)
 
     @cached_property
     def height(self) -> float:
-        """Highest point of the shapes at home above the root's origin, metres."""
+        """Height of the highest point at home above the root's origin [m]."""
         robot = self._robot
         T_root_link = forward_kinematics(robot, robot.home)
         top = 0.0
@@ -89,11 +88,11 @@ PROPERTIES: Mapping[str, str] = {
     "movable_to_tool": "",
     "height": "m",
 }
-"""What conditions can speak of, and its unit."""
+"""Unit of every property that conditions can use."""
 
 
 def clauses(condition: Expression) -> Iterator[Expression]:
-    """The conditions that ``and`` joins at the top."""
+    """Yield the conditions that are joined by ``and`` at the top level."""
     if condition.operator == "and":
         for operand in condition.operands:
             yield from clauses(operand)
@@ -102,7 +101,7 @@ def clauses(condition: Expression) -> Iterator[Expression]:
 
 
 def holds(condition: Expression, properties: RobotProperties) -> bool:
-    """Whether a robot meets a condition."""
+    """Return whether a robot meets a condition."""
     match condition.operator:
         case "and":
             return all(holds(operand, properties) for operand in condition.operands)
@@ -116,10 +115,10 @@ def holds(condition: Expression, properties: RobotProperties) -> bool:
 
 
 def require_condition(expression: Expression) -> None:
-    """Refuse what is no condition over known properties.
+    """Require that an expression is a condition on known properties.
 
     Raises:
-        GrammarError: At the place of what is wrong.
+        GrammarError: If it is not; the message names the location of the fault.
     """
     if expression.operator in ("and", "or", "not"):
         for operand in expression.operands:
@@ -134,9 +133,9 @@ def require_condition(expression: Expression) -> None:
     for operand in expression.operands:
         for name in _names(operand):
             if name.text not in PROPERTIES:
-                raise unknown("property", name.text, name.location, list(PROPERTIES))
+                raise unknown("property", name.text, name.location, PROPERTIES)
         sample = {name: (1.0, unit) for name, unit in PROPERTIES.items()}
-        units.add(evaluate(operand, Scope(sample, no_draw, ""))[1])
+        units.add(evaluate(operand, Scope(sample, typical_value, ""))[1])
     if len(units - {""}) > 1:
         raise GrammarError(
             f"{expression.location}: {expression} compares {' with '.join(sorted(units))}"
@@ -148,13 +147,12 @@ def _value(expression: Expression, properties: RobotProperties) -> float:
         name.text: (float(getattr(properties, name.text)), PROPERTIES[name.text])
         for name in _names(expression)
     }
-    return evaluate(expression, Scope(names, no_draw, ""))[0]
+    return evaluate(expression, Scope(names, typical_value, ""))[0]
 
 
 def _names(expression: Expression) -> Iterator[Expression]:
-    if expression.operator == "name":
-        yield expression
-    elif expression.operator == "call":
-        raise GrammarError(f"{expression.location}: a condition draws nothing: {expression}")
-    for operand in expression.operands:
-        yield from _names(operand)
+    for term in expression.walk():
+        if term.operator == "call":
+            raise GrammarError(f"{term.location}: a condition cannot draw values: {term}")
+        if term.operator == "name":
+            yield term

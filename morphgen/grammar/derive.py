@@ -1,4 +1,4 @@
-"""From a grammar to a derivation, one choice after the other."""
+"""Derive robots from a grammar: rewrite its start symbol until only parts are left."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from morphgen.grammar.limits import MAX_PARTS
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.parameters import MOUNT_YAW, Parameter, require_range
 from morphgen.grammar.syntax import Alternative, Expression, Item, Production
-from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
+from morphgen.grammar.values import Distribution, Scope, evaluate, typical_value
 
-MAIN_PORTS = ("top", "flange", "end")
-"""Ports where the next part goes when none is named."""
+DEFAULT_PORTS = ("top", "flange", "end")
+"""Ports that the next part is attached to when none is named; the first one that exists."""
 
 
 @dataclass
 class _Node:
-    """A part under construction."""
+    """A part of an unfinished derivation."""
 
     label: str
     part: str
@@ -32,23 +32,20 @@ class _Node:
     ports: tuple[str, ...]
     children: list[tuple[str, _Node]] = field(default_factory=list)
 
-    def frozen(self) -> Derivation:
-        return Derivation(
-            self.label,
-            self.part,
-            tuple(self.values.items()),
-            tuple((port, child.frozen()) for port, child in self.children),
-        )
+    def derivation(self) -> Derivation:
+        children = tuple((port, child.derivation()) for port, child in self.children)
+        return Derivation(self.label, self.part, tuple(self.values.items()), children)
 
 
 @dataclass(frozen=True)
-class Known:
-    """What derivations of one grammar with the same values of ``let`` share."""
+class DeriveCache:
+    """Facts shared by derivations of one grammar with the same values of ``let``."""
 
     weights: dict[str, list[float]] = field(default_factory=dict)
-    """Weights of each symbol's alternatives, as far as they were needed."""
-    fewest: Mapping[str, int] = field(default_factory=dict)
-    """Fewest parts of each symbol; with them a derivation is given up as early as it can be."""
+    """Weights of the alternatives by symbol; filled during derivations."""
+    fewest_parts: Mapping[str, int] = field(default_factory=dict)
+    """Smallest number of parts of each symbol; with it a derivation that will exceed the limit
+    stops as early as possible."""
 
 
 class TooManyPartsError(GrammarError):
@@ -60,27 +57,32 @@ def derive(
     library: Library,
     chooser: Chooser,
     max_parts: int = MAX_PARTS,
-    known: Known | None = None,
+    cache: DeriveCache | None = None,
 ) -> Derivation:
-    """Rewrite the start symbol until only parts are left.
+    """Rewrite the start symbol of a grammar until only parts are left.
 
     Args:
         grammar: The grammar.
-        library: Where its parts are.
-        chooser: Decides alternatives, counts and values.
-        max_parts: Parts beyond which the derivation is given up.
-        known: What earlier derivations with the same values of ``let`` found out.
+        library: Library of the grammar's parts.
+        chooser: Selects alternatives, repetition counts and parameter values.
+        max_parts: Largest number of parts.
+        cache: Facts of earlier derivations with the same values of ``let``.
 
     Raises:
         GrammarError: If a name is unknown, a port is missing or taken, a value does not fit its
-            parameter, or the derivation does not end (``EndlessError``); the message says where in
-            the grammar.
+            parameter, or the derivation has too many parts (``TooManyPartsError``); the message
+            names the location in the grammar.
     """
-    return _Run(grammar, library, chooser, max_parts, known or Known()).tree().frozen()
+    run = _Run(grammar, library, chooser, max_parts, cache or DeriveCache())
+    return run.root().derivation()
 
 
 class _Run:
-    """One derivation."""
+    """One derivation.
+
+    Every random choice has a key that names its position in the derivation, such as
+    ``robot/1.arm/panda.size``, so that it can be recorded and repeated.
+    """
 
     def __init__(
         self,
@@ -88,20 +90,20 @@ class _Run:
         library: Library,
         chooser: Chooser,
         max_parts: int,
-        known: Known,
+        cache: DeriveCache,
     ) -> None:
         self._grammar, self._library, self._chooser = grammar, library, chooser
         self._max_parts = max_parts
-        self._known = known
-        self._pending = known.fewest.get(grammar.start, 0)
-        """Fewest parts that are still to come."""
+        self._cache = cache
+        self._pending = cache.fewest_parts.get(grammar.start, 0)
+        """Smallest number of parts that are still to be added."""
         self._labels: set[str] = set()
         self._names: dict[str, tuple[float, str]] = {}
         for let in grammar.lets:
             scope = Scope(self._names, chooser.value, f"let {let.name}")
-            self._names[let.name] = evaluate(let.expression, _counted(scope))
+            self._names[let.name] = evaluate(let.expression, _with_unique_keys(scope))
 
-    def tree(self) -> _Node:
+    def root(self) -> _Node:
         start = self._grammar.production(self._grammar.start)
         if start is None:
             symbols = [production.symbol for production in self._grammar.productions]
@@ -110,27 +112,24 @@ class _Run:
                 + nearest(self._grammar.start, symbols)
             )
         first, _ = self._sequence(self._alternative(start, start.symbol), "", start.symbol, 0)
-        if MOUNT_YAW.name in first.values:
+        if MOUNT_YAW in first.values:
             raise GrammarError(
-                f"{start.location}: {first.part!r} stands on no port: it has no {MOUNT_YAW.name}"
+                f"{start.location}: {first.part!r} is not attached to a port: it has no {MOUNT_YAW}"
             )
         return first
 
     def _expand(
         self, item: Item, label: str, prefix: str, key: str, depth: int
     ) -> tuple[_Node, _Node]:
-        """Rewrite one item; return its first part and the one where it goes on.
+        """Rewrite one item; return its first part and the part that the next item attaches to.
 
-        A single part takes the label; of several, each takes its own name after the prefix.
+        A single part takes ``label``; several parts take their own names after ``prefix``.
         """
         production = self._grammar.production(item.name)
         if production is None:
             node = self._part(item, label, key)
             return node, node
-        if item.arguments:
-            raise GrammarError(
-                f"{item.location}: {item.name!r} is a symbol and takes no parameters"
-            )
+        require_no_arguments(item)
         if depth > MAX_PARTS:
             raise TooManyPartsError(
                 f"{item.location}: {item.name!r} does not end: {depth} levels deep"
@@ -145,110 +144,122 @@ class _Run:
     def _sequence(
         self, alternative: Alternative, prefix: str, key: str, depth: int
     ) -> tuple[_Node, _Node]:
-        ends: list[tuple[_Node, _Node]] = []
+        """Rewrite and attach the items of an alternative; return values as of ``_expand``."""
+        root: _Node | None = None
         trunk: _Node | None = None
         for position, item in enumerate(alternative.items):
-            limb = f"{prefix}{item.port}_" if item.port else prefix
-            below = f"{key}/{position}.{item.name}"
-            for label, inner, place in self._repeated(item, limb, below):
-                first, last = self._expand(item, label, inner, place, depth + 1)
-                ends.append((first, last))
+            limb_prefix = f"{prefix}{item.port}_" if item.port else prefix
+            item_key = f"{key}/{position}.{item.name}"
+            for label, inner_prefix, copy_key in self._copies(item, limb_prefix, item_key):
+                first, last = self._expand(item, label, inner_prefix, copy_key, depth + 1)
+                root = root or first
                 if trunk is not None:
                     _attach(trunk, first, item)
                 if trunk is None or not item.port:
                     trunk = last
-        return ends[0][0], trunk or ends[0][1]
+        assert root  # the syntax requires an item
+        assert trunk
+        return root, trunk
 
-    def _repeated(self, item: Item, prefix: str, key: str) -> list[tuple[str, str, str]]:
-        """(label of a single part, prefix of several, key) of every repetition."""
+    def _copies(self, item: Item, prefix: str, key: str) -> list[tuple[str, str, str]]:
+        """Return (label if it is a single part, prefix if it is several, key) of each copy."""
         if item.repetition is None:
             return [(prefix + item.name, prefix, key)]
         low, high = item.repetition
         n = low if low == high else self._chooser.count(f"{key}#", low, high)
-        if fewest := self._known.fewest:
-            self._expect((n - low) * fewest.get(item.name, 1), item)
+        if fewest := self._cache.fewest_parts:
+            self._add_pending((n - low) * fewest.get(item.name, 1), item)
         names = [f"{prefix}{item.name}{i}" for i in range(1, n + 1)]
         return [(name, f"{name}_", f"{key}[{i}]") for i, name in enumerate(names, start=1)]
 
     def _alternative(self, production: Production, key: str) -> Alternative:
-        weights = self._known.weights.get(production.symbol)
+        weights = self._cache.weights.get(production.symbol)
         if weights is None:
-            weights = self._known.weights[production.symbol] = self._weighed(production, key)
+            weights = self._cache.weights[production.symbol] = self._weights(production, key)
         index = self._chooser.alternative(key, weights) if len(weights) > 1 else 0
         alternative = production.alternatives[index]
-        if fewest := self._known.fewest:
-            self._expect(fewest_parts(alternative, fewest) - fewest[production.symbol], production)
+        if fewest := self._cache.fewest_parts:
+            more = count_fewest_parts(alternative, fewest) - fewest[production.symbol]
+            self._add_pending(more, production)
         return alternative
 
-    def _expect(self, more: int, where: Item | Production) -> None:
-        """Count parts to come; give up if there will be too many."""
+    def _add_pending(self, more: int, where: Item | Production) -> None:
+        """Count parts that are still to be added; stop if they exceed the limit."""
         self._pending += more
-        if len(self._labels) + self._pending > self._max_parts:
+        self._require_size(len(self._labels) + self._pending, where)
+
+    def _require_size(self, parts: int, where: Item | Production) -> None:
+        if parts > self._max_parts:
             raise TooManyPartsError(
                 f"{where.location}: more than {self._max_parts} parts: does it end?"
             )
 
-    def _weighed(self, production: Production, key: str) -> list[float]:
+    def _weights(self, production: Production, key: str) -> list[float]:
         weights = []
         for alternative in production.alternatives:
             weight = 1.0
             if alternative.weight is not None:
-                scope = Scope(self._names, no_draw, key)
-                weight = evaluate(alternative.weight, scope)[0]
+                scope = Scope(self._names, typical_value, key)
+                weight, _ = evaluate(alternative.weight, scope)
                 if weight < 0:
                     raise GrammarError(
                         f"{alternative.weight.location}: a weight is negative: {weight:g}"
                     )
             weights.append(weight)
-        if not math.isfinite(sum(weights)):
-            raise GrammarError(
-                f"{production.location}: the weights of {production.symbol!r} sum to no finite "
-                "number"
-            )
-        if sum(weights) <= 0:
-            raise GrammarError(
-                f"{production.location}: all weights of {production.symbol!r} are zero"
-            )
+        total, symbol = sum(weights), repr(production.symbol)
+        if not math.isfinite(total):
+            raise GrammarError(f"{production.location}: the sum of weights of {symbol} is infinite")
+        if total <= 0:
+            raise GrammarError(f"{production.location}: all weights of {symbol} are zero")
         return weights
 
     def _part(self, item: Item, label: str, key: str) -> _Node:
         manifest = require_part(item, self._grammar, self._library)
-        parameters = attached_parameters(manifest)
+        parameters = manifest.attached_parameters
         values = {name: parameter.default for name, parameter in parameters.items()}
         for name, expression in item.arguments:
-            scope = _counted(Scope(self._names, self._chooser.value, f"{key}.{name}"))
+            scope = _with_unique_keys(Scope(self._names, self._chooser.value, f"{key}.{name}"))
             values[name] = argument(item, name, expression, parameters, scope)
-        if values[MOUNT_YAW.name] == 0.0:
-            del values[MOUNT_YAW.name]
-        node = _Node(self._free(label), item.name, values, tuple(manifest.ports))
+        if values[MOUNT_YAW] == 0.0:
+            del values[MOUNT_YAW]  # derivations from before the parameter existed stay equal
+        node = _Node(self._unique(label), item.name, values, tuple(manifest.ports))
         self._pending -= 1
-        if len(self._labels) > self._max_parts:
-            raise TooManyPartsError(
-                f"{item.location}: more than {self._max_parts} parts: does it end?"
-            )
+        self._require_size(len(self._labels), item)
         return node
 
-    def _free(self, label: str) -> str:
-        free, k = label, 1
-        while free in self._labels:
+    def _unique(self, label: str) -> str:
+        unique, k = label, 1
+        while unique in self._labels:
             k += 1
-            free = f"{label}_{k}"
-        self._labels.add(free)
-        return free
+            unique = f"{label}_{k}"
+        self._labels.add(unique)
+        return unique
 
 
-def fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> int:
-    """The fewest parts of an alternative, given those of each symbol."""
+def count_fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> int:
+    """Return the smallest number of parts of an alternative, given that of each symbol."""
     return sum(
         (item.repetition or (1, 1))[0] * fewest.get(item.name, 1) for item in alternative.items
     )
 
 
-def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
-    """The manifest of an item that is no symbol.
+def require_no_arguments(symbol: Item) -> None:
+    """Require that an item that names a symbol has no parameters.
 
     Raises:
-        GrammarError: If it is no part either.
+        GrammarError: If it has.
+    """
+    if symbol.arguments:
+        raise GrammarError(
+            f"{symbol.location}: {symbol.name!r} is a symbol and takes no parameters"
+        )
+
+
+def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
+    """Return the manifest of an item that is not a symbol.
+
+    Raises:
+        GrammarError: If it is not a part either.
     """
     if item.name not in library.paths:
         valid = [*(production.symbol for production in grammar.productions), *library.paths]
@@ -259,11 +270,6 @@ def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
     return library.manifest(item.name)
 
 
-def attached_parameters(manifest: Manifest) -> dict[str, Parameter]:
-    """Parameters of a part in a tree: its own, and the turn of its mount."""
-    return {**manifest.parameters, MOUNT_YAW.name: MOUNT_YAW}
-
-
 def argument(
     item: Item,
     name: str,
@@ -271,11 +277,10 @@ def argument(
     parameters: Mapping[str, Parameter],
     scope: Scope,
 ) -> float:
-    """The value of an item's argument.
+    """Return the value of an item's argument in SI units.
 
     Raises:
-        GrammarError: If there is no such parameter, or the value is of another unit or out of
-            range.
+        GrammarError: If the parameter is unknown, or the value has another unit or is out of range.
     """
     if name not in parameters:
         raise GrammarError(
@@ -295,8 +300,8 @@ def argument(
         raise GrammarError(f"{expression.location}: {error}") from error
 
 
-def _counted(scope: Scope) -> Scope:
-    """A scope whose second and later distributions of one expression have keys of their own."""
+def _with_unique_keys(scope: Scope) -> Scope:
+    """Return a scope that gives each distribution of one expression its own key."""
     calls = 0
 
     def draw(key: str, distribution: Distribution) -> float:
@@ -308,25 +313,27 @@ def _counted(scope: Scope) -> Scope:
 
 
 def _attach(trunk: _Node, node: _Node, item: Item) -> None:
-    port = item.port or _main_port(trunk, item)
+    port = item.port or _default_port(trunk, item)
     if port not in trunk.ports:
         raise GrammarError(
             f"{item.location}: {trunk.part!r} has no port {port!r}{nearest(port, trunk.ports)}"
         )
     if any(port == taken for taken, _ in trunk.children):
-        raise GrammarError(f"{item.location}: port {port!r} of {trunk.part!r} is taken already")
+        raise GrammarError(f"{item.location}: port {port!r} of {trunk.part!r} is already taken")
     trunk.children.append((port, node))
 
 
-def _main_port(trunk: _Node, item: Item) -> str:
-    for port in MAIN_PORTS:
+def _default_port(trunk: _Node, item: Item) -> str:
+    for port in DEFAULT_PORTS:
         if port in trunk.ports:
             return port
     if len(trunk.ports) == 1:
         return trunk.ports[0]
     if not trunk.ports:
-        raise GrammarError(f"{item.location}: nothing can go on {trunk.part!r}: it has no port")
+        raise GrammarError(
+            f"{item.location}: nothing can be attached to {trunk.part!r}: it has no port"
+        )
     raise GrammarError(
-        f"{item.location}: say on which port of {trunk.part!r}, such as "
+        f"{item.location}: name the port of {trunk.part!r}, such as "
         f"{trunk.ports[0]}:{item.name}; ports: {', '.join(trunk.ports)}"
     )

@@ -1,9 +1,9 @@
-"""A grammar: symbols, values drawn once a robot, and conditions."""
+"""Find, read and write grammar files."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -30,20 +30,26 @@ SUFFIX = ".grammar"
 
 @dataclass(frozen=True)
 class Grammar:
-    """Everything that a grammar file and its includes say."""
+    """The statements of a grammar file and its includes."""
 
     name: str
     start: str
-    """The symbol that a robot is: the first of the file."""
+    """The symbol that derivations begin with: the first one of the file."""
     productions: tuple[Production, ...]
     lets: tuple[Let, ...] = ()
     wheres: tuple[Expression, ...] = ()
     digest: str = ""
-    """SHA-256 of the texts that it was read from, hexadecimal."""
+    """SHA-256 of the texts that the grammar was read from, hexadecimal."""
 
     def production(self, symbol: str) -> Production | None:
-        """How a symbol is rewritten; None if the name is a part."""
+        """Return the production of a symbol; None if the name is a part."""
         return self._by_symbol.get(symbol)
+
+    def alternatives(self) -> Iterator[tuple[Production, Alternative]]:
+        """Yield every alternative with its production."""
+        for production in self.productions:
+            for alternative in production.alternatives:
+                yield production, alternative
 
     @cached_property
     def _by_symbol(self) -> Mapping[str, Production]:
@@ -51,25 +57,25 @@ class Grammar:
 
 
 def grammar_names() -> list[str]:
-    """Names of the grammars that come with morphgen."""
+    """Return the names of the grammars that come with morphgen."""
     return sorted(path.stem for path in _shipped().glob(f"*{SUFFIX}"))
 
 
 def grammar_summary(name: str) -> str:
-    """Return what the first comment of a grammar that comes with morphgen says of its robots."""
+    """Return the description in the first comment of a grammar that comes with morphgen."""
     with (_shipped() / f"{name}{SUFFIX}").open(encoding="utf-8") as lines:
         return lines.readline().partition(": ")[2].strip()
 
 
 def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
-    """The file of a grammar.
+    """Return the file of a grammar.
 
     Args:
-        name: A path, or the name of a grammar of a user's library or of morphgen's own.
-        folders: The user's library.
+        name: A path, or the name of a grammar in ``folders`` or of one that comes with morphgen.
+        folders: Folders of the library.
 
     Raises:
-        GrammarError: If there is none.
+        GrammarError: If the grammar does not exist.
     """
     if name.endswith(SUFFIX) or "/" in name:
         path = Path(name)
@@ -77,28 +83,32 @@ def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
             raise GrammarError(f"{path}: no such file")
         return path
     users = [folder for folder in folders if not _shipped().is_relative_to(folder)]
-    found = [path for folder in (*users, _shipped()) for path in sorted(folder.rglob(f"*{SUFFIX}"))]
-    for path in found:
+    paths = [path for folder in (*users, _shipped()) for path in sorted(folder.rglob(f"*{SUFFIX}"))]
+    for path in paths:
         if path.stem == name:
             return path
-    raise GrammarError(f"unknown grammar {name!r}{nearest(name, {path.stem for path in found})}")
+    raise GrammarError(f"unknown grammar {name!r}{nearest(name, {path.stem for path in paths})}")
 
 
 def load_grammar(path: Path, folders: Iterable[Path] = ()) -> Grammar:
-    """Read a grammar and what it includes.
+    """Read a grammar with its includes.
 
-    A file may say anew what a symbol or value of an included file is.
+    A file's symbols and values replace those of the same name in the files that it includes.
+
+    Args:
+        path: The file.
+        folders: Folders of the library, which includes may come from.
 
     Raises:
         GrammarError: If a file cannot be read or parsed, includes itself or a file outside of its
-            folder and the libraries, names a symbol twice, or is beyond a limit.
+            folder and the library, defines a symbol twice, or exceeds a limit.
     """
     reader = _Reader(path, tuple(folders))
-    return _assembled(path.stem, str(path), reader.statements, reader.texts)
+    return _build(path.stem, str(path), reader.statements, reader.texts)
 
 
 def grammar_from_text(text: str, name: str) -> Grammar:
-    """Read a grammar from text without includes, such as ``grammar_text`` gives.
+    """Read a grammar from a text without includes, such as that of ``grammar_text``.
 
     Raises:
         GrammarError: If the text cannot be parsed, or includes another grammar.
@@ -106,16 +116,18 @@ def grammar_from_text(text: str, name: str) -> Grammar:
     statements = parse_grammar(text, name)
     for statement in statements:
         if isinstance(statement, Include):
-            raise GrammarError(f"{statement.location}: a grammar given as text includes no other")
+            raise GrammarError(
+                f"{statement.location}: a grammar given as text cannot include others"
+            )
     _require_unique(statements)
-    return _assembled(name, name, list(statements), [text])
+    return _build(name, name, statements, [text])
 
 
 def grammar_text(grammar: Grammar) -> str:
-    """The grammar with its includes as one text, the start symbol first.
+    """Return the grammar with its includes as one text, the start symbol first.
 
     Raises:
-        GrammarError: If the text is so long that it could not be read again.
+        GrammarError: If the text is too long to be read again.
     """
     ordered = sorted(grammar.productions, key=lambda p: p.symbol != grammar.start)
     lines = [f"let {let.name} = {let.expression}" for let in grammar.lets]
@@ -147,12 +159,14 @@ def _item_text(item: Item) -> str:
     )
 
 
-def _assembled(name: str, origin: str, statements: list[Statement], texts: list[str]) -> Grammar:
+def _build(
+    name: str, origin: str, statements: Sequence[Statement], texts: Iterable[str]
+) -> Grammar:
     productions = [s for s in statements if isinstance(s, Production)]
     if not productions:
         raise GrammarError(f"{origin}: no production, such as: robot -> base arm ee")
-    own = [p for p in productions if p.location.origin == origin]
-    start = (own or productions)[0].symbol
+    in_file = [p for p in productions if p.location.origin == origin]
+    start = (in_file or productions)[0].symbol
     wheres = tuple(s.condition for s in statements if isinstance(s, Where))
     for where in wheres:
         require_condition(where)
@@ -168,13 +182,13 @@ def _assembled(name: str, origin: str, statements: list[Statement], texts: list[
 
 
 class _Reader:
-    """Reads a grammar with its includes, within the limits of all of them together."""
+    """Reads a grammar with its includes; the limits apply to all files together."""
 
     def __init__(self, path: Path, folders: tuple[Path, ...]) -> None:
         self._folders = folders
         self._roots = [folder.resolve() for folder in (path.parent, *folders, _shipped())]
         self.statements: list[Statement] = []
-        """Those of an include before those of the file that includes it."""
+        """Statements of all files, those of an include before those of the including file."""
         self.texts: list[str] = []
         self._read(path, ())
         if len(self.statements) > MAX_STATEMENTS:
@@ -188,14 +202,14 @@ class _Reader:
             chain = " -> ".join(p.name for p in (*above, path))
             raise GrammarError(f"{above[-1]}: grammars include each other: {chain}")
         text = self._text(path)
-        own: list[Statement] = []
+        statements: list[Statement] = []
         for statement in parse_grammar(text, str(path)):
             if isinstance(statement, Include):
                 self._read(self._included(statement, path), (*above, path))
             else:
-                own.append(statement)
-        _require_unique(own)
-        self.statements += own
+                statements.append(statement)
+        _require_unique(statements)
+        self.statements += statements
 
     def _text(self, path: Path) -> str:
         if len(self.texts) == MAX_FILES:
@@ -227,7 +241,7 @@ class _Reader:
         try:
             inside = any(target.resolve().is_relative_to(root) for root in self._roots)
             is_there = inside and target.is_file()
-        except (OSError, ValueError):  # a name that no file system takes
+        except (OSError, ValueError):  # a name that is invalid for the file system
             inside, is_there = True, False
         if not inside:
             raise GrammarError(
@@ -248,7 +262,7 @@ def _require_unique(statements: Iterable[Statement]) -> None:
             key = (type(statement), name)
             if key in seen:
                 raise GrammarError(
-                    f"{statement.location}: {name!r} is defined at {seen[key]} already"
+                    f"{statement.location}: {name!r} is already defined at {seen[key]}"
                 )
             seen[key] = statement.location
 

@@ -13,11 +13,11 @@ from morphgen.formats.resolve import file_stamp
 from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
 
 LIBRARY_VARIABLE = "MORPHGEN_LIBRARY"
-"""Environment variable: folders of a user's own parts, separated like ``PATH``."""
+"""Environment variable with folders of a user's own parts, separated as in ``PATH``."""
 
 
 class Library:
-    """Manifests by name. A user's part may not take the name of another one."""
+    """Manifests of parts by name. Names are unique over all folders."""
 
     def __init__(self, folders: Iterable[Path]) -> None:
         self.folders = tuple(folders)
@@ -29,25 +29,25 @@ class Library:
         Raises:
             PartError: If a folder is missing or two files have the same name.
         """
-        found: dict[str, Path] = {}
+        paths: dict[str, Path] = {}
         for folder in self.folders:
             if not folder.is_dir():
                 raise PartError(f"library folder {folder} does not exist")
             for path in sorted(folder.rglob("*.yaml")):
-                if found.get(path.stem, path) != path:
-                    raise PartError(f"part {path.stem!r} is in {found[path.stem]} and in {path}")
-                found[path.stem] = path
-        return dict(sorted(found.items()))
+                if paths.get(path.stem, path) != path:
+                    raise PartError(f"part {path.stem!r} is in {paths[path.stem]} and in {path}")
+                paths[path.stem] = path
+        return dict(sorted(paths.items()))
 
     def manifest(self, name: str, kind: PartKind | None = None) -> Manifest:
-        """The manifest of a part.
+        """Return the manifest of a part.
 
         Args:
-            name: The part.
-            kind: What it must be, if that matters.
+            name: Name of the part.
+            kind: Required kind of the part; None for any.
 
         Raises:
-            PartError: If there is no such part, or it is of another kind.
+            PartError: If the part does not exist or has another kind.
         """
         if name not in self.paths:
             valid = self.names(kind) if kind else self.paths
@@ -60,23 +60,28 @@ class Library:
         return manifest
 
     def names(self, kind: PartKind | None = None) -> list[str]:
-        """Names of all parts, or of one kind, sorted."""
+        """Return the names of all parts, or of those of one kind, sorted."""
         return [name for name, path in self.paths.items() if kind in (None, _manifest(path).kind)]
 
     def manifests(self, kind: PartKind | None = None) -> list[Manifest]:
-        """Manifests of all parts, or of one kind: by kind, then name."""
-        found = [_manifest(path) for path in self.paths.values()]
-        chosen = [manifest for manifest in found if kind in (None, manifest.kind)]
-        return sorted(chosen, key=lambda manifest: (PART_KINDS.index(manifest.kind), manifest.name))
+        """Return the manifests of all parts, or of those of one kind, by kind and name."""
+        manifests = [_manifest(path) for path in self.paths.values()]
+        of_kind = [manifest for manifest in manifests if kind in (None, manifest.kind)]
+        return sorted(
+            of_kind, key=lambda manifest: (PART_KINDS.index(manifest.kind), manifest.name)
+        )
 
 
 def default_library(extra: Iterable[Path] = ()) -> Library:
-    """The package's parts, those of ``MORPHGEN_LIBRARY``, and those of ``extra`` folders."""
-    environment = os.environ.get(LIBRARY_VARIABLE, "")
-    users = [Path(entry) for entry in environment.split(os.pathsep) if entry]
-    given = (folder.absolute() for folder in (*users, *extra))
-    own = [Path(str(files(package))) for package in ("morphgen.templates", "morphgen.robots_real")]
-    return Library(dict.fromkeys((*own, *given)))
+    """Return the library of morphgen's parts and those of users.
+
+    Args:
+        extra: Folders of a user's own parts, in addition to those of ``MORPHGEN_LIBRARY``.
+    """
+    entries = os.environ.get(LIBRARY_VARIABLE, "").split(os.pathsep)
+    users = (path.absolute() for path in (*(Path(entry) for entry in entries if entry), *extra))
+    shipped = (Path(str(files(f"morphgen.{name}"))) for name in ("templates", "robots_real"))
+    return Library(dict.fromkeys((*shipped, *users)))
 
 
 def _manifest(path: Path) -> Manifest:
@@ -85,6 +90,6 @@ def _manifest(path: Path) -> Manifest:
 
 @lru_cache(maxsize=1024)
 def _read(path: Path, stamp: tuple[int, int]) -> Manifest:
-    """The manifest of a file as it is at its stamp."""
+    """Read a manifest; the stamp makes the cache forget a file that changed."""
     del stamp
     return read_manifest(path)

@@ -1,16 +1,20 @@
-"""Parameters of parts: their units, defaults and ranges, and reading their values."""
+"""Parameters of parts: units, defaults and ranges, and parsing their values."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Literal
+
+from msgspec import field
 
 from morphgen.errors import PartError, nearest
+from morphgen.formats.records import FiniteNumber, Record
 from morphgen.formats.rounding import format_number
 
-_SCALES: dict[str, dict[str, float]] = {
+Unit = Literal["m", "rad", "kg", ""]
+_SCALES: dict[Unit, dict[str, float]] = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},
     "rad": {"rad": 1.0, "deg": math.pi / 180},
     "kg": {"kg": 1.0, "g": 0.001},
@@ -19,55 +23,51 @@ _SCALES: dict[str, dict[str, float]] = {
 UNITS: Mapping[str, tuple[str, float]] = {
     name: (unit, scale) for unit, scales in _SCALES.items() for name, scale in scales.items()
 }
-"""Every unit that can be written: the SI unit it stands for, and its factor."""
+"""SI unit and factor of every unit that can be written."""
 _VALUE = re.compile(
     r"(?P<number>[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>[a-zA-Z]*)"
 )
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A number that shapes a part."""
+class Parameter(Record, frozen=True):
+    """A number that shapes a part, in SI units."""
 
-    name: str
-    default: float
-    minimum: float
-    maximum: float
-    unit: str = ""
-    """``m``, ``rad``, ``kg``, or empty for a pure number."""
+    default: FiniteNumber
+    minimum: FiniteNumber = field(name="min")
+    maximum: FiniteNumber = field(name="max")
+    unit: Unit = ""
+    """SI unit; empty for a pure number."""
     summary: str = ""
     integer: bool = False
-    """Whether only whole numbers make sense, such as a count."""
+    """Whether only integers are valid, such as for a count."""
 
     def __post_init__(self) -> None:
-        if self.unit not in _SCALES:
-            raise PartError(f"parameter {self.name}: unknown unit {self.unit!r}{_units()}")
         if not self.minimum <= self.default <= self.maximum:
-            raise PartError(
-                f"parameter {self.name}: default {self.default:g} is outside "
-                f"[{self.minimum:g}, {self.maximum:g}]"
+            raise ValueError(
+                f"default {self.default:g} is outside [{self.minimum:g}, {self.maximum:g}]"
             )
 
 
-MOUNT_YAW = Parameter(
-    "mount_yaw", 0.0, -2 * math.pi, 2 * math.pi, "rad", "turn about the axis of the port"
+MOUNT_YAW = "mount_yaw"
+"""Name of the parameter that every attached part has."""
+MOUNT_YAW_PARAMETER = Parameter(
+    0.0, -2 * math.pi, 2 * math.pi, "rad", "rotation about the axis of the port"
 )
-"""Every attached part has it."""
 
 
 def parse_value(text: str, parameter: Parameter, where: str) -> float:
-    """Read a number with an optional unit, such as ``45deg`` or ``80mm``.
+    """Parse a number with an optional unit, such as ``45deg`` or ``80mm``.
 
     Args:
-        text: What the user wrote; without a unit it is in SI.
-        parameter: What it is for.
-        where: Its name as the user wrote it, for messages.
+        text: The user's text; a number without a unit is in SI units.
+        parameter: The parameter that the value is for.
+        where: The parameter's name as the user wrote it, for messages.
 
     Returns:
         The value in SI units.
 
     Raises:
-        PartError: If it is no number, its unit is of another kind, or it is out of range.
+        PartError: If the text is not a number, has the wrong unit, or is out of range.
     """
     match = _VALUE.fullmatch(text.strip())
     if match is None:
@@ -82,10 +82,10 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
 
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
-    """Return the value if it lies in the parameter's range, to 12 digits.
+    """Return the value if it is in the parameter's range, to 12 digits.
 
     Raises:
-        PartError: If it does not.
+        PartError: If it is not.
     """
     low = min(parameter.minimum, float(format_number(parameter.minimum)))
     high = max(parameter.maximum, float(format_number(parameter.maximum)))
@@ -116,13 +116,7 @@ def resolve_values(
 
 
 def _expected(parameter: Parameter) -> str:
-    units = "/".join(_SCALES[parameter.unit])
-    unit = f" {units}" if units else ""
     low, high = f"{parameter.minimum:.4g}", f"{parameter.maximum:.4g}"
-    return f"; expected {low} to {high} {parameter.unit}".rstrip() + (
-        f" (units:{unit})" if unit else ""
-    )
-
-
-def _units() -> str:
-    return nearest("", (unit or "(none)" for unit in _SCALES))
+    units = "/".join(_SCALES[parameter.unit])
+    expected = f"; expected {low} to {high} {parameter.unit}".rstrip()
+    return expected + (f" (units: {units})" if units else "")

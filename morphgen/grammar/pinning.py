@@ -1,75 +1,68 @@
-"""Pin what a grammar leaves open: ``beads=5 bead.radius=20mm arm=ur5``."""
+"""Pin choices that a grammar leaves open: ``beads=5 bead.radius=20mm arm=ur5``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from morphgen.errors import GrammarError, nearest
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_WORD
-from morphgen.grammar.parameters import MOUNT_YAW, parse_value
+from morphgen.grammar.parameters import parse_value
 from morphgen.grammar.syntax import (
     Alternative,
     Expression,
     Item,
-    Let,
     Production,
     SourceLocation,
     parse_condition,
 )
-from morphgen.grammar.values import Scope, evaluate, no_draw
+from morphgen.grammar.values import Scope, evaluate, typical_value
 
 
 def pin(grammar: Grammar, words: Sequence[str], library: Library) -> Grammar:
-    """The grammar with some of its choices made.
+    """Return the grammar with some of its choices fixed.
 
-    ``symbol=name`` keeps the alternatives of a symbol that begin with a name, ``symbol=5`` fixes
-    its repetition, ``part.parameter=value`` a parameter wherever the part stands, ``name=value``
-    a value of ``let``.
+    ``symbol=name`` keeps the alternatives of a symbol that begin with a name; ``symbol=5`` fixes
+    the count of its repetition; ``part.parameter=value`` fixes a parameter of every copy of a
+    part; ``name=value`` fixes a value of ``let``.
 
     Args:
         grammar: The grammar.
         words: ``key=value`` words, in any order.
-        library: Where its parts are.
+        library: Library of the grammar's parts.
 
     Raises:
         GrammarError: If a word is malformed or names nothing in the grammar.
-        PartError: If a value is no number, of another unit or out of range.
+        PartError: If a value is not a number, has the wrong unit or is out of range.
     """
     for word in words:
         key, equals, value = word.partition("=")
         if not equals or not key or not value:
             raise GrammarError(f"{word!r} is not of the form key=value, such as beads=5")
-        owner, dot, name = key.rpartition(".")
+        part, dot, parameter = key.rpartition(".")
         if dot:
-            grammar = _with_parameter(grammar, owner, name, value, library)
+            grammar = _pin_parameter(grammar, part, parameter, value, library)
         elif any(let.name == key for let in grammar.lets):
-            grammar = _with_let(grammar, key, value)
+            grammar = _pin_let(grammar, key, value)
         else:
-            grammar = _with_symbol(grammar, key, value)
+            grammar = _pin_symbol(grammar, key, value)
     return grammar
 
 
-def _with_parameter(
-    grammar: Grammar, part: str, name: str, value: str, library: Library
-) -> Grammar:
-    parts = {
-        item.name
-        for production in grammar.productions
-        for alternative in production.alternatives
-        for item in alternative.items
-        if grammar.production(item.name) is None
-    }
+def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: Library) -> Grammar:
+    names = {item.name for production in grammar.productions for item in production.items()}
+    parts = {name for name in names if grammar.production(name) is None}
     if part not in parts:
         raise GrammarError(
             f"{part}.{name}: no part {part!r} in {grammar.name!r}{nearest(part, parts)}"
         )
-    parameters = {**library.manifest(part).parameters, MOUNT_YAW.name: MOUNT_YAW}
+    parameters = library.manifest(part).attached_parameters
     if name not in parameters:
         raise GrammarError(f"{part!r} has no parameter {name!r}{nearest(name, parameters)}")
-    number = _number(parse_value(value, parameters[name], f"{part}.{name}"))
+    pinned_value = parse_value(value, parameters[name], f"{part}.{name}")
+    number = Expression("number", (), SourceLocation("command line", 1, 1), "", pinned_value)
 
     def pinned(item: Item) -> Item:
         if item.name != part:
@@ -77,34 +70,25 @@ def _with_parameter(
         others = tuple(entry for entry in item.arguments if entry[0] != name)
         return replace(item, arguments=(*others, (name, number)))
 
+    def with_items(alternative: Alternative) -> Alternative:
+        return replace(alternative, items=tuple(map(pinned, alternative.items)))
+
     return _with_productions(
-        grammar,
-        [
-            replace(
-                production,
-                alternatives=tuple(
-                    replace(alternative, items=tuple(pinned(item) for item in alternative.items))
-                    for alternative in production.alternatives
-                ),
-            )
-            for production in grammar.productions
-        ],
+        grammar, lambda p: replace(p, alternatives=tuple(map(with_items, p.alternatives)))
     )
 
 
-def _with_let(grammar: Grammar, name: str, value: str) -> Grammar:
+def _pin_let(grammar: Grammar, name: str, value: str) -> Grammar:
     number = parse_condition(value, f"{name}={value}")
     unsigned = number.operands[0] if number.operator == "negative" else number
     if unsigned.operator != "number":
         raise GrammarError(f"{name}={value}: not a number, such as 0.02 or 20mm")
-    evaluate(number, Scope({}, no_draw, name))
-    lets = tuple(
-        Let(let.name, number, let.location) if let.name == name else let for let in grammar.lets
-    )
-    return replace(grammar, lets=lets)
+    evaluate(number, Scope({}, typical_value, name))  # raises if the unit is unknown
+    lets = (replace(let, expression=number) if let.name == name else let for let in grammar.lets)
+    return replace(grammar, lets=tuple(lets))
 
 
-def _with_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
+def _pin_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
     production = grammar.production(symbol)
     if production is None:
         valid = [*(p.symbol for p in grammar.productions), *(let.name for let in grammar.lets)]
@@ -117,35 +101,29 @@ def _with_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
             valid = [alternative.items[0].name for alternative in production.alternatives]
             raise GrammarError(f"{symbol}={value}: no such alternative{nearest(value, valid)}")
         pinned = replace(production, alternatives=kept)
-    return _with_productions(
-        grammar, [pinned if p.symbol == symbol else p for p in grammar.productions]
-    )
+    return _with_productions(grammar, lambda p: pinned if p.symbol == symbol else p)
 
 
 def _with_count(production: Production, count: int) -> Production:
-    found = [
-        (alternative, item)
+    """Fix the count of the one open repetition of a symbol; drop its other alternatives."""
+    repetitions = [
+        (alternative, item, item.repetition)
         for alternative in production.alternatives
         for item in alternative.items
         if item.repetition is not None and item.repetition[0] < item.repetition[1]
     ]
-    if len(found) != 1:
+    if len(repetitions) != 1:
         raise GrammarError(
-            f"{production.symbol}={count}: {production.symbol!r} has {len(found)} repetitions to "
-            "pin, not one"
+            f"{production.symbol}={count}: {production.symbol!r} has {len(repetitions)} "
+            "repetitions to pin, not one"
         )
-    ((alternative, repeated),) = found
-    low, high = repeated.repetition or (1, 1)
+    ((alternative, repeated, (low, high)),) = repetitions
     if not low <= count <= high:
         raise GrammarError(f"{production.symbol}={count}: expected {low} to {high}")
     fixed = replace(repeated, repetition=(count, count))
     items = tuple(fixed if item is repeated else item for item in alternative.items)
-    return replace(production, alternatives=(Alternative(items, alternative.weight),))
+    return replace(production, alternatives=(replace(alternative, items=items),))
 
 
-def _with_productions(grammar: Grammar, productions: Sequence[Production]) -> Grammar:
-    return replace(grammar, productions=tuple(productions))
-
-
-def _number(value: float) -> Expression:
-    return Expression("number", (), SourceLocation("command line", 1, 1), "", value)
+def _with_productions(grammar: Grammar, change: Callable[[Production], Production]) -> Grammar:
+    return replace(grammar, productions=tuple(map(change, grammar.productions)))

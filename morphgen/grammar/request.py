@@ -1,4 +1,4 @@
-"""Requests: ``arm=ur5 ee=plane left.ee.size=0.1`` to a derivation."""
+"""Parse requests: ``arm=ur5 ee=plane left.ee.size=0.1`` to a derivation."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from morphgen.grammar.parameters import MOUNT_YAW, parse_value, resolve_values
 from morphgen.grammar.pinning import pin
 
 SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")
-"""Kinds of parts that a request may choose."""
+"""Kinds of parts that a request can choose."""
 MAIN_PORTS: Mapping[PartKind, str] = {"base": "top", "arm": "flange"}
-"""Where the next part goes when no port is named."""
+"""Port of each kind of part that the next part is attached to when none is named."""
 
 
 @dataclass
 class _Slot:
-    """A part asked for at one place: ``base``, ``arm``, ``left.ee`` ..."""
+    """A part of a request, such as ``base``, ``arm`` or ``left.ee``."""
 
     kind: PartKind
     port: str
-    """The limb, such as ``left``; empty for the main one."""
+    """Name of the limb, such as ``left``; empty for the main limb."""
     part: str = ""
     values: dict[str, str] = field(default_factory=dict)
+    """Parameters as the user wrote them."""
 
     @property
     def key(self) -> str:
@@ -39,13 +40,13 @@ class _Slot:
 def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str]:
     """Return the derivation that words describe, and a name for its robot.
 
-    The words are one of: ``key=value`` words (see ``parse_request``); a grammar's name and what is
-    pinned in it (see ``morphgen.grammar.pinning.pin``), of which the first alternatives, smallest
-    counts and typical values are taken; or parts joined by dashes, each of which goes to the slot
-    of its kind: ``ur5-plane`` is ``arm=ur5 ee=plane``.
+    The words have one of three forms: ``key=value`` words (see ``parse_request``); the name of a
+    grammar and pinned choices (see ``morphgen.grammar.pinning.pin``), which give its first
+    alternatives, smallest counts and typical values; or parts joined by dashes, each of which
+    takes the slot of its kind: ``ur5-plane`` is ``arm=ur5 ee=plane``.
 
     Raises:
-        MorphgenError: If the words name what does not exist or does not fit.
+        MorphgenError: If the words name something that does not exist or does not fit.
     """
     if not words:
         raise CompositionError(
@@ -69,79 +70,80 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
 
 
 def known_grammars(library: Library) -> set[str]:
-    """Return the names of morphgen's grammars and of those in the user's folders."""
-    own = (path.stem for folder in library.folders for path in folder.rglob(f"*{SUFFIX}"))
-    return {*grammar_names(), *own}
+    """Return the names of morphgen's grammars and of those in the library's folders."""
+    in_library = (path.stem for folder in library.folders for path in folder.rglob(f"*{SUFFIX}"))
+    return {*grammar_names(), *in_library}
 
 
 def _slot_word(part: str, text: str, library: Library) -> str:
-    """The part with its slot, such as ``arm=ur5``."""
+    """Return the ``key=value`` word of a part, such as ``arm=ur5``."""
     if part not in library.paths:
         names = {name for kind in SLOTS for name in library.names(kind)} | known_grammars(library)
         raise CompositionError(
-            f"robot {text!r}: there is no such bundle or URDF, and {part!r} is no part"
+            f"robot {text!r}: there is no such bundle or URDF, and {part!r} is not a part"
             + nearest(part, names)
         )
     kind = library.manifest(part).kind
     if kind not in SLOTS:
         raise CompositionError(
-            f"robot {text!r}: {part!r} is a {kind}, which only a grammar can place"
+            f"robot {text!r}: {part!r} is a {kind}, which only a grammar can use"
             + nearest(part, known_grammars(library))
         )
     return f"{kind}={part}"
 
 
 def parse_request(words: Sequence[str], library: Library) -> Derivation:
-    """Read ``key=value`` words into a derivation.
+    """Return the derivation of ``key=value`` words.
 
-    ``base``, ``arm`` and ``ee`` choose parts (the base is ``fixed`` unless named). A limb on a
-    named port is written before them: ``left.arm=ur5``. Anything else is a parameter of a part:
-    ``ee.size=80mm``, ``left.ee.mount_yaw=45deg``.
+    ``base``, ``arm`` and ``ee`` choose parts; the base is ``fixed`` by default. A prefix names the
+    port of a limb: ``left.arm=ur5``. Every other key is a parameter of a part: ``ee.size=80mm``,
+    ``left.ee.mount_yaw=45deg``.
 
     Args:
         words: The words, in any order.
-        library: Where the parts are.
+        library: Library of the parts.
 
     Raises:
         CompositionError: If a word is malformed or given twice, a parameter belongs to no part,
-            a port does not exist, or nothing stands on the base.
-        PartError: If a part or parameter is unknown, or a value is wrong.
+            a port does not exist, or nothing is attached to the base.
+        PartError: If a part or parameter is unknown, or a value is invalid.
     """
-    slots = _slots(words)
+    slots = _parse_slots(words)
     base = slots.pop("base", _Slot("base", "", "fixed"))
     if not slots:
         raise CompositionError(
             "nothing to compose: name at least an arm or an ee, such as arm=ur5 ee=plane"
         )
     manifests = {key: library.manifest(slot.part, slot.kind) for key, slot in slots.items()}
-    children = _limbs(slots, manifests, library)
+    limbs = _limbs(slots, manifests, library)
     base_manifest = library.manifest(base.part, "base")
-    for port, child in children:
-        _require_port(base_manifest, port, child.label)
+    for port, limb in limbs:
+        _require_port(base_manifest, port, limb.label)
     ports = list(base_manifest.ports)
-    children.sort(key=lambda limb: ports.index(limb[0]))
-    return _node(base, base_manifest, tuple(children))
+    limbs.sort(key=lambda limb: ports.index(limb[0]))
+    return _node(base, base_manifest, tuple(limbs))
 
 
 def default_name(derivation: Derivation, library: Library) -> str:
-    """A name for a robot: its parts, and a short hash if a parameter is not at its default."""
+    """Return a robot's name: its parts, and a hash if a parameter differs from its default."""
     words = []
-    changed = False
+    is_changed = False
     labels = {node.label for node in derivation.walk()}
     for node in derivation.walk():
-        defaults = {p.name: p.default for p in library.manifest(node.part).parameters.values()}
-        changed |= dict(node.parameters) != defaults
+        parameters = library.manifest(node.part).parameters
+        defaults = {name: parameter.default for name, parameter in parameters.items()}
+        is_changed |= dict(node.parameters) != defaults
         if node.part in ("fixed", "none"):
             continue
         limb, _, kind = node.label.rpartition("_")
-        begins = limb and (kind == "arm" or f"{limb}_arm" not in labels)
-        words.append(f"{limb}-{node.part}" if begins else node.part)
-    if changed:
+        starts_limb = limb and (kind == "arm" or f"{limb}_arm" not in labels)
+        words.append(f"{limb}-{node.part}" if starts_limb else node.part)
+    if is_changed:
         words.append(derivation.digest[:8])
     return "-".join(words)
 
 
-def _slots(words: Sequence[str]) -> dict[str, _Slot]:
+def _parse_slots(words: Sequence[str]) -> dict[str, _Slot]:
     slots: dict[str, _Slot] = {}
     values: dict[str, str] = {}
     for word in words:
@@ -164,69 +166,64 @@ def _slots(words: Sequence[str]) -> dict[str, _Slot]:
     if any(key != "base" for key in slots):
         slots.setdefault("base", _Slot("base", "", "fixed"))
     for key, value in values.items():
-        owner, _, name = key.rpartition(".")
-        if owner not in slots:
-            raise CompositionError(_unknown_key(key, value, owner, slots))
-        slots[owner].values[name] = value
+        _assign(key, value, slots)
     return slots
 
 
-def _unknown_key(key: str, value: str, owner: str, slots: Mapping[str, _Slot]) -> str:
-    if owner:
-        return f"{key}={value}: no part is chosen for {owner!r}{nearest(owner, slots)}"
-    return (
-        f"{key}={value}: unknown key {key!r}; expected {', '.join(SLOTS)}, a limb such as left.arm "
-        "or left.ee, or a parameter of a part such as ee.size"
-    )
+def _assign(key: str, value: str, slots: Mapping[str, _Slot]) -> None:
+    """Give a parameter's value to the slot of its part."""
+    owner, _, name = key.rpartition(".")
+    if owner in slots:
+        slots[owner].values[name] = value
+    elif owner:
+        raise CompositionError(
+            f"{key}={value}: no part is chosen for {owner!r}{nearest(owner, slots)}"
+        )
+    else:
+        raise CompositionError(
+            f"{key}={value}: unknown key {key!r}; expected {', '.join(SLOTS)}, a limb such as "
+            "left.arm or left.ee, or a parameter of a part such as ee.size"
+        )
 
 
 def _limbs(
     slots: Mapping[str, _Slot], manifests: Mapping[str, Manifest], library: Library
 ) -> list[tuple[str, Derivation]]:
-    """(port of the base, what stands there), arms with their end-effectors."""
+    """Return (port of the base, derivation) of each limb, arms with their end-effectors."""
     limbs: list[tuple[str, Derivation]] = []
-    used: set[str] = set()
+    attached: set[str] = set()
+    """Keys of end-effectors that an arm carries."""
     for key, slot in slots.items():
         if slot.kind != "arm":
             continue
         arm = manifests[key]
-        held: list[tuple[str, Derivation]] = []
+        children: list[tuple[str, Derivation]] = []
         for port in arm.ports:
-            ee_key = _ee_key(slot, port, arm)
-            if ee_key in slots:
-                used.add(ee_key)
-                held.append((port, _node(slots[ee_key], manifests[ee_key])))
+            if port == MAIN_PORTS["arm"]:
+                ee_key = f"{slot.port}.ee" if slot.port else "ee"
             else:
-                limb, _, _ = ee_key.rpartition(".")
-                none = _Slot("ee", limb, "none")
-                held.append((port, _node(none, library.manifest("none", "ee"))))
-        limbs.append((slot.port or MAIN_PORTS["base"], _node(slot, arm, tuple(held))))
+                ee_key = f"{port}.ee"
+            if ee_key in slots:
+                attached.add(ee_key)
+                children.append((port, _node(slots[ee_key], manifests[ee_key])))
+            else:
+                empty = _Slot("ee", ee_key.rpartition(".")[0], "none")
+                children.append((port, _node(empty, library.manifest("none", "ee"))))
+        limbs.append((slot.port or MAIN_PORTS["base"], _node(slot, arm, tuple(children))))
     for key, slot in slots.items():
-        if slot.kind == "ee" and key not in used:
-            arm_key = f"{slot.port}.arm" if slot.port and slot.port in _ports(slots) else "arm"
+        if slot.kind == "ee" and key not in attached:
+            has_arm = slot.port and f"{slot.port}.arm" in slots
+            arm_key = f"{slot.port}.arm" if has_arm else "arm"
             if arm_key in slots:
                 _require_port(manifests[arm_key], slot.port or MAIN_PORTS["arm"], key)
             limbs.append((slot.port or MAIN_PORTS["base"], _node(slot, manifests[key])))
     return limbs
 
 
-def _ports(slots: Mapping[str, _Slot]) -> set[str]:
-    return {slot.port for slot in slots.values() if slot.kind == "arm"}
-
-
-def _ee_key(arm_slot: _Slot, port: str, arm: Manifest) -> str:
-    """The key that names the end-effector on an arm's port."""
-    if port == MAIN_PORTS["arm"]:
-        return f"{arm_slot.port}.ee" if arm_slot.port else "ee"
-    return f"{port}.ee"
-
-
 def _node(
     slot: _Slot, manifest: Manifest, children: tuple[tuple[str, Derivation], ...] = ()
 ) -> Derivation:
-    parameters = dict(manifest.parameters)
-    if slot.kind != "base":
-        parameters[MOUNT_YAW.name] = MOUNT_YAW
+    parameters = manifest.parameters if slot.kind == "base" else manifest.attached_parameters
     values = {}
     for name, text in slot.values.items():
         if name not in parameters:
@@ -236,10 +233,9 @@ def _node(
             )
         values[name] = parse_value(text, parameters[name], f"{slot.key}.{name}")
     complete = resolve_values(values, parameters, manifest.name)
-    if complete.get(MOUNT_YAW.name) == 0.0:
-        del complete[MOUNT_YAW.name]
-    label = slot.key.replace(".", "_")
-    return Derivation(label, manifest.name, tuple(complete.items()), children)
+    if complete.get(MOUNT_YAW) == 0.0:
+        del complete[MOUNT_YAW]
+    return Derivation(slot.key.replace(".", "_"), manifest.name, tuple(complete.items()), children)
 
 
 def _require_port(manifest: Manifest, port: str, wanted: str) -> None:

@@ -1,11 +1,12 @@
-"""A set of robots on disk: drawn in parallel, resumed after any interruption, the same bytes.
+"""Sets of robots on disk: drawn in parallel, resumable after any interruption.
 
     <set>/set.json          grammar, seed, conditions, format
     <set>/grammar.grammar   the grammar with its includes, as one text
-    <set>/<name>-000017/    a bundle, or with ``light`` its URDF and derivation only
-    <set>/index.jsonl       a line a robot, by number
+    <set>/<name>-000017/    a bundle, or in a ``light`` set only its URDF and derivation
+    <set>/index.jsonl       one line per robot, in order
 
-While a run lasts, what is done stands in ``.journal.jsonl``.
+A set has the same bytes however often it was interrupted and however many processes made it. During
+a run, the records of finished robots are in ``.journal.jsonl``.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ JOURNAL = ".journal.jsonl"
 Record = dict[str, Any]
 """A line of the index."""
 SetWorker = Callable[["SetConfig", Sequence[int]], Iterator[Record]]
-"""Makes the robots of the given numbers, in any order."""
+"""Makes the robots of the given indices, in any order."""
+
+_INDEX_TYPES = {"index": int, "name": str, "hash": str, "rejected": dict, "choices": dict}
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,16 @@ class SetConfig:
     grammar_text: str
     seed: int
     where: tuple[str, ...]
+    """Conditions in addition to the grammar's own."""
     light: bool
+    """Whether to write only the URDF and the derivation of a robot."""
     picture: bool
+    """Whether to render ``preview.png``."""
     library: tuple[Path, ...]
-    """The user's folders of parts."""
+    """Folders of a user's own parts."""
 
     def settings(self) -> Record:
-        """What ``set.json`` holds: a set is only continued with the same."""
+        """Return the content of ``set.json``; a set is only continued with equal settings."""
         return {
             "format": 1,
             "grammar": self.grammar_name,
@@ -73,52 +79,53 @@ class SetConfig:
 
 @dataclass(frozen=True)
 class SetReport:
-    """What a run did."""
+    """Result of ``make_set``."""
 
     made: int
+    """Robots made by this run."""
     kept: int
-    """Robots that were there already."""
+    """Robots that existed before."""
     rejected: dict[str, int]
-    """Draws that were thrown away over the whole set, by the reason."""
+    """Number of rejected draws of the whole set, by reason."""
     duplicates: list[tuple[str, str]]
-    """Robots with the same body as an earlier one: (name, name of the earlier)."""
+    """Robots with the derivation of an earlier one: (name, name of the earlier one)."""
 
 
 def make_set(
-    plan: SetConfig, n: int, work: SetWorker, progress: Callable[[int], None] = lambda done: None
+    config: SetConfig, n: int, work: SetWorker, progress: Callable[[int], None] = lambda done: None
 ) -> SetReport:
-    """Make robots 0 to n - 1 of a set, but for those that are there.
+    """Make the robots 0 to n - 1 of a set, except those that exist.
 
     Args:
-        plan: The set.
-        n: How many robots it shall hold.
+        config: The set.
+        n: Number of robots of the complete set.
         work: Makes robots, such as ``make_serially``.
-        progress: Told how many are done, again and again.
+        progress: Called repeatedly with the number of existing robots.
 
     Raises:
-        FormatError: If the folder holds a set made otherwise, or something else, or cannot be
+        FormatError: If the folder holds a set with other settings or something else, or cannot be
             written.
         SamplingError: If a robot's conditions cannot be met.
     """
-    _prepare(plan)
-    with locked_folder(plan.folder):
-        done = _finished(plan)
-        missing = [i for i in range(n) if i not in done]
+    _prepare(config)
+    with locked_folder(config.folder):
+        finished = _finished(config)
+        missing = [i for i in range(n) if i not in finished]
         progress(n - len(missing))
-        with (plan.folder / JOURNAL).open("a", encoding="utf-8") as journal:
+        with (config.folder / JOURNAL).open("a", encoding="utf-8") as journal:
             journal.write("\n")  # ends a line that an interruption cut short
-            for made, record in enumerate(work(plan, missing), 1):
+            for made, record in enumerate(work(config, missing), 1):
                 journal.write(json.dumps(record) + "\n")
                 journal.flush()
                 progress(n - len(missing) + made)
-        report = _write_index(plan, len(missing), len(done))
-        (plan.folder / JOURNAL).unlink()
+        report = _write_index(config, len(missing), len(finished))
+        (config.folder / JOURNAL).unlink()
     return report
 
 
-def make_serially(plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
+def make_serially(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
     """Make robots one after the other in this process."""
-    maker = RobotMaker(plan)
+    maker = RobotMaker(config)
     for index in indices:
         yield maker.make(index)
 
@@ -126,22 +133,24 @@ def make_serially(plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
 class RobotMaker:
     """Draws and writes robots of a set."""
 
-    def __init__(self, plan: SetConfig) -> None:
-        self._plan = plan
-        self._library: Library = default_library(plan.library)
-        self._grammar: Grammar = grammar_from_text(plan.grammar_text, plan.grammar_name)
-        self._where = [parse_condition(text) for text in plan.where]
+    def __init__(self, config: SetConfig) -> None:
+        self._config = config
+        self._library: Library = default_library(config.library)
+        self._grammar: Grammar = grammar_from_text(config.grammar_text, config.grammar_name)
+        self._where = [parse_condition(text) for text in config.where]
 
     def make(self, index: int) -> Record:
         """Draw and write one robot; return its line of the index."""
-        plan = self._plan
-        drawn = sample_robot(self._grammar, self._library, index, seed=plan.seed, where=self._where)
-        folder = plan.folder / drawn.robot.name
-        if plan.light:
-            _write_light(drawn, folder)
+        config = self._config
+        sample = sample_robot(
+            self._grammar, self._library, index, seed=config.seed, where=self._where
+        )
+        folder = config.folder / sample.robot.name
+        if config.light:
+            _write_light(sample, folder)
         else:
-            write_bundle(drawn.robot, folder, drawn.findings, picture=plan.picture)
-        return _record(drawn)
+            write_bundle(sample.robot, folder, sample.findings, picture=config.picture)
+        return _record(sample)
 
     def make_all(self, indices: Sequence[int]) -> list[Record]:
         """Draw and write several robots."""
@@ -149,18 +158,18 @@ class RobotMaker:
 
 
 def read_index(folder: Path) -> list[Record]:
-    """The index of a set.
+    """Return the index of a set.
 
     Raises:
-        FormatError: If the folder is no finished set, or a line of the index is none.
+        FormatError: If the folder is not a finished set, or a line of the index is invalid.
     """
     path = folder / INDEX
     if not path.is_file():
-        raise FormatError(f"{folder} is no finished set: it has no {INDEX}")
+        raise FormatError(f"{folder} is not a finished set: it has no {INDEX}")
     records = []
     with path.open("rb") as lines:
         for i, line in enumerate(lines, 1):
-            record = _record_in(line)
+            record = _parse_record(line)
             if record is None:
                 raise FormatError(f"{path}:{i}: not a line of an index of morphgen sample")
             records.append(record)
@@ -168,10 +177,10 @@ def read_index(folder: Path) -> list[Record]:
 
 
 def read_settings(folder: Path) -> Record:
-    """What a set was made with: its ``set.json``.
+    """Return the settings of a set, the content of its ``set.json``.
 
     Raises:
-        FormatError: If it is missing or invalid.
+        FormatError: If the file is missing or invalid.
     """
     path = folder / SETTINGS
     try:
@@ -183,130 +192,133 @@ def read_settings(folder: Path) -> Record:
     return settings
 
 
-def _record_in(line: bytes) -> Record | None:
-    """The record of a line; None if the line is cut short or is no record."""
+def _parse_record(line: bytes) -> Record | None:
+    """Return the record of a line; None if the line is cut short or invalid."""
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    kinds = {"index": int, "name": str, "hash": str, "rejected": dict, "choices": dict}
     if not isinstance(record, dict) or any(
-        not isinstance(record.get(key), kind) for key, kind in kinds.items()
+        not isinstance(record.get(key), kind) for key, kind in _INDEX_TYPES.items()
     ):
         return None
     numbers = (*record["rejected"].values(), *record["choices"].values())
     if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
         return None
+    # The name is a folder in the set's folder; it must not lead out of it.
     leads_out = record["name"] in ("", ".", "..") or set(record["name"]) & {"/", "\0"}
     return None if leads_out else record
 
 
-def _record(drawn: Sample) -> Record:
-    robot = drawn.robot
+def _record(sample: Sample) -> Record:
+    robot = sample.robot
     return {
-        "index": drawn.index,
+        "index": sample.index,
         "name": robot.name,
-        "hash": drawn.derivation.digest,
-        "derivation": str(drawn.derivation),
+        "hash": sample.derivation.digest,
+        "derivation": str(sample.derivation),
         "dof": robot.dof,
         "links": len(robot.links),
         "movable": len(robot.movable_joints),
-        "reach": round_number(drawn.properties.reach),
+        "reach": round_number(sample.properties.reach),
         "mass": round_number(robot.mass),
-        "findings": sorted({finding.code for finding in drawn.findings}),
-        "rejected": dict(sorted(drawn.rejected.items())),
-        "choices": {key: round_number(value) for key, value in drawn.choices.items()},
+        "findings": sorted({finding.code for finding in sample.findings}),
+        "rejected": dict(sorted(sample.rejected.items())),
+        "choices": {key: round_number(value) for key, value in sample.choices.items()},
     }
 
 
-def _write_light(drawn: Sample, folder: Path) -> None:
+def _write_light(sample: Sample, folder: Path) -> None:
     with replacing_folder(folder) as partial:
-        (partial / URDF).write_text(light_urdf(drawn.robot), encoding="utf-8")
-        (partial / DERIVATION).write_text(f"{drawn.derivation}\n", encoding="utf-8")
+        (partial / URDF).write_text(light_urdf(sample.robot), encoding="utf-8")
+        (partial / DERIVATION).write_text(f"{sample.derivation}\n", encoding="utf-8")
 
 
 def light_urdf(robot: Robot) -> str:
-    """URDF without a bundle: meshes are named where their data package has them."""
+    """Return a URDF whose meshes are named by their URIs in their data packages."""
     return urdf_text(robot, lambda mesh: portable_uri(mesh.path))
 
 
-def _prepare(plan: SetConfig) -> None:
-    """Make the folder, or see that it holds the same set."""
-    path = plan.folder / SETTINGS
-    wanted = plan.settings()
+def _prepare(config: SetConfig) -> None:
+    """Create the folder, or require that it holds a set with the same settings."""
+    path = config.folder / SETTINGS
+    settings = config.settings()
     if not path.exists():
-        if plan.folder.exists() and not _is_barely_begun(plan):
-            raise FormatError(f"{plan.folder} exists and is no set (no {SETTINGS}); name another")
-        try:
-            plan.folder.mkdir(parents=True, exist_ok=True)
-            write_atomic(plan.folder / GRAMMAR, plan.grammar_text)
-            write_atomic(path, json.dumps(wanted, indent=2) + "\n")
-        except OSError as error:
-            raise FormatError(f"cannot write to {plan.folder}: {error.strerror}") from error
-        return
-    found = read_settings(plan.folder)
-    for key, value in wanted.items():
-        if found.get(key) != value:
+        if config.folder.exists() and not _is_barely_begun(config):
             raise FormatError(
-                f"{plan.folder} holds another set: its {key} is {found.get(key)!r}, not {value!r}; "
-                "name another folder"
+                f"{config.folder} exists and is not a set (no {SETTINGS}); name another"
             )
-    if read_text(plan.folder / GRAMMAR, MAX_TEXT) != plan.grammar_text:
-        raise FormatError(f"{plan.folder} holds a set of another grammar; name another folder")
+        try:
+            config.folder.mkdir(parents=True, exist_ok=True)
+            write_atomic(config.folder / GRAMMAR, config.grammar_text)
+            write_atomic(path, json.dumps(settings, indent=2) + "\n")
+        except OSError as error:
+            raise FormatError(f"cannot write to {config.folder}: {error.strerror}") from error
+        return
+    existing = read_settings(config.folder)
+    for key, value in settings.items():
+        if existing.get(key) != value:
+            raise FormatError(
+                f"{config.folder} holds another set: its {key} is {existing.get(key)!r}, not "
+                f"{value!r}; name another folder"
+            )
+    if read_text(config.folder / GRAMMAR, MAX_TEXT) != config.grammar_text:
+        raise FormatError(f"{config.folder} holds a set of another grammar; name another folder")
 
 
-def _is_barely_begun(plan: SetConfig) -> bool:
-    """Whether a folder is empty, or what a run left that was interrupted before it made a set."""
-    grammar = plan.folder / GRAMMAR
-    own = {partial_path(grammar), partial_path(plan.folder / SETTINGS)}
-    if grammar.is_file() and grammar.read_bytes() == plan.grammar_text.encode():
-        own.add(grammar)
-    return plan.folder.is_dir() and own >= set(plan.folder.iterdir())
+def _is_barely_begun(config: SetConfig) -> bool:
+    """Return whether a folder is empty or has only the first files of an interrupted run."""
+    grammar = config.folder / GRAMMAR
+    first_files = {partial_path(grammar), partial_path(config.folder / SETTINGS)}
+    if grammar.is_file() and grammar.read_bytes() == config.grammar_text.encode():
+        first_files.add(grammar)
+    return config.folder.is_dir() and first_files >= set(config.folder.iterdir())
 
 
-def _finished(plan: SetConfig) -> dict[int, tuple[Path, int]]:
-    """Where the records of the robots that are there stand: file and offset, by number.
+def _finished(config: SetConfig) -> dict[int, tuple[Path, int]]:
+    """Return the location (file, offset) of each finished robot's record, by index.
 
-    A line cut short by an interruption counts for nothing. Records themselves stay on disk, so that
-    the size of a set is not bounded by memory.
+    A line cut short by an interruption is ignored. Records stay on disk, so that the size of a set
+    is not limited by memory. Partial folders of interrupted robots are deleted.
     """
-    places = {}
-    for path in (plan.folder / INDEX, plan.folder / JOURNAL):
+    locations = {}
+    for path in (config.folder / INDEX, config.folder / JOURNAL):
         if not path.is_file():
             continue
         offset = 0
         with path.open("rb") as lines:
             for line in lines:
-                record = _record_in(line)
-                if record and (plan.folder / record["name"] / URDF).is_file():
-                    places[record["index"]] = (path, offset)
+                record = _parse_record(line)
+                if record and (config.folder / record["name"] / URDF).is_file():
+                    locations[record["index"]] = (path, offset)
                 offset += len(line)
-    for leftover in plan.folder.glob(".*.*"):
+    for leftover in config.folder.glob(".*.*"):
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
-    return places
+    return locations
 
 
-def _write_index(plan: SetConfig, made: int, kept: int) -> SetReport:
-    """Write all records in order of their numbers, and sum them up."""
+def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
+    """Write all records in order of their indices, and summarize them."""
     rejected: Counter[str] = Counter()
-    first: dict[str, str] = {}
+    first_names: dict[str, str] = {}
+    """Name of the first robot of each derivation, by hash."""
     duplicates = []
-    partial = partial_path(plan.folder / INDEX)
-    places = _finished(plan)
+    partial = partial_path(config.folder / INDEX)
+    locations = _finished(config)
     with ExitStack() as stack:
-        sources = {path for path, _ in places.values()}
+        sources = {path for path, _ in locations.values()}
         files = {path: stack.enter_context(path.open("rb")) for path in sources}
         index = stack.enter_context(partial.open("wb"))
-        for number in sorted(places):
-            path, offset = places[number]
+        for number in sorted(locations):
+            path, offset = locations[number]
             files[path].seek(offset)
             line = files[path].readline()
             index.write(line)
             record = json.loads(line)
             rejected.update(record["rejected"])
-            earlier = first.setdefault(record["hash"], record["name"])
-            if earlier != record["name"]:
-                duplicates.append((record["name"], earlier))
-    partial.replace(plan.folder / INDEX)
+            first = first_names.setdefault(record["hash"], record["name"])
+            if first != record["name"]:
+                duplicates.append((record["name"], first))
+    partial.replace(config.folder / INDEX)
     return SetReport(made, kept, dict(rejected), duplicates)

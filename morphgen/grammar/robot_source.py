@@ -1,4 +1,4 @@
-"""Find the robots that a user names: files, bundles, sets, or words of a request."""
+"""Find and read the robots that a user names: files, bundles, sets, or words of a request."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DESCRIPTION_SUFFIXES = (".urdf", ".xacro")
 
 @dataclass(frozen=True)
 class RobotSource:
-    """Where a robot comes from: exactly one of a path and the words of a request."""
+    """Origin of a robot: either a path or the words of a request."""
 
     label: str
     """The path or the words, as printed in messages and tables."""
@@ -45,50 +45,46 @@ def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
     Each word is one of: a bundle's folder, a URDF or a xacro; a set of ``morphgen sample`` or a
     folder of bundles, which stand for all their robots; parts joined by dashes, such as
     ``ur5-plane``. Neighbouring words of the form ``key=value`` are one robot together, as in
-    ``arm=ur5 ee=plane``; a grammar's name begins a robot, too: ``chain beads=5``. A word with
+    ``arm=ur5 ee=plane``; a grammar's name also begins a robot: ``chain beads=5``. A word with
     spaces is a request of its own. Each robot is returned once.
 
     Raises:
-        CompositionError: If a word names nothing.
+        CompositionError: If no robot is named.
         FormatError: If a path does not exist, or a folder holds no robot.
     """
     sources: list[RobotSource] = []
     request: list[str] = []
     for word in words:
-        parts = word.split()
-        is_setting = "=" in word and not is_robot_file(word)
-        begins = len(parts) != 1 or not is_setting
-        if request and begins:
-            sources.append(_requested(request))
+        is_file = is_robot_file(word)
+        is_single = len(word.split()) == 1
+        is_setting = is_single and "=" in word and not is_file
+        if request and not is_setting:
+            sources.append(_request_source(request))
             request = []
-        if len(parts) == 1 and (
-            is_setting or (not is_robot_file(word) and _is_grammar(word, library))
-        ):
+        if is_setting or (is_single and not is_file and _is_grammar(word, library)):
             request.append(word)
-        elif is_robot_file(word):
-            sources += (RobotSource(str(path), path) for path in _robots_at(Path(word)))
+        elif is_file:
+            sources += _file_sources(Path(word))
         else:
-            sources.append(_requested(parts))
+            sources.append(_request_source(word.split()))
     if request:
-        sources.append(_requested(request))
+        sources.append(_request_source(request))
     if not sources:
         raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")
     return list(dict.fromkeys(sources))
 
 
-def find_robot(text: str | Path, library: Library) -> RobotSource:
+def find_robot(text: str | Path) -> RobotSource:
     """Return the one robot that a text names; see ``find_robots``.
 
     Raises:
-        CompositionError: If it names nothing, or several robots.
+        CompositionError: If it names several robots.
         FormatError: If a path does not exist, or holds no robot.
     """
-    if isinstance(text, Path):
-        sources = [RobotSource(str(path), path) for path in _robots_at(text)]
-    elif is_robot_file(text):
-        sources = [RobotSource(str(path), path) for path in _robots_at(Path(text))]
+    if isinstance(text, Path) or is_robot_file(text):
+        sources = _file_sources(Path(text))
     else:
-        sources = [_requested(text.split())]
+        sources = [_request_source(text.split())]
     if len(sources) > 1:
         raise CompositionError(
             f"{text} holds {len(sources)} robots; name one, such as {sources[0].label}"
@@ -97,20 +93,20 @@ def find_robot(text: str | Path, library: Library) -> RobotSource:
 
 
 def read_source(source: RobotSource, library: Library, root: Path | None = None) -> Robot:
-    """Return the robot: read from its file, or composed from its words.
+    """Return a robot: read from its file, or composed from its words.
 
-    A robot of a light set is composed from its derivation, since its URDF holds no home. In a
-    URDF, a link that is called ``tool`` becomes the frame ``tool``.
+    A robot of a light set is composed from its derivation, since its URDF has no home. In a URDF, a
+    link named ``tool`` becomes the frame ``tool``.
 
     Args:
-        source: As ``find_robots`` returns it.
-        library: Where the parts are.
+        source: The robot, as ``find_robots`` returns it.
+        library: Library of the parts.
         root: A folder that meshes, includes and YAML may come from, besides the description's own
             folder and package.
 
     Raises:
-        MorphgenError: If the file is broken, or the words name what does not exist or does not
-            fit.
+        MorphgenError: If the file is broken, or the words name something that does not exist or
+            does not fit.
     """
     path = source.path
     if path is None:
@@ -154,35 +150,25 @@ def is_robot_file(text: str) -> bool:
     """
     path = Path(text)
     is_description = text.endswith(DESCRIPTION_SUFFIXES) and path.is_file()
-    if is_description or (path.is_dir() and _holds_robots(path)):
+    if is_description or (path.is_dir() and holds_robots(path)):
         return True
     if "=" in text or text.partition(" ")[0].endswith(GRAMMAR_SUFFIX):
         return False
     return "/" in text or text in (".", "..") or text.endswith(DESCRIPTION_SUFFIXES)
 
 
-def _holds_robots(folder: Path) -> bool:
-    return (
-        is_robot_folder(folder)
-        or is_set_folder(folder)
-        or any(map(is_robot_folder, folder.iterdir()))
-    )
+def holds_robots(folder: Path) -> bool:
+    """Return whether a folder is a robot or a set, or has robots directly in it."""
+    is_robot = is_robot_folder(folder) or is_set_folder(folder)
+    return is_robot or any(map(is_robot_folder, folder.iterdir()))
 
 
-def _robots_at(path: Path) -> list[Path]:
-    if not path.exists():
-        raise FormatError(f"{path}: no such file or folder")
-    robots = [path] if path.is_file() else list(_robots_in(path))
-    if not robots:
-        raise FormatError(
-            f"{path} holds no robot; expected a bundle, a URDF, a set of morphgen sample, or a "
-            "folder of bundles"
-        )
-    return robots
+def robots_in(folder: Path) -> Iterator[Path]:
+    """Yield the robots of a folder: itself, those of a set by its index, or the bundles in it.
 
-
-def _robots_in(folder: Path) -> Iterator[Path]:
-    """Robots of a folder: itself, those of a set, or the bundles in it."""
+    Raises:
+        FormatError: If it is a set that is unfinished or has an invalid index.
+    """
     if is_robot_folder(folder):
         yield folder
     elif is_set_folder(folder):
@@ -191,7 +177,19 @@ def _robots_in(folder: Path) -> Iterator[Path]:
         yield from (child for child in sorted(folder.iterdir()) if is_robot_folder(child))
 
 
-def _requested(words: Sequence[str]) -> RobotSource:
+def _file_sources(path: Path) -> list[RobotSource]:
+    if not path.exists():
+        raise FormatError(f"{path}: no such file or folder")
+    robots = [path] if path.is_file() else list(robots_in(path))
+    if not robots:
+        raise FormatError(
+            f"{path} holds no robot; expected a bundle, a URDF, a set of morphgen sample, or a "
+            "folder of bundles"
+        )
+    return [RobotSource(str(robot), robot) for robot in robots]
+
+
+def _request_source(words: Sequence[str]) -> RobotSource:
     return RobotSource(" ".join(words), words=tuple(words))
 
 
@@ -209,22 +207,22 @@ def import_robot(
     name: str | None = None,
     repair: bool = True,
 ) -> Robot:
-    """Read a robot description and complete it.
+    """Read any robot description, and add what it lacks: a tool frame and ignored pairs.
 
     Args:
-        path: A URDF, or a xacro by its suffix.
+        path: A URDF, or a xacro (by its suffix).
         args: xacro arguments.
         root: A folder that meshes, includes and YAML may come from, besides the description's own
             folder and package.
-        root_link: Link where the robot begins; by default the file's root.
+        root_link: Link that becomes the robot's root; by default the file's root.
         tool: Link whose frame becomes the frame ``tool``; by default there is none.
-        name: Name of the robot; by default the file's own.
-        repair: Whether to make the safe repairs of ``morphgen.checks.fix``, without which some
-            loaders refuse the robot. Each is named in the provenance, as is what had to be mended
-            for the file to be read at all.
+        name: Name of the robot; by default the file's.
+        repair: Whether to apply the safe repairs of ``morphgen.checks.fix``, without which some
+            loaders refuse the robot. The provenance lists them, and all that was corrected to read
+            the file.
 
     Raises:
-        FormatError: If the file cannot be read, or has no such link.
+        FormatError: If the file cannot be read, or does not have a named link.
     """
     robot = read_urdf(path, args, default_finder(root=root))
     for option, link in (("root link", root_link), ("tool", tool)):
@@ -234,10 +232,10 @@ def import_robot(
             )
     if root_link is not None:
         robot = subtree(robot, root_link)
-    if tool is not None and tool not in robot.link_index:
-        raise FormatError(f"{path}: tool {tool!r} is not below the root link {root_link!r}")
     if tool is not None:
-        robot = _without_name_clash(robot)
+        if tool not in robot.link_index:
+            raise FormatError(f"{path}: tool {tool!r} is not below the root link {root_link!r}")
+        robot = _free_tool_name(robot)
         link = "tool_link" if tool == "tool" else tool
         robot = replace(robot, frames=(Frame("tool", link),))
     robot = replace(
@@ -249,8 +247,8 @@ def import_robot(
     return replace(robot, ignore_pairs=survey_collisions(robot).ignore_pairs)
 
 
-def _without_name_clash(robot: Robot) -> Robot:
-    """A link ``tool`` becomes ``tool_link``: a bundle's URDF has a link for the frame itself."""
+def _free_tool_name(robot: Robot) -> Robot:
+    """Rename a link ``tool`` to ``tool_link``: a bundle's URDF has a link for the frame itself."""
     return rename(
         robot,
         {"tool": "tool_link"} if "tool" in robot.link_index else {},

@@ -1,8 +1,8 @@
-"""The syntax tree of a ``*.grammar`` text, with errors by line and column."""
+"""Parse grammar texts to syntax trees; errors name the line and column."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,9 +23,10 @@ from morphgen.grammar.notation import parse_tree
 
 @dataclass(frozen=True)
 class SourceLocation:
-    """Where something stands in a text."""
+    """Line and column in a text."""
 
     origin: str
+    """File or other name of the text."""
     line: int
     column: int
 
@@ -45,16 +46,11 @@ class Expression:
     text: str = ""
     """The name, the function's name, or the unit of a number."""
     value: float = 0.0
-    """Of a number, as written: not in SI yet."""
+    """Value of a number in the unit as written, not in SI units."""
     levels: int = field(init=False, repr=False, compare=False)
-    """Levels of the expression: 1 without operands. Functions that recurse rely on its limit."""
+    """Depth of the tree, at most ``MAX_NESTING``, so that recursive functions are safe."""
 
     def __post_init__(self) -> None:
-        """Count the levels.
-
-        Raises:
-            GrammarError: If there are more than ``MAX_NESTING``.
-        """
         levels = 1 + max((operand.levels for operand in self.operands), default=0)
         if levels > MAX_NESTING:
             raise GrammarError(
@@ -62,6 +58,12 @@ class Expression:
                 f"most {MAX_NESTING}"
             )
         object.__setattr__(self, "levels", levels)
+
+    def walk(self) -> Iterator[Expression]:
+        """Yield the expression and all its operands, recursively."""
+        yield self
+        for operand in self.operands:
+            yield from operand.walk()
 
     def __str__(self) -> str:
         match self.operator:
@@ -81,19 +83,21 @@ class Expression:
 
 @dataclass(frozen=True)
 class Item:
-    """A symbol or part in a sequence."""
+    """A symbol or a part in an alternative."""
 
     name: str
     location: SourceLocation
     port: str = ""
-    """Port of the part before that it goes to; empty for the main one."""
+    """Port that the item is attached to; empty for the default port."""
     arguments: tuple[tuple[str, Expression], ...] = ()
+    """Parameters of a part: (name, value)."""
     repetition: tuple[int, int] | None = None
+    """Smallest and largest number of copies."""
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """One way to rewrite a symbol: a sequence of items."""
+    """A sequence of items that a symbol can be rewritten to."""
 
     items: tuple[Item, ...]
     weight: Expression | None = None
@@ -107,10 +111,15 @@ class Production:
     alternatives: tuple[Alternative, ...]
     location: SourceLocation
 
+    def items(self) -> Iterator[Item]:
+        """Yield the items of all alternatives."""
+        for alternative in self.alternatives:
+            yield from alternative.items
+
 
 @dataclass(frozen=True)
 class Include:
-    """Another grammar whose statements are taken over."""
+    """An include of another grammar's statements."""
 
     target: str
     location: SourceLocation
@@ -118,7 +127,7 @@ class Include:
 
 @dataclass(frozen=True)
 class Let:
-    """A value that is drawn once a robot."""
+    """A named value that is drawn once per robot."""
 
     name: str
     expression: Expression
@@ -127,7 +136,7 @@ class Let:
 
 @dataclass(frozen=True)
 class Where:
-    """A condition that every robot meets."""
+    """A condition that every robot meets; other draws are rejected."""
 
     condition: Expression
 
@@ -136,29 +145,30 @@ Statement = Production | Include | Let | Where
 
 
 def parse_grammar(text: str, origin: str) -> tuple[Statement, ...]:
-    """Parse grammar text.
+    """Parse the text of a grammar.
 
     Args:
         text: The grammar.
-        origin: What to call it in messages, usually its path.
+        origin: Name of the text in messages, usually its path.
 
     Raises:
-        GrammarError: At the first place that is no grammar, with what was expected there.
+        GrammarError: If the syntax is invalid; the message names the location and what is
+            expected there.
     """
-    return tuple(_parsed(text, origin, "grammar"))
+    return tuple(_parse(text, origin, "grammar"))
 
 
 def parse_condition(text: str, origin: str = "--where") -> Expression:
     """Parse a condition such as ``reach > 0.4 and dof >= 5``.
 
     Raises:
-        GrammarError: At the first place that is no condition.
+        GrammarError: If the syntax is invalid.
     """
-    condition: Expression = _parsed(text, origin, "or_")
+    condition: Expression = _parse(text, origin, "or_")
     return condition
 
 
-def _parsed(text: str, origin: str, start: str) -> Any:
+def _parse(text: str, origin: str, start: str) -> Any:
     tree = parse_tree(text, origin, start)
     try:
         return _Builder(origin).transform(tree)
@@ -168,7 +178,7 @@ def _parsed(text: str, origin: str, start: str) -> Any:
 
 @v_args(inline=True)
 class _Builder(Transformer_NonRecursive[Token, Any]):
-    """Lark's tree to ours, however deep."""
+    """Converts Lark's tree without recursion; a method per rule of the syntax."""
 
     def __init__(self, origin: str) -> None:
         super().__init__()
@@ -256,7 +266,7 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         try:
             value = float(digits)
         except ValueError as error:
-            raise GrammarError(f"{self._location(token)}: {text!r} is no number") from error
+            raise GrammarError(f"{self._location(token)}: {text!r} is not a number") from error
         return Expression("number", (), self._location(token), text[len(digits) :], value)
 
     def name(self, token: Token) -> Expression:
@@ -270,12 +280,16 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         return operand if sign == "+" else Expression("negative", (operand,), self._location(sign))
 
     def sum(self, *parts: Any) -> Expression:
-        return self._folded(parts)
+        """Fold operands and signs from the left: ``a - b - c`` is ``(a - b) - c``."""
+        folded: Expression = parts[0]
+        for sign, operand in zip(parts[1::2], parts[2::2], strict=True):
+            folded = Expression(str(sign), (folded, operand), self._location(sign))
+        return folded
 
-    def product(self, *parts: Any) -> Expression:
-        return self._folded(parts)
+    product = sum
 
     def comparison(self, *parts: Any) -> Expression:
+        """Split a chain: ``a < b < c`` is ``a < b and b < c``."""
         pairs = [
             Expression(str(parts[i + 1]), (parts[i], parts[i + 2]), self._location(parts[i + 1]))
             for i in range(0, len(parts) - 2, 2)
@@ -291,13 +305,7 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
     def negation(self, operand: Expression) -> Expression:
         return Expression("not", (operand,), operand.location)
 
-    def _folded(self, parts: Sequence[Any]) -> Expression:
-        folded: Expression = parts[0]
-        for i in range(1, len(parts), 2):
-            folded = Expression(str(parts[i]), (folded, parts[i + 1]), self._location(parts[i]))
-        return folded
 
-
-def unknown(what: str, name: str, location: SourceLocation, valid: Sequence[str]) -> GrammarError:
-    """The error for a name that means nothing, with the nearest that does."""
+def unknown(what: str, name: str, location: SourceLocation, valid: Iterable[str]) -> GrammarError:
+    """Return the error for an unknown name, with the valid ones."""
     return GrammarError(f"{location}: unknown {what} {name!r}{nearest(name, valid)}")

@@ -1,4 +1,4 @@
-"""Values of expressions: arithmetic, units and distributions."""
+"""Evaluate expressions: arithmetic, units and distributions."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from morphgen.grammar.syntax import Expression, unknown
 
 @dataclass(frozen=True)
 class Distribution:
-    """What a value is drawn from."""
+    """Probability distribution of a value."""
 
     kind: str
     """One of ``DISTRIBUTIONS``."""
     arguments: tuple[float, ...]
-    """SI units: (low, high); (mean, deviation, low, high) of ``normal``; the choices."""
+    """Arguments as in ``DISTRIBUTIONS``, in SI units."""
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Smallest and largest value that can come out."""
+        """Smallest and largest possible value."""
         if self.kind == "normal":
             return (self.arguments[2], self.arguments[3])
         return (min(self.arguments), max(self.arguments))
 
     @property
     def is_continuous(self) -> bool:
-        """Whether there is no list of its values."""
+        """Whether the possible values form an interval."""
         return self.kind in ("uniform", "loguniform", "normal")
 
     @property
     def typical(self) -> float:
-        """The value taken when nothing is drawn: the median, or the first choice."""
+        """Value used without random draws: the median, the first choice or the least integer."""
         low, high = self.bounds
         match self.kind:
             case "uniform":
@@ -49,24 +49,21 @@ class Distribution:
             case _:
                 return low
 
-    def nearest(self, value: float) -> float | None:
-        """What it can give that is ``value`` to 11 digits; None if there is nothing."""
+    def closest(self, value: float) -> float | None:
+        """Return the possible value that equals ``value`` to 11 digits, or None."""
         low, high = self.bounds
-        match self.kind:
-            case "choice":
-                found = min(self.arguments, key=lambda choice: abs(choice - value))
-            case "randint":
-                found = min(max(round(value), low), high)
-            case _:
-                found = min(max(value, low), high)
-        return found if math.isclose(found, value, rel_tol=1e-11, abs_tol=1e-12) else None
+        if self.kind == "choice":
+            closest = min(self.arguments, key=lambda choice: abs(choice - value))
+        else:
+            closest = min(max(round(value) if self.kind == "randint" else value, low), high)
+        return closest if math.isclose(closest, value, rel_tol=1e-11, abs_tol=1e-12) else None
 
     def draw(self, uniform: Callable[[], float], normal: Callable[[], float]) -> float:
         """Draw a value.
 
         Args:
-            uniform: Draws from [0, 1).
-            normal: Draws from the standard normal distribution.
+            uniform: Returns a uniform sample of [0, 1).
+            normal: Returns a sample of the standard normal distribution.
         """
         low, high = self.bounds
         match self.kind:
@@ -90,39 +87,35 @@ DISTRIBUTIONS: Mapping[str, str] = {
     "choice": "value, ...",
     "randint": "low, high",
 }
-"""What each distribution takes; ``normal`` is clipped, ``randint`` includes both ends."""
+"""Arguments of each distribution; ``normal`` is clipped, ``randint`` includes both bounds."""
 
 
 class Draw(Protocol):
-    """Decides the value of a distribution at a point of the derivation."""
+    """Selects the value of a distribution."""
 
     def __call__(self, key: str, distribution: Distribution) -> float:
-        """Return a value that the distribution can give."""
+        """Return a possible value; the key names the random choice in the derivation."""
 
 
 @dataclass(frozen=True)
 class Scope:
-    """What names mean, and how distributions are decided."""
+    """Everything that the value of an expression depends on."""
 
     names: Mapping[str, tuple[float, str]]
-    """Values in SI units and their units; an empty unit for pure numbers."""
+    """Values of names in SI units, with their units; the unit of a pure number is empty."""
     draw: Draw
     key: str
-    """Where in the derivation the expression stands."""
+    """Key of the expression in the derivation; it is passed to ``draw``."""
 
 
 def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
-    """Value of an arithmetic expression.
-
-    Args:
-        expression: The expression.
-        scope: Names and decisions.
+    """Evaluate an arithmetic expression.
 
     Returns:
         The value in SI units, and its unit: ``m``, ``rad``, ``kg`` or empty for a pure number.
 
     Raises:
-        GrammarError: If a name, function or unit is unknown, units do not fit, or the result is
+        GrammarError: If a name, function or unit is unknown, units do not match, or the result is
             not finite.
     """
     value, unit = _evaluate(expression, scope)
@@ -132,31 +125,30 @@ def evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
 
 
 def distribution_of(expression: Expression, scope: Scope) -> tuple[Distribution, str]:
-    """The distribution that a call names, and the unit of its values.
+    """Return the distribution that a call expression names, and the unit of its values.
 
     Raises:
-        GrammarError: If there is no such distribution or its arguments do not fit.
+        GrammarError: If the distribution is unknown or its arguments are invalid.
     """
-    kind, location = expression.text, expression.location
+    kind = expression.text
     if kind not in DISTRIBUTIONS:
-        raise unknown("distribution", kind, location, list(DISTRIBUTIONS))
+        raise unknown("distribution", kind, expression.location, DISTRIBUTIONS)
     operands = [evaluate(operand, scope) for operand in expression.operands]
     units = {unit for _, unit in operands if unit}
     if len(units) > 1:
-        raise GrammarError(f"{location}: {expression} mixes units {' and '.join(sorted(units))}")
+        raise _error(expression, f"mixes units {' and '.join(sorted(units))}")
     distribution = Distribution(kind, tuple(value for value, _ in operands))
     _require_arguments(distribution, expression)
     return distribution, units.pop() if units else ""
 
 
 def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
-    location = expression.location
     match expression.operator:
         case "number":
             return _quantity(expression)
         case "name":
             if expression.text not in scope.names:
-                raise unknown("value", expression.text, location, list(scope.names))
+                raise unknown("value", expression.text, expression.location, scope.names)
             return scope.names[expression.text]
         case "call":
             distribution, unit = distribution_of(expression, scope)
@@ -168,16 +160,19 @@ def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
             left, right = (evaluate(operand, scope) for operand in expression.operands)
             return _arithmetic(expression, left, right)
         case _:
-            raise GrammarError(f"{location}: {expression} is a condition, not a value")
+            raise _error(expression, "is a condition, not a value")
 
 
 def _quantity(expression: Expression) -> tuple[float, str]:
     if not expression.text:
         return expression.value, ""
     if expression.text not in UNITS:
-        raise unknown("unit", expression.text, expression.location, list(UNITS))
+        raise unknown("unit", expression.text, expression.location, UNITS)
     unit, scale = UNITS[expression.text]
     return expression.value * scale, unit
+
+
+_VALID_UNITS = "values are lengths, angles, masses or pure numbers"
 
 
 def _arithmetic(
@@ -187,49 +182,45 @@ def _arithmetic(
     match expression.operator:
         case "+" | "-":
             if a_unit and b_unit and a_unit != b_unit:
-                raise GrammarError(
-                    f"{expression.location}: {expression} mixes units {a_unit} and {b_unit}"
-                )
+                raise _error(expression, f"mixes units {a_unit} and {b_unit}")
             return (a + b if expression.operator == "+" else a - b), a_unit or b_unit
         case "*":
             if a_unit and b_unit:
-                raise GrammarError(
-                    f"{expression.location}: {expression} multiplies {a_unit} by {b_unit}; "
-                    "values are lengths, angles, masses or pure numbers"
-                )
+                raise _error(expression, f"multiplies {a_unit} by {b_unit}; {_VALID_UNITS}")
             return a * b, a_unit or b_unit
         case _:
             if b == 0:
-                raise GrammarError(f"{expression.location}: {expression} divides by zero")
+                raise _error(expression, "divides by zero")
             if b_unit and a_unit != b_unit:
-                raise GrammarError(
-                    f"{expression.location}: {expression} divides {a_unit or 'a pure number'} by "
-                    f"{b_unit}; values are lengths, angles, masses or pure numbers"
-                )
+                dividend = a_unit or "a pure number"
+                raise _error(expression, f"divides {dividend} by {b_unit}; {_VALID_UNITS}")
             return a / b, "" if b_unit else a_unit
 
 
 def _require_arguments(distribution: Distribution, expression: Expression) -> None:
-    given, location = distribution.arguments, expression.location
-    signature = f"{distribution.kind}({DISTRIBUTIONS[distribution.kind]})"
-    wanted = {"choice": None, "normal": 4}.get(distribution.kind, 2)
-    if (wanted is not None and len(given) != wanted) or not given:
-        raise GrammarError(f"{location}: {expression} does not fit {signature}")
+    given, kind = distribution.arguments, distribution.kind
+    signature = f"{kind}({DISTRIBUTIONS[kind]})"
+    expected = {"choice": None, "normal": 4}.get(kind, 2)
+    if (expected is not None and len(given) != expected) or not given:
+        raise _error(expression, f"does not fit {signature}")
     low, high = distribution.bounds
-    ordered = given[-2] <= given[-1] if wanted is not None else True
-    if not ordered:
-        raise GrammarError(f"{location}: {expression}: low is above high in {signature}")
+    if expected is not None and given[-2] > given[-1]:
+        raise _error(expression, f"low is above high in {signature}", ": ")
     if not math.isfinite(high - low) or (low > 0 and not math.isfinite(high / low)):
-        raise GrammarError(f"{location}: {expression}: {low:g} and {high:g} are too far apart")
-    if distribution.kind == "loguniform" and low <= 0:
-        raise GrammarError(f"{location}: {expression}: low must be above zero")
-    if distribution.kind == "normal" and given[1] < 0:
-        raise GrammarError(f"{location}: {expression}: the deviation is negative")
-    if distribution.kind == "randint" and (low != int(low) or high != int(high)):
-        raise GrammarError(f"{location}: {expression}: randint needs whole numbers")
+        raise _error(expression, f"{low:g} and {high:g} are too far apart", ": ")
+    if kind == "loguniform" and low <= 0:
+        raise _error(expression, "low must be above zero", ": ")
+    if kind == "normal" and given[1] < 0:
+        raise _error(expression, "the deviation is negative", ": ")
+    if kind == "randint" and (low != int(low) or high != int(high)):
+        raise _error(expression, "randint needs whole numbers", ": ")
 
 
-def no_draw(key: str, distribution: Distribution) -> float:
-    """Decide every distribution by its typical value."""
+def _error(expression: Expression, text: str, separator: str = " ") -> GrammarError:
+    return GrammarError(f"{expression.location}: {expression}{separator}{text}")
+
+
+def typical_value(key: str, distribution: Distribution) -> float:
+    """Return the typical value of a distribution; a ``Draw`` without randomness."""
     del key
     return distribution.typical

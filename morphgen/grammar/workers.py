@@ -15,60 +15,61 @@ from morphgen.processes import CHUNK_SIZE, parallel_map, ray_cluster, require_ra
 
 
 def make_in_processes(jobs: int) -> SetWorker:
-    """Work in ``jobs`` processes of this machine."""
+    """Return a worker that makes robots in ``jobs`` processes of this machine."""
 
-    def work(plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-        return parallel_map(_Making(plan), indices, jobs)
+    def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
+        return parallel_map(_LazyMaker(config), indices, jobs)
 
     return work
 
 
-class _Making:
-    """Makes robots of a plan; each process opens its parts once."""
+class _LazyMaker:
+    """Makes robots of a set; it is sent to processes, which each load the parts once."""
 
-    def __init__(self, plan: SetConfig) -> None:
-        self._plan = plan
+    def __init__(self, config: SetConfig) -> None:
+        self._config = config
 
     @cached_property
     def _maker(self) -> RobotMaker:
-        return RobotMaker(self._plan)
+        return RobotMaker(self._config)
 
     def __call__(self, index: int) -> Record:
         return self._maker.make(index)
 
 
 def make_on_ray(address: str | None) -> SetWorker:
-    """Work on the Ray cluster at an address; without one, on a local Ray.
+    """Return a worker that makes robots on the Ray cluster at an address, or on a local Ray.
 
-    Its machines have morphgen installed and share the set's folder.
+    The machines of the cluster need morphgen and share the set's folder.
 
     Raises:
         MissingDependencyError: If ray is not installed.
     """
     ray = require_ray()
 
-    def work(plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
+    def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
         if not indices:
             return
         try:
             with ray_cluster(address):
-                yield from _spread(ray, replace(plan, folder=plan.folder.resolve()), indices)
+                absolute = replace(config, folder=config.folder.resolve())
+                yield from _distribute(ray, absolute, indices)
         except ray.exceptions.RayTaskError as error:
             raise error.cause if isinstance(error.cause, MorphgenError) else error from None
         except ray.exceptions.RayError as error:
             raise MorphgenError(
-                f"a Ray worker died ({error}); what is done is kept: run again"
+                f"a Ray worker died ({error}); finished robots are kept: run again"
             ) from error
 
     return work
 
 
-def _spread(ray: ModuleType, plan: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-    """A maker on every CPU, each given a chunk whenever it is free."""
+def _distribute(ray: ModuleType, config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
+    """Start a maker on every CPU, and give each the next chunk when it is free."""
     chunks = deque(indices[i : i + CHUNK_SIZE] for i in range(0, len(indices), CHUNK_SIZE))
     cpus = max(int(ray.cluster_resources().get("CPU", 1)), 1)
     remote = ray.remote(num_cpus=1)(RobotMaker)
-    free = deque(remote.remote(plan) for _ in range(min(cpus, len(chunks))))
+    free = deque(remote.remote(config) for _ in range(min(cpus, len(chunks))))
     running: dict[Any, Any] = {}
     while chunks or running:
         while chunks and free:

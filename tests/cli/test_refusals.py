@@ -110,7 +110,7 @@ def test_check_refuses_what_is_no_xml(refused, urdf, xml):
     ("argv", "message"),
     [
         ("show nowhere.urdf", "nowhere.urdf: no such file"),
-        ("check nowhere", "'nowhere' is no part"),
+        ("check nowhere", "'nowhere' is not a part"),
         ("check nowhere/", "nowhere: no such file"),
         ("import nowhere.xacro", "nowhere.xacro: no such file"),
         ("conform ./", ". holds no robot; expected a bundle"),
@@ -169,7 +169,7 @@ def test_a_missing_data_package_says_how_to_install_it(refused, tmp_path):
 
 def test_a_broken_manifest_is_named_by_line_and_column(refused, tmp_path):
     (tmp_path / "stump.yaml").write_text("name: stump\nkind: [\n")
-    assert "stump.yaml:3:1: no valid YAML" in refused("compose", "ee=stump", "--library", ".")
+    assert "stump.yaml:3:1: invalid YAML" in refused("compose", "ee=stump", "--library", ".")
 
 
 def test_an_output_folder_that_cannot_be_written_is_named(refused, tmp_path):

@@ -175,7 +175,7 @@ def test_a_robot_without_a_tool_is_refused_with_its_path(refused, robot_urdf, bu
     [
         (("nowhere/",), "nowhere: no such file or folder"),
         (("empty/",), "empty holds no robot; expected a bundle, a URDF, a set"),
-        (("begun",), "begun is no finished set: it has no index.jsonl"),
+        (("begun",), "begun is not a finished set: it has no index.jsonl"),
         (("robots/notes.txt",), "notes.txt"),
     ],
 )

@@ -44,7 +44,7 @@ def test_bodies_of_many_links_are_measured_too(capsys):
             ["reach", "arm3", "--workers", "0"],
             "argument --workers: 0: expected a whole number, 1 or more",
         ),
-        (["reach", "ur55-plane"], "'ur55' is no part"),
+        (["reach", "ur55-plane"], "'ur55' is not a part"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(words, named, capsys):

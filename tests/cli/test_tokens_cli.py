@@ -123,7 +123,7 @@ def test_it_writes_a_file_the_same_bytes_each_time(run, bundle, tmp_path):
         ("robots/nowhere", "robots/nowhere: no such file or folder"),
         ("nowhere.urdf", "nowhere.urdf: no such file or folder"),
         ("nowhere.grammar", "nowhere.grammar: no such file"),
-        ("chian", "'chian' is no part; did you mean 'chain'?"),
+        ("chian", "'chian' is not a part; did you mean 'chain'?"),
         ("./folder.npz", "folder.npz holds no robot"),
     ],
 )

@@ -43,9 +43,15 @@ def test_shipped_grammars_are_sound(name):
         (["robot -> cubes", "a -> cubes"], "g:2:1: 'a' cannot be reached from 'robot'"),
         (["let r = 1", "robot -> cubes"], "g:1:5: 'r' is never used"),
         (["robot -> pedestal up:ur5"], "g:1:22: 'pedestal' has no port 'up'"),
-        (["robot -> gantry plane cube"], "g:1:23: nothing can go on 'plane': it has no port"),
-        (["robot -> gantry a ur5", "a -> beam{1,9} | plane"], "nothing can go on 'plane'"),
-        (["robot -> cubes | ur5(mount_yaw=1)"], "'ur5' stands on no port: it has no mount_yaw"),
+        (
+            ["robot -> gantry plane cube"],
+            "g:1:23: nothing can be attached to 'plane': it has no port",
+        ),
+        (["robot -> gantry a ur5", "a -> beam{1,9} | plane"], "nothing can be attached to 'plane'"),
+        (
+            ["robot -> cubes | ur5(mount_yaw=1)"],
+            "'ur5' is not attached to a port: it has no mount_yaw",
+        ),
         (["robot -> yumi_gripper"], "g:1:1: 'yumi_gripper' needs a base: its mount"),
         (["robot -> @weight(0) cubes"], "g:1:1: all weights of 'robot' are zero"),
     ],
@@ -134,7 +140,7 @@ def test_a_structure_that_cannot_be_is_told_when_its_turn_comes():
         grammar("robot -> gantry ee", "ee -> plane | plane cube"), LIBRARY
     )
     assert next(listed).part == "gantry"
-    with pytest.raises(GrammarError, match="g:2:21: nothing can go on 'plane'"):
+    with pytest.raises(GrammarError, match="g:2:21: nothing can be attached to 'plane'"):
         next(listed)
 
 

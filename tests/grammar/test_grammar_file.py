@@ -129,12 +129,12 @@ def test_two_files_may_include_the_same_third(write):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (["robot -> a", "robot -> b"], "2:1: 'robot' is defined at g:1:1 already"),
-        (["let r = 1", "let r = 2", "robot -> a"], "2:5: 'r' is defined at g:1:5 already"),
+        (["robot -> a", "robot -> b"], "2:1: 'robot' is already defined at g:1:1"),
+        (["let r = 1", "let r = 2", "robot -> a"], "2:5: 'r' is already defined at g:1:5"),
         (["let r = 1"], "g: no production, such as: robot -> base arm ee"),
         ([""], "g: no production"),
         (["robot -> a", "where size > 3"], "2:7: unknown property 'size'"),
-        (["include nlink", "robot -> a"], "1:9: a grammar given as text includes no other"),
+        (["include nlink", "robot -> a"], "1:9: a grammar given as text cannot include others"),
     ],
 )
 def test_a_grammar_that_contradicts_itself_is_refused(lines, message):

@@ -9,7 +9,6 @@ import pytest
 from helpers.parts import write_part
 from morphgen.checks import check
 from morphgen.errors import PartError
-from morphgen.grammar.catalogue import catalogue
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import LIBRARY_VARIABLE, Library, default_library
 from morphgen.grammar.manifest import PART_KINDS
@@ -110,16 +109,6 @@ def test_templates_and_real_parts_of_every_kind_are_there():
     assert len(kinds) == len(LIBRARY.names())
 
 
-def test_the_catalogue_has_a_row_a_part_with_figures_that_can_be():
-    rows = {row["name"]: row for row in catalogue(LIBRARY, "base")}
-    assert set(rows) == set(LIBRARY.names("base"))
-    assert rows["gantry"]["dof"] == 5
-    assert rows["gantry"]["reach"] == pytest.approx(np.hypot(0.8, np.hypot(0.5, 0.5)), abs=0.01)
-    assert rows["fixed"]["mass"] == 0
-    assert {row["source"] for row in rows.values()} == {"template"}
-    assert {row["kind"] for row in rows.values()} == {"base"}
-
-
 def test_an_unknown_part_names_the_nearest_of_its_kind():
     with pytest.raises(PartError, match="unknown ee 'plan'; did you mean 'plane'") as caught:
         LIBRARY.manifest("plan", "ee")
@@ -178,5 +167,5 @@ def test_a_broken_manifest_does_not_keep_the_other_parts_from_being_used(tmp_pat
     (tmp_path / "broken.yaml").write_text("name: ]")
     library = default_library([tmp_path])
     assert library.manifest("pincer", "ee").name == "pincer"
-    with pytest.raises(PartError, match=r"broken\.yaml:1:7: no valid YAML"):
+    with pytest.raises(PartError, match=r"broken\.yaml:1:7: invalid YAML"):
         library.names("ee")

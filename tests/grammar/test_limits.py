@@ -145,7 +145,7 @@ def test_numbers_that_are_not_finite_are_faults(line, message):
 
 def test_weights_that_sum_to_no_finite_number_are_refused():
     found = grammar("robot -> @weight(1e308) cubes | @weight(1e308) cartpole")
-    with pytest.raises(GrammarError, match="g:1:1: the weights of 'robot' sum to no finite number"):
+    with pytest.raises(GrammarError, match="g:1:1: the sum of weights of 'robot' is infinite"):
         derive(found, LIBRARY, FirstChooser())
 
 

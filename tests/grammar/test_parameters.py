@@ -5,9 +5,14 @@ import math
 import pytest
 
 from morphgen.errors import PartError
-from morphgen.grammar.parameters import MOUNT_YAW, Parameter, parse_value, resolve_values
+from morphgen.grammar.parameters import (
+    MOUNT_YAW_PARAMETER,
+    Parameter,
+    parse_value,
+    resolve_values,
+)
 
-SIZE = Parameter("size", 0.1, 0.05, 0.5, "m")
+SIZE = Parameter(0.1, 0.05, 0.5, "m")
 
 
 @pytest.mark.parametrize(
@@ -18,7 +23,7 @@ def test_lengths(text, value):
 
 
 def test_degrees_become_radians():
-    assert parse_value("45deg", MOUNT_YAW, "ee.mount_yaw") == pytest.approx(math.pi / 4)
+    assert parse_value("45deg", MOUNT_YAW_PARAMETER, "ee.mount_yaw") == pytest.approx(math.pi / 4)
 
 
 @pytest.mark.parametrize("text", ["45deg", "1kg", "3 furlongs"])
@@ -45,5 +50,5 @@ def test_unknown_parameter_names_the_nearest():
 
 
 def test_default_outside_its_range_is_a_fault_of_the_manifest():
-    with pytest.raises(PartError, match="default 2 is outside"):
-        Parameter("size", 2.0, 0.0, 1.0, "m")
+    with pytest.raises(ValueError, match="default 2 is outside"):
+        Parameter(2.0, 0.0, 1.0, "m")

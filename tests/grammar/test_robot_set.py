@@ -186,7 +186,7 @@ def test_an_interruption_before_the_first_robot_is_no_foreign_folder(tmp_path, w
 def test_an_index_is_whole_or_not_there(tmp_path, whole):
     own = plan(tmp_path / "s")
     interrupted(own, 8, 3)
-    with pytest.raises(FormatError, match=r"is no finished set: it has no index\.jsonl"):
+    with pytest.raises(FormatError, match=r"is not a finished set: it has no index\.jsonl"):
         read_index(own.folder)
 
 
@@ -237,7 +237,9 @@ def test_a_set_is_only_continued_as_it_was_begun(whole, change, message):
 def test_a_folder_with_something_else_is_refused(tmp_path, name):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / name).write_text("mine")
-    with pytest.raises(FormatError, match=r"exists and is no set \(no set\.json\); name another"):
+    with pytest.raises(
+        FormatError, match=r"exists and is not a set \(no set\.json\); name another"
+    ):
         make_set(plan(tmp_path / "s"), 1, make_serially)
     assert tree(tmp_path / "s") == {name: b"mine"}
 

@@ -8,14 +8,14 @@ import pytest
 
 from morphgen.errors import GrammarError
 from morphgen.grammar.syntax import parse_condition
-from morphgen.grammar.values import Distribution, Scope, evaluate, no_draw
+from morphgen.grammar.values import Distribution, Scope, evaluate, typical_value
 
 LOG_MEAN = 99 / math.log(100)
 NAMES = {"r": (0.02, "m"), "k": (3.0, ""), "turn": (1.0, "rad")}
 
 
 def value(text):
-    return evaluate(parse_condition(text, "g"), Scope(NAMES, no_draw, ""))
+    return evaluate(parse_condition(text, "g"), Scope(NAMES, typical_value, ""))
 
 
 def drawn(text, n=4000):
@@ -161,4 +161,4 @@ def test_the_typical_value_is_the_middle_or_the_first(text, typical):
     ],
 )
 def test_a_value_that_was_rounded_for_a_file_is_found_again(distribution, asked, given):
-    assert distribution.nearest(asked) == given
+    assert distribution.closest(asked) == given

@@ -67,10 +67,10 @@ def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("given", "error", "says"),
     [
-        ("ur5-plain", CompositionError, "'plain' is no part; did you mean 'plane'?"),
+        ("ur5-plain", CompositionError, "'plain' is not a part; did you mean 'plane'?"),
         ("prismz", CompositionError, "did you mean 'prims'?"),
         ("chian beads=4", CompositionError, "did you mean 'chain'?"),
-        ("bead", CompositionError, "'bead' is a segment, which only a grammar can place"),
+        ("bead", CompositionError, "'bead' is a segment, which only a grammar can use"),
         ("ur5-ur10", CompositionError, "arm is given twice: ur5 and ur10"),
         ("arm=ur5 ee=plain", PartError, "did you mean 'plane'?"),
         ("robots/missing", FormatError, "robots/missing: no such file"),

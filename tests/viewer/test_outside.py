@@ -78,7 +78,7 @@ def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, quer
         ("?robot=" + "a" * 10_000, "at most 8000 are read"),
         ("?robot=" + "a/" * 3000, "no such file or folder"),
         ("?robot=%ff%fe", "no such file or folder"),
-        ("?robot=words:%00", "is no part"),
+        ("?robot=words:%00", "is not a part"),
         ("?robot=words:", "no robot is named"),
         ("?compose=%00.grammar", "no such file or folder"),
         ("?gallery=%00", "no such file or folder"),

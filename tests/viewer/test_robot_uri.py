@@ -102,7 +102,7 @@ def test_nothing_outside_is_read(files, uri):
         (f"split:{SPLIT}@both/x", "expected split:NAME@train/ROBOT"),
         (f"split:{SPLIT}@test/chain-000009", "did you mean 'chain-000001'|no test robot"),
         ("split:nothing@test/x", "no such file"),
-        ("words:arm", "'arm' is no part"),
+        ("words:arm", "'arm' is not a part"),
     ],
 )
 def test_invalid_uris_say_why(files, uri, why):

@@ -1,0 +1,47 @@
+"""The catalogue has one row per part; the stored facts equal those computed from the parts."""
+
+import json
+
+import numpy as np
+import pytest
+
+from helpers.parts import write_part
+from morphgen.grammar import catalogue as module
+from morphgen.grammar.catalogue import FACTS_FILE, catalogue, compute_facts, source_digest
+from morphgen.grammar.library import Library, default_library
+
+LIBRARY = default_library()
+STORED = json.loads(FACTS_FILE.read_text())
+
+
+def test_the_catalogue_has_a_row_a_part_with_figures_that_can_be():
+    rows = {row["name"]: row for row in catalogue(LIBRARY, "base")}
+    assert set(rows) == set(LIBRARY.names("base"))
+    assert rows["gantry"]["dof"] == 5
+    assert rows["gantry"]["reach"] == pytest.approx(np.hypot(0.8, np.hypot(0.5, 0.5)), abs=0.01)
+    assert rows["fixed"]["mass"] == 0
+    assert {row["source"] for row in rows.values()} == {"template"}
+    assert {row["kind"] for row in rows.values()} == {"base"}
+
+
+def test_facts_are_stored_for_every_shipped_part():
+    assert sorted(STORED) == LIBRARY.names()
+
+
+@pytest.mark.parametrize("name", LIBRARY.names())
+def test_stored_facts_are_those_of_the_part(name):
+    assert STORED[name] == compute_facts(LIBRARY.manifest(name))
+
+
+def test_the_shipped_catalogue_loads_no_part(monkeypatch):
+    monkeypatch.setattr(module, "compute_facts", None)
+    assert len(catalogue(LIBRARY)) == len(STORED)
+
+
+def test_a_part_that_is_not_stored_or_that_changed_is_computed(tmp_path):
+    write_part(tmp_path, name="cube")
+    (row,) = catalogue(Library([tmp_path]))
+    assert (row["name"], row["dof"]) == ("cube", 2)
+    before = source_digest(Library([tmp_path]).manifest("cube"))
+    (tmp_path / "pincer.xacro").write_text((tmp_path / "pincer.xacro").read_text() + "\n")
+    assert source_digest(Library([tmp_path]).manifest("cube")) != before
