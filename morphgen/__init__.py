@@ -40,8 +40,8 @@ def __getattr__(name: str) -> object:
         return _import_module("morphgen.tasks")
     if name not in __all__:
         raise AttributeError(f"module 'morphgen' has no attribute {name!r}")
-    homes = {"MorphgenError": "morphgen.errors", "Robot": "morphgen.model.robot"}
-    return getattr(_import_module(homes.get(name, "morphgen.api")), name)
+    modules = {"MorphgenError": "morphgen.errors", "Robot": "morphgen.model.robot"}
+    return getattr(_import_module(modules.get(name, "morphgen.api")), name)
 
 
 def __dir__() -> list[str]:

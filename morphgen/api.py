@@ -1,4 +1,4 @@
-"""What ``import morphgen`` offers: compose, check, read and write robots."""
+"""The functions of ``import morphgen``: compose, sample, read, write, check and fix robots."""
 
 from __future__ import annotations
 
@@ -30,26 +30,32 @@ def compose(
     library: Iterable[Path] = (),
     **words: str | float,
 ) -> Robot:
-    """Join parts into a robot.
+    """Compose a robot from parts.
+
+    Example:
+        >>> robot = morphgen.compose("ur5-plane")
+        >>> robot.dof
+        6
+        >>> robot = morphgen.compose(arm="ur5", ee="plane", **{"ee.size": "80mm"})
+        >>> robot = morphgen.compose("chain beads=5")
 
     Args:
-        request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``, parts joined by
-            dashes, such as ``ur5-plane``, or a grammar and what is pinned in it, such as
+        request: ``key=value`` words, such as ``arm=ur5 ee=plane ee.size=80mm``; parts joined by
+            dashes, such as ``ur5-plane``; or a grammar and pinned choices, such as
             ``chain beads=5``.
-        name: The robot's name; by default from its parts.
+        name: Name of the robot; by default it is made from the parts.
         geometry: Collision shapes of real parts: meshes, or fitted boxes, cylinders and spheres.
-        library: Folders of your own parts.
-        **words: More words of the request: ``compose(arm="ur5", ee="plane")``; keys with a point
-            as ``**{"ee.size": "80mm"}``.
+        library: Folders of your own parts and grammars.
+        **words: More ``key=value`` words. Values without a unit are in SI units.
 
     Raises:
-        MorphgenError: If the request names what does not exist or does not fit; the message
-            says what does.
+        MorphgenError: If a part, parameter, port or grammar does not exist or does not fit, or a
+            value is out of range; the message lists what is valid.
     """
     parts = default_library(library)
     request_words = [*request.split(), *(f"{key}={value}" for key, value in words.items())]
-    derivation, own = parse_words(request_words, parts)
-    robot = compose_derivation(derivation, parts, name or own)
+    derivation, default_name = parse_words(request_words, parts)
+    robot = compose_derivation(derivation, parts, name or default_name)
     return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
 
 
@@ -61,29 +67,41 @@ def sample(
     where: str | None = None,
     library: Iterable[Path] = (),
 ) -> Iterator[Robot]:
-    """Draw robots from a grammar, one when asked for.
+    """Draw robots from a grammar; each is drawn when the iterator reaches it.
+
+    Example:
+        >>> for robot in morphgen.sample("arm3", 2, seed=7, where="reach > 0.4"):
+        ...     print(robot.name)
+        arm3-000000
+        arm3-000001
 
     Args:
-        grammar: Name of a grammar that comes with morphgen or lies in ``library``, or a path.
-        n: How many.
+        grammar: Name of a grammar that comes with morphgen or is in ``library``, or a path.
+        n: Number of robots.
         seed: Seed; robot i does not depend on n.
-        where: A condition such as ``reach > 0.4 and dof >= 5``.
+        where: Condition that every robot meets, such as ``reach > 0.4 and dof >= 5``.
         library: Folders of your own parts and grammars.
 
     Raises:
-        GrammarError: If the grammar or condition is malformed.
-        SamplingError: If the conditions can hardly be met.
+        GrammarError: If the grammar or the condition is invalid.
+        SamplingError: While iterating, if no robot meets the conditions in 500 draws.
     """
     parts = default_library(library)
-    found = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
+    loaded = load_grammar(find_grammar(str(grammar), parts.folders), parts.folders)
     conditions = [parse_condition(where)] if where else []
     for condition in conditions:
         require_condition(condition)
-    return (drawn.robot for drawn in sample_robots(found, parts, n, seed=seed, where=conditions))
+    samples = sample_robots(loaded, parts, n, seed=seed, where=conditions)
+    return (sample.robot for sample in samples)
 
 
 def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) -> Robot:
-    """Read a bundle's folder, a URDF or a xacro.
+    """Read a robot from a bundle's folder, a URDF or a xacro.
+
+    Example:
+        >>> folder = morphgen.write(morphgen.compose("ur5-plane"), "robots", picture=False)
+        >>> morphgen.read(folder).name
+        'ur5-plane'
 
     Args:
         path: The file or folder.
@@ -91,15 +109,28 @@ def read(path: str | PathLike[str], *, root: str | PathLike[str] | None = None) 
             folder and package.
 
     Raises:
-        FormatError: If it is none of them, or broken.
+        FormatError: If the path is none of these, or the description is invalid.
     """
     return read_robot(Path(path), root=None if root is None else Path(root))
 
 
 def write(robot: Robot, folder: str | PathLike[str], *, picture: bool = True) -> Path:
-    """Check a robot and write its bundle: ``folder / robot.name``.
+    """Check a robot and write its bundle: URDF, MJCF, meshes, card and picture.
+
+    Example:
+        >>> folder = morphgen.write(morphgen.compose("ur5-plane"), "robots", picture=False)
+        >>> print(folder)
+        robots/ur5-plane
+
+    Args:
+        robot: The robot.
+        folder: Folder in which the bundle's folder ``robot.name`` is created or replaced.
+        picture: Whether to render ``preview.png``.
+
+    Returns:
+        The bundle's folder.
 
     Raises:
-        FormatError: If the folder cannot be written, or holds something else of that name.
+        FormatError: If the folder cannot be written, or contains something else of that name.
     """
     return write_bundle(robot, Path(folder) / robot.name, check(robot), picture=picture)

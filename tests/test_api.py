@@ -1,5 +1,6 @@
 """``import morphgen`` is enough, and costs nothing until it is used."""
 
+import doctest
 import subprocess
 import sys
 
@@ -46,6 +47,14 @@ def test_a_robot_prints_as_one_line():
         repr(robot)
         == f"Robot('lwr-plane': {len(robot.links)} links, 7 independent joints, 16.11 kg)"
     )
+
+
+@pytest.mark.parametrize("name", ["compose", "sample", "read", "write"])
+def test_the_examples_of_the_documentation_work(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (example,) = doctest.DocTestFinder().find(getattr(morphgen, name), name, globs={})
+    example.globs["morphgen"] = morphgen
+    assert doctest.DocTestRunner().run(example).failed == 0
 
 
 def test_a_mistake_is_one_clear_error():

@@ -1,1 +1,1 @@
-"""The language of morphgen: parts, derivations and composition."""
+"""The language of morphgen: grammars, parts, derivations and their composition to robots."""

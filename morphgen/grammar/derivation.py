@@ -1,7 +1,7 @@
-"""Derivations: which parts a body is made of, with which parameters, attached where.
+"""Derivations: the parts of a robot, their parameters, and the ports that they are attached to.
 
-The text of a derivation reads ``base=fixed(spread=0.6)[top: arm=ur5[flange: ee=stick]]``: a label,
-the part, its parameters in SI units, and what is attached to its ports.
+A derivation is written ``base=fixed(spread=0.6)[top: arm=ur5[flange: ee=stick]]``: a label, the
+part, its parameters in SI units, and the derivations attached to its ports.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ NUMBER: /[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?/
 
 @dataclass(frozen=True)
 class Derivation:
-    """A part with its parameters, and what is attached to its ports."""
+    """A part with its parameters, and the parts attached to its ports."""
 
     label: str
-    """Scope of the part's names, unique in the tree, such as ``arm`` or ``left_ee``."""
+    """Prefix of the part's names in the robot, such as ``left_ee``; unique in the tree."""
     part: str
     parameters: tuple[tuple[str, float], ...] = ()
-    """Every parameter of the part, SI units."""
+    """Every parameter of the part: (name, value in SI units)."""
     children: tuple[tuple[str, Derivation], ...] = ()
-    """(port, what is attached to it)."""
+    """(port, derivation attached to it)."""
 
     def __str__(self) -> str:
         values = ", ".join(f"{name}={format_number(value)}" for name, value in self.parameters)
@@ -52,7 +52,7 @@ class Derivation:
         )
 
     def walk(self) -> Iterator[Derivation]:
-        """The node and all below it, parents first."""
+        """Yield the node and all below it, parents first."""
         yield self
         for _, child in self.children:
             yield from child.walk()
@@ -64,11 +64,15 @@ class Derivation:
 
 
 def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
-    """Read a derivation's text.
+    """Parse the text of a derivation.
+
+    Args:
+        text: The derivation, as ``str`` returns it.
+        origin: Name of the text in messages, usually its path.
 
     Raises:
-        GrammarError: At the first place that is none; or if it is too long, or of more than
-            ``MAX_PARTS`` parts.
+        GrammarError: If the syntax is invalid, the text is too long, or the derivation has more
+            than ``MAX_PARTS`` parts.
     """
     if len(text) > MAX_DERIVATION_TEXT:
         raise GrammarError(
@@ -80,7 +84,8 @@ def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
     except UnexpectedInput as error:
         location = f"{origin}:{max(error.line, 1)}:{max(error.column, 1)}"
         raise GrammarError(
-            f"{location}: no derivation, such as base=fixed[top: arm=ur5[flange: ee=stick]]"
+            f"{location}: invalid derivation; expected one such as "
+            "base=fixed[top: arm=ur5[flange: ee=stick]]"
         ) from error
     except VisitError as error:
         raise error.orig_exc from error
@@ -88,24 +93,24 @@ def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
 
 
 def outline(derivation: Derivation) -> str:
-    """The derivation with a line a part, indented."""
+    """Return the derivation with one indented line per part."""
     return "\n".join(_outline(derivation, "", 0))
 
 
 def difference(a: Derivation, b: Derivation) -> list[str]:
-    """What differs between two derivations, a line a difference; none if they are the same."""
+    """Return the differences of two derivations, one line each; empty if they are equal."""
     return [f"{sign} {line}" for sign, line in _difference(_flat(a), _flat(b))]
 
 
 def _outline(node: Derivation, port: str, depth: int) -> Iterator[str]:
-    own = Derivation(node.label, node.part, node.parameters)
-    yield "  " * depth + (f"{port}: " if port else "") + str(own)
+    line = Derivation(node.label, node.part, node.parameters)
+    yield "  " * depth + (f"{port}: " if port else "") + str(line)
     for name, child in node.children:
         yield from _outline(child, name, depth + 1)
 
 
 def _flat(derivation: Derivation) -> dict[str, str]:
-    """Facts by what they are about: a part's kind and place, and each parameter."""
+    """Return the part and port of each label, and the value of each ``label.parameter``."""
     facts: dict[str, str] = {derivation.label: derivation.part}
     for node in derivation.walk():
         for name, value in node.parameters:
@@ -132,7 +137,7 @@ def _parser() -> Lark:
 
 @v_args(inline=True)
 class _Builder(Transformer_NonRecursive[Token, Any]):
-    """Lark's tree to derivations, however deep."""
+    """Converts Lark's tree without recursion; a method per rule of the syntax."""
 
     def __init__(self, origin: str) -> None:
         super().__init__()
@@ -142,7 +147,8 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         self._parts += 1
         if self._parts > MAX_PARTS:
             raise GrammarError(
-                f"{self._origin}: a derivation of more than {MAX_PARTS} parts, the most of a robot"
+                f"{self._origin}: a derivation has more than {MAX_PARTS} parts; expected at most "
+                f"{MAX_PARTS}"
             )
         values = tuple(entry for entry in rest if isinstance(entry[1], float))
         children = tuple(entry for entry in rest if isinstance(entry[1], Derivation))

@@ -1,29 +1,30 @@
-"""Limits of what a grammar may ask for: no text keeps a command busy for long or fills memory."""
+"""Limits of grammars, so that no text from a stranger runs for hours or fills the memory."""
 
 from __future__ import annotations
 
 MAX_PARTS = 100
-"""Parts of one robot, and levels of symbols above a part; loaders hold fewer parts. A recursion
-that goes further is taken to be endless, and no repetition may ask for more."""
+"""Largest number of parts of a robot, of copies in a repetition, and of nested symbols. A recursion
+that goes deeper is considered endless; loaders of robots have smaller limits."""
 MAX_TEXT = 64 * 1024
-"""Length of a grammar with its includes, and of a condition [bytes]; all shipped grammars together
-have 3 kB."""
+"""Largest size of a grammar with its includes, and of a condition [bytes]; all shipped grammars
+together have 3 kB."""
 MAX_FILES = 100
-"""Files that a grammar may be read from, itself among them."""
+"""Largest number of files of a grammar, including itself."""
 MAX_STATEMENTS = 1000
-"""Statements of a grammar with its includes."""
+"""Largest number of statements of a grammar with its includes."""
 MAX_ALTERNATIVES = 1000
-"""Alternatives of one symbol."""
+"""Largest number of alternatives of one symbol."""
 MAX_WORD = 100
-"""Length of a name or a number [characters]."""
+"""Largest length of a name or a number [characters]."""
 MAX_NESTING = 100
-"""Levels of an expression; ``1 + 1 + 1`` has three."""
+"""Largest depth of an expression; ``1 + 1 + 1`` has three levels."""
 MAX_FAULTS = 20
-"""Faults of items that are reported at once."""
+"""Largest number of faults that ``morphgen grammar check`` reports at once."""
 COUNT_DIGITS = 100
+"""Exponent of ``MAX_COUNT``."""
 MAX_COUNT: int = 10**COUNT_DIGITS
-"""Structures beyond which they are not counted exactly."""
+"""Largest number of structures that is counted exactly."""
 MAX_SEARCH = 20_000
-"""Parts that are placed in search of one more structure before the search is given up."""
+"""Number of parts without a new structure after which an enumeration is given up."""
 MAX_DERIVATION_TEXT = 256 * 1024
-"""Length of a derivation's text [characters]."""
+"""Largest length of a derivation's text [characters]."""

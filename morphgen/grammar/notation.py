@@ -1,4 +1,4 @@
-"""The notation of grammars: text to Lark's tree, with errors by line and column."""
+"""The notation of grammars: parse texts to Lark trees; errors name the line and column."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _SPACE: /[ \t\r]+/
 %ignore _SPACE
 """
 
-_WORDS = {
+_TOKEN_NAMES = {
     "$END": "the end",
     "_END": "a new line",
     "NAME": "a name",
@@ -90,11 +90,11 @@ def parse_tree(text: str, origin: str, start: str) -> Tree[Token]:
 
     Args:
         text: A grammar or a condition.
-        origin: What to call it in messages, usually its path.
-        start: The rule that it is to follow: ``grammar`` or ``or_``.
+        origin: Name of the text in messages, usually its path.
+        start: Rule of the syntax to apply: ``grammar``, or ``or_`` for a condition.
 
     Raises:
-        GrammarError: If it is too long, or at the first place that does not follow the rule.
+        GrammarError: If the text is too long or does not follow the rule.
     """
     if len(text) > MAX_TEXT:
         raise GrammarError(
@@ -104,7 +104,7 @@ def parse_tree(text: str, origin: str, start: str) -> Tree[Token]:
     try:
         return _parser().parse(text, start=start)
     except UnexpectedInput as error:
-        raise GrammarError(_explained(error, text, origin)) from error
+        raise GrammarError(_message(error, text, origin)) from error
 
 
 @lru_cache(maxsize=1)
@@ -112,7 +112,7 @@ def _parser() -> Lark:
     return Lark(_SYNTAX, parser="lalr", start=["grammar", "or_"], maybe_placeholders=True)
 
 
-def _explained(error: UnexpectedInput, text: str, origin: str) -> str:
+def _message(error: UnexpectedInput, text: str, origin: str) -> str:
     line, column, token = error.line, error.column, getattr(error, "token", None)
     ended = token is not None and token.type == "$END"
     if ended:
@@ -120,7 +120,7 @@ def _explained(error: UnexpectedInput, text: str, origin: str) -> str:
         line, column = len(lines), len(lines[-1]) + 1
     names = getattr(error, "accepts", None) or getattr(error, "expected", None)
     names = names or getattr(error, "allowed", None) or ()
-    expected = sorted({_WORDS.get(name, name) for name in names})
+    expected = sorted({_TOKEN_NAMES.get(name, name) for name in names})
     if ended:
         found = "the end"
     elif token is not None:
