@@ -1,4 +1,4 @@
-"""Expand xacro without ROS. Each call stands alone: nothing of one is left for the next."""
+"""Expand xacro without ROS. Calls are independent: no state passes from one to the next."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from xml.parsers.expat import ExpatError
 
 from morphgen.errors import FormatError, nearest
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
-from morphgen.formats.xacro_child import MEMORY_LIMIT, run_in_child
 from morphgen.formats.xacro_engine import thread_engine
 from morphgen.formats.xacro_files import (
     ElementPlaces,
@@ -23,12 +22,13 @@ from morphgen.formats.xacro_files import (
     read_file,
 )
 from morphgen.formats.xacro_functions import RefusedError
+from morphgen.formats.xacro_process import MEMORY_LIMIT, run_in_child
 from morphgen.formats.xml import parse_xml
 
 MAX_INCLUDE_DEPTH = 40
-"""Files that may be open within one another before it is called a loop."""
+"""Deepest nesting of includes; deeper ones are taken for a loop."""
 MAX_REASON = 400
-"""Longest reason of an error [characters]; expressions can be long."""
+"""Longest reason in an error [characters]; expressions can be long."""
 
 _COMMANDS = ("arg", "dirname", "eval", "find", "optenv")
 _FAULTS = (
@@ -44,7 +44,7 @@ _FAULTS = (
     TypeError,
     ValueError,
 )
-"""What a faulty document can make the evaluator raise, besides its own exception."""
+"""Exceptions that an invalid document can raise in the evaluator, besides XacroException."""
 
 
 def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
@@ -81,20 +81,25 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
         except FormatError:
             if not expansion.met_foreign:
                 raise
-    document: str = run_in_child("expand", path, finder, args=args)["document"]
+    document: str = run_in_child(expand_here, path, finder, args=args)
     return document.encode()
 
 
+def expand_here(path: Path, finder: PackageFinder, args: Mapping[str, str]) -> str:
+    """Expand a xacro file in this process; ``expand`` decides which process that is."""
+    return Expansion(args, path, finder).run_file().decode()
+
+
 def evaluate(expression: str, values: Mapping[str, float]) -> float:
-    """Return the number that a text with ``${...}`` stands for.
+    """Evaluate a text with ``${...}`` to a number.
 
     Args:
         expression: Such as ``"0.5"`` or ``"${length / 2}"``, with xacro's functions (``pi``,
             ``sin``, ``max``, ``radians``, ...).
-        values: Numbers that it may use by name; they hide xacro's own names.
+        values: Numbers by name; they hide xacro's own names.
 
     Raises:
-        FormatError: It cannot be evaluated, or is no finite number.
+        FormatError: It cannot be evaluated, or is not a finite number.
     """
     engine = thread_engine()
     engine.eval_extension = _no_substitution
@@ -111,7 +116,7 @@ def evaluate(expression: str, values: Mapping[str, float]) -> float:
 
 
 class Expansion:
-    """One call's state: the arguments, the files read, and what they declare."""
+    """State of one expansion: its arguments, and the arguments that the files read declare."""
 
     def __init__(
         self,
@@ -128,9 +133,9 @@ class Expansion:
             args: Values of the document's ``xacro:arg``.
             origin: The file, absolute.
             finder: Where ``$(find package)`` looks.
-            objects: Values of further arguments that reach expressions as they are.
-            installed_only: Whether to read no file but what ``is_installed``; ``met_foreign`` then
-                says whether one was asked for.
+            objects: Further arguments, whose values reach expressions without conversion to text.
+            installed_only: Whether to refuse files that are not ``is_installed``; ``met_foreign``
+                is then true if the document asked for one.
         """
         self.engine = thread_engine()
         self.engine.parse = self._parse_include
@@ -162,7 +167,7 @@ class Expansion:
         return self.run(data)
 
     def run(self, data: bytes) -> bytes:
-        """Expand a document that stands for the file.
+        """Expand a document in place of the file's content.
 
         Raises:
             FormatError: As ``expand``.
@@ -179,7 +184,7 @@ class Expansion:
 
     @contextmanager
     def _located(self) -> Iterator[None]:
-        """Turn what goes wrong into one line that names the file and line in hand."""
+        """Turn exceptions into one-line errors with the file and line being processed."""
         try:
             yield
         except (self.engine.XacroException, *_FAULTS) as error:
@@ -198,7 +203,9 @@ class Expansion:
     def _parse_include(self, _: object, filename: str) -> minidom.Document:
         files = self.engine.filestack
         if len(files) > MAX_INCLUDE_DEPTH:
-            raise FormatError(f"{files[-2]}: includes {filename} without end (from {self.origin})")
+            raise FormatError(
+                f"{files[-2]}: includes {filename} in an endless loop (from {self.origin})"
+            )
         including = files[-2]
         try:
             data = self._read(filename, including)
@@ -221,13 +228,13 @@ class Expansion:
         return read_file(Path(filename))
 
     def _list_files(self, pattern: str) -> list[str]:
-        """Files of a pattern, which must begin in a folder that may be read."""
+        """Return the files that match a pattern; its fixed first folders must be allowed."""
         folder = Path(re.split(r"[*?[]", pattern)[0] + "x").parent
         require_allowed_text(folder, self.finder, self.origin, Path(self.engine.filestack[-1]))
         return glob(pattern)  # noqa: PTH207 - an absolute pattern, as xacro takes it
 
     def _substitute(self, text: str) -> object:
-        """Evaluate one ``$(command words)``."""
+        """Evaluate one substitution ``$(command words)``."""
         match text[2:-1].split():
             case ["arg", name] if name in self.objects:
                 return self.objects[name]
@@ -251,12 +258,12 @@ class Expansion:
                     f" $({command}) is not supported, use a xacro:arg"
                 )
         raise self.engine.XacroException(
-            f"{text} is no substitution; valid: {', '.join(_COMMANDS)}"
+            f"unknown substitution {text}; valid: {', '.join(_COMMANDS)}"
         )
 
 
 class _Arguments(dict[str, str]):
-    """Arguments by name; remembers which were asked for."""
+    """Arguments by name, with a record of the names that were used."""
 
     def __init__(self, fault: type[Exception], given: Mapping[str, str]) -> None:
         super().__init__(given)
@@ -271,25 +278,21 @@ class _Arguments(dict[str, str]):
 
 
 def _no_substitution(text: str) -> str:
-    raise ValueError(f"{text} has no meaning here")
+    raise ValueError(f"{text} is not valid here")
 
 
 def _reason(error: BaseException) -> str:
-    """What went wrong first, in one line; the package wraps an error once for each expression."""
+    """Return the innermost error in one line; xacro wraps it once for each expression."""
     suffix = ""
     while isinstance(inner := getattr(error, "exc", None), BaseException):
         suffix = getattr(error, "suffix", None) or suffix
         error = inner
     if isinstance(error, RecursionError):
-        return "macros or properties use one another without end, or too deep"
+        return "macros or properties refer to each other endlessly or too deeply"
     if isinstance(error, MemoryError):
         return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
-    reason = _one_line(f"{error or type(error).__name__} {suffix}")
+    reason = " ".join(f"{error or type(error).__name__} {suffix}".split())
     return reason if len(reason) <= MAX_REASON else f"{reason[:MAX_REASON]}..."
-
-
-def _one_line(text: object) -> str:
-    return " ".join(str(text).split())
 
 
 def _unknown_name_hint(error: BaseException | None, values: Mapping[str, float]) -> str:

@@ -1,12 +1,11 @@
-"""Xacro expanded once for all values of its parameters.
+"""Expand a xacro once for all values of its parameters.
 
-Expanding a xacro takes longer than all else that composing does. Where parameters only enter
-numbers by arithmetic, one expansion with symbols in their place gives the document as text with
-expressions in it; filling that in for new values gives the same bytes as expanding anew.
+Expanding a xacro is the slowest step of composing a robot. If parameters only enter the document's
+numbers by arithmetic, one expansion with symbols instead of values gives a text with expressions.
+Evaluating these for new values gives the same bytes as another expansion.
 
-
-What a document does with its parameters is noted as expressions, which the allow-list evaluates;
-for a document that may come from a stranger, the noting happens in a process with limits.
+The expressions are evaluated by the same allow-list as those of a xacro. A document that is not
+installed with morphgen is traced in the child process with limits.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from pathlib import Path
 from morphgen.errors import FormatError
 from morphgen.formats.resolve import PackageFinder, is_installed
 from morphgen.formats.xacro import Expansion
-from morphgen.formats.xacro_child import run_in_child
 from morphgen.formats.xacro_expressions import Expression
 from morphgen.formats.xacro_functions import Function, RefusedError
+from morphgen.formats.xacro_process import run_in_child
 
 _OPEN, _CLOSE = "\ue000", "\ue001"
 _MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
@@ -47,11 +46,11 @@ _UNTRACEABLE = (
     TypeError,
     LookupError,
 )
-"""What a template that does so makes the evaluator raise."""
+"""Exceptions that tracing such a template can raise."""
 
 
 class Traced:
-    """A number that is not known yet: notes what is done with it."""
+    """A symbol in place of a number; it records the arithmetic done with it as an expression."""
 
     def __init__(self, code: str) -> None:
         self.code = code
@@ -104,14 +103,14 @@ class CompiledXacro:
     """A document with expressions over parameters."""
 
     texts: tuple[str, ...]
-    """What stands before, between and after the expressions."""
+    """Texts before, between and after the expressions."""
     expressions: tuple[Expression, ...]
-    """The different ones; most documents use one several times."""
+    """Distinct expressions; most documents use one several times."""
     order: tuple[int, ...]
-    """Which of them stands after each text but the last."""
+    """Index of the expression after each text except the last."""
 
     def fill(self, values: Mapping[str, str]) -> bytes:
-        """The document for values of the parameters, given as xacro arguments.
+        """Return the document for values of the parameters, given as xacro arguments.
 
         Raises:
             FormatError: If an expression cannot be evaluated for them.
@@ -137,20 +136,20 @@ def compile_xacro(
     Args:
         path: The file.
         constants: Arguments that decide the document's structure, such as counts.
-        numbers: Arguments that are numbers. The first time, what is filled in for these values is
-            compared with an expansion.
-        finder: Where ``$(find package)`` looks.
+        numbers: Arguments that are numbers. The first call compares the filled document for these
+            values with an expansion.
+        finder: Finds the packages of ``$(find package)``.
 
     Returns:
-        The compiled document; None if the file does more with a number than arithmetic, or cannot
-        be expanded for these: ``expand`` does it, or tells why not.
+        The compiled document; None if the file uses a number other than by arithmetic, or cannot be
+        expanded for these values. Then call ``expand``, which raises the error, if any.
     """
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
     return _compiled(path, stamp, tuple(constants.items()), _Example(numbers), finder)
 
 
 class _Example(dict[str, str]):
-    """Values of numbers, all alike as a key of the cache if the names are the same."""
+    """Values of numbers; as a key of the cache, examples with the same names are equal."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(tuple(self))
@@ -167,16 +166,15 @@ def _compiled(
     example: _Example,
     finder: PackageFinder,
 ) -> CompiledXacro | None:
-    """The compiled form of a file as it is at ``stamp``."""
+    """Compile a file; ``stamp`` makes the cache read it again after a change."""
     del stamp
     path = path.absolute()
     given = dict(constants)
     try:
         if is_installed(path):
-            traced = trace(path, given, example, finder, installed_only=True)
+            traced = trace(path, finder, given, example, installed_only=True)
         else:
-            answer = run_in_child("trace", path, finder, constants=given, numbers=example)
-            traced = answer["traced"]
+            traced = run_in_child(trace, path, finder, constants=given, numbers=example)
         return None if traced is None else _translated(*traced)
     except _UNTRACEABLE:
         return None
@@ -184,19 +182,19 @@ def _compiled(
 
 def trace(
     path: Path,
+    finder: PackageFinder,
     constants: Mapping[str, str],
     numbers: Mapping[str, str],
-    finder: PackageFinder,
     *,
     installed_only: bool = False,
 ) -> tuple[list[str], list[str]] | None:
-    """Expand a xacro file in this process, with numbers that are not known yet.
+    """Expand a xacro file in this process with symbols in place of numbers.
 
     Args:
         path: The file, absolute.
+        finder: As for ``compile_xacro``.
         constants: As for ``compile_xacro``.
         numbers: As for ``compile_xacro``.
-        finder: As for ``compile_xacro``.
         installed_only: As for ``Expansion``.
 
     Returns:
@@ -223,7 +221,7 @@ def _translated(texts: Sequence[str], expressions: Sequence[str]) -> CompiledXac
 
 
 def _lifted(name: str, function: Callable[..., object]) -> Callable[..., object]:
-    """A function that notes its call where an argument is not known yet."""
+    """Return a function that records its call if an argument is a symbol."""
 
     def call(*operands: object) -> object:
         if any(isinstance(operand, Traced) for operand in operands):
@@ -241,7 +239,7 @@ def _code(operand: object) -> str:
     if isinstance(operand, Traced):
         return operand.code
     if isinstance(operand, bool) or not isinstance(operand, int | float):
-        raise UntraceableError(f"{operand!r} is no number")
+        raise UntraceableError(f"{operand!r} is not a number")
     return f"({operand!r})"
 
 
@@ -250,7 +248,7 @@ def _symbol(name: str) -> str:
 
 
 def _literal(text: str) -> int | float:
-    """A xacro argument as xacro takes it: whole numbers are ints."""
+    """Convert a xacro argument as xacro does: whole numbers become int."""
     try:
         return int(text)
     except ValueError:

@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import pytest
 
-from morphgen.formats import xacro_child
+from morphgen.formats import xacro_process
 
 HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
 SECRET = "root:hunter2"
@@ -260,8 +260,8 @@ PROPERTIES = "".join(
             "the expansion makes more than 20000000 characters",
         ),
         ("<a>" * 5000 + "</a>" * 5000, "Excessive depth"),
-        ('<xacro:macro name="m"><a><xacro:m/></a></xacro:macro><xacro:m/>', "without end"),
-        ('<xacro:include filename="robot.urdf.xacro"/>', "without end"),
+        ('<xacro:macro name="m"><a><xacro:m/></a></xacro:macro><xacro:m/>', "endless"),
+        ('<xacro:include filename="robot.urdf.xacro"/>', "endless"),
     ],
 )
 def test_a_document_cannot_swell(refused, hostile, body, reason):
@@ -274,20 +274,20 @@ ENDLESS = f"<xacro:macro name='m' params=\"a:={'a' * 60}'\"/>"
 
 @pytest.mark.parametrize("limit", ["CPU_LIMIT", "WALL_LIMIT"])
 def test_what_no_bound_foresees_is_ended(refused, hostile, monkeypatch, limit):
-    monkeypatch.setattr(xacro_child, limit, 2)
+    monkeypatch.setattr(xacro_process, limit, 2)
     path = hostile(ENDLESS)
     what = {"CPU_LIMIT": "2 s of CPU time", "WALL_LIMIT": "2 s"}[limit]
     assert f"{path}: its expansion takes more than {what}\n" in refused("show", path)
 
 
 def test_memory_that_no_bound_foresees_is_refused(refused, hostile, monkeypatch):
-    monkeypatch.setattr(xacro_child, "MEMORY_LIMIT", 150 << 20)
+    monkeypatch.setattr(xacro_process, "MEMORY_LIMIT", 150 << 20)
     path = hostile("<a/>" * 500_000)
     assert "needs more than 150 MiB of memory" in refused("show", path)
 
 
 def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatch):
-    monkeypatch.setattr(xacro_child, "CPU_LIMIT", 2)
+    monkeypatch.setattr(xacro_process, "CPU_LIMIT", 2)
     library = tmp_path / "library"
     library.mkdir()
     (library / "trap.yaml").write_text(
@@ -306,7 +306,7 @@ def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatc
 
 
 def test_the_child_writes_no_file(tmp_path):
-    code = "from morphgen.formats.xacro_server import _limit; _limit(9, 2**30); "
+    code = "from morphgen.formats.xacro_process import limit_process; limit_process(9, 2**30); "
     write = "file = open('written', 'w'); file.write('a'); file.close()"
     done = subprocess.run(
         [sys.executable, "-c", code + write], capture_output=True, text=True, check=False

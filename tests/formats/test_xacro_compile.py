@@ -129,7 +129,7 @@ def test_what_cannot_be_expanded_is_left_to_the_expansion_to_tell(write, body):
 def test_the_marks_of_expressions_in_a_document_are_text(write, expression):
     path = write(f'<a v="\ue000{expression}\ue001"/>')
     for trusted in (False, True):
-        assert trace(path, {}, {"x": "0.3"}, FINDER, installed_only=trusted) is None
+        assert trace(path, FINDER, {}, {"x": "0.3"}, installed_only=trusted) is None
     assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
     assert f"\ue000{expression}\ue001" in expand(path, {"x": "0.3"}, FINDER).decode()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import morphgen.formats
-from morphgen.formats import xacro_child, xacro_files
+from morphgen.formats import xacro_files, xacro_process
 from morphgen.formats.xacro import MAX_INCLUDE_DEPTH
 from morphgen.formats.xacro_engine import MAX_ELEMENTS, MAX_TEXT
 from morphgen.formats.xacro_expressions import MAX_LENGTH, Expression
@@ -192,8 +192,8 @@ def test_the_page_names_every_function_and_bound():
         f"| {MAX_INCLUDE_DEPTH} |",
         f"{MAX_ELEMENTS:,} elements processed, {xacro_files.MAX_CLONES:,} copied, {MAX_TEXT:,}",
         f"| {xacro_files.MAX_OUTPUT:,} characters |",
-        f"{xacro_child.CPU_LIMIT} s of CPU time, {xacro_child.WALL_LIMIT} s of waiting, "
-        f"{xacro_child.MEMORY_LIMIT >> 30} GiB of memory",
+        f"{xacro_process.CPU_LIMIT} s of CPU time, {xacro_process.WALL_LIMIT} s of waiting, "
+        f"{xacro_process.MEMORY_LIMIT >> 30} GiB of memory",
     )
     assert [bound for bound in bounds if bound not in page] == []
 
