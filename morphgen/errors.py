@@ -1,25 +1,26 @@
-"""Every error that morphgen raises on purpose, and the hint that lists valid choices."""
+"""The errors that morphgen raises for users, and the hint that lists valid names."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
 
-_LISTED = 24
-_LONGEST = 200
-"""Characters of the longest name that is compared with others, which takes their square."""
+_MAX_LISTED = 24
+"""Largest number of valid names that a hint lists completely."""
+_MAX_COMPARED = 200
+"""Longest name that is compared with the valid ones [characters]; the time grows quadratically."""
 
 
 class MorphgenError(Exception):
-    """Root of the errors a user can cause; its text is one line fit for a terminal."""
+    """Base of all errors that a user can cause; its text is one line for the terminal."""
 
 
 class RobotError(MorphgenError):
-    """A robot's structure contradicts itself."""
+    """The structure of a robot is inconsistent."""
 
 
 class FormatError(MorphgenError):
-    """A file cannot be read or written as what it claims to be."""
+    """A file cannot be read or written, or its content is invalid."""
 
 
 class MeshError(FormatError):
@@ -27,52 +28,52 @@ class MeshError(FormatError):
 
 
 class PartError(MorphgenError):
-    """A part, its manifest or one of its parameters is unknown or wrong."""
+    """A part, its manifest or one of its parameters is unknown or invalid."""
 
 
 class FitError(MorphgenError):
-    """Shapes that no primitive can stand for."""
+    """No primitive can approximate the shapes."""
 
 
 class BenchmarkError(MorphgenError):
-    """Tokens, a similarity or a split that cannot be made as asked."""
+    """Tokens, a similarity or a split cannot be computed as requested."""
 
 
 class TaskError(MorphgenError):
-    """A task that cannot be set up for a robot, or an action that is none."""
+    """A task cannot be set up for a robot, or an action is invalid."""
 
 
 class SimulationError(MorphgenError):
-    """A simulator that cannot hold a scene, became unstable or died."""
+    """A simulator cannot load a scene, diverged or ended."""
 
 
 class DivergedError(SimulationError):
-    """Environments whose numbers mean nothing any more, until they are reset; all others are well.
+    """Some environments diverged and must be reset; all others are valid.
 
-    Its text is the reason of the first.
+    The text of the error is the reason of the first environment.
     """
 
     def __init__(self, reasons: Mapping[int, str]) -> None:
-        """Name them, at least one, each by its number and with what is wrong."""
+        """Create the error from the reasons by environment index; there must be at least one."""
         super().__init__(dict(sorted(reasons.items())))
 
     @property
     def reasons(self) -> dict[int, str]:
-        """What is wrong, by environment."""
-        found: dict[int, str] = self.args[0]
-        return found
+        """Reason of the divergence by environment index."""
+        reasons: dict[int, str] = self.args[0]
+        return reasons
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the reason of the first environment."""
         return next(iter(self.reasons.values()))
 
 
 class GrammarError(MorphgenError):
-    """A grammar, a condition or a derivation is malformed or means nothing."""
+    """A grammar, a condition or a derivation is malformed or refers to unknown names."""
 
 
 class CompositionError(MorphgenError):
-    """Parts cannot be joined as asked."""
+    """Parts cannot be joined as requested."""
 
 
 class MissingDependencyError(MorphgenError):
@@ -80,9 +81,9 @@ class MissingDependencyError(MorphgenError):
 
 
 def one_line(text: str) -> str:
-    """Return text as one line of a terminal: white space made single, what cannot be shown escaped.
+    """Return text as one line: single spaces, unprintable characters escaped.
 
-    A name from a file can hold line breaks, or characters that move a terminal's cursor.
+    Names from files can contain line breaks or characters that control the terminal.
     """
     words = " ".join(text.split())
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
@@ -92,18 +93,18 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """Return a hint for an unknown name: the closest valid one and the list, if not too long.
 
     Args:
-        name: What the user wrote.
-        valid: Every name that would have been accepted.
+        name: The unknown name.
+        valid: All valid names.
 
     Returns:
         Text to append to an error, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
     """
     choices = sorted(valid)
-    if len(name) > _LONGEST:
+    if len(name) > _MAX_COMPARED:
         return f"; {len(choices)} are valid"
     close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
-    if len(choices) > _LISTED:
+    if len(choices) > _MAX_LISTED:
         listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))
         return f"{guess} nearest of {len(choices)}: {', '.join(listed)}"
     return f"{guess} valid: {', '.join(choices) or '(none)'}"

@@ -228,7 +228,7 @@ def _require_inner_paths(path: str, data: bytes) -> None:
         try:
             card = json.loads(data)
         except (ValueError, RecursionError) as error:
-            raise UploadError(f"{path}: not valid JSON: {shorten(str(error))}") from error
+            raise UploadError(f"{path}: invalid JSON: {shorten(str(error))}") from error
         hashes = card.get("hashes") if isinstance(card, dict) else None
         for name in hashes if isinstance(hashes, dict) else ():
             _require_inner_uri(path, name)

@@ -95,7 +95,7 @@ def parse_split(text: str, path: Path) -> SplitFile:
     except yaml.MarkedYAMLError as error:
         raise BenchmarkError(f"{path}{_place(error)}") from error
     except yaml.YAMLError as error:
-        raise BenchmarkError(f"{path}: no valid YAML: {error}") from error
+        raise BenchmarkError(f"{path}: invalid YAML: {error}") from error
 
 
 def _place(error: yaml.MarkedYAMLError) -> str:
@@ -104,7 +104,7 @@ def _place(error: yaml.MarkedYAMLError) -> str:
     line = f":{mark.line + 1}" if mark else ""
     began = error.context_mark.line + 1 if error.context and error.context_mark else 0
     context = f" ({error.context} from line {began})" if began else ""
-    return f"{line}: no valid YAML: {error.problem}{context}"
+    return f"{line}: invalid YAML: {error.problem}{context}"
 
 
 class _Reader:

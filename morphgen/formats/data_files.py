@@ -1,4 +1,4 @@
-"""Read JSON and YAML of strangers: regular files only, bounded in size, depth and expansion."""
+"""Read JSON and YAML from untrusted sources: regular files of bounded size, depth and expansion."""
 
 from __future__ import annotations
 
@@ -12,79 +12,79 @@ import yaml
 from morphgen.errors import FormatError
 
 MAX_FILE_BYTES = 64 * 2**20
-"""Bytes of the largest data file that is read."""
+"""Largest data file that is read [bytes]."""
 MAX_DEPTH = 100
-"""Levels of lists and objects in the deepest data that is read."""
+"""Deepest nesting of lists and objects that is read."""
 MAX_YAML_VALUES = 1_000_000
-"""Values in the largest YAML file that is read, those of repeated aliases included."""
+"""Largest number of values in a YAML file, with every alias expanded."""
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
+def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Return the content of a regular file.
 
     Args:
-        path: The file; a link to one will do. A pipe or a device is not opened.
-        most: Bytes of the largest file to read.
+        path: The file, or a link to it. Pipes and devices, which may never end, are not opened.
+        max_bytes: Largest file to read [bytes].
 
     Raises:
-        FormatError: If it is no regular file or larger than that.
+        FormatError: If it is not a regular file or too large.
         OSError: If it cannot be read.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        raise FormatError(f"{path}: is no regular file")
-    if status.st_size > most:
-        raise FormatError(f"{path}: holds {status.st_size} bytes; at most {most} are read")
+        raise FormatError(f"{path}: is not a regular file")
+    if status.st_size > max_bytes:
+        raise FormatError(f"{path}: holds {status.st_size} bytes; at most {max_bytes} are read")
     with path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise FormatError(f"{path}: holds more than {most} bytes, which is the most that is read")
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise FormatError(f"{path}: holds more than {max_bytes} bytes, the most that is read")
     return data
 
 
-def read_text(path: Path, most: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a regular UTF-8 file of at most so many bytes, line ends made alike.
+def read_text(path: Path, max_bytes: int = MAX_FILE_BYTES) -> str:
+    """Return the text of a regular UTF-8 file, with its line ends unified.
 
     Raises:
-        FormatError: As ``read_bytes``, or it is no UTF-8.
+        FormatError: As ``read_bytes``, or if it is not UTF-8.
         OSError: If it cannot be read.
     """
     try:
-        text = read_bytes(path, most).decode("utf-8")
+        text = read_bytes(path, max_bytes).decode("utf-8")
     except UnicodeDecodeError as error:
-        why = f"no UTF-8 text ({error.reason} at byte {error.start})"
+        why = f"not UTF-8 text ({error.reason} at byte {error.start})"
         raise FormatError(f"{path}: cannot be read: {why}") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_json(path: Path) -> Any:  # noqa: ANN401
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     Raises:
-        FormatError: As ``read_text``, or it is no JSON.
+        FormatError: As ``read_text``, or if it is not JSON.
         OSError: If it cannot be read.
     """
     return parse_json(read_text(path), str(path))
 
 
 def parse_json(text: str, origin: str) -> Any:  # noqa: ANN401
-    """Return what JSON text holds.
+    """Return the value of a JSON text.
 
     Args:
         text: One JSON value.
-        origin: Where it stands, for messages.
+        origin: Name of its file, for messages.
 
     Raises:
-        FormatError: If it is no JSON, or deeper than ``MAX_DEPTH``.
+        FormatError: If it is not JSON, or deeper than ``MAX_DEPTH``.
     """
     try:
         data = json.loads(text)
     except RecursionError as error:
         raise _too_deep(origin) from error
     except ValueError as error:
-        raise FormatError(f"{origin}: no valid JSON: {error}") from error
+        raise FormatError(f"{origin}: invalid JSON: {error}") from error
     level = [data]
     for _ in range(MAX_DEPTH):
         level = [
@@ -99,18 +99,18 @@ def parse_json(text: str, origin: str) -> Any:  # noqa: ANN401
 
 
 def require_plain_yaml(text: str | bytes, origin: str) -> None:
-    """Require that YAML can be composed without harm.
+    """Require that YAML can be loaded without exhausting the stack or the memory.
 
-    PyYAML's C parser ends the process on brackets nested some thousand deep, and an alias to a list
-    of aliases multiplies. So the events are counted first, which need no recursion.
+    PyYAML's C parser crashes the process on deeply nested brackets, and nested aliases multiply
+    ("billion laughs"). Counting the parser's events first needs neither recursion nor expansion.
 
     Args:
         text: One document.
-        origin: Where it stands, for messages.
+        origin: Name of its file, for messages.
 
     Raises:
         FormatError: If it is deeper than ``MAX_DEPTH`` or holds more than ``MAX_YAML_VALUES``.
-        yaml.YAMLError: If it is no YAML.
+        yaml.YAMLError: If it is not YAML.
     """
     sizes: dict[str, int] = {}
     opened: list[tuple[str | None, int]] = []
@@ -130,7 +130,7 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
                 if any(anchor == event.anchor for anchor, _ in opened):
                     line = event.start_mark.line + 1 if event.start_mark else 1
                     why = "found unconstructable recursive node"
-                    raise FormatError(f"{origin}:{line}: no valid YAML: {why}")
+                    raise FormatError(f"{origin}:{line}: invalid YAML: {why}")
                 count += sizes.get(event.anchor or "", 1)
         if len(opened) > MAX_DEPTH:
             raise _too_deep(origin)

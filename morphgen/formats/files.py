@@ -1,4 +1,4 @@
-"""Files and folders that are never half there, and folders that one run has to itself."""
+"""Write files and folders atomically, and lock folders against concurrent runs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from filelock import FileLock, Timeout
 from morphgen.errors import FormatError
 
 LOCK = ".lock"
-"""The file that a run holds in its folder."""
+"""Name of the lock file in a folder."""
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file by way of ``partial_path`` it, so that it is never half there.
+    """Write a file atomically, by way of ``partial_path``; one process at a time may do so.
 
     Raises:
         OSError: If it cannot be written; then nothing is left behind.
@@ -33,7 +33,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file that the user named; several processes may at once.
+    """Write a file that the user named; concurrent processes may write the same one.
 
     Raises:
         FormatError: If it cannot be written; then nothing is left behind.
@@ -45,16 +45,15 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 
 def partial_path(path: Path) -> Path:
-    """Where a file is written before it takes its place."""
+    """Return the path where ``write_atomic`` writes a file before it replaces the old one."""
     return path.with_name(f".{path.name}.partial")
 
 
 @contextmanager
 def replacing_file(path: Path) -> Iterator[Path]:
-    """A file in a temporary folder beside ``path`` that takes its place if the block succeeds.
+    """Yield a path in a temporary folder whose file replaces ``path`` if the block succeeds.
 
-    Other processes may do the same at once, which ``write_atomic`` does not bear: its partial file
-    has a name by which a run knows its own.
+    Unlike ``write_atomic``, concurrent processes may write the same file.
 
     Raises:
         OSError: If it cannot be written; then nothing is left behind.
@@ -66,7 +65,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
 
 def write_cache_file(path: Path, content: str | bytes) -> None:
-    """Write a file of a cache, which several processes may do at once; makes its folder.
+    """Write a file of a cache and create its folder; concurrent processes may write the same one.
 
     Raises:
         OSError: If it cannot be written.
@@ -82,28 +81,32 @@ def _replace(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder against a second run; a killed one holds nothing.
+    """Lock a folder against other runs; the lock ends with its process.
 
     Raises:
-        FormatError: If another run holds it, or it cannot be written.
+        FormatError: If another run has locked it, or it cannot be written.
     """
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise FormatError(f"{folder} is being written by another run; wait for its end") from error
+        raise FormatError(
+            f"{folder} is being written by another run; wait until it ends"
+        ) from error
     except OSError as error:
         raise FormatError(f"cannot write to {folder}: {error.strerror}") from error
     try:
         yield
     finally:
-        (folder / LOCK).unlink(missing_ok=True)  # before the release: nobody holds it meanwhile
+        (folder / LOCK).unlink(
+            missing_ok=True
+        )  # before the release, when nobody else can have locked it
         lock.release()
 
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside ``folder`` that takes its place if the block succeeds."""
+    """Yield a temporary folder that replaces ``folder`` if the block succeeds."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -123,15 +126,15 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
 
 
 def _swap(folder: Path, partial: Path) -> None:
-    """Put ``partial`` in the place of ``folder``, which stays if that fails."""
-    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    old = aside / folder.name
+    """Replace ``folder`` by ``partial``; if that fails, ``folder`` stays."""
+    backup = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    old = backup / folder.name
     try:
         folder.rename(old)
         partial.rename(folder)
     except BaseException:
         if old.exists() and not folder.exists():
             old.rename(folder)
-        shutil.rmtree(aside)
+        shutil.rmtree(backup)
         raise
-    shutil.rmtree(aside)
+    shutil.rmtree(backup)

@@ -1,4 +1,4 @@
-"""``Robot`` to MuJoCo: MJCF text, and an ``MjSpec`` compiled from the same text."""
+"""Write a robot as MJCF text, or build an ``MjSpec`` from the same text."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from morphgen.formats.mjcf_elements import (
     joint_attributes,
     pose_attributes,
 )
+from morphgen.formats.quiet import log_mujoco_warnings
 from morphgen.formats.urdf_text import MUJOCO_BOUNDS
 from morphgen.model.dynamics import Actuation, actuation
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Joint, Link, Robot
 
+log_mujoco_warnings()
+
 TIMESTEP = 0.005
-"""Physics step of the written model, seconds."""
+"""Physics step of the written model [s]."""
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 """Geom groups; MuJoCo's viewers show groups 0 to 2."""
 _SITE_GROUP = 4
@@ -32,30 +35,29 @@ MJCF_COMPILER = {"angle": "radian", "inertiafromgeom": "false", **MUJOCO_BOUNDS}
 def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
     """Write a robot as MJCF; the same robot gives the same bytes.
 
-    Every link is a body of its name, the root welded to the world (a root named ``world``, a name
-    that MuJoCo keeps for itself, is the world body). Visual shapes are in group 2 and touch
-    nothing, collision shapes in group 3. Every independent joint has a position actuator of its
-    name, with the gains of ``morphgen.model.dynamics.actuation``, and the robot carries its own
-    weight (``gravcomp``), as the controllers of real arms see to it; mimic joints are equality
-    constraints, ignored pairs ``<exclude>``, frames sites; ``home`` is a keyframe.
+    Every link becomes a body of the same name, with the root welded to the world. A root named
+    ``world``, MuJoCo's reserved name, is the world body. Visual shapes are in group 2 without
+    contacts, collision shapes in group 3. Every independent joint has a position actuator of the
+    same name with the gains of ``morphgen.model.dynamics.actuation``. Gravity is compensated
+    (``gravcomp``), as by the controllers of real arms. Mimic joints are equality constraints,
+    ignored pairs are ``<exclude>``, frames are sites and ``home`` is a keyframe.
 
-    Numbers are written here with 12 significant digits. ``MjSpec.to_xml``, with its 6 digits,
-    moves a tool by micrometres and inertias by parts per million; so nothing goes through it.
+    Numbers have 12 significant digits. ``MjSpec.to_xml`` is not used because its 6 digits move a
+    tool by micrometres and change inertias by parts per million.
 
-    A massless link on a moving joint is refused by MuJoCo; the ``<compiler>`` bounds it at
-    1e-12 kg and 1e-14 kg m^2, far below any real part. What a motor adds to the inertia of a light
-    joint is armature. An effort of zero means, as in most URDFs that have it, that nobody filled it
-    in: the actuator has no limit.
+    MuJoCo refuses a massless link on a moving joint, so ``<compiler>`` bounds links at 1e-12 kg and
+    1e-14 kg m^2, far below any real part. Armature is the motor's share of a light joint's inertia.
+    An effort of zero counts as missing, as in most URDFs: the actuator has no limit.
 
     Args:
-        robot: The body.
-        mesh_file: File to write for a mesh, relative to the MJCF, such as ``meshes/hand.stl``.
-            The file must hold the mesh as the shape uses it: its part alone, scale applied.
+        robot: The robot.
+        mesh_file: Maps a mesh to its file relative to the MJCF, such as ``meshes/hand.stl``. The
+            file must contain the mesh as the shape uses it: only its part, with scale applied.
             MuJoCo reads STL of at most 200,000 faces and OBJ of any size.
 
     Raises:
         FormatError: If MJCF cannot express the robot: a link named ``world`` that is not a root
-            without mass, or limits without any room between them.
+            without mass, or limits with lower >= upper.
         MeshError: If a collision mesh cannot be read.
     """
     meshes = Meshes(mesh_file)
@@ -68,9 +70,9 @@ def to_spec(robot: Robot, mesh_file: MeshFile | None = None) -> mujoco.MjSpec:
     """Build an editable MuJoCo model, equal to what ``mjcf_text`` writes.
 
     Args:
-        robot: The body.
-        mesh_file: As for ``mjcf_text``; None puts the triangles themselves into the model, for
-            collision those of the convex hull.
+        robot: The robot.
+        mesh_file: As for ``mjcf_text``; None puts the triangles into the model, for collision
+            shapes those of the convex hull.
 
     Raises:
         FormatError: As ``mjcf_text``.
@@ -119,8 +121,8 @@ def _write_bodies(
         if link.name == "world":
             if i > 0 or (link.inertial is not None and link.inertial.mass > 0):
                 raise FormatError(
-                    f"robot {robot.name!r}: link 'world' is not a root without mass; MuJoCo keeps "
-                    "that name for the world, rename the link"
+                    f"robot {robot.name!r}: link 'world' is not a root without mass; MuJoCo "
+                    "reserves that name, rename the link"
                 )
             body = world
         else:
@@ -222,7 +224,7 @@ def _limits(joint: Joint) -> str | None:
     lower, upper = joint.limits
     if lower >= upper:
         raise FormatError(
-            f"joint {joint.name!r}: limits ({lower:g}, {upper:g}) leave no room to move; MJCF "
+            f"joint {joint.name!r}: limits ({lower:g}, {upper:g}) leave no range; MJCF "
             "needs lower < upper, or make the joint fixed"
         )
     return join(joint.limits)

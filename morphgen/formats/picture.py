@@ -1,4 +1,4 @@
-"""A picture of a robot, drawn without display or GPU."""
+"""Draw a robot without a display or GPU."""
 
 from __future__ import annotations
 
@@ -15,16 +15,21 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import MissingDependencyError
-from morphgen.formats.quiet import quiet
+from morphgen.formats.quiet import log_mujoco_warnings, quiet
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
 
 SIZE = (640, 480)
+"""Width and height of a picture [px]."""
 _OVERSAMPLING = 2
+"""Pixels that PyBullet draws per pixel and direction, against aliasing."""
 _FOV = 35.0
+"""Vertical field of view [deg]."""
 _YAW, _PITCH = 50.0, -20.0
+"""Direction of the camera [deg]."""
 _MARGIN = 0.92
+"""Share of the picture that the robot may fill."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +38,17 @@ class View:
 
     target: tuple[float, float, float]
     distance: float
-    """Metres."""
+    """Distance of the camera from the target [m]."""
 
 
 class GlContext(Protocol):
-    """What MuJoCo's OpenGL contexts have in common."""
+    """Interface of MuJoCo's OpenGL contexts."""
 
     def make_current(self) -> None:
-        """Draw here from now on."""
+        """Make this the context that OpenGL draws to."""
 
     def free(self) -> None:
-        """Give the context back."""
+        """Release the context."""
 
 
 def render(
@@ -53,16 +58,14 @@ def render(
     q: ArrayLike | None = None,
     size: tuple[int, int] = SIZE,
 ) -> Image.Image:
-    """Draw a robot as its files show it.
-
-    PyBullet's software renderer where PyBullet is installed, MuJoCo's otherwise.
+    """Draw a robot from its files, with PyBullet's software renderer or else with MuJoCo's.
 
     Args:
-        robot: The body that the files hold.
+        robot: The robot that the files describe.
         urdf: Its URDF.
         mjcf: Its MJCF.
         q: Configuration, shape (dof,); home by default.
-        size: Width and height, pixels.
+        size: Width and height [px].
 
     Raises:
         MissingDependencyError: If neither renderer works here.
@@ -75,7 +78,7 @@ def render(
 
 
 def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
-    """The closest view that holds the robot and its foot, both centred."""
+    """Return the closest view that shows all of the robot and its root's origin, centred."""
     T_root_link = forward_kinematics(robot, q)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
@@ -140,6 +143,7 @@ def _render_mujoco(
 ) -> Image.Image:
     import mujoco
 
+    log_mujoco_warnings()
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     data = mujoco.MjData(model)
     for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
@@ -174,7 +178,7 @@ def _render_mujoco(
 
 
 def gl_context(width: int, height: int) -> GlContext:
-    """An offscreen OpenGL context of MuJoCo's, by EGL or OSMesa.
+    """Create an offscreen OpenGL context of MuJoCo by EGL or OSMesa.
 
     Raises:
         MissingDependencyError: If neither is installed.
@@ -188,6 +192,6 @@ def gl_context(width: int, height: int) -> GlContext:
         else:
             return context
     raise MissingDependencyError(
-        "nothing can be drawn: there is no offscreen OpenGL (on Debian and Ubuntu: apt-get install "
+        "cannot draw: no offscreen OpenGL (on Debian and Ubuntu: apt-get install "
         "libegl1 libgl1-mesa-dri): " + "; ".join(reasons)
     )

@@ -1,8 +1,9 @@
-"""Keep what C code prints from the terminal."""
+"""Keep messages of C libraries out of the terminal and out of the current folder."""
 
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,9 +11,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what C code prints to the process's standard streams from the terminal.
+    """Discard what C code prints to stdout and stderr in this block.
 
-    Other threads are kept from printing, too.
+    The streams belong to the process, so the output of other threads is discarded, too.
     """
     saved = [os.dup(fd) for fd in (1, 2)]
     sink = os.open(os.devnull, os.O_WRONLY)
@@ -21,14 +22,22 @@ def quiet() -> Iterator[None]:
             os.dup2(sink, fd)
         yield
     finally:
-        _flush()
+        if os.name == "posix":
+            # C buffers output and would print it after the block. Python cannot flush C's buffers.
+            ctypes.CDLL(None).fflush(None)
         for fd, original in zip((1, 2), saved, strict=True):
             os.dup2(original, fd)
             os.close(original)
         os.close(sink)
 
 
-def _flush() -> None:
-    """Write what C keeps in its buffers, which it would else print when the process ends."""
-    if os.name == "posix":
-        ctypes.CDLL(None).fflush(None)
+def log_mujoco_warnings() -> None:
+    """Send MuJoCo's warnings to the logger ``morphgen.mujoco``.
+
+    Without a callback MuJoCo writes them to ``MUJOCO_LOG.TXT`` in the current folder and to stdout.
+    A callback that somebody else has set stays.
+    """
+    import mujoco
+
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(logging.getLogger("morphgen.mujoco").warning)

@@ -32,7 +32,7 @@ def read_file(path: Path) -> bytes:
 
     Raises:
         OSError: If it cannot be read.
-        RefusedError: If it is no regular file, or too large.
+        RefusedError: If it is not a regular file, or too large.
     """
     try:
         return read_bytes(path, MAX_FILE)
@@ -96,7 +96,7 @@ def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
         units: xacro's unit tags.
 
     Raises:
-        FormatError: If it is no valid YAML.
+        FormatError: If it is invalid YAML.
         RefusedError: If it is too large with all its aliases followed.
     """
 
@@ -117,9 +117,9 @@ def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
-        raise FormatError(f"{path}{place}: no valid YAML: {error.problem}") from error
+        raise FormatError(f"{path}{place}: invalid YAML: {error.problem}") from error
     except yaml.YAMLError as error:
-        raise FormatError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from error
+        raise FormatError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
     size_of(content)
     return content
 

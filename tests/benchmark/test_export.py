@@ -376,7 +376,7 @@ def test_loading_needs_no_torch(whole):
         ("build.json", None, r"is no built split: it has no build.json; morphgen split build"),
         ("SHA256SUMS", None, "is not finished: it has no SHA256SUMS; build it again"),
         ("robots.jsonl", None, "robots.jsonl: no such file"),
-        ("robots.jsonl", b"{\n", "robots.jsonl:1: no valid JSON"),
+        ("robots.jsonl", b"{\n", "robots.jsonl:1: invalid JSON"),
         ("robots.jsonl", b"[]\n", "robots.jsonl:1: expected an object with a name and a side"),
         ("robots.jsonl", b"\xff\n", "robots.jsonl: cannot be read"),
         ("robots.jsonl", b"", "tokens.npz is not of the robots in robots.jsonl"),

@@ -18,7 +18,7 @@ EXTRAPOLATION = ("split", "new", "extrapolation", "--train-category", "stick,nli
 EXTRAPOLATION += ("--test-category", "chain", "--train", "6")
 TRAPS = {
     "task": ("task: reach", "task: push", "the file was changed since it was written"),
-    "syntax": ("regime: ", "regime: [", "no valid YAML: "),
+    "syntax": ("regime: ", "regime: [", "invalid YAML: "),
     "key": ("body: ", "boddy: ", "unknown key 'boddy'; did you mean 'body'?"),
     "robot": ("size=0.1", "size=0.2", "the file was changed since it was written"),
 }

@@ -106,7 +106,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         write_bundle(arm(), tmp_path / "file" / "arm")
 
 
-@pytest.mark.parametrize(("content", "message"), [("{", "no valid JSON"), ('{"format": 99}', "99")])
+@pytest.mark.parametrize(("content", "message"), [("{", "invalid JSON"), ('{"format": 99}', "99")])
 def test_a_broken_card_is_refused(tmp_path, content, message):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     (folder / "card.json").write_text(content)

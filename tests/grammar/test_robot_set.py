@@ -253,7 +253,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
 
 def test_broken_settings_are_told(whole):
     (whole / SETTINGS).write_text("{")
-    with pytest.raises(FormatError, match=r"set\.json: no valid JSON"):
+    with pytest.raises(FormatError, match=r"set\.json: invalid JSON"):
         make_set(plan(whole), 8, make_serially)
 
 
@@ -341,6 +341,6 @@ def test_a_journal_of_anything_else_is_passed_over(whole, line):
 def test_settings_that_are_none_are_refused(whole, text):
     (whole / SETTINGS).write_text(text)
     with pytest.raises(
-        FormatError, match=r"set.json: (no valid JSON|is nested deeper|expected the settings)"
+        FormatError, match=r"set.json: (invalid JSON|is nested deeper|expected the settings)"
     ):
         make_set(plan(whole), 9, make_serially)

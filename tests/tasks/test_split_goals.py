@@ -310,7 +310,7 @@ def test_a_build_without_goals_says_how_to_get_them(home):
         ('"format": 1,', "", "not an index of goal sets: KeyError"),
         ('"goals": 12,', '"golas": 12,', "not an index of goal sets: TypeError"),
         ('"sets": [', '"sets": [3,', "not an index of goal sets: TypeError"),
-        ("{", "{{", "no valid JSON"),
+        ("{", "{{", "invalid JSON"),
         ('"task": "push"', '"task": "reach"', "gantry-cylinder.npz: no goal set for reach: 'poses"),
         ("train/gantry-cylinder", "train/gantry-cylinde", "gantry-cylinde.npz: no such file"),
         (

@@ -1,0 +1,33 @@
+"""MuJoCo's warnings are logged; they leave no file in the current folder of a user."""
+
+import subprocess
+import sys
+
+CODE = """
+import logging, sys
+import morphgen.formats.mjcf
+import mujoco
+
+logging.basicConfig(stream=sys.stdout, format="%(name)s %(levelname)s %(message)s")
+xml = "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(xml)
+data = mujoco.MjData(model)
+data.qvel[0] = float("nan")
+mujoco.mj_step(model, data)
+"""
+
+
+def test_a_warning_is_logged_and_writes_no_file(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert done.stdout.startswith("morphgen.mujoco WARNING Nan, Inf or huge value in QVEL")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_callback_of_the_user_stays(tmp_path):
+    code = "import mujoco; mujoco.set_mju_user_warning(lambda text: print('mine', text))\n" + CODE
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert done.stdout.startswith("mine Nan, Inf or huge value in QVEL")
