@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def bar(
     unit: str = "robot",
     total: int | None = None,
     layout: str | None = None,
+    delay: float = REDRAW_INTERVAL,
 ) -> Iterator[Bar]:
     """Yield a bar, which disappears at the end.
 
@@ -62,6 +63,7 @@ def bar(
         unit: Name of an item.
         total: Number of items; None if the updates tell it.
         layout: Format of the bar, as for tqdm.
+        delay: Time before the bar appears, so that quick commands do not flicker [s].
     """
     from tqdm import tqdm
 
@@ -69,12 +71,12 @@ def bar(
     with (
         tqdm(
             desc=title,
-            unit=unit,
+            unit=f" {unit}",
             total=total,
             bar_format=layout,
             file=sys.stderr,
             disable=hidden,
-            delay=REDRAW_INTERVAL,
+            delay=delay,
             leave=False,
         ) as shown,
         _redrawn(shown),
@@ -146,7 +148,8 @@ class TrainingProgress:
     """Shows the progress of trainings and evaluations, one after the other."""
 
     def __init__(self) -> None:
-        self._bar: tqdm[NoReturn] | None = None
+        self._shown = ExitStack()
+        self._shown.enter_context(status(argparse.Namespace(), "preparing"))
 
     def __call__(self, subrun: Subrun) -> ShowMetrics:
         """Begin with a subrun; return the function that shows its metrics."""
@@ -156,40 +159,30 @@ class TrainingProgress:
         name = subrun.config.source.member or subrun.config.source.name
         if not sys.stderr.isatty():
             return lambda report, num_updates: _print_update(name, report, num_updates)
-        total = subrun.config.num_updates * subrun.config.ppo.num_steps * subrun.config.num_envs
-        shown = self._bar = tqdm(
+        shown = tqdm(
             desc=name,
-            total=total,
+            total=subrun.config.num_updates * subrun.config.ppo.num_steps * subrun.config.num_envs,
             unit="step",
             unit_scale=True,
             file=sys.stderr,
             dynamic_ncols=True,
         )
+        self._shown.callback(shown.close)
         return lambda report, num_updates: _draw_update(shown, report)
 
     def evaluation(self, name: str) -> Progress:
         """Begin with an evaluation; return the function that shows how many episodes ended."""
-        from tqdm import tqdm
-
         self.close()
         if not sys.stderr.isatty():
             return _print_each_minute(name)
-        self._bar = tqdm(
-            desc=name,
-            unit="episode",
-            file=sys.stderr,
-            dynamic_ncols=True,
-            leave=False,
-            bar_format="{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]",
+        layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
+        return self._shown.enter_context(
+            bar(argparse.Namespace(), name, "episode", layout=layout, delay=0)
         )
 
-        return Bar(self._bar)
-
     def close(self) -> None:
-        """Finish the bar, if there is one."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
+        """Finish the bar that is shown."""
+        self._shown.close()
 
 
 def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, repeated
+from morphgen.cli.progress import status
 
 if TYPE_CHECKING:
     from morphgen.model.robot import Joint, Robot
@@ -44,12 +45,13 @@ def compose(args: argparse.Namespace) -> int:
     from morphgen.grammar.request import parse_words
 
     library = opt.library_of(args)
-    derivation, name = parse_words(args.words, library)
-    robot = compose(derivation, library, name if args.name is None else args.name)
-    if args.geometry == "primitive":
-        from morphgen.fitting.replace_collision import as_primitives
+    with status(args, "composing"):
+        derivation, name = parse_words(args.words, library)
+        robot = compose(derivation, library, name if args.name is None else args.name)
+        if args.geometry == "primitive":
+            from morphgen.fitting.replace_collision import as_primitives
 
-        robot = as_primitives(robot, library.folders)
+            robot = as_primitives(robot, library.folders)
     return _write_and_report(robot, args)
 
 
@@ -93,15 +95,16 @@ def import_robot(args: argparse.Namespace) -> int:
             f"--root {args.root}: no such folder; the link where the robot begins is named by "
             "--root-link"
         )
-    robot = import_robot(
-        args.file,
-        {name: value for name, _, value in pairs},
-        root=args.root,
-        root_link=args.root_link,
-        tool=args.tool,
-        name=args.name,
-        repair=not args.as_is,
-    )
+    with status(args, f"importing {args.file}"):
+        robot = import_robot(
+            args.file,
+            {name: value for name, _, value in pairs},
+            root=args.root,
+            root_link=args.root_link,
+            tool=args.tool,
+            name=args.name,
+            repair=not args.as_is,
+        )
     return _write_and_report(robot, args)
 
 
@@ -116,8 +119,9 @@ def _write_and_report(robot: Robot, args: argparse.Namespace) -> int:
     from morphgen.formats.data_files import read_json
 
     folder = bundle_folder(args.out, robot.name)
-    findings = check(robot)
-    write_bundle(robot, folder, findings, picture=not args.no_picture)
+    with status(args, f"checking and writing {folder}"):
+        findings = check(robot)
+        write_bundle(robot, folder, findings, picture=not args.no_picture)
 
     def text() -> str:
         lines = [
@@ -153,7 +157,8 @@ def list_parts(args: argparse.Namespace) -> None:
 
     from morphgen.grammar.catalogue import catalogue
 
-    rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
+    with status(args, "reading the parts"):
+        rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
     opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
 
 
@@ -174,7 +179,8 @@ def show(args: argparse.Namespace) -> None:
         raise CompositionError(
             f"{' '.join(args.words)}: {len(sources)} robots; name one, such as {sources[0].label}"
         )
-    robot = read_source(sources[0], opt.library_of(args), args.root)
+    with status(args, f"reading {sources[0].label}"):
+        robot = read_source(sources[0], opt.library_of(args), args.root)
     opt.print_result(args, _facts(robot), lambda: _tree(robot))
 
 

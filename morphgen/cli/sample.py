@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, repeated
 from morphgen.cli.grammar import GRAMMAR
-from morphgen.cli.progress import bar, track
+from morphgen.cli.progress import bar, status, track
 
 if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
@@ -103,7 +103,8 @@ def derive(args: argparse.Namespace) -> int:
         opt.print_result(args, str(derivation), lambda: outline(derivation))
         return 0
     path = args.robot / URDF
-    text = _replayed_urdf(args.robot, derivation, opt.library_of(args))
+    with status(args, "composing"):
+        text = _replayed_urdf(args.robot, derivation, opt.library_of(args))
     same = text == path.read_text(encoding="utf-8")
     opt.print_result(
         args, {"same": same}, lambda: f"{path}: {'the same bytes' if same else 'other bytes'}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
-from morphgen.cli.progress import training_progress
+from morphgen.cli.progress import status, training_progress
 from morphgen.rl.agents import AGENTS
 
 if TYPE_CHECKING:
@@ -114,11 +114,13 @@ SIDES = ["train", "test"]
 )
 def train(args: argparse.Namespace) -> None:
     """Train and print the paths of the checkpoints."""
-    from morphgen.rl.robot_source import other_side
+    with status(args, "loading"):
+        from morphgen.rl.robot_source import other_side
 
-    source = other_side(robots_to_train(args.words, args), args.on)
-    spec = agent_spec(args)
-    config = run_config(source, spec, args)
+    with status(args, "reading the robots"):
+        source = other_side(robots_to_train(args.words, args), args.on)
+        spec = agent_spec(args)
+        config = run_config(source, spec, args)
     _require_used(config, args)
     folder = args.out or Path("runs") / _folder_name(source) / str(spec) / f"seed{args.seed}"
     _train(folder, config, args)
