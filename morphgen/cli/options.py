@@ -50,7 +50,7 @@ JOBS_LIBRARY_JSON = (JOBS, *LIBRARY_JSON)
 ROOT_LIBRARY_JSON = (ROOT, *LIBRARY_JSON)
 BUNDLE_OUT = (
     path_option("--out", "DIR", "output folder", default=Path("robots")),
-    option("--name", help="name of the robot and of its folder (default: from its parts)"),
+    option("--name", help="name of the robot and of its folder (default: from its parts or file)"),
     NO_PICTURE,
 )
 WORKERS = number("--workers", "number of processes of PyBullet, or of threads of MuJoCo", default=1)

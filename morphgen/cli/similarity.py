@@ -25,7 +25,7 @@ LARGEST_MATRIX = 20
     "similarity",
     "compare robots: tokens, kinematic trees, workspaces",
     opt.ROBOTS,
-    option("--measure", choices=MEASURES, default="tree", help="one of %(choices)s"),
+    option("--measure", choices=MEASURES, default="tree", help="how the robots are compared"),
     path_option("--heatmap", "FILE.png", "draw the matrix"),
     path_option("--map", "FILE.png", "draw the robots by their distances"),
     path_option("--csv", "FILE", "write a row per pair of robots"),

@@ -25,7 +25,7 @@ SWITCHES = {
     "slow-critic": "compute returns with a moving average of the critic (default: on)",
     "discrete": "discrete actions (default: on if the task of all robots is reach)",
     "task-reweighting": "weight the robots randomly (default: off)",
-    "curriculum": "push: move the line from near to far during training (default: on)",
+    "curriculum": "push: move the target line from near to far during training (default: on)",
     "fixed-deviation": "keep the initial standard deviation of continuous actions (default: off)",
     "mask-morphology": "hide the robot's morphology from the agent (default: off)",
     "tool-position": "add the tool's position to the observations (default: off)",
@@ -153,7 +153,7 @@ def train(args: argparse.Namespace) -> None:
     ),
     on_off(
         "curriculum",
-        "push: move the line from near to far again (default: it stays at its final place)",
+        "push: move the target line from near to far again (default: it stays far)",
         default=False,
     ),
     *learning_options(30_000, 16),
