@@ -117,7 +117,7 @@ class Follow(Task):
     def sample(self, robot, config, *, obstacles, ground, seeds, identity):
         """Draw free configurations."""
         space = FreeSpace(Scene(robot, ground=ground))
-        q, tried = space.draw(config.num_goals, np.random.default_rng(seeds))
+        q, tried = space.sample(config.num_goals, np.random.default_rng(seeds))
         poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(q), 1))
         poses[:, :3] = frame_pose(robot, q)[:, :3, 3]
         return FollowSet(q=q, goal_poses=poses, tried=tried, accepted=len(q), **identity)

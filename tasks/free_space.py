@@ -1,4 +1,4 @@
-"""Which configurations are free of collisions in a scene."""
+"""Collision tests of configurations in a scene, and sampling of free configurations."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from morphgen.tasks.sim.base import Scene
 from morphgen.typing import Array
 
 TRIES = 1000
-"""Configurations tested for each free one that is needed, before giving up."""
+"""Configurations to test per required free one before giving up."""
 
 _GROUND_SIZE = (200.0, 200.0, 20.0)
-"""The ground is the top of a box, metres."""
+"""Size of the box whose top is the ground [m]."""
 _POINT = 1e-3
-"""Radius of the ball that stands for the point of the tool, metres."""
+"""Radius of the ball that represents the tool point [m]."""
 _CHUNK = 256
+"""Configurations drawn at a time; part of the random stream, so a change gives other goals."""
 _MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
     ("prismatic", (1.0, 0.0, 0.0)),
     ("prismatic", (0.0, 1.0, 0.0)),
@@ -36,26 +37,26 @@ _MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
     ("continuous", (0.0, 1.0, 0.0)),
     ("continuous", (1.0, 0.0, 0.0)),
 )
-"""Joints that put the block anywhere: x, y, z, then yaw, pitch and roll."""
+"""Kinds and axes of the block's virtual joints: x, y, z, then yaw, pitch and roll."""
 _AWAY = (0.0, 0.0, 1e4, 0.0, 0.0, 0.0)
-"""Where the block is when it is asked for nowhere."""
+"""Positions of the block's virtual joints when there is no pose of it: far above everything."""
 
 
 class FreeSpace:
     """A scene's robot, ground and obstacles, compiled once and tested at many configurations.
 
-    A configuration is free if nothing penetrates (deeper than ``self_collision.PENETRATION``):
-    links each other, but for ``untested_pairs``; links the ground, but for the root link and
-    those fixed to it; any link an obstacle. Nor is the point of the tool in an obstacle, also where
-    no link is, as between the fingers of a hand. The block, which can be pushed, is an obstacle
-    where a pose of it is given, and nowhere else; it may stand on the ground, or in it.
+    A configuration is free if none of these pairs penetrates deeper than
+    ``self_collision.PENETRATION``: two links, except for ``untested_pairs``; a link and the ground,
+    except for the root link and links fixed to it; a link and an obstacle; the tool point and an
+    obstacle (the point may be where no link is, as between the fingers of a hand). The block counts
+    as an obstacle where its pose is given; it may stand on the ground, or in it.
     """
 
     def __init__(self, scene: Scene) -> None:
         """Compile.
 
         Args:
-            scene: Robot, where its root is, ground, obstacles and block.
+            scene: Robot with the pose of its root, ground, obstacles and block.
 
         Raises:
             MeshError: If a collision mesh cannot be read.
@@ -68,12 +69,12 @@ class FreeSpace:
         self._tested = SelfCollisionChecker(_with_surroundings(scene, self._obstacles, self._block))
 
     def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
-        """Whether configurations are free.
+        """Return which configurations are free.
 
         Args:
-            q: Independent joint positions, shape (n, dof), rad or m.
+            q: Independent joint positions, shape (n, dof) [rad or m].
             blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7); where
-                it penetrates an obstacle or the root link, nothing is free.
+                it penetrates an obstacle or the root link, no configuration is free.
 
         Returns:
             Shape (n,).
@@ -84,11 +85,11 @@ class FreeSpace:
         """
         return np.array([not found for found in self._each(q, blocks)], dtype=np.bool_)
 
-    def room(self, blocks: ArrayLike) -> NDArray[np.bool_]:
-        """Whether the block penetrates nothing that stands still: no obstacle and no base.
+    def block_is_clear(self, blocks: ArrayLike) -> NDArray[np.bool_]:
+        """Return at which poses the block penetrates neither an obstacle nor the robot's base.
 
         Args:
-            blocks: Its poses in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7).
+            blocks: Poses of the block in the world, (x, y, z, qw, qx, qy, qz), shape (n, 7).
 
         Returns:
             Shape (n,).
@@ -106,10 +107,10 @@ class FreeSpace:
         return np.array(clear, dtype=np.bool_)
 
     def obstacle_hits(self, q: ArrayLike) -> NDArray[np.bool_]:
-        """Which obstacles the robot penetrates, whatever else it does.
+        """Return which obstacles the robot penetrates, whatever else collides.
 
         Args:
-            q: Independent joint positions, shape (n, dof), rad or m.
+            q: Independent joint positions, shape (n, dof) [rad or m].
 
         Returns:
             Shape (n, number of obstacles).
@@ -121,28 +122,27 @@ class FreeSpace:
         hits = [[name in row for name in self._obstacles] for row in rows]
         return np.array(hits, dtype=np.bool_).reshape(len(rows), len(self._obstacles))
 
-    def draw(
+    def sample(
         self,
         n: int,
         rng: np.random.Generator,
-        counts: Callable[[Array], bool] = lambda q: True,
+        accept: Callable[[Array], bool] = lambda q: True,
     ) -> tuple[Array, int]:
-        """Draw free configurations, uniformly within the joint limits.
+        """Sample free configurations, uniformly within the joint limits.
 
-        The first few of many are the same as few; ``rng`` is left anywhere.
+        A smaller sample is the beginning of a larger one. ``rng`` advances by whole chunks.
 
         Args:
-            n: How many.
-            rng: Where they come from.
-            counts: Whether a free one, shape (dof,), counts; the others are drawn again.
+            n: Number of configurations.
+            rng: Source of random numbers.
+            accept: Further condition on a free configuration, shape (dof,).
 
         Returns:
-            The free ones that count in the order in which they were drawn, shape (n, dof), and how
-            many were tested until then.
+            The accepted configurations, shape (n, dof), and the number of tested ones.
 
         Raises:
-            BenchmarkError: If fewer are found in ``TRIES`` times n.
-            ValueError: If the limits of a joint are no range.
+            BenchmarkError: If ``TRIES`` times n configurations do not suffice.
+            ValueError: If the limits of a joint are not a range.
         """
         kept: list[Array] = []
         collisions: Counter[Pair] = Counter()
@@ -154,7 +154,7 @@ class FreeSpace:
             for row, found in zip(q, self._each(q), strict=True):
                 tried += 1
                 collisions.update(found.keys())
-                if not found and counts(row):
+                if not found and accept(row):
                     kept.append(row)
                     if len(kept) == n:
                         break
@@ -187,7 +187,7 @@ class FreeSpace:
         )
 
     def _placed(self, blocks: ArrayLike | None, n: int) -> Array:
-        """Positions of the block's joints, shape (n, 6), or (n, 0) if there is no block."""
+        """Return the block's virtual joint positions, shape (n, 6), or (n, 0) without a block."""
         if blocks is None:
             return np.tile(_AWAY, (n, 1)) if self.scene.block else np.zeros((n, 0))
         blocks = np.asarray(blocks, dtype=np.float64)
@@ -203,10 +203,10 @@ class FreeSpace:
 
 
 def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
-    """Find joints that are outside of their limits in configurations (n, dof).
+    """Find joints outside of their limits in configurations (n, dof).
 
     Yields:
-        The row of the configuration, and what is wrong with it.
+        The row of the configuration, and a description of the fault.
     """
     names = [robot.joints[k].name for k in robot.independent_joints]
     low, high = joint_limits(robot).T
@@ -216,11 +216,11 @@ def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
 
 
 def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Robot:
-    """The robot with ground, obstacles and block as links of its own, so that all are tested alike.
+    """Return the robot with ground, obstacles and block as further links, to be tested alike.
 
-    The ground is fixed to the root, and what is fixed to each other is never tested. An obstacle
-    is to be tested against the root too, so each is on a slide of its own, which stays at zero.
-    The block has joints that put it anywhere.
+    The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles
+    must be tested against the root too, so each is on a virtual slide that stays at zero. The block
+    has virtual joints for every direction.
     """
     robot = scene.robot
     links = {link.name for link in robot.links}

@@ -1,4 +1,4 @@
-"""Goal sets of robots: drawn once, kept in a cache, and stored as files of a split.
+"""Goal sets of robots: sampled once, kept in a cache, and stored as files of a split.
 
 A file has an array for each field; the same set gives the same bytes.
 """
@@ -42,24 +42,25 @@ def goal_set(
     cache: Path | None = None,
     shipped: GoalSet | None = None,
 ) -> GoalSet:
-    """Return a robot's goal set: one that came with a split, one from the cache, or a new one.
+    """Return a robot's goal set: the shipped one, the cached one, or a new one.
 
-    The same robot, pairs of links to ignore, seed, ground, constants and obstacles give the same
-    set, whatever the robot is called; fewer goals are the first of more.
+    A set depends on robot, ignored pairs of links, seed, ground, constants and obstacles, not on
+    the robot's name. A smaller set is the beginning of a larger one.
 
     Args:
         robot: The robot, with a tool.
         task: The task.
-        config: Its constants, among them the number of goals.
+        config: Constants of the task, such as the number of goals.
         obstacles: Whether there are obstacles.
-        seed: Seed of all that is drawn, at least 0.
-        ground: Height of the ground in the root frame, metres.
-        cache: Folder of stored sets; by default one in the user's cache.
-        shipped: The set to take, which must be the one that would be drawn.
+        seed: Seed of all random numbers, at least 0.
+        ground: Height of the ground in the root frame [m].
+        cache: Folder of stored goal sets; by default one in the user's cache.
+        shipped: Goal set that came with a split; it must be the one that would be sampled.
 
     Raises:
-        BenchmarkError: If the numbers are invalid, or the robot cannot have such a set.
-        TaskError: Likewise; or if the set's file is broken, or ``shipped`` is another set.
+        BenchmarkError: If a number is invalid, or the robot cannot have such a set.
+        TaskError: If the robot cannot have such a set, its file is broken, or ``shipped`` is
+            another set.
         MeshError: If a mesh cannot be read.
     """
     if seed < 0 or config.num_goals < 1:
@@ -77,8 +78,8 @@ def goal_set(
     if shipped is not None:
         if shipped.key != key:
             raise TaskError(
-                f"robot {robot.name!r}: the set that is shipped is of another body, seed, ground "
-                "or other constants of the task; morphgen split build --goals makes it anew"
+                f"robot {robot.name!r}: the shipped goal set is of another robot, seed, ground or "
+                "constants of the task; build it again: morphgen split build --goals"
             )
         return shipped
 
@@ -95,13 +96,13 @@ def goal_set(
     return _cached(kind, folder / f"{key}.npz", robot.name, sample)
 
 
-def set_npz(made: GoalSet) -> bytes:
-    """Return a set as the content of a file.
+def set_npz(goals: GoalSet) -> bytes:
+    """Return a goal set as the content of a file.
 
     Blocks are rows of 12: edges, pose (x, y, z, qw, qx, qy, qz), mass and friction.
     """
     content = io.BytesIO()
-    np.savez(content, **arrays_of(made))  # type: ignore[arg-type]  # they are not allow_pickle
+    np.savez(content, **arrays_of(goals))  # type: ignore[arg-type]  # they are not allow_pickle
     return content.getvalue()
 
 
@@ -109,18 +110,18 @@ def set_from_npz(content: bytes, kind: type[G]) -> G:
     """Read what ``set_npz`` wrote.
 
     Raises:
-        ValueError: If it is no such set; says why.
+        ValueError: If it is not such a set; with the reason.
     """
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as data:
-            return kind(**{each.name: _value(each.name, data[each.name]) for each in fields(kind)})
+            return kind(**{f.name: _value(f.name, data[f.name]) for f in fields(kind)})
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise ValueError(str(error)) from error
 
 
-def arrays_of(made: GoalSet) -> dict[str, NDArray[Any]]:
+def arrays_of(goals: GoalSet) -> dict[str, NDArray[Any]]:
     """Return the fields of a set as arrays, by name; see ``set_npz``."""
-    return {each.name: _array(getattr(made, each.name)) for each in fields(made)}
+    return {field.name: _array(getattr(goals, field.name)) for field in fields(goals)}
 
 
 def goals_from_npz(content: bytes, task: str, path: Path) -> GoalSet:
@@ -132,44 +133,44 @@ def goals_from_npz(content: bytes, task: str, path: Path) -> GoalSet:
         path: Path of the file, for messages.
 
     Raises:
-        BenchmarkError: If it is no such set.
+        BenchmarkError: If it is not such a set.
         TaskError: If the task is unknown.
     """
     kind: type[GoalSet] = TASKS[task].goal_set_type
     try:
         goals = set_from_npz(content, kind)
     except ValueError as error:
-        raise BenchmarkError(f"{path}: no goal set for {task}: {error}") from error
+        raise BenchmarkError(f"{path}: not a goal set for {task}: {error}") from error
     shapes = goals.q.shape, goals.goal_poses.shape
     if len(shapes[0]) != 2 or shapes[1] != (shapes[0][0], 7):
         raise BenchmarkError(
-            f"{path}: configurations and poses are of shapes {shapes[0]} and {shapes[1]}"
+            f"{path}: configurations and poses have shapes {shapes[0]} and {shapes[1]}"
         )
     return goals
 
 
 def _cached(kind: type[G], path: Path, robot: str, sample: Callable[[], G]) -> G:
-    """Return a set from a cache, or sample it and keep it there.
+    """Return a goal set from the cache, or sample and store it.
 
-    Warns if the folder cannot be written. The file is named by the set's key.
+    Warns if it cannot be stored. The name of the file is the set's key.
 
     Raises:
         TaskError: If the file is broken, or of another set.
     """
     if path.is_file():
         try:
-            found = set_from_npz(path.read_bytes(), kind)
+            cached = set_from_npz(path.read_bytes(), kind)
         except (OSError, ValueError) as error:
-            raise TaskError(f"{path}: no {kind.__name__}: {error}; delete it") from error
-        if found.key != path.stem:
-            raise TaskError(f"{path}: a set of key {found.key}, not what its name says; delete it")
-        return replace(found, robot=robot)
-    made = sample()
+            raise TaskError(f"{path}: not a {kind.__name__}: {error}; delete it") from error
+        if cached.key != path.stem:
+            raise TaskError(f"{path}: its key is {cached.key}, not its name; delete it")
+        return replace(cached, robot=robot)
+    goals = sample()
     try:
-        write_cache_file(path, set_npz(made))
+        write_cache_file(path, set_npz(goals))
     except OSError as error:
-        warnings.warn(f"cannot keep a {kind.__name__} in {path}: {error.strerror}", stacklevel=3)
-    return made
+        warnings.warn(f"cannot store a {kind.__name__} in {path}: {error.strerror}", stacklevel=3)
+    return goals
 
 
 def _array(value: object) -> NDArray[Any]:

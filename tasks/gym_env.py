@@ -35,20 +35,27 @@ register_gym_envs()
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
-    """A robot at a task; ``gymnasium.make("morphgen/Reach-v0")`` makes one, and so for each task.
+    """A robot at a task, such as ``gymnasium.make("morphgen/Reach-v0")`` makes.
 
-    Observations are those of ``TaskBatch`` without what only a batch of several robots needs: no
-    padding, no masks, and no fields of other tasks. Tokens are (links, 48).
+    Observations are those of ``TaskBatch`` without padding, masks and fields of other tasks; tokens
+    have the shape (links, 48).
 
-    An action is a number for each joint that the task moves, in the order of their links: for reach
-    the joints on the way to the tool, for push fingers too. ``action_joints`` has their names,
-    ``action_links`` their links, the rows of the tokens. Continuous actions are shares of a joint's
-    largest step, in [-1, 1]; discrete ones are indices of ``morphgen.tasks.actions.BINS``.
+    An action has a number for each joint that the task controls, in the order of their links: for
+    reach the joints between root and tool, for push fingers too. Continuous actions are fractions
+    of a joint's largest step, in [-1, 1]; discrete ones are indices of
+    ``morphgen.tasks.actions.BINS``.
 
-    ``info`` has ``success``, ``distance``, ``score`` and ``terms`` (see ``Step``), and whether
-    links touch each other, ``self_collision``. Episodes end by themselves: no time limit is needed.
+    ``info`` has ``success``, ``distance``, ``score``, ``diverged`` and ``terms`` (see ``Step``),
+    and ``self_collision``: whether links collide with each other in this environment. Episodes end
+    by themselves: no time limit wrapper is needed.
 
-    ``reset(seed=s)`` begins the episodes that environment 0 of ``make_batch(..., seed=s)`` has.
+    ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
+
+    Attributes:
+        batch: The batch of one environment.
+        env_spec: Specification of the environment.
+        action_joints: Names of the joints that the entries of an action move.
+        action_links: Indices of the links of these joints, which are rows of the tokens.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -74,40 +81,41 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
-        """Set up.
+        """Load the robot, sample its goal set if it is not cached, and load the simulation.
 
         Args:
             task: Name of a task, such as ``reach`` or ``push``.
-            robot: A robot, or what ``load_robot`` knows: ``ur5-plane``, words of ``morphgen
-                compose``, a bundle's folder or a URDF, with fitted primitives as collision shapes.
+            robot: A robot, or a name that ``load_robot`` accepts: ``ur5-plane``, words of
+                ``morphgen compose``, a bundle's folder or a URDF. Its collision shapes are the
+                fitted primitives.
             sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
                 ``default_simulator()``.
-            obstacles: Whether there are any.
+            obstacles: Whether there are obstacles.
             kind: Actions are ``continuous`` or ``discrete``.
-            observe: Entries of observations that are not there by default.
-            contacts: What may touch what; by default everything.
+            observe: Optional entries of observations.
+            contacts: Pairs of things that collide; by default everything.
             config: Constants of the task.
-            goal_seed: Of goals, starts and obstacles.
-            cache: Folder of these; by default the user's.
+            goal_seed: Seed of goals, starts and obstacles.
+            cache: Folder of stored goal sets; by default one in the user's cache.
             library: Folders of your own parts.
             max_links: Number that link indices in tokens are relative to; by default the paper's
                 23, or the links of the robot if it has more.
             render_mode: ``rgb_array`` or None.
-            size: Width and height of what is rendered, pixels.
+            size: Width and height of rendered pictures [pixels].
 
         Raises:
-            TaskError: If an argument is none of the choices.
+            TaskError: If an argument is invalid.
             MorphgenError: As ``make_batch``.
         """
         if render_mode is not None and render_mode not in RENDER_MODES:
             hint = nearest(render_mode, RENDER_MODES)
             raise TaskError(f"unknown render mode {render_mode!r}{hint}")
         self._contacts = contacts or Contacts()
-        kind_of_config = TASKS[task].config_type
-        if config is not None and not isinstance(config, kind_of_config):
+        config_type = TASKS[task].config_type
+        if config is not None and not isinstance(config, config_type):
             raise TaskError(
                 f"{type(config).__name__} is not the config of {task}: expected "
-                f"{kind_of_config.__name__}"
+                f"{config_type.__name__}"
             )
         self.task = task
         self.render_mode, self._size = render_mode, size
@@ -128,33 +136,36 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             max_links=max_links,
         )
         self.env_spec = self.batch.specs[0]
-        own = self.env_spec.robot
+        robot_links = self.env_spec.robot.joints
         other_fields = set(STANDARD_FIELDS) - set(TASKS[task].fields)
         self._hidden = {field.name for field in other_fields}
         self.action_links: tuple[int, ...] = tuple(
             torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
         )
-        self.action_joints = tuple(own.joints[link - 1].name for link in self.action_links)
+        self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
         self._running = self._closed = self._was_reset = False
         self._last: RenderState | None = None
-        seen = self._seen(self.batch.observe())
+        first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
-            gym.Space[NumpyObservation], observation_space({k: v[None] for k, v in seen.items()})
+            gym.Space[NumpyObservation],
+            observation_space({k: v[None] for k, v in first.items()}, TASKS[task].fields),
         )
         self.action_space = action_space(kind, len(self.action_links))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NumpyObservation, dict[str, Any]]:
-        """Begin an episode; without a seed the next one, and the very first at random."""
+        """Begin an episode: the next one, or with a seed the first; the very first is random."""
         self._require_open()
         super().reset(seed=seed)
         if seed is None and not self._was_reset:
             seed = int(self.np_random.integers(2**63))
-        fresh = self._last is not None and seed is None
-        seen = self.batch.observe() if fresh else self.batch.reset(seed)
+        # Where an episode has ended, the batch has begun the next one already.
+        next_has_begun = self._last is not None and seed is None
+        observation = self.batch.observe() if next_has_begun else self.batch.reset(seed)
         self._running, self._last, self._was_reset = True, None, True
-        return self._seen(seen), {"self_collision": self._contacts.self_collision}
+        info = {"self_collision": self._contacts.self_collision}
+        return self._without_padding(observation), info
 
     def step(
         self, action: NDArray[Any]
@@ -162,24 +173,24 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         """Act for one control step.
 
         Raises:
-            TaskError: If the action is none, or no episode is running.
+            TaskError: If the action is invalid, or no episode is running.
             SimulationError: If the simulator failed.
         """
         self._require_open()
         if not self._running:
             raise TaskError("no episode is running; call reset()")
         actions = self._padded(action)
-        now = render_state(self.batch)
+        before = render_state(self.batch)
         step = self.batch.step(actions)
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         if terminated or truncated:
             self._running = False
-            self._last = _moved(now, step)
-        seen = self._seen(step.final_observation)
-        return seen, float(step.reward[0]), terminated, truncated, self._info(step)
+            self._last = _final_state(before, step)
+        observation = self._without_padding(step.final_observation)
+        return observation, float(step.reward[0]), terminated, truncated, self._info(step)
 
     def render(self) -> Frame | None:
-        """The environment as it is, (height, width, 3), if ``render_mode`` is ``rgb_array``."""
+        """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
         self._require_open()
         if self.render_mode is None:
             gym.logger.warn(
@@ -191,7 +202,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         return self._renderer.frame(self._last or render_state(self.batch))
 
     def close(self) -> None:
-        """Free everything; a second time does nothing."""
+        """Free everything; a second call does nothing."""
         self._closed = True
         self.batch.close()
         if self._renderer is not None:
@@ -202,18 +213,19 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             raise TaskError("this environment is closed")
 
     def _padded(self, action: NDArray[Any]) -> torch.Tensor:
-        """An action for every link, shape (1, L)."""
-        given = np.asarray(action)
+        """Return actions for all links, shape (1, L), from an action for the task's joints."""
+        action = np.asarray(action)
         expected = (len(self.action_links),)
-        if given.shape != expected:
+        if action.shape != expected:
             joints = ", ".join(self.action_joints)
-            raise TaskError(f"the action has shape {given.shape}; expected {expected}: {joints}")
-        actions = torch.zeros(self.batch.action_mask.shape, dtype=torch.from_numpy(given).dtype)
-        actions[0, list(self.action_links)] = torch.from_numpy(given)
+            raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
+        values = torch.from_numpy(action)
+        actions = torch.zeros(self.batch.action_mask.shape, dtype=values.dtype)
+        actions[0, list(self.action_links)] = values
         return actions
 
-    def _seen(self, observation: Observation) -> NumpyObservation:
-        """What is seen of a batch of one."""
+    def _without_padding(self, observation: Observation) -> NumpyObservation:
+        """Return the observation of a batch of one without padding, masks and foreign fields."""
         links = slice(len(self.env_spec.robot.links))
         rows: dict[str, Any] = {"tokens": links, "velocity": links}
         rows["previous_action"] = list(self.action_links)
@@ -234,7 +246,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         }
 
 
-def _moved(before: RenderState, step: Step) -> RenderState:
-    """Return the moment after a step, whatever episode has begun since."""
+def _final_state(before: RenderState, step: Step) -> RenderState:
+    """Return the state after an episode's last step, before the next one began."""
     block = None if before.block is None else step.block_pose[0].cpu().numpy()
     return replace(before, q=step.q[0, : len(before.q)].cpu().numpy(), block=block)

@@ -59,7 +59,7 @@ def draw_obstacles(
     drawn = CANDIDATES * count
     edges = rng.uniform(low, high, (drawn, 3)) * workspace(robot).reach
     turns = rng.uniform(-math.pi, math.pi, drawn)
-    q, _ = FreeSpace(Scene(robot, ground=ground)).draw(PROBES + drawn, rng)
+    q, _ = FreeSpace(Scene(robot, ground=ground)).sample(PROBES + drawn, rng)
     tools = frame_pose(robot, q[PROBES:], TOOL)
     boxes = [
         _box(place, edge, turn, ground)

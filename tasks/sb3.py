@@ -1,4 +1,4 @@
-"""A task batch as a vectorised environment of stable-baselines3."""
+"""A task batch as a vector environment of stable-baselines3."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ Indices = int | Iterable[int] | None
 
 
 def sb3_vector(batch: TaskBatch) -> SB3Vector:
-    """Return the batch as a ``VecEnv``, such as for stable-baselines3's ``PPO``."""
+    """Return the batch as a ``VecEnv``, for example for stable-baselines3's ``PPO``."""
     return SB3Vector(TaskVector(batch))
 
 
 class SB3Vector(VecEnv):
-    """Steps a ``TaskVector``, which it owns.
+    """A ``VecEnv`` that steps a ``TaskVector``, which it owns.
 
-    ``infos`` are lists of dicts. Where an episode ended they have ``terminal_observation``,
-    ``TimeLimit.truncated`` (time ran out, so that the value of what was seen last counts) and
-    ``is_success``; always ``distance`` and ``score``.
+    Every info has ``distance`` and ``score``; where an episode ended also
+    ``terminal_observation``, ``TimeLimit.truncated`` (bootstrap from that observation's value),
+    ``is_success`` and ``diverged``.
     """
 
     def __init__(self, vector: TaskVector) -> None:
-        """Wrap environments, whose episodes begin anew at ``reset``."""
+        """Wrap environments; ``reset`` begins new episodes."""
         self.vector = vector
         self._actions: NDArray[Any] = np.zeros(0)
         super().__init__(
@@ -47,11 +47,11 @@ class SB3Vector(VecEnv):
         )
 
     def reset(self) -> dict[str, NDArray[Any]]:
-        """Begin an episode everywhere, with the seed if one was given."""
-        seen, _ = self.vector.reset(seed=self._seeds[0])
+        """Begin an episode in every environment, with the seed if one was set."""
+        observation, _ = self.vector.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
-        return seen
+        return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep actions for ``step_wait``."""
@@ -61,27 +61,27 @@ class SB3Vector(VecEnv):
         self,
     ) -> tuple[NumpyObservation, NDArray[Any], NDArray[np.bool_], list[dict[str, Any]]]:
         """Act for one control step."""
-        seen, reward, terminated, truncated, facts = self.vector.step(self._actions)
-        over = terminated | truncated
+        observation, reward, terminated, truncated, step_infos = self.vector.step(self._actions)
+        ended = terminated | truncated
         infos: list[dict[str, Any]] = [
             {"distance": distance, "score": score}
             for distance, score in zip(
-                facts["distance"].tolist(), facts["score"].tolist(), strict=True
+                step_infos["distance"].tolist(), step_infos["score"].tolist(), strict=True
             )
         ]
-        for env in np.flatnonzero(over):
-            infos[env]["terminal_observation"] = facts["final_obs"][env]
+        for env in np.flatnonzero(ended):
+            infos[env]["terminal_observation"] = step_infos["final_obs"][env]
             infos[env]["TimeLimit.truncated"] = bool(truncated[env])
-            infos[env]["is_success"] = bool(facts["success"][env])
-            infos[env]["diverged"] = bool(facts["diverged"][env])
-        return seen, reward, over, infos
+            infos[env]["is_success"] = bool(step_infos["success"][env])
+            infos[env]["diverged"] = bool(step_infos["diverged"][env])
+        return observation, reward, ended, infos
 
     def close(self) -> None:
         """Free the environments."""
         self.vector.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of the ``TaskVector``, which all environments share."""
+        """Return an attribute of the ``TaskVector``, which all environments share."""
         value = getattr(self.vector, attr_name)
         return [value for _ in self._get_indices(indices)]
 
@@ -89,7 +89,7 @@ class SB3Vector(VecEnv):
         """Set an attribute of the ``TaskVector``.
 
         Raises:
-            TaskError: If only some environments are to have it.
+            TaskError: If ``indices`` leaves some environments out.
         """
         self._require_all(attr_name, indices)
         setattr(self.vector, attr_name, value)
@@ -104,7 +104,7 @@ class SB3Vector(VecEnv):
         """Call a method of the ``TaskVector`` once, for all environments.
 
         Raises:
-            TaskError: If it is to be called for some environments only.
+            TaskError: If ``indices`` leaves some environments out.
         """
         self._require_all(method_name, indices)
         result = getattr(self.vector, method_name)(*method_args, **method_kwargs)
@@ -113,13 +113,15 @@ class SB3Vector(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
-        """No environment is."""
+        """Return False for each environment."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """None: a batch is not rendered."""
+        """Return None for each environment: a batch is not rendered."""
         return [None] * self.num_envs
 
     def _require_all(self, name: str, indices: Indices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
-            raise TaskError(f"{name}: environments of a batch have their attributes in common")
+            raise TaskError(
+                f"{name}: environments of a batch share their attributes; leave out indices"
+            )

@@ -79,9 +79,9 @@ class GoalSet(Protocol):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     start_belongs_to_goal: ClassVar[bool]
-    """Whether a goal is the same as another only if the configurations at the start are, too."""
+    """Whether two goals are the same only if their start configurations are the same, too."""
     not_compared: ClassVar[frozenset[str]]
-    """Fields that an audit certifies, and does not compare with those of a set drawn anew."""
+    """Fields that an audit certifies, but does not compare with those of a set sampled anew."""
 
     @property
     def robot(self) -> str:
@@ -89,15 +89,15 @@ class GoalSet(Protocol):
 
     @property
     def key(self) -> str:
-        """Hash of all that the set follows from: 64 hexadecimal digits."""
+        """Hash of everything that the set depends on: 64 hexadecimal digits."""
 
     @property
     def q(self) -> Array:
-        """Configurations at the start of episodes, shape (G, dof), rad or m."""
+        """Start configurations of episodes, shape (G, dof) [rad or m]."""
 
     @property
     def goal_poses(self) -> Array:
-        """A pose for each goal by which goals are told apart, shape (G, 7), xyz and wxyz."""
+        """Pose that identifies each goal, position and quaternion wxyz, shape (G, 7)."""
 
     @property
     def obstacles(self) -> tuple[Block, ...]:
@@ -105,7 +105,7 @@ class GoalSet(Protocol):
 
     @property
     def tried(self) -> int:
-        """Number of candidates that were tested."""
+        """Number of tested candidates."""
 
     @property
     def accepted(self) -> int:
@@ -113,7 +113,7 @@ class GoalSet(Protocol):
 
     @property
     def seed(self) -> int:
-        """Seed of all that was drawn."""
+        """Seed of the random numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,14 +173,14 @@ class Marker:
 
 @dataclass(frozen=True, eq=False)
 class TaskState:
-    """What a step is evaluated by: rows of k environments; positions in the root frame."""
+    """State after a step for its evaluation: rows of k environments; positions in root frames."""
 
     tool: torch.Tensor
-    """Position of the tool, shape (k, 3), metres."""
+    """Position of the tool, shape (k, 3) [m]."""
     block_pose: torch.Tensor
     """Pose of the block, shape (k, 7); zeros if there is none."""
     limit_violation: torch.Tensor
-    """Sum over joints of how far they are outside of their limits, shape (k,), rad and m."""
+    """Sum over joints of their distance outside of the limits, shape (k,) [rad and m]."""
     acceleration: torch.Tensor
     """Sum over joints of the absolute mean acceleration in the step, shape (k,)."""
     diverged: torch.Tensor
@@ -189,14 +189,14 @@ class TaskState:
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """How a step went: rows of k environments."""
+    """Result of a step: rows of k environments."""
 
     success: torch.Tensor
-    """Shape (k,), bool."""
+    """Whether the task is fulfilled, shape (k,), bool."""
     terminated: torch.Tensor
     """Whether the task ends the episode, shape (k,), bool."""
     distance: torch.Tensor
-    """Distance from success, shape (k,), metres."""
+    """Distance from success, shape (k,) [m]."""
     score: torch.Tensor
     """Score of the step, shape (k,); see ``Task.episode_score``."""
     terms: dict[str, torch.Tensor]
@@ -204,7 +204,7 @@ class StepResult:
 
 
 class TaskEnvs(ABC):
-    """The environments of one task in a batch, k rows; all methods but ``begin`` loop over none."""
+    """The environments of one task in a batch, k rows; only ``begin`` may loop over them."""
 
     @abstractmethod
     def begin(
@@ -213,8 +213,8 @@ class TaskEnvs(ABC):
         """Begin episodes.
 
         Args:
-            rows: Environments whose episodes begin, shape (m,), int64, each from 0 to k - 1.
-            random: A stream of random numbers for each of these.
+            rows: Indices below k of environments whose episodes begin, shape (m,), int64.
+            random: Random number generator of each of these environments.
 
         Returns:
             Joint positions at the start, shape (m, J), and poses of the block, shape (m, 7), zeros
@@ -223,7 +223,7 @@ class TaskEnvs(ABC):
 
     @abstractmethod
     def evaluate(self, state: TaskState) -> StepResult:
-        """Return how a step went, and move on whatever follows time."""
+        """Return the result of a step, and advance whatever depends on time."""
 
     @abstractmethod
     def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -238,15 +238,15 @@ class TaskEnvs(ABC):
         return {}
 
     def advance(self, progress: float) -> None:
-        """Follow the curriculum, if there is one; progress of the training is from 0 to 1."""
+        """Advance the curriculum, if there is one; progress of the training is from 0 to 1."""
         return
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return what the next episodes follow from, besides random numbers; k rows each."""
+        """Return the state that the next episodes depend on besides random numbers; k rows each."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Take over what ``state_dict`` returned."""
+        """Restore what ``state_dict`` returned."""
         return
 
 
@@ -262,21 +262,21 @@ class Task(ABC, Generic[C, G]):
     config_type: type[C]
     goal_set_type: type[G]
     goal_format: int
-    """Version of ``sample``, part of every key; raise it when other sets are drawn."""
+    """Version of ``sample``, part of every key; increase it when sampled sets change."""
     cache_folder: str
     """Name of the folder of goal sets in the user's cache."""
     fields: tuple[ObservationField, ...]
     """Observation fields that the task fills."""
     moves_fingers: bool = False
-    """Whether actions move joints beyond the tool, too."""
+    """Whether actions also move joints beyond the tool."""
     discrete_actions: bool = False
-    """Whether agents act by bins unless asked for numbers."""
+    """Whether agents use discrete actions by default."""
     relative_to_random: bool = True
-    """Whether the reported score is what is above that of the random policy."""
+    """Whether the reported score is the difference from the random policy's score."""
     relative_distance: bool = True
-    """Whether the distance at the end is also reported relative to the robot's reach."""
+    """Whether the final distance is also reported relative to the robot's reach."""
     target: str = "goal"
-    """Noun for what ``StepResult.distance`` is the distance from."""
+    """Noun for the thing that ``StepResult.distance`` is measured from."""
     goal_files_readme: str = ""
     """Lines of Markdown that explain the arrays of a stored goal set."""
 
@@ -291,14 +291,14 @@ class Task(ABC, Generic[C, G]):
         seeds: np.random.SeedSequence,
         identity: Mapping[str, Any],
     ) -> G:
-        """Draw a robot's goal set.
+        """Sample a robot's goal set.
 
         Args:
             robot: The robot, with a tool.
             config: Constants of the task.
             obstacles: Whether there are obstacles.
             ground: Height of the ground in the root frame, metres.
-            seeds: Where all random numbers come from.
+            seeds: Source of all random numbers.
             identity: The fields ``robot``, ``key`` and ``seed`` of the set.
 
         Raises:
@@ -308,12 +308,12 @@ class Task(ABC, Generic[C, G]):
 
     @abstractmethod
     def certify(self, goals: G, robot: Robot, scene: Scene) -> list[str]:
-        """Test the goals of a set; return what is wrong, a line each.
+        """Test the goals of a set; return its faults, a line each.
 
         Args:
             goals: The set.
             robot: The robot.
-            scene: Where it stands, with the obstacles of the set.
+            scene: Its scene, with the obstacles of the set.
         """
 
     @abstractmethod
@@ -327,15 +327,15 @@ class Task(ABC, Generic[C, G]):
         """
 
     def check(self, robot: Robot, config: C) -> None:
-        """Refuse constants or robots that have no goal set, before anything is drawn.
+        """Refuse robots that cannot have a goal set, before anything is sampled.
 
         Raises:
-            TaskError: If a constant is out of its range.
+            TaskError: If the robot does not suit the constants.
             BenchmarkError: If the robot's tool does not move.
         """
 
     def key_parts(self, config: C) -> list[object]:
-        """Return what the goal set follows from besides robot, obstacles, seed and ground."""
+        """Return what the goal set depends on besides robot, obstacles, seed and ground."""
         return [config.num_goals]
 
     def scene(self, robot: Robot, goals: G, ground: float) -> Scene:

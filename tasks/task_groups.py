@@ -1,4 +1,4 @@
-"""The environments of a batch, grouped by task: each task sees rows of its own alone."""
+"""The environments of a batch grouped by task, so that each task evaluates only its own."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from morphgen.tasks.task import (
 
 @dataclass(frozen=True, eq=False)
 class BatchResult(StepResult):
-    """How a step went, for all environments of a batch."""
+    """Results of a step for all environments of a batch."""
 
     reward: torch.Tensor
-    """Sum of the terms, shape (n,)."""
+    """Sum of the reward terms, shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,14 @@ class _Group:
 
 
 class TaskGroups:
-    """The environments of a batch by task; tensors of the batch have n rows."""
+    """The environments of a batch by task; tensors of the batch have n rows.
+
+    Attributes:
+        max_episode_steps: Time limit of episodes, shape (n,) [control steps].
+        moves_fingers: Whether actions move joints beyond the tool, shape (n,), bool.
+        observation_fields: The standard fields, and those that the tasks declare.
+        masks: Which environments have the fields of each mask, shape (n,) each, bool.
+    """
 
     def __init__(
         self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, num_joints: int
@@ -49,7 +56,7 @@ class TaskGroups:
         """Group environments.
 
         Args:
-            specs: Specifications.
+            specs: Specifications of environments.
             env_robot_index: Index of each environment's specification, shape (n,), int64.
             num_joints: Independent joints of a row, padding included.
 
@@ -62,9 +69,7 @@ class TaskGroups:
         self._row = torch.zeros(n, dtype=torch.int64, device=device)
         """Row of each environment in its group."""
         self.max_episode_steps = torch.zeros(n, dtype=torch.int64, device=device)
-        """Time limit of episodes, shape (n,) [control steps]."""
         self.moves_fingers = torch.zeros(n, dtype=torch.bool, device=device)
-        """Whether actions move joints beyond the tool, shape (n,)."""
         for name in dict.fromkeys(spec.task for spec in used):
             own = [i for i, spec in enumerate(specs) if spec.task == name]
             task, config = TASKS[name], specs[own[0]].config
@@ -81,12 +86,11 @@ class TaskGroups:
             self.max_episode_steps[rows] = config.max_episode_steps
             self.moves_fingers[rows] = task.moves_fingers
         every = (field for group in self._groups.values() for field in group.task.fields)
-        self._fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *every)))
+        self.observation_fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *every)))
         self.masks = {
             mask: torch.zeros(n, dtype=torch.bool, device=device)
-            for mask in dict.fromkeys(field.mask for field in self._fields)
+            for mask in dict.fromkeys(field.mask for field in self.observation_fields)
         }
-        """Which environments have the fields of a mask, shape (n,) each."""
         for group in self._groups.values():
             for field in group.task.fields:
                 self.masks[field.mask][group.rows] = True
@@ -112,7 +116,7 @@ class TaskGroups:
             random: A stream of random numbers for each environment of the batch.
 
         Yields:
-            For each task, which rows of ``envs`` it has, and what ``TaskEnvs.begin`` returns.
+            For each task, its rows in ``envs``, and the result of ``TaskEnvs.begin``.
         """
         for name, group in self._groups.items():
             rows = torch.nonzero(self.task_mask(name)[envs])[:, 0]
@@ -149,7 +153,7 @@ class TaskGroups:
         )
 
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the observation fields of all tasks, shape (n, size) each, in own memory.
+        """Return the observation fields of all tasks, shape (n, size) each, as copies.
 
         Args:
             block_pose: Pose of the block, shape (n, 7); zeros if there is none.
@@ -157,16 +161,16 @@ class TaskGroups:
         n = len(self._row)
         values = {
             field.name: torch.zeros(n, field.size, device=self._row.device)
-            for field in self._fields
+            for field in self.observation_fields
         }
         for group in self._groups.values():
             alone = len(self._groups) == 1
-            seen = group.envs.observe(block_pose if alone else block_pose[group.rows])
-            for name, own in seen.items():
+            task_values = group.envs.observe(block_pose if alone else block_pose[group.rows])
+            for name, value in task_values.items():
                 if alone:
-                    values[name] = own.clone()
+                    values[name] = value.clone()
                 else:
-                    values[name][group.rows] = own
+                    values[name][group.rows] = value
         return values
 
     def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:
@@ -175,7 +179,7 @@ class TaskGroups:
         return group.envs.marker_poses(int(self._row[env]))
 
     def advance(self, progress: float) -> None:
-        """Follow the curricula; progress of the training is from 0 to 1."""
+        """Advance the curricula; the progress of the training is from 0 to 1."""
         for group in self._groups.values():
             group.envs.advance(progress)
 
@@ -189,7 +193,7 @@ class TaskGroups:
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what ``state_dict`` returned."""
+        """Restore what ``state_dict`` returned."""
         for group in self._groups.values():
             own = {
                 name: state[name].to(self._row.device)[group.rows]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.observation import Observation
-from morphgen.tasks.task import BOUND
+from morphgen.tasks.task import BOUND, ObservationField
 
 _INFO_KEYS = ("success", "distance", "score", "diverged")
 """Fields of a ``Step`` in ``infos``, besides the terms."""
@@ -30,49 +30,58 @@ NumpyObservation = dict[str, Array]
 
 
 def numpy_observation(observation: Observation) -> NumpyObservation:
-    """An observation of n environments in NumPy: own memory, float32, masks as int8.
+    """Return the observation of n environments as NumPy copies: float32, masks as int8.
 
-    What has one number or none an environment gets an axis, so that every space is a vector; what
-    is empty, such as obstacles where there are none, is left out.
+    Entries with one number per environment get an axis, so that every space is at least a vector.
+    Empty entries, such as obstacles if there are none, are left out.
     """
-    found = {}
+    entries = {}
     for name, values in observation.items():
         wide = values.reshape(len(values), -1) if values.dim() == 1 else values
         if wide[0].numel():
             dtype = np.int8 if values.dtype == torch.bool else np.float32
-            found[name] = np.array(wide.cpu().numpy(), dtype=dtype)
-    return found
+            entries[name] = np.array(wide.cpu().numpy(), dtype=dtype)
+    return entries
 
 
-def observation_space(observation: NumpyObservation) -> spaces.Dict:
-    """The space of one environment of a batch that is observed so: boxes, and masks."""
-    made: dict[str, spaces.Space[Any]] = {}
+def observation_space(
+    observation: NumpyObservation, fields: Iterable[ObservationField]
+) -> spaces.Dict:
+    """Return the space of one environment from an observation of a batch: boxes, and masks.
+
+    Args:
+        observation: Observation of n environments.
+        fields: Observation fields of the tasks, which declare the bounds of their entries.
+    """
+    bounds = {field.name: (field.low, field.high) for field in fields}
+    entries: dict[str, spaces.Space[Any]] = {}
     for name, values in sorted(observation.items()):
         shape = values.shape[1:]
         if values.dtype == np.int8:
-            made[name] = spaces.MultiBinary(shape)
+            entries[name] = spaces.MultiBinary(shape)
         else:
-            made[name] = spaces.Box(-BOUND, BOUND, shape, np.float32)
-    return spaces.Dict(made)
+            low, high = bounds.get(name, (-BOUND, BOUND))
+            entries[name] = spaces.Box(low, high, shape, np.float32)
+    return spaces.Dict(entries)
 
 
 def action_space(kind: str, actions: int) -> spaces.Box | spaces.MultiDiscrete:
-    """The space of one environment's actions: shares of the joints' steps, or indices of bins."""
+    """Return the space of one environment's actions: fractions of joint steps, or bin indices."""
     if kind == "continuous":
         return spaces.Box(-1.0, 1.0, (actions,), np.float32)
     return spaces.MultiDiscrete([len(BINS)] * actions)
 
 
 class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
-    """A batch in NumPy. It owns the batch: ``close`` frees it.
+    """A batch with a NumPy interface. It owns the batch: ``close`` frees it.
 
     Observations are those of ``TaskBatch``, padded, float32; masks are int8, with at least one
-    axis; what is empty is left out. An action has a number for every link, (n, L), of which those
-    count that ``observation["actions"]`` marks: all bodies of a batch share this one space.
+    axis; empty entries are left out. An action has a number for every link, (n, L), of which those
+    count that ``observation["actions"]`` marks: all robots of a batch share this one space.
 
     Where an episode ends, the next begins in the same step (``AutoresetMode.SAME_STEP``):
-    ``infos["final_obs"]`` is then an array of observations, and of None where none ended, and
-    ``infos["final_info"]`` has the facts of the last step. Every step has ``success``,
+    ``infos["final_obs"]`` is then an array of observations, with None where no episode ended, and
+    ``infos["final_info"]`` has the infos of the last step. Every step has ``success``,
     ``distance``, ``score``, ``diverged`` and ``terms`` (see ``Step``), each with its mask, such as
     ``_success``: the environments whose episode goes on, or in ``final_info`` those whose episode
     ended.
@@ -81,10 +90,11 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(self, batch: TaskBatch) -> None:
-        """Wrap a batch, whose episodes begin anew at ``reset``."""
+        """Wrap a batch; ``reset`` begins new episodes."""
         self.batch, self.num_envs = batch, batch.num_envs
-        seen = numpy_observation(batch.observe())
-        self.single_observation_space = observation_space(seen)
+        self.single_observation_space = observation_space(
+            numpy_observation(batch.observe()), batch.groups.observation_fields
+        )
         self.single_action_space = action_space(batch.action_kind, batch.robot_tables.max_links)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -95,8 +105,9 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         """Begin an episode everywhere.
 
         Args:
-            seed: Of all episodes from now on, as ``make_batch`` has it; by default they go on.
-            options: None are known.
+            seed: Seed of all episodes from now on, as in ``make_batch``; by default the random
+                streams continue.
+            options: Unused.
         """
         self._require_open()
         super().reset(seed=seed)
@@ -106,21 +117,21 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         """Act for one control step.
 
         Raises:
-            TaskError: If the actions are none.
+            TaskError: If the actions are invalid.
             SimulationError: If the simulator failed.
         """
         self._require_open()
         step = self.batch.step(torch.from_numpy(np.array(actions)))
         terminated, truncated = _numpy(step.terminated), _numpy(step.truncated)
         over = terminated | truncated
-        infos = _facts(step, ~over)
+        infos = _infos(step, ~over)
         if over.any():
             final = np.full(self.num_envs, None, dtype=object)
             rows = numpy_observation(step.final_observation)
             for env in np.flatnonzero(over):
                 final[env] = {name: values[env].copy() for name, values in rows.items()}
             infos |= {"final_obs": final, "_final_obs": over.copy()}
-            infos |= {"final_info": _facts(step, over), "_final_info": over.copy()}
+            infos |= {"final_info": _infos(step, over), "_final_info": over.copy()}
         reward = _numpy(step.reward)
         return numpy_observation(step.observation), reward, terminated, truncated, infos
 
@@ -141,24 +152,23 @@ def task_vector(
     robots: Sequence[str | Path | Robot] = (),
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
-    """Make what ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, robots=[...])`` returns.
+    """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``.
 
     Args:
         num_envs: Number of environments.
         task: Name of the task.
-        robot: The robot of all environments, if ``robots`` names none.
+        robot: The robot of all environments, if ``robots`` is empty.
         robots: Robots; environment i has robot i modulo their number.
-        **options: As of ``make_batch``.
+        **options: Arguments of ``make_batch``.
     """
     return TaskVector(make_batch(task, robots or [robot], num_envs, **options))
 
 
-def _facts(step: Step, where: Array) -> dict[str, Any]:
-    """What is known of a step, each with the mask of the environments that it is known of."""
-    facts = {name: _numpy(getattr(step, name)) for name in _INFO_KEYS}
-    found = _masked(facts, where)
+def _infos(step: Step, where: Array) -> dict[str, Any]:
+    """Return the infos of a step, each with the mask of the environments that have it."""
+    infos = _masked({name: _numpy(getattr(step, name)) for name in _INFO_KEYS}, where)
     terms = _masked({name: _numpy(values) for name, values in step.terms.items()}, where)
-    return found | {"terms": terms, "_terms": where.copy()}
+    return infos | {"terms": terms, "_terms": where.copy()}
 
 
 def _masked(values: dict[str, Array], where: Array) -> dict[str, Any]:

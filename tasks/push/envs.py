@@ -1,4 +1,4 @@
-"""Environments that push, as tensors: starts, curriculum, rewards and score of every step."""
+"""Environments of push as tensors: starts, curriculum, rewards and scores of every step."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PushEnvs(TaskEnvs):
         self._size = torch.tensor([pushes.block.size for pushes in sets], device=device)[spec]
         self._middle = [(np.ptp(s.blocks[:, 0]) / 2 + s.blocks[:, 0].min(), s.ground) for s in sets]
         self.line = self._final_line.clone()
-        """y that the block must cross now, shape (k,), metres."""
+        """Current y that the block must cross, shape (k,) [m]."""
 
     def begin(
         self, rows: torch.Tensor, random: Sequence[np.random.Generator]
@@ -71,7 +71,7 @@ class PushEnvs(TaskEnvs):
         return {"line": np.array(pose, dtype=np.float32)}
 
     def advance(self, progress: float) -> None:
-        """Move the line as the curriculum has it; see ``curriculum_line``."""
+        """Move the line according to the curriculum; see ``curriculum_line``."""
         self.line = curriculum_line(self._config, self._final_line, progress)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
@@ -79,7 +79,7 @@ class PushEnvs(TaskEnvs):
         return {"line": self.line.clone()}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Put the line where it was."""
+        """Restore the position of the line."""
         self.line = state["line"].to(self.line, copy=True)
 
 
@@ -94,8 +94,8 @@ def push_terms(
 
     Args:
         config: Weights.
-        to_go: Distance of the block from the line, 0 beyond it, shape (k,), metres.
-        approach: Distance of tool and block, shape (k,), metres.
+        to_go: Distance of the block from the line, 0 beyond it, shape (k,) [m].
+        approach: Distance between tool and block, shape (k,) [m].
         limit_violation: See ``TaskState``, shape (k,).
         success: Whether the block is across, shape (k,), bool.
     """

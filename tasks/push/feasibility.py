@@ -1,4 +1,4 @@
-"""Feasibility of a push: a free way for the block, and configurations behind it and at the line."""
+"""Feasibility of a push: a clear path, and configurations behind the block and at the line."""
 
 from __future__ import annotations
 
@@ -19,50 +19,52 @@ from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 
 LAYOUTS = 8
-"""Number of obstacle layouts that are drawn before giving up."""
+"""Number of obstacle layouts to draw before giving up."""
 KEPT = 0.5
-"""Share of the ways clear without obstacles that must be left with them."""
+"""Fraction of the paths that are clear without obstacles that must stay clear with them."""
 BEHIND = (0.1, 0.4, 0.8, 1.2, 1.6)
-"""Distances of the tool behind the block's hindmost point, in edges; the first that is free counts.
-They go beyond the radius of the largest sphere, whose tool is at its bottom."""
+"""Distances of the tool behind the block's rearmost point, in block edges, in the order of trial.
+They exceed the radius of the largest sphere, whose tool is at its bottom."""
 CLOSE = 1e-3
-"""Largest distance of a tool from its goal along x and along y, metres."""
+"""Largest distance of a tool from its goal along x and along y [m]."""
 NEAREST = 12
-"""Number of configurations from which each goal of the tool is tried."""
+"""Number of nearest sampled configurations from which inverse kinematics starts."""
 
 _PROBES = 64
-"""Number of blocks by whose ways a layout of obstacles is tested."""
+"""Number of blocks whose paths test a layout of obstacles."""
 _SPACING = 0.125
-"""Distance of the block poses that are tested on a way, in edges of the block."""
+"""Distance of the tested poses on a path, in block edges."""
 _BANK = 2048
-_DRAWN = 65_536
-_ROUNDS = 8
+"""Number of free configurations to collect."""
+_DRAWN, _ROUNDS = 65_536, 8
+"""Configurations drawn per round, and number of rounds."""
 _LOW, _HIGH = 0.15, 0.85
-"""Range of heights of the tool, in edges of the block."""
+"""Range of heights of the tool, in block edges."""
 
 
 @dataclass(frozen=True, eq=False)
 class Feasibility:
-    """What a robot can do with n blocks; rows where it cannot are not finite."""
+    """Certificates of pushes of n blocks; rows of infeasible pushes are NaN."""
 
-    room: NDArray[np.bool_]
-    """Whether nothing that stands still is on the block's straight way, shape (n,)."""
+    path_is_clear: NDArray[np.bool_]
+    """Whether no obstacle or base is on the block's straight path, shape (n,)."""
     behind: Array
     """Free configurations with the tool behind the block, at its height, shape (n, dof)."""
     across: Array
-    """The same with the tool where the block's centre crosses the line, without the block."""
+    """Free configurations with the tool where the block's centre crosses the line, without the
+    block, shape (n, dof)."""
 
 
 class FeasibilityTest:
-    """Finds configurations near random free ones whose tools are where blocks will be."""
+    """Finds certificates of pushes, by inverse kinematics from sampled free configurations."""
 
     def __init__(self, space: FreeSpace, region: Region, rng: np.random.Generator) -> None:
-        """Collect free configurations whose tools are low and near the blocks.
+        """Sample free configurations whose tools are low and near the blocks.
 
         Args:
             space: The robot with its obstacles and block.
-            region: Where blocks start and end.
-            rng: Where configurations come from.
+            region: Region of the blocks.
+            rng: Source of random configurations.
         """
         self._space, self._region = space, region
         self._robot: Robot = space.scene.robot
@@ -73,57 +75,58 @@ class FeasibilityTest:
         self._bank, self._tools = sample_tools_in_box(space, low, high, rng)
 
     def __call__(self, blocks: Array) -> Feasibility:
-        """Test blocks.
+        """Find certificates for blocks.
 
         Args:
             blocks: Poses of blocks that stand on the ground, shape (n, 7).
         """
         n, edge = len(blocks), self._region.edge
-        room = path_is_clear(self._space, self._region, blocks)
+        clear = path_is_clear(self._space, self._region, blocks)
         behind, across = (np.full((n, self._robot.dof), np.nan) for _ in range(2))
         if len(self._bank):
             at_line = blocks[:, :2].copy()
             at_line[:, 1] = self._region.line
-            self._fill(across, room, at_line, None)
-            hindmost = blocks[:, 1] - edge / 2 * _extents(blocks)
+            self._fill(across, clear, at_line, None)
+            rear_y = blocks[:, 1] - edge / 2 * _extents(blocks)
             for distance in BEHIND:
-                place = np.stack([blocks[:, 0], hindmost - distance * edge], axis=1)
-                wanted = np.isfinite(across[:, 0]) & ~np.isfinite(behind[:, 0])
-                self._fill(behind, wanted, place, blocks)
-        return Feasibility(room, behind, across)
+                goals = np.stack([blocks[:, 0], rear_y - distance * edge], axis=1)
+                missing = np.isfinite(across[:, 0]) & ~np.isfinite(behind[:, 0])
+                self._fill(behind, missing, goals, blocks)
+        return Feasibility(clear, behind, across)
 
     def _fill(
-        self, found: Array, wanted: NDArray[np.bool_], places: Array, blocks: Array | None
+        self, q_out: Array, mask: NDArray[np.bool_], tool_xy: Array, blocks: Array | None
     ) -> None:
-        """Put free configurations whose tools are at places (n, 2) into rows that are wanted."""
-        rows = np.flatnonzero(wanted)
+        """Write free configurations with tools at ``tool_xy`` (n, 2) into the rows of a mask."""
+        rows = np.flatnonzero(mask)
         if not len(rows):
             return
         near, edge = min(NEAREST, len(self._bank)), self._region.edge
-        apart = np.linalg.norm(places[rows, None] - self._tools[None, :, :2], axis=2)
-        start = np.argsort(apart, axis=1, kind="stable")[:, :near].ravel()
+        distance = np.linalg.norm(tool_xy[rows, None] - self._tools[None, :, :2], axis=2)
+        start = np.argsort(distance, axis=1, kind="stable")[:, :near].ravel()
         height = np.clip(self._tools[start, 2] - self._ground, _LOW * edge, _HIGH * edge)
         goals = np.concatenate(
-            [np.repeat(places[rows], near, axis=0), self._ground + height[:, None]], axis=1
+            [np.repeat(tool_xy[rows], near, axis=0), self._ground + height[:, None]], axis=1
         )
         q, error = solve_position_ik(self._robot, self._bank[start], goals)
-        low = height - error[:, 2]
-        there = (np.abs(error[:, :2]) < CLOSE).all(axis=1) & (low > 0) & (low < edge)
-        tested = np.zeros(len(q), dtype=np.bool_)
-        of = None if blocks is None else np.repeat(blocks[rows], near, axis=0)[there]
-        tested[there] = self._space.free(q[there], of)
-        free = tested.reshape(len(rows), near)
+        tool_z = height - error[:, 2]
+        is_close = (np.abs(error[:, :2]) < CLOSE).all(axis=1)
+        reached = is_close & (tool_z > 0) & (tool_z < edge)
+        is_free = np.zeros(len(q), dtype=np.bool_)
+        poses = None if blocks is None else np.repeat(blocks[rows], near, axis=0)[reached]
+        is_free[reached] = self._space.free(q[reached], poses)
+        free = is_free.reshape(len(rows), near)
         first = free.argmax(axis=1)
         good = free.any(axis=1)
-        found[rows[good]] = q.reshape(len(rows), near, -1)[good, first[good]]
+        q_out[rows[good]] = q.reshape(len(rows), near, -1)[good, first[good]]
 
 
 def path_is_clear(space: FreeSpace, region: Region, blocks: Array) -> NDArray[np.bool_]:
-    """Return whether nothing that stands still is on the ways of blocks, also if they turn.
+    """Return whether the paths of blocks are clear of obstacles and base, even if they turn.
 
     Args:
-        space: Obstacles, base and block.
-        region: Where the ways end.
+        space: The robot with its obstacles and block.
+        region: Region of the blocks, where the paths end.
         blocks: Poses at the start, shape (n, 7).
 
     Returns:
@@ -132,9 +135,11 @@ def path_is_clear(space: FreeSpace, region: Region, blocks: Array) -> NDArray[np
     parts = int((region.line - region.y[0]) / (_SPACING * region.edge)) + 2
     turned = blocks.copy()
     turned[:, 3:] = yawed(_yaws(blocks) + np.pi / 4)
-    ways = np.tile(np.stack([blocks, turned]), (parts, 1, 1, 1))
-    ways[..., 1] = np.linspace(blocks[:, 1], region.line, parts)[:, None]
-    return np.asarray(space.room(ways.reshape(-1, 7)).reshape(-1, len(blocks)).all(axis=0))
+    poses = np.tile(np.stack([blocks, turned]), (parts, 1, 1, 1))
+    poses[..., 1] = np.linspace(blocks[:, 1], region.line, parts)[:, None]
+    return np.asarray(
+        space.block_is_clear(poses.reshape(-1, 7)).reshape(-1, len(blocks)).all(axis=0)
+    )
 
 
 def clear_obstacles(
@@ -145,33 +150,35 @@ def clear_obstacles(
     ground: float,
     seeds: np.random.SeedSequence,
 ) -> tuple[Block, ...]:
-    """Draw obstacles as ``draw_obstacles`` does that leave most ways of the block free.
+    """Draw obstacles as ``draw_obstacles`` does that leave most paths of the block clear.
 
     Args:
         robot: The robot.
-        config: How many obstacles, and of what size.
-        region: Where the block starts and ends.
-        block: Its size.
-        ground: Height of the ground in the root frame, metres.
-        seeds: Of all that is drawn.
+        config: Number and size of the obstacles.
+        region: Region of the block.
+        block: The block.
+        ground: Height of the ground in the root frame [m].
+        seeds: Source of all random numbers.
 
     Raises:
-        TaskError: If in each of ``LAYOUTS`` layouts less than ``KEPT`` of the ways are left.
+        TaskError: If each of ``LAYOUTS`` layouts leaves less than ``KEPT`` of the paths clear.
         BenchmarkError: If obstacles cannot be placed at all.
     """
-    of_probes, *layouts = seeds.spawn(LAYOUTS + 1)
-    probes = draw_blocks(region, ground, _PROBES, np.random.default_rng(of_probes))
+    probe_seeds, *layouts = seeds.spawn(LAYOUTS + 1)
+    probes = draw_blocks(region, ground, _PROBES, np.random.default_rng(probe_seeds))
 
-    def ways(placed: tuple[Block, ...]) -> int:
-        space = FreeSpace(Scene(robot, block=block, obstacles=placed, ground=ground))
+    def num_clear(obstacles: tuple[Block, ...]) -> int:
+        space = FreeSpace(Scene(robot, block=block, obstacles=obstacles, ground=ground))
         return int(path_is_clear(space, region, probes).sum())
 
-    needed = KEPT * ways(())
+    needed = KEPT * num_clear(())
     for layout in layouts:
         rng = np.random.default_rng(layout)
-        placed = draw_obstacles(robot, config.obstacles, config.obstacle_size, rng, ground=ground)
-        if ways(placed) >= needed:
-            return placed
+        obstacles = draw_obstacles(
+            robot, config.obstacles, config.obstacle_size, rng, ground=ground
+        )
+        if num_clear(obstacles) >= needed:
+            return obstacles
     raise TaskError(
         f"robot {robot.name!r}: each of {LAYOUTS} layouts of {config.obstacles} obstacles stands "
         f"in more than {1 - KEPT:.0%} of the block's ways: take fewer or smaller obstacles"
@@ -181,36 +188,38 @@ def clear_obstacles(
 def sample_tools_in_box(
     space: FreeSpace, low: Array, high: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Draw random free configurations whose tools are in a box.
+    """Sample free configurations whose tools are in a box.
 
     Args:
-        space: What is free; the block is nowhere.
-        low: Lowest corner of the box in the root frame, shape (3,), metres.
-        high: Its highest corner.
-        rng: Where configurations come from.
+        space: The robot with its obstacles, without a block.
+        low: Lowest corner of the box in the root frame, shape (3,) [m].
+        high: Highest corner of the box.
+        rng: Source of random configurations.
 
     Returns:
-        As many as are found soon: configurations, shape (n, dof), and their tools, (n, 3), metres.
+        Configurations, shape (n, dof), and tool positions, shape (n, 3) [m]; at most ``_BANK``, and
+        fewer if ``_ROUNDS`` rounds find fewer.
     """
     robot = space.scene.robot
-    kept, where = np.zeros((0, robot.dof)), np.zeros((0, 3))
+    kept, kept_tools = np.zeros((0, robot.dof)), np.zeros((0, 3))
     for _ in range(_ROUNDS):
         q = random_configurations(robot, _DRAWN, rng)
         tools = frame_positions(robot, np.ascontiguousarray(q.T)).T
         inside = np.flatnonzero(((tools > low) & (tools < high)).all(axis=1))[:_BANK]
         free = inside[space.free(q[inside])]
-        kept, where = np.concatenate([kept, q[free]]), np.concatenate([where, tools[free]])
+        kept = np.concatenate([kept, q[free]])
+        kept_tools = np.concatenate([kept_tools, tools[free]])
         if len(kept) >= _BANK:
             break
-    return kept[:_BANK], where[:_BANK]
+    return kept[:_BANK], kept_tools[:_BANK]
 
 
 def _yaws(blocks: Array) -> Array:
-    """Return rotations of blocks (n, 7) about z, shape (n,), rad."""
+    """Return rotations of blocks (n, 7) about z, shape (n,) [rad]."""
     return np.asarray(2 * np.arctan2(blocks[:, 6], blocks[:, 3]))
 
 
 def _extents(blocks: Array) -> Array:
-    """Return extents of blocks (n, 7) along y, in edges: from 1 to the square root of 2."""
+    """Return extents of blocks (n, 7) along y, in block edges: from 1 to the square root of 2."""
     yaw = _yaws(blocks)
     return np.asarray(np.abs(np.cos(yaw)) + np.abs(np.sin(yaw)))

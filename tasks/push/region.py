@@ -20,71 +20,72 @@ from morphgen.tasks.push.config import PushConfig
 from morphgen.typing import Array
 
 FULL_REACH = 0.4
-"""Robots that reach less have everything scaled down, metres."""
+"""Reach below which everything is scaled down in proportion [m]."""
 
-_SAMPLES = 16_384
+_SAMPLES, _SEED = 16_384, 0
+"""Number and seed of the configurations that sample the tool's range."""
 _LEVEL = 1e-3
-"""A tool whose height varies by less moves in a plane, metres."""
-_SEED = 0
+"""Variation of its height below which a tool moves in a plane [m]."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """Where a block starts and ends in the world, metres."""
+    """Where a block starts and ends, in the world."""
 
     edge: float
-    """Edge of the block, a cube."""
+    """Edge length of the block, a cube [m]."""
     scale: float
-    """1, or less for robots that reach less than ``FULL_REACH``."""
+    """Scale of lengths: 1, or less for robots that reach less than ``FULL_REACH``."""
     x: tuple[float, float]
+    """Range of x of the block's centre at the start [m]."""
     y: tuple[float, float]
-    """Ranges of x and y of the block's centre at the start."""
+    """Range of y of the block's centre at the start [m]."""
     line: float
-    """y that the block's centre must cross."""
+    """y that the block's centre must cross [m]."""
 
 
 def push_region(
     robot: Robot, config: PushConfig, ground: float, rng: np.random.Generator
 ) -> Region:
-    """Return the region of a robot's block, by how its tool moves.
+    """Return the region of a robot's block, which depends on how its tool moves.
 
     - Free robots, whose tool slides along two horizontal directions: the edge is in metres, x in
       ``config.free_x``.
     - Arms, whose tool slides along none and leaves every plane: the edge is relative to the
-      effective reach, x in ``config.arm_x`` of it beyond the shoulder.
-    - All others, such as a rod on one slide or a chain of links in a plane: x is anywhere that the
-      tool gets to at the height of the block while slides are at home, and it is left to proofs
-      where it can push. The edge is in metres if the tool slides, relative to the effective reach
-      if not.
+      effective reach, x in ``config.arm_x`` effective reaches beyond the shoulder.
+    - All others, such as a rod on one slide or a chain of links in a plane: x is anywhere the tool
+      can be at the height of the block while slides are at home; feasibility tests decide where it
+      can push. The edge is in metres if the tool slides, else relative to the effective reach.
 
-    y at the start is below ``config.start``, by ``config.start_depth`` at most, and the line is at
-    ``config.line``: in proportion less for bodies that reach under 0.4 m. The reach that counts is
-    the effective reach, or for bodies that slide half of their tool's range of y; where it slides
-    along one direction only, over the square root of 2, since it has to swing round the block.
+    y at the start is at most ``config.start_depth`` below ``config.start``, and the line is at
+    ``config.line``; both are scaled down in proportion for robots that reach less than 0.4 m. That
+    reach is the effective reach, or for robots that slide half of the range of y of the tool; for
+    slides along one direction only it is divided by the square root of 2, since the tool has to
+    swing around the block.
 
     Args:
-        robot: The body, with a tool.
-        config: The task.
-        ground: Height of the ground in the root frame, metres.
-        rng: Where the edge comes from.
+        robot: The robot, with a tool.
+        config: Constants of the task.
+        ground: Height of the ground in the root frame [m].
+        rng: Source of the random edge length.
 
     Raises:
-        TaskError: If the tool does not get down to the block, or not along y at all.
+        TaskError: If the tool cannot get down to the block, or cannot move along y.
         BenchmarkError: If the robot has no tool that moves.
     """
     space = workspace(robot)  # refuses a robot whose tool does not move
     tools = _tools(robot)
-    share = float(rng.uniform(*config.block_size))
+    size = float(rng.uniform(*config.block_size))
     slides = _directions(robot)
     if slides:
         reach = float(np.ptp(tools[1])) / 2 / (1.0 if slides == 2 else math.sqrt(2))
     else:
-        reach = effective_reach(space.reach, space.shoulder[2] - ground, share)
+        reach = effective_reach(space.reach, space.shoulder[2] - ground, size)
     if not reach > 0:
-        how = "does not move along y" if slides else "does not get down to the ground"
-        raise TaskError(f"robot {robot.name!r} cannot push: its tool {how}")
+        why = "does not move along y" if slides else "does not get down to the ground"
+        raise TaskError(f"robot {robot.name!r} cannot push: its tool {why}")
     scale = min(1.0, reach / FULL_REACH)
-    edge = share * (scale if slides else reach)
+    edge = size * (scale if slides else reach)
     if slides == 2:
         x = (config.free_x[0] * scale, config.free_x[1] * scale)
     elif not slides and np.ptp(tools[2]) > _LEVEL:
@@ -100,10 +101,10 @@ def draw_blocks(region: Region, ground: float, n: int, rng: np.random.Generator)
     """Draw poses of blocks that stand on the ground, uniform in the region and turned at random.
 
     Args:
-        region: Where they start.
-        ground: Height of the ground, metres.
-        n: Number of poses.
-        rng: Where they come from; the first of many are the same as few.
+        region: Region of the blocks.
+        ground: Height of the ground [m].
+        n: Number of poses; fewer are the beginning of more.
+        rng: Source of random numbers.
 
     Returns:
         Shape (n, 7).
@@ -124,21 +125,21 @@ def yawed(yaw: Array) -> Array:
     return np.where(q[:, :1] < 0, -q, q)
 
 
-def effective_reach(reach: float, height: float, share: float) -> float:
-    """Return how far from the shoulder's vertical an arm reaches the centre of a block.
+def effective_reach(reach: float, height: float, size: float) -> float:
+    """Return the largest horizontal distance from the shoulder to a block's centre in reach [m].
 
-    The block's edge is a share of this effective reach e, so its centre is ``share * e / 2`` above
-    the ground, and by Pythagoras e^2 + (height - share e / 2)^2 = reach^2; e is the larger root.
+    The block's edge is ``size`` times this effective reach e, so its centre is size e / 2 above the
+    ground, and by Pythagoras e^2 + (height - size e / 2)^2 = reach^2; e is the larger root.
 
     Args:
-        reach: Largest distance of the tool from the shoulder, metres.
-        height: Of the shoulder above the ground, metres.
-        share: The block's edge, relative to e.
+        reach: Largest distance of the tool from the shoulder [m].
+        height: Height of the shoulder above the ground [m].
+        size: Edge length of the block, relative to e.
 
     Returns:
-        Metres; 0 if the tool does not get down there.
+        The effective reach; 0 if the tool cannot get down to the block.
     """
-    a, b = 1 + share**2 / 4, height * share / 2
+    a, b = 1 + size**2 / 4, height * size / 2
     root = b**2 - a * (height**2 - reach**2)
     return max((b + math.sqrt(root)) / a, 0.0) if root >= 0 else 0.0
 
@@ -153,7 +154,7 @@ def _tools(robot: Robot, *, sliding: bool = True) -> Array:
 
 
 def _directions(robot: Robot) -> int:
-    """Return along how many horizontal directions the tool slides, all else at home."""
+    """Return the number of horizontal directions along which the tool slides, at home."""
     _, directions = joint_axes(robot, forward_kinematics(robot, np.array(robot.home)))
     axes = [
         directions[k + 1, :2]

@@ -1,4 +1,4 @@
-"""Push sets: poses of a block from which a robot can push it, each with its feasibility proof."""
+"""Push sets: poses of a block from which a robot can push it, with feasibility certificates."""
 
 from __future__ import annotations
 
@@ -21,46 +21,48 @@ from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 
 TRIES = 30
-"""Poses of the block tried for each start that is needed, before giving up."""
+"""Poses of the block to test per required start before giving up."""
 RESTS = 1e-6
-"""Largest height of a block above the ground that counts as standing on it, metres."""
+"""Largest height above the ground of a block that stands on it [m]."""
 
 _CHUNK = 32
+"""Poses of the block that are tested at a time."""
 _CONFIGURATIONS = 1000
+"""Free configurations to test for a start before giving up."""
 
 
 @dataclass(frozen=True, eq=False)
 class PushStartSet:
-    """Starts of a robot's episodes of push, and the block and obstacles that they share."""
+    """Starts of a robot's push episodes, and the block and obstacles that they share."""
 
     start_belongs_to_goal: ClassVar[bool] = True
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "behind", "across"))
 
     robot: str
     key: str
-    """Hash of all that the set follows from: 64 hexadecimal digits."""
+    """Hash of everything that the set depends on: 64 hexadecimal digits."""
     q: Array
-    """Free configurations at the start, shape (S, dof), rad or m."""
+    """Free configurations at the start, shape (S, dof) [rad or m]."""
     blocks: Array
-    """Poses of the block then in the world: (x, y, z, qw, qx, qy, qz), shape (S, 7)."""
+    """Poses of the block at the start in the world: (x, y, z, qw, qx, qy, qz), shape (S, 7)."""
     block: Block
-    """A cube; its own pose is that of the first start."""
+    """The block, a cube, at its pose in the first start."""
     line: float
-    """y that the block's centre must cross, metres."""
+    """y that the block's centre must cross [m]."""
     scale: float
-    """1, or less for robots that reach less than 0.4 m."""
+    """Scale of lengths: 1, or less for robots that reach less than 0.4 m."""
     ground: float
-    """Height of the ground, metres."""
+    """Height of the ground [m]."""
     obstacles: tuple[Block, ...]
     tried: int
-    """Number of poses of the block that were tested."""
+    """Number of tested poses of the block."""
     accepted: int
-    """Number of poses that are proven: S."""
+    """Number of feasible poses that became starts: S."""
     seed: int
     behind: Array
-    """Proofs: free configurations with the tool behind the block, at its height, (S, dof)."""
+    """Certificates: free configurations with the tool behind the block, at its height, (S, dof)."""
     across: Array
-    """Proofs: the same with the tool on the line, where the block's centre is to cross it."""
+    """Certificates: free configurations with the tool where the block's centre crosses the line."""
 
     @property
     def goal_poses(self) -> Array:
@@ -77,102 +79,102 @@ def sample_starts(
     seeds: np.random.SeedSequence,
     identity: Mapping[str, Any],
 ) -> PushStartSet:
-    """Draw a robot's push set; see ``Task.sample``.
+    """Sample a robot's push set; see ``Task.sample``.
 
-    Blocks stand on the ground where ``push_region`` has them, turned at random. A pose counts if
-    nothing that stands still, obstacle or base, is on the straight way along y across the line,
-    and if there are free configurations with the tool behind the block and with the tool on the
-    line, both at the height of the block. Configurations at the start are drawn uniformly within
-    the joint limits; what collides, also with the block, is drawn again.
+    Blocks stand on the ground in the ``push_region``, turned at random. A pose is feasible if no
+    obstacle or base is on the straight path along y across the line, and if there are free
+    configurations with the tool behind the block and with the tool on the line, both at the height
+    of the block. Start configurations are uniform within the joint limits; those that collide, also
+    with the block, are drawn again.
 
     Raises:
-        TaskError: If the robot cannot push, too few of the poses tried can be proven, or obstacles
-            stand in the way whatever is drawn.
+        TaskError: If the robot cannot push, too few poses are feasible, or every layout of
+            obstacles blocks most paths.
         BenchmarkError: If the robot has no tool that moves, or hardly a free configuration.
         MeshError: If a mesh cannot be read.
     """
-    of_region, of_proofs, of_places, of_starts, of_obstacles = seeds.spawn(5)
-    region = push_region(robot, config, ground, np.random.default_rng(of_region))
+    region_seeds, test_seeds, block_seeds, start_seeds, obstacle_seeds = seeds.spawn(5)
+    region = push_region(robot, config, ground, np.random.default_rng(region_seeds))
     edge = region.edge
     block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
-    placed: tuple[Block, ...] = ()
+    boxes: tuple[Block, ...] = ()
     if obstacles:
-        placed = clear_obstacles(robot, config, region, block, ground, of_obstacles)
-    space = FreeSpace(Scene(robot, block=block, obstacles=placed, ground=ground))
-    test = FeasibilityTest(space, region, np.random.default_rng(of_proofs))
-    kept, tried = _proven(robot, config.num_goals, region, test, ground, of_places)
-    blocks = np.array([each[0] for each in kept])
+        boxes = clear_obstacles(robot, config, region, block, ground, obstacle_seeds)
+    space = FreeSpace(Scene(robot, block=block, obstacles=boxes, ground=ground))
+    test = FeasibilityTest(space, region, np.random.default_rng(test_seeds))
+    kept, tried = _feasible(robot, config.num_goals, region, test, ground, block_seeds)
+    blocks, behind, across = (np.array(column) for column in zip(*kept, strict=True))
     return PushStartSet(
-        q=_starts(space, blocks, of_starts),
+        q=_starts(space, blocks, start_seeds),
         blocks=blocks,
         block=replace(block, pose=_pose(blocks[0])),
         line=region.line,
         scale=region.scale,
         ground=ground,
-        obstacles=placed,
+        obstacles=boxes,
         tried=tried,
         accepted=len(kept),
-        behind=np.array([each[1] for each in kept]),
-        across=np.array([each[2] for each in kept]),
+        behind=behind,
+        across=across,
         **identity,
     )
 
 
-def _proven(
+def _feasible(
     robot: Robot,
-    wanted: int,
+    needed: int,
     region: Region,
     test: FeasibilityTest,
     ground: float,
     seeds: np.random.SeedSequence,
 ) -> tuple[list[tuple[Array, Array, Array]], int]:
-    """Return poses of the block with their proofs, and how many were tried."""
+    """Return feasible poses with their certificates, and the number of tested poses."""
     rng = np.random.default_rng(seeds)
     kept: list[tuple[Array, Array, Array]] = []
     refused: Counter[str] = Counter()
     tried = 0
-    while tried < TRIES * wanted:
+    while tried < TRIES * needed:
         blocks = draw_blocks(region, ground, _CHUNK, rng)
-        found = test(blocks)
-        for place, room, behind, across in zip(
-            blocks, found.room, found.behind, found.across, strict=True
+        result = test(blocks)
+        for block, is_clear, behind, across in zip(
+            blocks, result.path_is_clear, result.behind, result.across, strict=True
         ):
             tried += 1
-            if not room:
+            if not is_clear:
                 refused["something stands in the block's way"] += 1
             elif not np.isfinite(across).all():
                 refused["the tool does not get to the line at its height"] += 1
             elif not np.isfinite(behind).all():
                 refused["the tool does not get behind it"] += 1
             else:
-                kept.append((place, behind, across))
-            if len(kept) == wanted:
+                kept.append((block, behind, across))
+            if len(kept) == needed:
                 return kept, tried
     reasons = ", ".join(f"{why} ({times / tried:.0%})" for why, times in refused.most_common())
     raise TaskError(
-        f"robot {robot.name!r} can hardly push: only {len(kept)} of {tried:,} places of a block of "
+        f"robot {robot.name!r} can hardly push: only {len(kept)} of {tried:,} poses of a block of "
         f"{region.edge:.3g} m with x in ({region.x[0]:.3g}, {region.x[1]:.3g}) and y in "
-        f"({region.y[0]:.3g}, {region.y[1]:.3g}) are proven (acceptance rate "
-        f"{len(kept) / tried:.2g}), {wanted} are needed; {reasons}"
+        f"({region.y[0]:.3g}, {region.y[1]:.3g}) are feasible (acceptance rate "
+        f"{len(kept) / tried:.2g}), {needed} are needed; {reasons}"
     )
 
 
 def _starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> Array:
     """Return a free configuration for each block, shape (n, dof); they do not depend on n."""
-    found = []
+    starts = []
     for block, child in zip(blocks, seeds.spawn(len(blocks)), strict=True):
         rng = np.random.default_rng(child)
         for _ in range(_CONFIGURATIONS):
-            q, _ = space.draw(1, rng)
+            q, _ = space.sample(1, rng)
             if space.free(q, block[None])[0]:
-                found.append(q[0])
+                starts.append(q[0])
                 break
         else:
             raise TaskError(
                 f"robot {space.scene.robot.name!r}: {_CONFIGURATIONS} free configurations all "
                 f"penetrate the block at ({block[0]:.3g}, {block[1]:.3g}, {block[2]:.3g})"
             )
-    return np.array(found)
+    return np.array(starts)
 
 
 def _pose(row: Array) -> Pose:
@@ -181,19 +183,19 @@ def _pose(row: Array) -> Pose:
 
 
 def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
-    """Test that every block can be pushed across the line, as far as configurations tell.
+    """Test that every block can be pushed across the line, by the configurations of the set.
 
-    Tool positions are MuJoCo's, not those of our kinematics, which the proofs were found with.
+    Tool positions are computed by MuJoCo, not by our kinematics, which found the certificates.
 
     Args:
         pushes: The set.
         robot: The robot.
-        scene: Its ground and obstacles; the block is the set's.
+        scene: Ground and obstacles; the block is the set's.
 
     Returns:
-        What is wrong, a line each: a block that does not stand on the ground, is past the line or
-        in what stands still; a configuration out of limits or in collision; a proof whose tool is
-        not behind the block, or not on the line; a set of another robot or other obstacles.
+        Faults, a line each: a block that does not stand on the ground, is past the line or in an
+        obstacle or the base; a configuration out of limits or in collision; a certificate whose
+        tool is not behind the block, or not on the line; a set of another robot or other obstacles.
 
     Raises:
         FormatError: If MJCF cannot express the robot.
@@ -210,20 +212,20 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
         7,
     ):
         shapes = ", ".join(str(q.shape) for q in (*configurations.values(), pushes.blocks))
-        return [f"arrays {shapes} are no starts of robot {robot.name!r} with {robot.dof} joints"]
+        return [f"arrays {shapes} are not starts of robot {robot.name!r} with {robot.dof} joints"]
     if not all(np.isfinite(q).all() for q in (*configurations.values(), pushes.blocks)):
         return ["not all numbers are finite"]
-    wrong = []
+    faults = []
     if scene.obstacles != pushes.obstacles:
-        wrong.append("the obstacles of the scene are not those of the push set")
+        faults.append("the obstacles of the scene are not those of the push set")
     for name, q in configurations.items():
-        wrong += [f"start {i}: {name}: {why}" for i, why in outside_limits(robot, q)]
+        faults += [f"start {i}: {name}: {why}" for i, why in outside_limits(robot, q)]
     space = FreeSpace(replace(scene, robot=robot, block=pushes.block))
-    wrong += _misplaced_blocks(pushes, space)
+    faults += _misplaced_blocks(pushes, space)
     for name, q in configurations.items():
         free = space.free(q, None if q is pushes.across else pushes.blocks)
-        wrong += [f"start {i}: {name} is in collision" for i in np.flatnonzero(~free).tolist()]
-    return [*wrong, *_misplaced_tools(pushes, robot)]
+        faults += [f"start {i}: {name} is in collision" for i in np.flatnonzero(~free).tolist()]
+    return [*faults, *_misplaced_tools(pushes, robot)]
 
 
 def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
@@ -233,7 +235,7 @@ def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
         yield f"start {i}: the block is {above[i]:.2g} m above the ground"
     for i in np.flatnonzero(pushes.blocks[:, 1] >= pushes.line).tolist():
         yield f"start {i}: the block is across the line already"
-    for i in np.flatnonzero(~space.room(pushes.blocks)).tolist():
+    for i in np.flatnonzero(~space.block_is_clear(pushes.blocks)).tolist():
         yield f"start {i}: the block is in an obstacle or the base"
 
 

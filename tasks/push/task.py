@@ -1,4 +1,4 @@
-"""Push as an object behind the protocol of tasks."""
+"""The task push."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from morphgen.tasks.push.envs import PushEnvs
 
 _LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002
+"""Size of the strip that shows the line [m]."""
 
 
 class Push(Task[PushConfig, PushStartSet]):
@@ -41,7 +42,7 @@ class Push(Task[PushConfig, PushStartSet]):
 """
 
     def key_parts(self, config: PushConfig) -> list[object]:
-        """Return the number of starts, and what they are drawn from."""
+        """Return the number of starts, and the constants that they depend on."""
         ranges = [*config.block_size, *config.arm_x, *config.free_x]
         numbers = [config.line, config.start, config.start_depth]
         numbers += [config.block_mass, config.friction]
@@ -57,13 +58,13 @@ class Push(Task[PushConfig, PushStartSet]):
         seeds: np.random.SeedSequence,
         identity: Mapping[str, Any],
     ) -> PushStartSet:
-        """Draw poses of the block that can be pushed; see ``sample_starts``."""
+        """Sample poses of the block that can be pushed; see ``sample_starts``."""
         return sample_starts(
             robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
         )
 
     def certify(self, goals: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
-        """Test every start and its proofs; see ``certify_starts``."""
+        """Test every start with its certificate; see ``certify_starts``."""
         return certify_starts(goals, robot, scene)
 
     def scene(self, robot: Robot, goals: PushStartSet, ground: float) -> Scene:
@@ -81,7 +82,7 @@ class Push(Task[PushConfig, PushStartSet]):
         return last
 
     def markers(self, config: PushConfig, goals: PushStartSet) -> tuple[Marker, ...]:
-        """Return a strip on the ground as long as the starts of the block are spread, and more."""
+        """Return a strip on the ground, longer than the starts of the block are spread."""
         length = float(np.ptp(goals.blocks[:, 0])) + 4 * max(goals.block.size)
         return (Marker("line", "box", (length, _LINE_WIDTH, _LINE_HEIGHT)),)
 

@@ -1,4 +1,4 @@
-"""Environments that reach, as tensors: goals, rewards and score of every step."""
+"""Environments of reach as tensors: goals, rewards and scores of every step."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ class ReachEnvs(TaskEnvs):
         sets = [each.goals for each in specs]
         for goals in sets:
             if len(goals.q) < 2:
-                raise TaskError(f"robot {goals.robot!r}: a goal set needs two goals")
+                raise TaskError(f"robot {goals.robot!r}: {len(goals.q)} goals; expected 2 or more")
         device = spec.device
         self._count = [len(goals.q) for goals in sets]
         self._q = padded_rows([goals.q for goals in sets], num_joints, device)
         self._poses = padded_rows([goals.goal_poses for goals in sets], 7, device)
         self.goal = torch.zeros(len(spec), 7, device=device)
-        """Wanted pose of the tool, shape (k, 7)."""
+        """Goal pose of the tool, shape (k, 7)."""
         self.goal_configuration = torch.zeros(len(spec), num_joints, device=device)
         """Joint positions that bring the tool to its goal, shape (k, J)."""
 
     def begin(
         self, rows: torch.Tensor, random: Sequence[np.random.Generator]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw starts and goals of the robots' sets, never the same one for both."""
+        """Draw a start and another goal of each robot's set."""
         spec = self._spec[rows]
         pairs = [
             stream.choice(self._count[i], size=2, replace=False)
@@ -81,8 +81,8 @@ def reach_terms(
     """Return the reward terms of reach (paper, tables of reward terms).
 
     Args:
-        config: Weights and the distance that is near.
-        distance: Distance of tool and goal, shape (k,), metres.
+        config: Weights, and the distance of success.
+        distance: Distance between tool and goal, shape (k,) [m].
         limit_violation: See ``TaskState``, shape (k,).
         acceleration: See ``TaskState``, shape (k,).
     """

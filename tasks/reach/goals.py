@@ -1,6 +1,6 @@
-"""Goal sets of reach: tool poses that are reachable, each with a configuration that proves it.
+"""Goal sets of reach: tool poses, each with a configuration that proves that it is reachable.
 
-The configurations are the starts of episodes, too.
+The configurations are also the starts of episodes.
 """
 
 from __future__ import annotations
@@ -23,26 +23,27 @@ from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 
 EXACT = 1e-6
-"""Largest deviation of a goal from the tool of its configuration, metres and of a quaternion."""
+"""Tolerance between a goal and the tool pose of its configuration [m, and of quaternions]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReachGoalSet:
-    """Goals of a robot, which are its starts too, and the obstacles that they are free of."""
+    """Goals of a robot, which are also its starts, and its obstacles."""
 
     start_belongs_to_goal: ClassVar[bool] = False
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot",))
 
     robot: str
     key: str
-    """Hash of all that the set follows from: 64 hexadecimal digits."""
+    """Hash of everything that the set depends on: 64 hexadecimal digits."""
     q: Array
-    """Free configurations in the main component of C-space, shape (G, dof), rad or m."""
+    """Free configurations in the main component of C-space, shape (G, dof) [rad or m]."""
     poses: Array
-    """Of the tool at them in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0, shape (G, 7)."""
+    """Tool poses of the configurations in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0,
+    shape (G, 7)."""
     obstacles: tuple[Block, ...]
     tried: int
-    """Number of random configurations that were tested."""
+    """Number of tested random configurations."""
     accepted: int
     """Number of configurations that became goals: G."""
     seed: int
@@ -62,42 +63,41 @@ def sample_goals(
     seeds: np.random.SeedSequence,
     identity: Mapping[str, Any],
 ) -> ReachGoalSet:
-    """Draw a robot's goal set; see ``Task.sample``.
+    """Sample a robot's goal set; see ``Task.sample``.
 
-    Configurations are drawn uniformly within the joint limits. One that collides, with the ground
-    and obstacles too, is drawn again, and so is one outside of the main component of free C-space
-    (see ``cspace_components``).
+    Configurations are uniform within the joint limits. Those that collide, also with the ground or
+    an obstacle, and those outside of the main component of free C-space (``cspace_components``) are
+    drawn again.
     """
-    of_goals, of_obstacles = (np.random.default_rng(child) for child in seeds.spawn(2))
-    placed: tuple[Block, ...] = ()
+    goals_rng, obstacles_rng = (np.random.default_rng(child) for child in seeds.spawn(2))
+    blocks: tuple[Block, ...] = ()
     if obstacles:
         count, size = config.obstacles, config.obstacle_size
-        placed = draw_obstacles(robot, count, size, of_obstacles, ground=ground)
-    space = FreeSpace(Scene(robot, obstacles=placed, ground=ground))
+        blocks = draw_obstacles(robot, count, size, obstacles_rng, ground=ground)
+    space = FreeSpace(Scene(robot, obstacles=blocks, ground=ground))
     planes = cspace_components(robot)
-    q, tried = space.draw(
-        config.num_goals, of_goals, lambda each: not in_other_component(planes, each).any()
+    q, tried = space.sample(
+        config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
     )
     poses = _vectors(frame_pose(robot, q, TOOL))
     return ReachGoalSet(
-        q=q, poses=poses, obstacles=placed, tried=tried, accepted=len(q), **identity
+        q=q, poses=poses, obstacles=blocks, tried=tried, accepted=len(q), **identity
     )
 
 
 def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
-    """Test that every goal can be taken.
+    """Test that every goal is reachable.
 
-    Tool poses are MuJoCo's, not those of our kinematics, which the goals are made with.
+    Tool poses are computed by MuJoCo, not by our kinematics, which the goals were made with.
 
     Args:
         goals: The set.
         robot: The robot.
-        scene: Where it stands, and among which obstacles.
+        scene: Pose of its root, ground and obstacles.
 
     Returns:
-        What is wrong, a line each: a configuration out of limits, in collision or in another
-        component of C-space, or whose tool is not at the goal; a set of another robot or other
-        obstacles.
+        Faults, a line each: a configuration out of limits, in collision, in another component of
+        C-space, or whose tool is not at the goal; a set of another robot or other obstacles.
 
     Raises:
         FormatError: If MJCF cannot express the robot.
@@ -105,30 +105,30 @@ def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
     """
     if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
         return [
-            f"configurations {goals.q.shape} and poses {goals.poses.shape} are no goals of robot "
+            f"configurations {goals.q.shape} and poses {goals.poses.shape} are not goals of robot "
             f"{robot.name!r} with {robot.dof} joints"
         ]
-    wrong = []
+    faults = []
     if scene.obstacles != goals.obstacles:
-        wrong.append("the obstacles of the scene are not those of the goal set")
-    wrong += [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
+        faults.append("the obstacles of the scene are not those of the goal set")
+    faults += [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
     usable = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
     free = FreeSpace(replace(scene, robot=robot)).free(goals.q[usable])
-    wrong += [f"goal {i}: its configuration is in collision" for i in usable[~free].tolist()]
+    faults += [f"goal {i}: its configuration is in collision" for i in usable[~free].tolist()]
     planes = cspace_components(robot)
     for i in usable[free].tolist():
         for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
             a, b = planes[k].pairs[0]
-            wrong.append(f"goal {i}: {a!r} and {b!r} touch on all ways to most others")
+            faults.append(f"goal {i}: {a!r} and {b!r} touch on every path to most others")
     tools = _vectors(MujocoKinematics(robot).frame_pose(goals.q[usable]))
     for i, tool in zip(usable.tolist(), tools, strict=True):
-        away, turned = _deviation(goals.poses[i], tool)
-        if not (away <= EXACT and turned <= EXACT):
-            wrong.append(
-                f"goal {i}: the tool of its configuration is {away:.2g} m away, and its quaternion "
-                f"{turned:.2g}"
+        distance, rotation = _deviation(goals.poses[i], tool)
+        if not (distance <= EXACT and rotation <= EXACT):
+            faults.append(
+                f"goal {i}: the tool of its configuration is {distance:.2g} m away, and its "
+                f"quaternion {rotation:.2g}"
             )
-    return wrong
+    return faults
 
 
 def _deviation(a: Array, b: Array) -> tuple[float, float]:
@@ -138,6 +138,6 @@ def _deviation(a: Array, b: Array) -> tuple[float, float]:
 
 
 def _vectors(T: Array) -> Array:
-    """Poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
+    """Return poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
     poses = [Pose.from_matrix(each) for each in T]
     return np.array([[*pose.position, *pose.quaternion] for pose in poses]).reshape(len(T), 7)

@@ -1,4 +1,4 @@
-"""Reach as an object behind the protocol of tasks."""
+"""The task reach."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Reach(Task[ReachConfig, ReachGoalSet]):
-    """Bring the tool to a goal, and keep it there for 6 s."""
+    """Bring the tool to a goal and keep it there, within 6 s."""
 
     name = "reach"
     config_type = ReachConfig
@@ -49,7 +49,7 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         seeds: np.random.SeedSequence,
         identity: Mapping[str, Any],
     ) -> ReachGoalSet:
-        """Draw free configurations; see ``sample_goals``."""
+        """Sample free configurations; see ``sample_goals``."""
         return sample_goals(
             robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
         )
@@ -65,7 +65,7 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         return ReachEnvs(specs, spec, num_joints)
 
     def markers(self, config: ReachConfig, goals: ReachGoalSet) -> tuple[Marker, ...]:
-        """Return a ball in which the tool is near, with axes of the wanted pose."""
+        """Return a ball with the radius of success, and axes of the goal pose."""
         return (Marker("goal", "frame", (2 * config.near,) * 3),)
 
 

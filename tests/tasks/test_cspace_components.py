@@ -89,7 +89,7 @@ def test_robots_as_they_are_have_none(words):
 
 def test_goals_are_on_the_larger_side(tmp_path):
     body = walled(ACROSS)
-    both, _ = FreeSpace(Scene(body)).draw(40, np.random.default_rng(0))
+    both, _ = FreeSpace(Scene(body)).sample(40, np.random.default_rng(0))
     assert 5 < (both[:, 0] > 0.5).sum() < 35
     goals = draw_goals(body, ReachConfig(num_goals=40), obstacles=False, seed=0, cache=tmp_path)
     assert (goals.q[:, 0] < 0.5).all()
@@ -102,7 +102,7 @@ def test_goals_are_on_the_larger_side(tmp_path):
 def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
     space = FreeSpace(Scene(walled(ACROSS)))
     with pytest.raises(BenchmarkError) as caught:
-        space.draw(1, np.random.default_rng(0), lambda q: False)
+        space.sample(1, np.random.default_rng(0), lambda q: False)
     said = re.search(
         r"only 0 of 1,000 .* free of collisions and (\d+) more are, but cut", str(caught.value)
     )
@@ -118,7 +118,7 @@ def test_a_certificate_notices_what_is_beyond(tmp_path):
     lines = certify_goals(goals, body, Scene(body))
     there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]
     assert there
-    said = "'ball' and 'base' touch on all ways to most others"
+    said = "'ball' and 'base' touch on every path to most others"
     assert [line for line in lines if "touch" in line] == [f"goal {i}: {said}" for i in there]
 
 

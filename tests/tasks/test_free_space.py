@@ -188,12 +188,12 @@ def plane_hits(scene, q):
 
 def test_draws_are_free_uniform_and_the_first_of_more():
     space = FreeSpace(Scene(aside()))
-    q, tried = space.draw(400, np.random.default_rng(0))
+    q, tried = space.sample(400, np.random.default_rng(0))
     assert q.shape == (400, 1)
     assert space.free(q).all()
     assert 400 / tried == pytest.approx(1.4 / 2, abs=0.05)
     assert np.histogram(q, 4, (-0.4, 1.0))[0] == pytest.approx(100, abs=35)
-    few, fewer = space.draw(30, np.random.default_rng(0))
+    few, fewer = space.sample(30, np.random.default_rng(0))
     assert (few == q[:30]).all()
     assert fewer < tried
 
@@ -201,7 +201,7 @@ def test_draws_are_free_uniform_and_the_first_of_more():
 def test_a_drawn_count_is_that_of_all_that_were_tested(monkeypatch):
     monkeypatch.setattr(module, "_CHUNK", 7)
     space = FreeSpace(Scene(aside()))
-    q, tried = space.draw(50, np.random.default_rng(0))
+    q, tried = space.sample(50, np.random.default_rng(0))
     all_drawn = random_configurations(aside(), tried, np.random.default_rng(0))
     verdicts = space.free(all_drawn)
     assert verdicts.sum() == 50
@@ -212,7 +212,7 @@ def test_a_drawn_count_is_that_of_all_that_were_tested(monkeypatch):
 def test_a_robot_that_is_never_free_is_named_with_what_collides(monkeypatch):
     monkeypatch.setattr(module, "TRIES", 20)
     with pytest.raises(BenchmarkError) as caught:
-        FreeSpace(Scene(aside(), Pose((0.0, 0.0, -3.0)))).draw(10, np.random.default_rng(0))
+        FreeSpace(Scene(aside(), Pose((0.0, 0.0, -3.0)))).sample(10, np.random.default_rng(0))
     text = str(caught.value)
     assert "'lift': only 0 of 200 random" in text
     assert "rate 0)" in text
@@ -259,14 +259,14 @@ def test_the_block_may_stand_on_the_ground_but_not_in_what_stands_still():
     space = pushed(obstacles=(wall,))
     expected = [True, True, False, False]
     assert space.free(np.zeros((4, 1)), blocks).tolist() == expected
-    assert space.room(blocks).tolist() == expected
+    assert space.block_is_clear(blocks).tolist() == expected
 
 
 def test_room_is_left_by_what_moves():
     space = pushed()
     in_ball, in_plate = block_at(0.5, 0.5), block_at(0.1, 0.1)
     assert not space.free([[0.0]], [in_ball])[0]
-    assert space.room([in_ball, in_plate]).tolist() == [True, False]
+    assert space.block_is_clear([in_ball, in_plate]).tolist() == [True, False]
 
 
 def test_the_point_of_a_tool_is_not_in_the_block():
@@ -298,6 +298,6 @@ def test_what_is_not_finite_is_not_free_but_an_error(value):
         with pytest.raises(ValueError, match="not finite"):
             space.free(q, blocks)
     with pytest.raises(ValueError, match="not finite"):
-        space.room(gone)
+        space.block_is_clear(gone)
     with pytest.raises(ValueError, match="not finite"):
         space.obstacle_hits(lost)

@@ -107,7 +107,7 @@ def test_obstacles_are_in_the_workspace_and_leave_the_robot_at_home(words, groun
         assert all(0.06 * reach <= edge <= 0.15 * reach for edge in box.size)
         assert box.pose.position[2] >= ground + box.size[2] / 2 - 1e-12
         assert np.linalg.norm(np.subtract(centre, box.pose.position)) <= reach
-    q, _ = FreeSpace(Scene(body, ground=ground)).draw(300, np.random.default_rng(9))
+    q, _ = FreeSpace(Scene(body, ground=ground)).sample(300, np.random.default_rng(9))
     assert space.free(q).mean() > KEPT - 0.15
 
 
@@ -115,7 +115,7 @@ def test_obstacles_that_leave_too_little_are_passed_over(body, monkeypatch):
     def left(share):
         monkeypatch.setattr(obstacles, "KEPT", share)
         boxes = draw_obstacles(body, 8, (0.5, 0.7), np.random.default_rng(0), ground=LIFTED)
-        q, _ = FreeSpace(Scene(body, ground=LIFTED)).draw(200, np.random.default_rng(1))
+        q, _ = FreeSpace(Scene(body, ground=LIFTED)).sample(200, np.random.default_rng(1))
         return FreeSpace(Scene(body, obstacles=boxes, ground=LIFTED)).free(q).mean()
 
     assert left(0.0) < 0.6
@@ -275,7 +275,7 @@ def test_a_broken_file_is_named(body, cache, keep):
     made(body, cache)
     (path,) = cache.iterdir()
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(TaskError, match=f"{path.name}: no ReachGoalSet: .*; delete it"):
+    with pytest.raises(TaskError, match=f"{path.name}: not a ReachGoalSet: .*; delete it"):
         made(body, cache)
 
 
@@ -299,7 +299,7 @@ def test_a_file_under_another_name_is_noticed(body, cache):
 
 def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot keep a ReachGoalSet"):
+    with pytest.warns(UserWarning, match="cannot store a ReachGoalSet"):
         found = made(body, tmp_path / "file" / "goals")
     assert len(found.q) == 12
 

@@ -69,7 +69,7 @@ def test_every_block_can_be_pushed_across(words, boxes, cache):
     for share in np.linspace(0, 1, 9):
         on_its_way = found.blocks.copy()
         on_its_way[:, 1] += share * (found.line - y)
-        assert space.room(on_its_way).all()
+        assert space.block_is_clear(on_its_way).all()
 
 
 @pytest.mark.parametrize("words", ARMS)
@@ -228,12 +228,12 @@ def test_a_broken_or_misnamed_file_is_named(cache):
     with pytest.raises(TaskError, match=f"a set of key {first.key}, not"):
         made("prims", cache, seed=1)
     paths[0].write_bytes(paths[0].read_bytes()[:-100])
-    with pytest.raises(TaskError, match=f"{paths[0].name}: no PushStartSet: .*; delete it"):
+    with pytest.raises(TaskError, match=f"{paths[0].name}: not a PushStartSet: .*; delete it"):
         made("prims", cache)
 
 
 def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot keep a PushStartSet"):
+    with pytest.warns(UserWarning, match="cannot store a PushStartSet"):
         found = made("prims", tmp_path / "file" / "pushes")
     assert len(found.q) == 5

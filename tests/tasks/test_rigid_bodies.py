@@ -45,5 +45,5 @@ def test_neighbours_are_ignored_whoever_reads_the_robot():
     made = load_robot("arm3-stick")
     bare = replace(made, ignore_pairs=())
     assert set(untested_pairs(bare)) <= set(untested_pairs(made)) == set(made.ignore_pairs)
-    _, tried = FreeSpace(Scene(bare, ground=-1.0)).draw(20, np.random.default_rng(0))
+    _, tried = FreeSpace(Scene(bare, ground=-1.0)).sample(20, np.random.default_rng(0))
     assert tried < 200
