@@ -1,4 +1,4 @@
-"""Pictures of similarity are the same bytes every time, and hold what was asked for."""
+"""Pictures of similarity are reproducible and complete."""
 
 import io
 import struct
@@ -41,7 +41,7 @@ def pixels(png):
 
 
 def chunks(png):
-    """Names of a PNG's chunks."""
+    """Return the names of a PNG's chunks."""
     found, at = [], 8
     while at < len(png):
         (size,) = struct.unpack(">I", png[at : at + 4])
@@ -58,7 +58,7 @@ def test_every_number_of_robots_can_be_drawn(n):
 
 
 @pytest.mark.parametrize("n", [2, MAX_NAMED + 1])
-def test_drawn_twice_it_is_the_same_picture(n):
+def test_pictures_are_reproducible(n):
     assert drawings(n) == drawings(n)
 
 
@@ -75,7 +75,7 @@ def test_the_users_settings_change_no_picture():
         assert matplotlib.rcParams["font.size"] == 20
 
 
-def test_bright_is_alike_whichever_way_a_measure_counts():
+def test_bright_cells_mean_similar_robots_for_every_measure():
     n = MAX_NAMED + 20
     half = np.arange(n) < n / 2
     apart = (half[:, None] != half).astype(float)
@@ -104,13 +104,13 @@ def test_names_of_a_map_are_written_up_to_a_number_of_robots():
     assert map_png(some, [map_panel(MAX_NAMED + 1)]) == map_png(others, [map_panel(MAX_NAMED + 1)])
 
 
-def test_names_are_no_formulas():
+def test_names_are_not_parsed_as_formulas():
     odd = ["$\\frac$", "a_b", "$", "\\alpha"]  # the first would be refused as one
     assert heatmap_png(odd, [panel(4)])
     assert map_png(odd, [map_panel(4)])
 
 
-def test_panels_stand_beside_each_other():
+def test_panels_are_drawn_side_by_side():
     one = pixels(heatmap_png(names(5), [panel(5)]))
     three = pixels(heatmap_png(names(5), [panel(5), panel(5, "cosine", True), panel(5)]))
     assert three.shape[0] == one.shape[0]
@@ -118,7 +118,7 @@ def test_panels_stand_beside_each_other():
     assert pixels(map_png(names(5), [map_panel(5)] * 2)).shape[1] == 1500
 
 
-def test_families_have_colours_of_their_own():
+def test_families_have_different_colours():
     points = map_panel(6)
     grey = pixels(map_png(list("abcdef"), [points]))
     coloured = pixels(map_png(["a-1", "a-2", "a-3", "b-1", "b-2", "c"], [points]))

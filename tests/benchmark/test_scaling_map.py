@@ -1,4 +1,4 @@
-"""Classical scaling finds a plane again, and says what it leaves out."""
+"""Classical multidimensional scaling recovers planar points and reports its share."""
 
 import numpy as np
 import pytest
@@ -39,13 +39,13 @@ def test_the_order_of_robots_only_reorders_the_points():
     np.testing.assert_allclose(other.points, found.points[shuffle], atol=1e-9)
 
 
-def test_what_does_not_fit_is_not_counted_as_kept():
+def test_the_share_of_the_variation_excludes_further_dimensions():
     box = np.array([[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)], dtype=float)
     found = classical_mds(apart(box))
     assert found.kept == pytest.approx((9 + 4) / (9 + 4 + 1))
 
 
-def test_distances_that_fit_into_no_space_count_against_the_map():
+def test_non_euclidean_distances_reduce_the_share():
     star = np.array([[0, 1, 1, 1], [1, 0, 2, 2], [1, 2, 0, 2], [1, 2, 2, 0]], dtype=float)
     values = np.linalg.eigvalsh(-(np.eye(4) - 0.25) @ (star**2) @ (np.eye(4) - 0.25) / 2)
     assert values.min() < -0.1
@@ -54,13 +54,13 @@ def test_distances_that_fit_into_no_space_count_against_the_map():
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_bodies_that_are_all_alike_are_one_point(n):
+def test_equal_robots_are_one_point(n):
     found = classical_mds(np.zeros((n, n)))
     np.testing.assert_array_equal(found.points, np.zeros((n, 2)))
     assert found.kept == 1.0
 
 
-def test_two_bodies_are_as_far_as_they_are():
+def test_the_distance_of_two_robots_is_exact():
     found = classical_mds([[0.0, 0.4], [0.4, 0.0]])
     np.testing.assert_allclose(found.points, [[0.2, 0.0], [-0.2, 0.0]], atol=1e-12)
 
@@ -77,6 +77,6 @@ def test_two_bodies_are_as_far_as_they_are():
         [[0, np.nan], [np.nan, 0]],
     ],
 )
-def test_what_are_no_distances_is_refused(wrong):
+def test_invalid_distances_are_an_error(wrong):
     with pytest.raises(ValueError, match="distances"):
         classical_mds(wrong)

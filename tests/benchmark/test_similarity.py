@@ -1,4 +1,4 @@
-"""Comparing robots by name, every pair once."""
+"""Similarity measures, matrices and distances."""
 
 import itertools
 from dataclasses import replace
@@ -44,7 +44,7 @@ def test_the_measures_are_named():
     assert all(name == measure.name for name, measure in MEASURES.items())
 
 
-def test_a_body_is_most_like_itself(some):
+def test_a_robot_is_most_similar_to_itself(some):
     for one in some:
         assert cosine(one, one) == pytest.approx(1)
         assert tree_distance(one, one) == 0
@@ -55,7 +55,7 @@ def test_a_body_is_most_like_itself(some):
         assert 0 <= workspace_overlap(one, other) < 0.999
 
 
-def test_the_cosine_is_that_of_flattened_padded_tokens_without_q():
+def test_the_cosine_uses_flattened_padded_tokens_without_q():
     robots = [morphgen.compose(request) for request in REQUESTS[:3]]
     flat = [
         pad_tokens(tokens(robot, token_shapes(robot)), 23)[0][:, :32].ravel() for robot in robots
@@ -66,7 +66,7 @@ def test_the_cosine_is_that_of_flattened_padded_tokens_without_q():
         assert found == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_pose_changes_no_tokens_but_home_changes_the_tree():
+def test_home_changes_the_tree_but_not_the_cosine():
     robot = arm()
     shapes = {link.name: link.collisions[0] for link in robot.links}
     bent = replace(robot, home=(1.4, 0.5, 0.01, 0.02))
@@ -76,7 +76,7 @@ def test_a_pose_changes_no_tokens_but_home_changes_the_tree():
     assert tree_distance(a, b) > 0.01
 
 
-def test_bodies_of_more_than_23_links_need_a_common_maximum():
+def test_robots_of_more_than_23_links_need_a_common_maximum():
     with pytest.raises(
         BenchmarkError, match=r"25 links, more than max_links 23; make max_links 25"
     ):
@@ -90,7 +90,7 @@ def test_bodies_of_more_than_23_links_need_a_common_maximum():
 
 
 @pytest.mark.parametrize("name", MEASURES)
-def test_a_matrix_is_symmetric_and_holds_what_the_measure_says(some, name):
+def test_a_matrix_is_symmetric_and_has_the_values_of_the_measure(some, name):
     values = similarity_matrix(some, name)
     function = MEASURES[name].function
     assert values.shape == (5, 5)
@@ -114,7 +114,7 @@ def test_every_pair_is_compared_once(some, monkeypatch):
     assert similarity_matrix([], "count").shape == (0, 0)
 
 
-def test_distances_are_zero_to_oneself_and_grow_as_bodies_differ(some):
+def test_distances_are_zero_on_the_diagonal_and_grow_with_dissimilarity(some):
     for name in MEASURES:
         values = similarity_matrix(some, name)
         apart = to_distances(values, name)
@@ -124,7 +124,7 @@ def test_distances_are_zero_to_oneself_and_grow_as_bodies_differ(some):
         assert (np.diff(apart[0, 1:][order]) >= 0).all()
 
 
-def test_an_unknown_measure_is_told_the_valid_ones(some):
+def test_an_unknown_measure_is_an_error_that_lists_the_valid_ones(some):
     for ask in (lambda: similarity_matrix(some, "cosin"), lambda: get_measure("cosin")):
         with pytest.raises(
             BenchmarkError, match=r"'cosin'; did you mean 'cosine'\? valid: cosine, tree, workspace"
@@ -132,7 +132,7 @@ def test_an_unknown_measure_is_told_the_valid_ones(some):
             ask()
 
 
-def test_what_has_no_features_is_refused(tmp_path):
+def test_robots_without_a_movable_tool_are_errors(tmp_path):
     robot = arm()
     with pytest.raises(BenchmarkError, match="no frame 'tool'"):
         features(replace(robot, frames=()), {})

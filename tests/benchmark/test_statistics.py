@@ -1,4 +1,4 @@
-"""A split in numbers, ours and the paper's."""
+"""Statistics of splits, and those of the paper."""
 
 from dataclasses import replace
 
@@ -51,19 +51,19 @@ def test_masses_reaches_and_cosines_have_mean_and_range():
         assert got == pytest.approx(expected, abs=5e-5)
 
 
-def test_a_body_at_two_tasks_is_two_robots_and_one_body():
+def test_a_robot_with_two_tasks_counts_twice():
     reaching = replace(member("cubes"), name="reaching", task="reach")
     found = statistics(split(["cubes", reaching], ["base=gantry ee=cube"]), LIBRARY)
     assert (found["train"]["robots"], found["train"]["bodies"]) == (2, 1)
 
 
-def test_processes_change_nothing():
+def test_the_number_of_processes_does_not_matter():
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["base=gantry ee=cube"])
     assert statistics(made, LIBRARY, jobs=2) == statistics(made, LIBRARY)
 
 
-def test_a_robot_that_cannot_be_composed_has_no_figures():
+def test_a_robot_that_cannot_be_composed_is_an_error():
     wrong = replace(member("cubes"), derivation="cubes=cubez")
     with pytest.raises(
         BenchmarkError, match=r"'mine/some': robot 'cubes': .*'cubez'; did you mean"
@@ -73,7 +73,7 @@ def test_a_robot_that_cannot_be_composed_has_no_figures():
         statistics(split(["cubes"], []), LIBRARY)
 
 
-def test_every_row_of_the_paper_has_scenarios_and_few_scenarios_no_row():
+def test_rows_of_the_paper_and_scenarios_match():
     sets = {robot_set(name) for name in split_names()}
     assert set(PAPER) <= sets
     assert sets - set(PAPER) == {"extrapolation/arms-small"}
@@ -82,6 +82,6 @@ def test_every_row_of_the_paper_has_scenarios_and_few_scenarios_no_row():
 
 
 @pytest.mark.parametrize("name", ["extrapolation/primitives/reach", "composition/ee-task"])
-def test_scenarios_of_templates_and_few_meshes_have_the_papers_counts(name):
+def test_scenarios_have_the_counts_of_the_paper(name):
     ours, theirs = statistics(read_split(name), LIBRARY)["train"], paper_row(name)
     assert (ours["links"], ours["movable"]) == (theirs.links, theirs.movable)

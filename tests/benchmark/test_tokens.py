@@ -1,4 +1,4 @@
-"""Tokens say what the robot is; padded, and in a file."""
+"""Encoding, padding and writing tokens."""
 
 import io
 import math
@@ -30,13 +30,13 @@ from morphgen.model.robot import Frame, Joint, Link, Robot
 
 
 def hinge(kind="revolute", limits=(-1.0, 1.0), **changes):
-    """A body of one joint."""
+    """A robot with one joint."""
     joint = Joint("j", kind, "a", "b", axis=(0, 0, 1), limits=limits, **changes)
     home = () if kind == "fixed" else (0.0,)
     return Robot("hinge", (Link("a"), Link("b")), (joint,), home=home)
 
 
-def test_the_fields_are_the_papers_in_order_and_size():
+def test_fields_have_the_order_and_size_of_the_paper():
     sizes = [field.size for field in LAYOUT]
     assert sizes == [1, 1, 4, 6, 7, 3, 7, 3, 16]
     assert [field.start for field in LAYOUT] == [sum(sizes[:i]) for i in range(len(sizes))]
@@ -79,7 +79,7 @@ def test_every_number_of_an_arm():
         (Box((0.1, 0.2, 0.3)), [0, 0, 1, 0.1, 0.2, 0.3]),
     ],
 )
-def test_a_primitive_is_a_one_hot_and_its_sizes(geometry, numbers):
+def test_a_primitive_is_encoded_as_one_hot_and_sizes(geometry, numbers):
     made = tokens(hinge(), {"b": Shape(geometry)})
     np.testing.assert_allclose(field_of(made, "geometry")[1], numbers)
     assert not field_of(made, "geometry")[0].any()
@@ -93,7 +93,7 @@ def test_poses_have_quaternions_with_positive_w():
         np.testing.assert_allclose(field_of(made, name)[1], [1, 2, 3, 0.5, -0.5, 0.5, -0.5])
 
 
-def test_axes_have_unit_length_and_fixed_joints_none():
+def test_axes_have_unit_length_and_are_zero_for_fixed_joints():
     made = tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(3, 0, 4)),)), {})
     np.testing.assert_allclose(field_of(made, "joint axis"), [[0, 0, 0], [0.6, 0, 0.8]])
     made = tokens(hinge("fixed"), {})
@@ -102,14 +102,14 @@ def test_axes_have_unit_length_and_fixed_joints_none():
     np.testing.assert_array_equal(field_of(made, "joint type"), [[0, 0, 1]] * 2)
 
 
-def test_the_flag_is_on_the_link_of_the_frame_tool_alone():
+def test_only_the_link_of_the_tool_frame_is_flagged():
     frames = (Frame("left_tool", "left"), Frame("tool", "right"), Frame("camera", "base"))
     flags = field_of(arm_tokens(frames=frames), "end-effector")
     assert flags.tolist() == [[0] * 4] * 5 + [[1] * 4]
     assert not field_of(arm_tokens(frames=frames[:1]), "end-effector").any()
 
 
-def test_indices_are_divided_by_the_largest_that_there_can_be():
+def test_indices_are_divided_by_the_largest_index():
     robot = arm()
     made = tokens(robot, {}, max_links=6)
     np.testing.assert_allclose(made[:, 0], [0, 0.2, 0.4, 0.6, 0.8, 1])
@@ -128,7 +128,7 @@ def test_indices_are_divided_by_the_largest_that_there_can_be():
         (hinge("revolute", (-6.4, 6.4)), [6.4, -3.2], [1, -0.5]),
     ],
 )
-def test_q_is_scaled_by_the_joints_range(robot, q, x):
+def test_q_is_normalized_by_the_joint_limits(robot, q, x):
     found = normalize_positions(robot, np.array(q)[:, None])
     np.testing.assert_allclose(found[:, 0], x, atol=1e-12)
 
@@ -141,7 +141,7 @@ def test_mimic_joints_follow_their_leader():
     np.testing.assert_allclose(x[:, 4], (-q[:, 3] + 0.02) / 0.02)
 
 
-def test_every_position_has_a_code_of_its_own():
+def test_position_codes_are_unique():
     x = np.linspace(-1, 1, 2001)
     code = encode_position(x)
     assert len({tuple(row) for row in code.round(6).tolist()}) == len(x)
@@ -201,12 +201,12 @@ def test_a_robot_of_one_link_has_one_token():
         (hinge(), {}, {"q": [[0.0], [math.nan]]}, "robot 'hinge': joint 'j': q is not finite"),
     ],
 )
-def test_what_has_no_token_is_refused(robot, shapes, options, message):
+def test_invalid_robots_and_shapes_are_errors(robot, shapes, options, message):
     with pytest.raises(BenchmarkError, match=re.escape(message)):
         tokens(robot, shapes, **options)
 
 
-def test_a_zero_axis_and_a_q_of_another_robot_are_refused():
+def test_a_zero_axis_and_a_q_of_the_wrong_length_are_errors():
     with pytest.raises(RobotError, match="joint 'j': its axis"):
         tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(0, 0, 0)),)), {})
     with pytest.raises(ValueError, match=r"needs \(\.\.\., 1\)"):
@@ -224,7 +224,7 @@ def test_padding_adds_rows_of_zeros_and_a_mask():
         pad_tokens(made, 5)
 
 
-def test_a_file_of_tokens_is_the_same_bytes_and_needs_no_pickle():
+def test_token_files_are_reproducible_and_need_no_pickle():
     links = [link.name for link in arm().links]
     content = tokens_npz(arm_tokens(), links, "arm", 23)
     assert content == tokens_npz(arm_tokens(), links, "arm", 23)

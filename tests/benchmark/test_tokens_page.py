@@ -1,4 +1,4 @@
-"""The page of tokens shows what there is."""
+"""The page on tokens agrees with the code."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from morphgen.benchmark.tokens import LAYOUT, tokens
 PAGE = (Path(__file__).parents[2] / "docs" / "tokens.md").read_text(encoding="utf-8")
 
 
-def test_the_pages_example_runs_and_says_the_shapes():
+def test_the_example_runs_and_has_the_documented_shapes():
     (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     assert len(code.splitlines()) < 10
     names = {}

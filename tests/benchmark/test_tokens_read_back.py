@@ -1,4 +1,4 @@
-"""What tokens say is read back as a robot, and what is no token is refused."""
+"""Decoding tokens to robots, and errors of invalid tokens."""
 
 import math
 import re
@@ -97,7 +97,7 @@ def assert_read_back(made, **options):
 
 @settings(deadline=None)
 @given(bodies())
-def test_tokens_of_the_robot_of_tokens_are_the_tokens(body):
+def test_decoded_robots_have_the_same_tokens(body):
     robot, shapes, q = body
     for made in tokens(robot, shapes, q):
         back = assert_read_back(made)
@@ -111,7 +111,7 @@ def test_tokens_of_the_robot_of_tokens_are_the_tokens(body):
 
 @settings(deadline=None)
 @given(bodies())
-def test_the_robot_of_tokens_has_the_same_links_at_zero(body):
+def test_decoded_robots_have_the_same_link_poses_at_zero(body):
     robot, shapes, _ = body
     joints = tuple(replace(joint, mimic=None) for joint in robot.joints)
     robot = replace(robot, joints=joints, home=(0.0,) * sum(j.is_movable for j in joints))
@@ -121,7 +121,7 @@ def test_the_robot_of_tokens_has_the_same_links_at_zero(body):
 
 
 @pytest.mark.parametrize("request_", COMPOSED)
-def test_composed_robots_are_read_back(request_):
+def test_composed_robots_are_decoded(request_):
     robot = morphgen.compose(request_)
     shapes = token_shapes(robot, default_library().folders)
     q = random_configurations(robot, 5, np.random.default_rng(0))
@@ -134,7 +134,7 @@ def test_composed_robots_are_read_back(request_):
     ]
 
 
-def test_the_robot_of_tokens_moves_in_scaled_positions():
+def test_decoded_robots_move_in_normalized_positions():
     back, shapes = robot_from_tokens(arm_tokens(), "back")
     assert back.name == "back"
     assert [link.name for link in back.links] == [f"link{i}" for i in range(6)]
@@ -146,7 +146,7 @@ def test_the_robot_of_tokens_moves_in_scaled_positions():
     assert shapes["link0"] == Shape(Box((0.1, 0.1, 0.04)))
 
 
-def test_tokens_in_single_precision_are_read():
+def test_single_precision_tokens_are_decoded():
     made = arm_tokens()
     back, shapes = robot_from_tokens(made.astype(np.float32), "back")
     np.testing.assert_allclose(tokens(back, shapes), made, atol=2e-5)
@@ -224,20 +224,20 @@ def spoilt(row, column, value):
         (spoilt(1, 32, 2.0), "link 1: joint position: number "),
     ],
 )
-def test_what_is_no_token_is_refused_by_link_and_field(made, message):
+def test_invalid_tokens_are_errors_that_name_link_and_field(made, message):
     with pytest.raises(BenchmarkError, match=re.escape(message)) as refusal:
         robot_from_tokens(made, "x")
     assert str(refusal.value).startswith("tokens of 'x'")
 
 
-def test_a_base_that_moves_is_refused():
+def test_a_movable_base_is_an_error():
     made = arm_tokens()
     made[0, 19:] = made[1, 19:]
     with pytest.raises(BenchmarkError, match="link 0: joint type: revolute, but the base is fixed"):
         robot_from_tokens(made, "x")
 
 
-def test_tokens_made_for_other_sizes_are_refused():
+def test_tokens_of_another_max_links_are_an_error():
     made = tokens(arm(), {}, max_links=30)
     assert_read_back(made, max_links=30)
     with pytest.raises(BenchmarkError, match="made with another max_links than 23"):

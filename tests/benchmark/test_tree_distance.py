@@ -1,4 +1,4 @@
-"""The edit distance of kinematic trees: the least work, a metric, and blind to bookkeeping."""
+"""The edit distance of kinematic trees is minimal, a metric, and independent of the file."""
 
 import itertools
 import math
@@ -29,7 +29,7 @@ GEOMETRIES = (Box((0.1, 0.2, 0.3)), Sphere(0.05), Cylinder(0.02, 0.4), Capsule(0
 
 
 def body(*joints, shapes=(), home=None):
-    """A robot of joints given as (kind, parent, axis, offset), link0 its root."""
+    """A robot with joints (kind, parent, axis, offset) and root link0."""
     made = [
         Joint(f"joint{k}", kind, f"link{parent}", f"link{k}", Pose((offset, 0.0, 0.0)), axis)
         for k, (kind, parent, axis, offset) in enumerate(joints, 1)
@@ -68,7 +68,7 @@ def trees(draw, most=5):
 
 
 def brute_force(a, b):
-    """The cheapest of all mappings that keep order and descent."""
+    """Minimum cost over all mappings that keep order and ancestry."""
     costs = change_costs(a, b)
     everything = math.fsum(a.weights) + math.fsum(b.weights)
     best = everything
@@ -90,13 +90,13 @@ def is_below(tree, lower, upper):
 
 @given(trees(4), trees(4))
 @settings(max_examples=150, deadline=None)
-def test_it_is_the_least_of_all_ways_to_change_one_into_the_other(a, b):
+def test_the_distance_is_the_minimum_over_all_mappings(a, b):
     assert edit_distance(a, b) == pytest.approx(brute_force(a, b), abs=1e-12)
 
 
 @given(trees(), trees())
 @settings(deadline=None)
-def test_it_is_the_same_both_ways_and_zero_to_oneself(a, b):
+def test_the_distance_is_symmetric_and_zero_on_the_diagonal(a, b):
     assert normalised_distance(a, b) == normalised_distance(b, a)
     assert normalised_distance(a, a) == 0.0
     assert 0.0 <= normalised_distance(a, b) <= 1.0
@@ -104,7 +104,7 @@ def test_it_is_the_same_both_ways_and_zero_to_oneself(a, b):
 
 @given(trees(), trees(), trees())
 @settings(max_examples=300, deadline=None)
-def test_no_way_round_is_shorter(a, b, c):
+def test_the_triangle_inequality(a, b, c):
     for measured in (edit_distance, normalised_distance):
         assert measured(a, c) <= measured(a, b) + measured(b, c) + 1e-12
 
@@ -119,7 +119,7 @@ def test_the_costs_of_changes_insertions_and_deletions_are_a_metric(a, b, c):
     assert (straight[:, None, :] <= costs[:, :, None] + onwards[None] + 1e-12).all()
 
 
-def test_nothing_in_common_is_one_and_nothing_at_all_is_the_same():
+def test_the_distance_is_one_without_common_parts_and_zero_between_empty_trees():
     hinge = body(("revolute", 0, (0, 0, 1), 0.1))
     assert distance(body(), hinge) == 1.0
     assert distance(body(), body()) == 0.0
@@ -138,13 +138,13 @@ def test_nothing_in_common_is_one_and_nothing_at_all_is_the_same():
         (("revolute", 0, (0, 0, 1), 0.45), 1 / 8 * 0.25 / 0.7),
     ],
 )
-def test_a_changed_joint_costs_what_the_page_says(change, cost):
+def test_costs_of_changed_joints(change, cost):
     hinge = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, BLOCK])
     other = body(change, shapes=[None, BLOCK])
     assert edit_distance(tree(hinge), tree(other)) == pytest.approx(cost, abs=1e-12)
 
 
-def test_another_size_costs_its_mean_relative_difference():
+def test_cost_of_a_changed_size():
     hinge = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, BLOCK])
     other = body(("revolute", 0, (0, 0, 1), 0.2), shapes=[None, Shape(Box((0.3, 0.1, 0.6)))])
     cost = 1 / 16 * (0 + 0.1 / 0.55 + 0.3 / 0.95) / 3
@@ -154,7 +154,7 @@ def test_another_size_costs_its_mean_relative_difference():
 @pytest.mark.parametrize(
     ("other", "cost"), [(Sphere(0.1), 1 / 16), (Cylinder(0.1, 0.2), 1 / 16), (Box((0.2,) * 3), 0.0)]
 )
-def test_another_shape_of_the_same_size_costs_a_sixteenth(other, cost):
+def test_cost_of_a_changed_shape(other, cost):
     cube, changed = (
         body(("prismatic", 0, (0, 0, 1), 0.2), shapes=[None, Shape(geometry)])
         for geometry in (Box((0.2, 0.2, 0.2)), other)
@@ -170,12 +170,12 @@ def test_a_capsule_counts_as_a_cylinder_and_a_shape_as_more_than_none():
     assert edit_distance(a, tree(body(joint))) > 1 / 16
 
 
-def test_a_mesh_is_refused():
+def test_a_mesh_is_an_error():
     with pytest.raises(ValueError, match="a mesh has no label"):
         labelled_tree(body(), {"link0": Shape(Mesh(Path("a.stl")))}, 1.0)
 
 
-def test_a_joint_more_costs_one_and_a_body_on_a_fixed_joint_a_quarter():
+def test_costs_of_insertions():
     hinge = ("revolute", 0, (0, 0, 1), 0.2)
     one = tree(body(hinge))
     two = tree(body(hinge, ("revolute", 1, (0, 1, 0), 0.3)))
@@ -193,7 +193,7 @@ def test_axes_are_compared_at_home():
     assert edit_distance(tree(turned), tree(along_y)) == pytest.approx(0, abs=1e-12)
 
 
-def test_frames_without_a_body_do_not_count():
+def test_bare_frames_do_not_count():
     plain = body(("revolute", 0, (0, 0, 1), 0.3), ("revolute", 1, (0, 1, 0), 0.2))
     framed = body(
         ("fixed", 0, (1, 0, 0), 0.1),
@@ -206,7 +206,7 @@ def test_frames_without_a_body_do_not_count():
     assert distance(plain, framed) == pytest.approx(0, abs=1e-12)
 
 
-def test_a_body_between_does_count():
+def test_a_link_with_a_shape_on_a_fixed_joint_counts():
     plain = body(("revolute", 0, (0, 0, 1), 0.3))
     stood = body(
         ("fixed", 0, (1, 0, 0), 0.1), ("revolute", 1, (0, 0, 1), 0.3), shapes=[None, BLOCK]
@@ -274,7 +274,7 @@ def test_names_do_not_matter():
     assert distance(robot, other) == 0.0
 
 
-def test_alike_bodies_are_nearer_than_others():
+def test_similar_robots_are_nearer_than_others():
     near = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm=lwr ee=plane"))
     far = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm3"))
     assert 0 < near < 0.1 < far

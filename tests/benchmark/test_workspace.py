@@ -1,4 +1,4 @@
-"""Where tools can go: about the shoulder, in units of reach, whatever stands below."""
+"""Workspaces relative to the shoulder and in units of reach."""
 
 import itertools
 from dataclasses import replace
@@ -19,7 +19,7 @@ LWR = "arm=lwr ee=plane"
 
 
 def chain(*joints, tool=(0.0, 0.0, 0.5)):
-    """Links on joints given as (kind, origin, axis), one after the other, and a tool."""
+    """A chain of joints (kind, origin, axis) with a tool."""
     made = [
         Joint(f"j{k}", kind, f"l{k}", f"l{k + 1}", Pose(origin), axis, limits=(-1.0, 1.0))
         for k, (kind, origin, axis) in enumerate(joints)
@@ -30,7 +30,7 @@ def chain(*joints, tool=(0.0, 0.0, 0.5)):
 
 
 def led(robot):
-    """The arm with its tool on a finger that follows another."""
+    """The arm with its tool on a mimic finger."""
     *joints, last = robot.joints
     joints.append(replace(last, mimic=Mimic("left", -0.5, 0.1)))
     tool = Frame("tool", "right", Pose((0.01, 0.02, 0.03)))
@@ -49,13 +49,13 @@ def led(robot):
     ],
     ids=lambda robot: robot.name,
 )
-def test_tools_are_where_forward_kinematics_has_them(robot):
+def test_the_density_agrees_with_forward_kinematics(robot):
     q = random_configurations(robot, 100, np.random.default_rng(0))
     expected = frame_pose(robot, q)[:, :3, 3]
     np.testing.assert_allclose(frame_positions(robot, q.T).T, expected, atol=1e-12)
 
 
-def test_the_density_is_of_all_samples_and_the_same_every_time():
+def test_the_density_is_normalized_and_reproducible():
     found, again = workspace(arm()), workspace(arm())
     assert found.density.shape == (21, 21, 21)
     assert found.density.sum() == pytest.approx(1)
@@ -64,19 +64,19 @@ def test_the_density_is_of_all_samples_and_the_same_every_time():
     assert density_overlap(found, again) == pytest.approx(1, abs=1e-12)
 
 
-def test_it_is_the_same_both_ways_and_a_share():
+def test_the_overlap_is_symmetric_and_in_the_unit_interval():
     a, b = (workspace(morphgen.compose(words)) for words in (LWR, "arm3"))
     assert density_overlap(a, b) == density_overlap(b, a)
     assert 0.3 < density_overlap(a, b) < 0.9
 
 
-def test_bodies_whose_tools_never_meet_share_nothing():
+def test_disjoint_workspaces_have_no_overlap():
     up = workspace(chain(("revolute", (0, 0, 0), (1, 0, 0))))
     flat = workspace(chain(("revolute", (0, 0, 0), (0, 0, 1)), tool=(0.5, 0.0, 0.0)))
     assert density_overlap(up, flat) == 0.0
 
 
-def test_a_hinge_reaches_its_radius_and_nowhere_else():
+def test_a_hinge_reaches_a_circle():
     found = workspace(chain(("revolute", (0, 0, 1), (0, 0, 1)), tool=(0.5, 0.0, 0.2)))
     assert found.shoulder == pytest.approx((0, 0, 1.2))
     assert found.reach == pytest.approx(0.5)
@@ -94,14 +94,14 @@ def test_size_does_not_matter(factor):
     assert density_overlap(workspace(robot), workspace(large)) == pytest.approx(1, abs=1e-9)
 
 
-def test_what_an_arm_stands_on_does_not_matter():
+def test_the_pedestal_does_not_matter():
     robot = workspace(morphgen.compose(LWR))
     raised = workspace(morphgen.compose(f"base=pedestal {LWR}"))
     assert raised.shoulder[2] > robot.shoulder[2] + 0.1
     assert density_overlap(robot, raised) == pytest.approx(1, abs=1e-9)
 
 
-def test_where_an_axis_has_its_origin_does_not_matter():
+def test_the_origin_of_a_joint_on_its_axis_does_not_matter():
     robot = morphgen.compose(LWR)
     first = next(k for k in robot.independent_joints)
     child = robot.joints[first].child
@@ -118,7 +118,7 @@ def test_where_an_axis_has_its_origin_does_not_matter():
     assert density_overlap(workspace(moved), workspace(robot)) == pytest.approx(1, abs=1e-9)
 
 
-def test_the_shoulder_is_where_the_second_axis_crosses_the_first():
+def test_the_shoulder_is_the_intersection_of_the_first_two_axes():
     turn = ("revolute", (0.3, 0, 0.1), (0, 0, 1))
     lift = ("revolute", (0.1, 0, 0.4), (0, 1, 0))
     assert shoulder(chain(turn, lift)) == pytest.approx((0.3, 0, 0.5))
@@ -137,7 +137,7 @@ def test_the_shoulder_of_a_planar_arm_is_in_its_plane():
     assert shoulder(chain(turn, turn, tool=(0.5, 0, 0.4))) == pytest.approx((0.3, 0, 0.6))
 
 
-def test_the_shoulder_of_a_body_that_only_slides_is_the_middle_of_its_travel():
+def test_the_shoulder_of_prismatic_robots_is_the_middle_of_their_travel():
     slide = ("prismatic", (0.3, 0, 0), (1, 0, 0))
     far = replace(chain(slide, tool=(0, 0, 0)).joints[0], limits=(0.0, 3.0))
     robot = replace(chain(slide, tool=(0, 0, 0)), joints=(far,))
@@ -146,7 +146,7 @@ def test_the_shoulder_of_a_body_that_only_slides_is_the_middle_of_its_travel():
     assert found.reach == pytest.approx(1.5, rel=1e-3)
 
 
-def test_the_same_arm_with_another_finger_is_drawn_in_the_same_poses():
+def test_the_samples_of_an_arm_do_not_depend_on_its_gripper():
     robot = arm()
     other = replace(
         robot,
@@ -176,28 +176,28 @@ def test_densities_depend_less_on_the_number_of_samples_than_occupied_cells():
 
 
 def shared_cells(a, b):
-    """Intersection over union of the occupied cells."""
+    """Return the intersection over union of the occupied cells."""
     mine, yours = a.density > 0, b.density > 0
     return (mine & yours).sum() / (mine | yours).sum()
 
 
-def test_a_robot_without_a_tool_is_told_how_to_get_one():
+def test_a_missing_tool_is_an_error_that_names_the_remedy():
     with pytest.raises(BenchmarkError, match=r"'arm' has no frame 'tool'.*import FILE --tool LINK"):
         workspace(replace(arm(), frames=()))
 
 
-def test_a_tool_that_no_joint_moves_is_refused():
+def test_an_immobile_tool_is_an_error():
     with pytest.raises(BenchmarkError, match="no joint moves its tool, which is on link 'base'"):
         workspace(replace(arm(), frames=(Frame("tool", "base"),)))
 
 
-def test_a_tool_that_stays_on_its_only_axis_is_refused():
+def test_a_tool_on_its_only_axis_is_an_error():
     with pytest.raises(BenchmarkError, match="only turns about its own origin"):
         workspace(chain(("revolute", (0, 0, 1), (0, 0, 1))))
 
 
 @pytest.mark.parametrize("limits", [(0.0, np.inf), (1.0, -1.0), (np.nan, 1.0)])
-def test_limits_that_are_no_range_are_refused(limits):
+def test_limits_without_a_range_are_an_error(limits):
     robot = arm()
     joint = replace(robot.joints[1], limits=limits)
     wrong = replace(robot, joints=(robot.joints[0], joint, *robot.joints[2:]))

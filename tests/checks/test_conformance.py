@@ -1,4 +1,4 @@
-"""Conformance: all loaders agree on what we write, and the check notices when one does not."""
+"""Conformance: all loaders agree on our bundles, and disagreements are reported."""
 
 from dataclasses import replace
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ LOADERS = ["yourdfpy", "pybullet", "mujoco (urdf)", "mujoco (mjcf)", "pinocchio"
 
 
 def massless_tree():
-    """Massless root, massless moving links, a fixed massless one, every kind of joint."""
+    """A robot with a massless root, massless links and every kind of joint."""
     strength = {"effort": 10.0, "velocity": 1.0}
     links = (
         Link("root"),
@@ -83,7 +83,7 @@ def rows_of(robot, folder):
     return {row.loader: row for row in report.rows if row.passed is not None}
 
 
-def test_a_moved_joint_is_noticed_by_its_distance(tmp_path):
+def test_a_moved_joint_is_a_position_error(tmp_path):
     robot = arm()
     folder = bundle(robot, tmp_path)
     T = robot.joints[0].T_parent_joint
@@ -94,7 +94,7 @@ def test_a_moved_joint_is_noticed_by_its_distance(tmp_path):
         assert row.message == "tool is 2e-05 m off"
 
 
-def test_a_turned_tool_is_noticed_by_its_angle(tmp_path):
+def test_a_rotated_tool_is_a_rotation_error(tmp_path):
     robot = arm()
     folder = bundle(robot, tmp_path)
     (tool,) = robot.frames
@@ -129,7 +129,7 @@ def test_a_missing_tool_is_noticed(tmp_path):
         assert "'tool'" in row.message
 
 
-def test_files_that_a_loader_refuses_are_its_rows_fault(tmp_path):
+def test_a_rejected_file_fails_the_row_of_its_loader(tmp_path):
     robot = arm()
     folder = bundle(robot, tmp_path)
     (folder / "robot.xml").write_text("<mujoco><nonsense/></mujoco>")
@@ -138,7 +138,7 @@ def test_files_that_a_loader_refuses_are_its_rows_fault(tmp_path):
     assert [name for name, row in rows.items() if not row.passed] == ["mujoco (mjcf)"]
 
 
-def test_a_loader_that_is_not_installed_is_said_so(tmp_path, monkeypatch):
+def test_a_missing_loader_is_reported(tmp_path, monkeypatch):
     real = find_spec
     monkeypatch.setattr(
         module, "find_spec", lambda name: None if name == "pinocchio" else real(name)
@@ -149,11 +149,11 @@ def test_a_loader_that_is_not_installed_is_said_so(tmp_path, monkeypatch):
     assert report.passed
 
 
-def test_a_folder_that_is_no_bundle_is_refused(tmp_path):
+def test_a_folder_that_is_not_a_bundle_is_an_error(tmp_path):
     with pytest.raises(FormatError, match="no bundle"):
         conformance(tmp_path)
 
 
-def test_a_robot_that_does_not_move(tmp_path):
+def test_a_robot_without_movable_joints(tmp_path):
     robot = Robot("block", (rod("block"),), frames=(Frame("tool", "block", Pose((0, 0, 0.3))),))
     assert conformance(bundle(robot, tmp_path), samples=2).passed

@@ -1,4 +1,4 @@
-"""Each fault is named by its code; a sound robot is left alone."""
+"""Every fault has a finding; a valid robot has none."""
 
 from dataclasses import replace
 
@@ -9,8 +9,8 @@ from helpers.faulty_robots import (
     MESHES,
     ROBOTS,
     hinge,
-    sound,
-    sound_mesh,
+    valid_robot,
+    valid_robot_with_mesh,
     with_body,
     with_end,
     with_joint,
@@ -23,16 +23,16 @@ from morphgen.model.tree import rename
 
 
 def found(robot: Robot, code: str) -> Finding:
-    """The first finding of that code."""
+    """Return the first finding with a code."""
     return next(finding for finding in check(robot) if finding.code == code)
 
 
-def test_a_sound_robot_is_clean(tmp_path):
-    assert check(sound()) == ()
-    assert check(sound_mesh(tmp_path)) == ()
+def test_a_valid_robot_has_no_findings(tmp_path):
+    assert check(valid_robot()) == ()
+    assert check(valid_robot_with_mesh(tmp_path)) == ()
 
 
-def test_a_gripper_that_mimics_is_only_told_about_loaders():
+def test_a_mimic_gripper_has_only_the_finding_about_loaders():
     assert [finding.severity for finding in check(arm())] == ["info"]
 
 
@@ -58,8 +58,8 @@ def test_findings_are_sorted_and_repeatable(code):
     assert all(f.why and f.fix and "\n" not in f.why + f.fix for f in findings)
 
 
-def test_the_tool_is_asked_for_only_where_it_is_required():
-    assert check(replace(sound(), frames=()), tool_required=False) == ()
+def test_a_tool_is_required_only_on_request():
+    assert check(replace(valid_robot(), frames=()), tool_required=False) == ()
 
 
 def test_a_bare_frame_needs_no_mass():
@@ -68,8 +68,8 @@ def test_a_bare_frame_needs_no_mass():
     assert check(with_end(Link("pad", Inertial(0.0)), pad)) == ()
 
 
-def test_a_massless_link_beside_a_heavy_one_is_harmless_and_alone_refused():
-    shape = sound().link("right").collisions
+def test_a_massless_link_is_an_error_only_without_a_rigid_neighbour_with_mass():
+    shape = valid_robot().link("right").collisions
     moving = with_end(Link("pad", collisions=shape), hinge("pad"))
     fixed = with_end(
         Link("pad", collisions=shape), replace(hinge("pad"), kind="fixed", limits=None)
@@ -78,7 +78,7 @@ def test_a_massless_link_beside_a_heavy_one_is_harmless_and_alone_refused():
     assert found(fixed, "inertia-missing").severity == "info"
 
 
-def test_the_triangle_inequality_is_drawn_where_mujoco_draws_it():
+def test_the_triangle_inequality_agrees_with_mujoco():
     for low, code in ((1.0001e-3, None), (0.9999e-3, "inertia-not-physical")):
         body = (low, 0.0, 0.0, low, 0.0, 2e-3)
         codes = {finding.code for finding in check(with_body("lower", inertia=body))}
@@ -96,18 +96,18 @@ def test_the_triangle_inequality_is_drawn_where_mujoco_draws_it():
                 mujoco.MjModel.from_xml_string(xml)
 
 
-def test_a_long_axis_matters_more_for_a_slide_than_for_a_hinge():
+def test_a_long_axis_is_an_error_only_for_prismatic_joints():
     for joint, severity in (("extend", "error"), ("elbow", "warning")):
-        robot = with_joint(sound(), joint, axis=(0.0, 0.0, 1.5))
+        robot = with_joint(valid_robot(), joint, axis=(0.0, 0.0, 1.5))
         assert found(robot, "axis-not-unit").severity == severity
 
 
 def test_an_axis_rounded_in_a_file_is_a_unit_axis():
-    robot = with_joint(sound(), "elbow", axis=(0.7071, 0.7071, 0.0))
+    robot = with_joint(valid_robot(), "elbow", axis=(0.7071, 0.7071, 0.0))
     assert "axis-not-unit" not in {finding.code for finding in check(robot)}
 
 
-def test_a_follower_is_judged_by_its_whole_chain():
+def test_the_range_of_a_mimic_joint_includes_its_whole_chain():
     robot = with_joint(arm(), "right", mimic=Mimic("left", -0.5))
     assert {finding.severity for finding in check(robot)} == {"info"}
     free = with_joint(robot, "left", kind="continuous", limits=None)
@@ -115,10 +115,10 @@ def test_a_follower_is_judged_by_its_whole_chain():
 
 
 def test_a_root_may_be_called_world():
-    assert check(rename(sound(), {"base": "world"})) == ()
+    assert check(rename(valid_robot(), {"base": "world"})) == ()
 
 
-def test_overlap_of_an_ignored_pair_is_no_finding():
+def test_overlap_of_an_ignored_pair_is_not_a_finding():
     robot = ROBOTS["self-collision"]()
     pairs = [finding.where for finding in check(robot) if finding.code == "self-collision"]
     ignored = tuple(tuple(pair.removeprefix("links ").split(", ")) for pair in pairs)

@@ -1,4 +1,4 @@
-"""Links that nothing visible joins to their parent are named; those that touch are not."""
+"""Gaps between the visual shapes of links at home."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from helpers.faulty_robots import hinge, sound, with_end, with_link
+from helpers.faulty_robots import hinge, valid_robot, with_end, with_link
 from morphgen.checks import check, home_pose
 from morphgen.checks.home_pose import MAX_GAP, check_links_apart
 from morphgen.grammar.library import default_library
@@ -19,7 +19,7 @@ from morphgen.model.tree import scale_links
 
 
 def pair(parent, child, T_parent_child=Pose(), between=()):  # noqa: B008
-    """A robot of two links with one shape each, and bare links between them."""
+    """A robot of two links with one shape each and bare links between them."""
     names = ["parent", *between, "child"]
     links = (
         Link("parent", visuals=(Shape(parent),)),
@@ -48,14 +48,14 @@ def test_links_that_touch_or_nearly_do_are_not_apart(offset):
     assert found(pair(box, box, Pose((0, 0, offset)))) == []
 
 
-def test_a_gap_is_named_with_both_links_and_its_width():
+def test_a_gap_is_reported_with_both_links_and_its_width():
     box = Box((0.1, 0.1, 0.1))
     assert found(pair(box, box, Pose((0.0, 0.0, 0.1 + 1.2 * MAX_GAP)))) == [
         ("links parent, child", "at home 6 mm of air are between what one sees of them")
     ]
 
 
-def test_a_bare_link_passes_the_question_on_and_hides_no_gap():
+def test_links_without_shapes_are_skipped():
     ball = Sphere(0.05)
     near, far = (Pose((z, 0.0, 0.0)) for z in (0.1, 0.2))
     assert found(pair(ball, ball, near, between=("a", "b"))) == []
@@ -64,21 +64,21 @@ def test_a_bare_link_passes_the_question_on_and_hides_no_gap():
     ]
 
 
-def test_a_robot_without_visual_shapes_has_no_gaps_to_see():
+def test_a_robot_without_visual_shapes_has_no_gaps():
     box = Shape(Box((0.1, 0.1, 0.1)))
     robot = pair(box.geometry, box.geometry, Pose((1.0, 0.0, 0.0)))
     bare = replace(robot.links[0], visuals=(), collisions=(box,))
     assert found(replace(robot, links=(bare, robot.links[1]))) == []
 
 
-def test_the_gap_is_that_at_home():
+def test_gaps_are_measured_at_home():
     reach = hinge("tip", axis=(0.0, 0.0, 1.0), kind="prismatic", limits=(0.0, 1.0))
     robot = with_end(Link("tip", visuals=(Shape(Box((0.1, 0.1, 0.1))),)), reach)
     assert found(robot) == []
     assert found(replace(robot, home=(*robot.home[:-1], 1.0))) != []
 
 
-def test_a_solid_inside_of_another_is_not_apart(tmp_path):
+def test_an_enclosed_solid_is_not_apart(tmp_path):
     shell = mesh(tmp_path, "shell.stl", trimesh.creation.box((0.4, 0.4, 0.4)))
     core = mesh(tmp_path, "core.stl", trimesh.creation.icosphere(radius=0.05))
     for small in (core, Sphere(0.05), Box((0.05, 0.05, 0.05))):
@@ -95,9 +95,7 @@ def test_a_rod_in_the_opening_of_a_ring_is_apart_from_it(tmp_path):
     ]
 
 
-def test_the_distance_of_dense_meshes_is_exact_however_few_triangles_are_tried_first(
-    tmp_path, monkeypatch
-):
+def test_distances_of_dense_meshes_do_not_depend_on_the_coarse_test(tmp_path, monkeypatch):
     ball = mesh(tmp_path, "ball.stl", trimesh.creation.icosphere(5, radius=0.1))
     turned = Pose.from_xyz_rpy((0.0, 0.12, 0.16), (0.3, 0.2, 0.1))
     for few in (5, 500, 10**6):
@@ -109,7 +107,7 @@ def test_the_distance_of_dense_meshes_is_exact_however_few_triangles_are_tried_f
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_primitives_are_apart_by_what_their_triangles_say(seed):
+def test_distances_of_primitives_agree_with_their_triangles(seed):
     rng = np.random.default_rng(seed)
     kinds = (Box((0.1, 0.2, 0.05)), Sphere(0.05), Cylinder(0.03, 0.2), Capsule(0.03, 0.1))
     for a in kinds:
@@ -125,21 +123,21 @@ def test_primitives_are_apart_by_what_their_triangles_say(seed):
             assert touching == [True, True, False]
 
 
-def test_what_cannot_be_read_or_placed_is_left_to_other_checks(tmp_path):
+def test_unreadable_shapes_and_invalid_joints_are_left_to_other_checks(tmp_path):
     (tmp_path / "bad.stl").write_text("no mesh")
     gone = pair(Mesh(tmp_path / "gone.stl"), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
     broken = pair(Mesh(tmp_path / "bad.stl"), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
     flat = pair(Box((0.0, 0.1, 0.1)), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
     scale = pair(Mesh(tmp_path / "bad.stl", (0.0, 1.0, 1.0)), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
-    lost = replace(sound(), home=(float("nan"), *sound().home[1:]))
+    lost = replace(valid_robot(), home=(float("nan"), *valid_robot().home[1:]))
     for robot in (gone, broken, flat, scale, lost):
         assert found(robot) == []
 
 
 @pytest.mark.parametrize("name", ["base", "upper"])
-def test_either_link_may_say_why_the_gap_is_as_it_should_be(name):
+def test_either_link_can_accept_a_gap(name):
     ball = Shape(Sphere(0.02), Pose((0.0, 0.0, 0.18)))
-    torn = with_link(sound(), "upper", visuals=(ball, Shape(Sphere(0.02), Pose((0, 0, 0.3)))))
+    torn = with_link(valid_robot(), "upper", visuals=(ball, Shape(Sphere(0.02), Pose((0, 0, 0.3)))))
     (finding,) = check(torn)
     assert (finding.code, finding.severity) == ("links-apart", "warning")
     told = replace(torn, provenance={"accepted": {name: {"links-apart": "a magnet"}}})
@@ -148,7 +146,7 @@ def test_either_link_may_say_why_the_gap_is_as_it_should_be(name):
     assert finding.why.endswith("; accepted: a magnet")
 
 
-def test_a_panda_scaled_about_its_link_frames_is_torn_apart():
+def test_a_panda_scaled_about_its_link_frames_has_gaps():
     panda = load_part(default_library().manifest("panda")).fragment
     factors = {"panda_link0": 1.5, "panda_link1": 0.5, "panda_link4": 1.4}
     torn = {finding.where for finding in check_links_apart(scale_links(panda, factors))}

@@ -1,4 +1,4 @@
-"""``fix`` removes what it says is fixable, nothing else, and leaves sound robots alone."""
+"""``fix`` repairs the fixable findings and nothing else."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ from helpers.faulty_robots import (
     FLAT_INERTIA,
     MESHES,
     ROBOTS,
-    sound,
+    valid_robot,
     with_body,
     with_joint,
     with_link,
@@ -24,12 +24,12 @@ from morphgen.model.tree import rename
 
 
 def keys(robot: Robot) -> set[tuple[str, str]]:
-    """Code and place of every finding."""
+    """Return code and place of every finding."""
     return {(finding.code, finding.where) for finding in check(robot)}
 
 
 def assert_fixable_means_fixed(robot: Robot) -> None:
-    """Whatever is fixable is gone, whatever is not is still there, and nothing is new."""
+    """Assert that exactly the fixable findings are gone and none is new."""
     findings = check(robot)
     repaired, gone = fix(robot)
     fixable = {finding for finding in findings if finding.fixable}
@@ -49,18 +49,18 @@ def test_fixable_means_fixed_with_meshes(code, tmp_path, monkeypatch):
     assert_fixable_means_fixed(MESHES[code](tmp_path))
 
 
-def test_a_sound_robot_stays_itself():
-    robot = sound()
+def test_a_valid_robot_is_unchanged():
+    robot = valid_robot()
     assert fix(robot) == (robot, ())
 
 
 def test_missing_mass_is_that_of_the_solid_geometry():
-    robot, _ = fix(with_link(sound(), "lower", inertial=None))
-    shapes = sound().link("lower").collisions
+    robot, _ = fix(with_link(valid_robot(), "lower", inertial=None))
+    shapes = valid_robot().link("lower").collisions
     assert robot.link("lower").inertial == inertial_from_density(shapes, DEFAULT_DENSITY)
 
 
-def test_an_impossible_inertia_keeps_its_mass_and_its_centre():
+def test_the_repair_of_an_inertia_keeps_mass_and_centre():
     broken = with_body("lower", inertia=FLAT_INERTIA, com=(0.0, 0.0, 0.1))
     before, after = broken.link("lower").inertial, fix(broken)[0].link("lower").inertial
     assert (after.mass, after.com) == (before.mass, before.com)
@@ -70,7 +70,7 @@ def test_an_impossible_inertia_keeps_its_mass_and_its_centre():
 
 def test_joints_are_repaired_together_with_home():
     broken = with_joint(
-        sound(), "shoulder", axis=(0, 3, 4), limits=(0.2, -0.2), effort=None, velocity=-1.0
+        valid_robot(), "shoulder", axis=(0, 3, 4), limits=(0.2, -0.2), effort=None, velocity=-1.0
     )
     robot, gone = fix(broken)
     joint = robot.joints[0]
@@ -87,9 +87,9 @@ def test_joints_are_repaired_together_with_home():
     }
 
 
-def test_home_that_is_no_number_becomes_the_reachable_position_nearest_zero():
+def test_a_nan_home_becomes_the_position_within_limits_nearest_to_zero():
     broken = replace(
-        with_joint(sound(), "shoulder", limits=(0.3, 1.0)), home=(math.nan, 0, 0, 0, 0)
+        with_joint(valid_robot(), "shoulder", limits=(0.3, 1.0)), home=(math.nan, 0, 0, 0, 0)
     )
     assert fix(broken)[0].home[0] == 0.3
 
@@ -111,7 +111,7 @@ def test_repaired_names_are_sound(code):
     assert check(robot) == ()
 
 
-def test_new_names_are_unique_and_safe_ones_stay():
+def test_new_names_are_unique_and_safe_names_are_kept():
     assert safe_names(["a b", "a_b", "a/b", ""]) == {
         "a b": "a_b_2",
         "a_b": "a_b",
@@ -121,7 +121,7 @@ def test_new_names_are_unique_and_safe_ones_stay():
     assert safe_names(["world", "a"], reserved={"world"}) == {"world": "world_2", "a": "a"}
 
 
-def test_faults_that_meet_in_one_robot_are_repaired_together():
+def test_several_faults_are_repaired_together():
     broken = with_joint(with_body("lower", mass=math.nan), "extend", axis=(0, 0, 9), effort=None)
     broken = with_link(broken, "upper", inertial=None)
     broken = rename(broken, {"right": "world", "left": "left pad"}, {"elbow": "an elbow"})
@@ -130,10 +130,10 @@ def test_faults_that_meet_in_one_robot_are_repaired_together():
     assert check(repaired) == ()
 
 
-def test_a_link_without_solid_geometry_keeps_its_fault():
-    body = sound().link("lower").inertial
+def test_a_link_without_solid_geometry_is_not_repaired():
+    body = valid_robot().link("lower").inertial
     broken = with_link(
-        sound(), "lower", inertial=replace(body, mass=-1.0), collisions=(), visuals=()
+        valid_robot(), "lower", inertial=replace(body, mass=-1.0), collisions=(), visuals=()
     )
     finding = next(finding for finding in check(broken) if finding.code == "mass-invalid")
     assert not finding.fixable
@@ -141,7 +141,7 @@ def test_a_link_without_solid_geometry_keeps_its_fault():
 
 
 def test_a_joint_that_is_locked_at_zero_is_made_fixed():
-    robot, gone = fix(with_joint(sound(), "elbow", limits=(0.0, 0.0), effort=None))
+    robot, gone = fix(with_joint(valid_robot(), "elbow", limits=(0.0, 0.0), effort=None))
     assert {finding.code for finding in gone} == {"home-outside-limits", "limits-empty"}
     assert robot.joints[robot.joint_index["elbow"]].kind == "fixed"
     assert "joint elbow: it was made fixed: both limits are 0" in robot.provenance["repairs"]

@@ -1,4 +1,4 @@
-"""Self-collision: what penetrates, and what does so by design."""
+"""Self-collision tests and pairs to ignore."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -42,7 +42,7 @@ def slides(*offsets):
 
 
 def chain(*links, kind="revolute"):
-    """Links on joints one after the other, 0.3 m apart."""
+    """A chain of links on joints, 0.3 m apart."""
     joints = tuple(
         Joint(f"to_{child.name}", kind, parent.name, child.name, Pose((0, 0, 0.3)), (0, 1, 0))
         for parent, child in pairwise(links)
@@ -59,7 +59,7 @@ def test_depths_are_those_of_spheres():
     assert found[2] == {("ball0", "ball1"): pytest.approx(0.05, abs=1e-6)}
 
 
-def test_faces_that_meet_do_not_collide():
+def test_touching_faces_do_not_collide():
     block = (Shape(Box((0.1, 0.1, 0.1))),)
     robot = slides(0.0, 0.1)
     robot = replace(
@@ -98,8 +98,8 @@ def test_spheres_agree_with_the_distance_of_their_centres():
         assert set(found) == expected
 
 
-def test_the_roots_links_are_tested_like_any_other():
-    """MuJoCo by itself never tests what is welded to the world against its children."""
+def test_links_of_the_root_are_tested():
+    """MuJoCo by default does not test bodies welded to the world against their children."""
     robot = chain(ball("a"), replace(ball("b"), collisions=(Shape(Sphere(0.3)),)))
     (found,) = penetrations(robot, [robot.home])
     assert set(found) == {("a", "b")}
@@ -122,17 +122,17 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
     assert set(found) == {("inside", "ring")}
 
 
-def test_neighbours_are_attached():
+def test_links_across_a_joint_are_adjacent():
     robot = chain(ball("a"), ball("b"), ball("c"))
     assert adjacent_pairs(robot) == (("a", "b"), ("b", "c"))
 
 
-def test_links_without_shapes_do_not_part_neighbours():
+def test_links_without_shapes_do_not_separate_adjacent_links():
     robot = chain(ball("a"), Link("x"), Link("y"), ball("b"), ball("c"))
     assert adjacent_pairs(robot) == (("a", "b"), ("b", "c"))
 
 
-def test_links_on_fixed_joints_are_one_body():
+def test_links_on_fixed_joints_are_adjacent():
     links = (ball("a"), ball("b"), ball("c"), ball("d"))
     robot = chain(*links)
     fixed = replace(robot.joints[1], kind="fixed")
@@ -140,19 +140,19 @@ def test_links_on_fixed_joints_are_one_body():
     assert adjacent_pairs(robot) == (("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d"))
 
 
-def test_siblings_on_an_empty_root_are_not_attached():
+def test_siblings_on_an_empty_root_are_not_adjacent():
     assert adjacent_pairs(slides(0.0, 0.3)) == ()
 
 
-def test_touching_at_home_is_ignored():
+def test_pairs_that_penetrate_at_home_are_ignored():
     robot = slides(0.0, 0.05, 0.5)
     pairs = survey_collisions(robot).ignore_pairs
     assert pairs == (("ball0", "ball1"),)
     assert penetrations(replace(robot, ignore_pairs=pairs), [robot.home]) == [{}]
 
 
-def test_never_separating_pairs_are_ignored():
-    """Home is one of the few places where the fin is out of the wall's way."""
+def test_pairs_that_nearly_always_penetrate_are_ignored():
+    """The fin penetrates the wall in most configurations, but not at home."""
     wall = Link("wall", collisions=(Shape(Box((0.02, 2.0, 2.0)), Pose((0.3, 0.0, 0.0))),))
     fin = Link("fin", collisions=(Shape(Sphere(0.1), Pose((0.0, 0.0, 0.1))),))
     for reach, expected in ((10.0, False), (0.08, True)):
@@ -165,7 +165,7 @@ def test_never_separating_pairs_are_ignored():
         assert ("fin", "wall") not in penetrations(robot, [robot.home])[0]
 
 
-def test_the_result_depends_on_nothing_but_the_robot():
+def test_the_survey_is_deterministic():
     assert survey_collisions(arm()).ignore_pairs == survey_collisions(arm()).ignore_pairs
 
 
@@ -184,26 +184,26 @@ def test_only_pairs_across_parts_are_tested():
     assert not set(asked) & set(whole)
 
 
-def test_known_pairs_are_kept_whatever_their_order():
+def test_known_pairs_are_sorted():
     robot = slides(0.0, 0.5)
     assert survey_collisions(robot, known_pairs=[("ball1", "ball0")]).ignore_pairs == (
         ("ball0", "ball1"),
     )
 
 
-def test_a_known_pair_of_no_link_is_an_error():
+def test_a_known_pair_with_an_unknown_link_is_an_error():
     with pytest.raises(RobotError, match="no link 'ball9'"):
         survey_collisions(slides(0.0, 0.5), known_pairs=[("ball0", "ball9")])
 
 
-def test_a_root_named_world_and_a_locked_joint_are_no_matter():
+def test_a_root_named_world_and_a_locked_joint_compile():
     robot = slides(0.0, 0.05)
     joints = tuple(replace(j, parent="world", limits=(0.0, 0.0)) for j in robot.joints)
     robot = replace(robot, links=(Link("world"), *robot.links[1:]), joints=joints)
     assert survey_collisions(robot).ignore_pairs == (("ball0", "ball1"),)
 
 
-def test_configurations_of_another_shape_are_refused():
+def test_configurations_of_the_wrong_shape_are_an_error():
     checker = SelfCollisionChecker(slides(0.0, 0.3))
     for q in ([0.0, 0.0], [[0.0]]):
         with pytest.raises(ValueError, match="q has shape"):
@@ -216,7 +216,7 @@ def test_a_heap_of_overlapping_links_fits_into_memory():
     assert len(found) == 40 * 39 // 2
 
 
-def test_where_mujoco_gives_up_a_hair_beside_it_counts(monkeypatch, tmp_path, capfd):
+def test_a_configuration_is_perturbed_where_epa_fails(monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
     collide, given_up = mujoco.mj_collision, []
 
@@ -236,8 +236,8 @@ def test_where_mujoco_gives_up_a_hair_beside_it_counts(monkeypatch, tmp_path, ca
     assert capfd.readouterr() == ("", "")
 
 
-def test_two_cylinders_that_mujoco_gives_up_on_for_a_ten_millionth():
-    """As two of YuMi's elbows once met, 0.02 mm deep; MuJoCo 4.0 gives up on them."""
+def test_two_cylinders_on_which_epa_fails():
+    """Two elbow shapes of YuMi that overlap by 0.02 mm; EPA of MuJoCo 4.0 fails on them."""
     shapes = (
         Shape(
             Cylinder(0.034199, 0.161572),
@@ -260,7 +260,7 @@ def test_two_cylinders_that_mujoco_gives_up_on_for_a_ten_millionth():
     assert found == {}
 
 
-def test_what_mujoco_cannot_tell_at_all_is_an_error(monkeypatch):
+def test_repeated_epa_failure_is_an_error(monkeypatch):
     def give_up(model, data):
         del model, data
         mujoco.get_mju_user_warning()("EPA: out of memory for faces on expanding polytope")

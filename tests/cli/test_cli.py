@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import start, tree
-from helpers.faulty_robots import sound, with_joint
+from helpers.faulty_robots import valid_robot, with_joint
 from helpers.parts import PINCER, write_part
 from helpers.robots import arm
 from morphgen.cli import main
@@ -80,7 +80,7 @@ def test_show_prints_the_frames_of_a_bundle_as_json(run, tmp_path):
 
 
 def test_check_is_silent_about_a_sound_bundle(run, tmp_path):
-    folder = write_bundle(sound(), tmp_path / "sound", picture=False)
+    folder = write_bundle(valid_robot(), tmp_path / "sound", picture=False)
     assert run("check", folder, "--strict") == (0, f"{folder}: 0 error, 0 warning, 0 info\n", "")
 
 
@@ -93,12 +93,12 @@ def test_check_is_silent_about_a_sound_bundle(run, tmp_path):
     ],
 )
 def test_check_fails_for_errors_and_if_strict_for_warnings(run, robot_urdf, change, codes):
-    path = robot_urdf(with_joint(sound(), "elbow", **change))
+    path = robot_urdf(with_joint(valid_robot(), "elbow", **change))
     assert (run("check", path)[0], run("check", path, "--strict")[0]) == codes
 
 
 def test_check_says_what_is_wrong_where_and_how_to_mend_it(run, robot_urdf):
-    path = robot_urdf(with_joint(sound(), "elbow", limits=(1.0, -1.0)))
+    path = robot_urdf(with_joint(valid_robot(), "elbow", limits=(1.0, -1.0)))
     _, out, _ = run("check", path)
     _, finding, remedy = out.splitlines()
     assert finding.startswith("  error limits-inverted at joint elbow: ")
@@ -120,7 +120,9 @@ def test_check_reports_a_broken_structure_as_findings(run, urdf):
 
 
 def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
-    path = urdf(urdf_text(replace(sound(), frames=()), str).replace('xyz="1 0 0"', 'xyz="3 0 0"'))
+    path = urdf(
+        urdf_text(replace(valid_robot(), frames=()), str).replace('xyz="1 0 0"', 'xyz="3 0 0"')
+    )
     code, out, err = run("check", path, "--fix", "mended")
     assert (code, err) == (0, "")
     assert "repaired axis-not-unit at joint elbow" in out
@@ -171,7 +173,7 @@ def test_conform_compares_all_loaders(run, tmp_path):
 
 def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
-    other = write_bundle(replace(sound(), name="other"), tmp_path / "other", picture=False)
+    other = write_bundle(replace(valid_robot(), name="other"), tmp_path / "other", picture=False)
     (folder / "robot.xml").write_bytes(
         (other / "robot.xml").read_bytes().replace(b"elbow", b"knee")
     )

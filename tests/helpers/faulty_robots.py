@@ -1,4 +1,4 @@
-"""Robots with one fault each, by the code of the finding that names it."""
+"""Robots with one fault each, by the code of its finding."""
 
 import math
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from morphgen.model.tree import rename
 FLAT_INERTIA = (1e-3, 0.0, 0.0, 1e-3, 0.0, 2.5e-3)
 
 
-def sound() -> Robot:
-    """A robot that every check passes in silence: the arm, its right finger moving by itself."""
+def valid_robot() -> Robot:
+    """A robot without findings: the arm with an independent right finger."""
     return with_joint(arm(), "right", mimic=None)
 
 
 def with_joint(robot: Robot, name: str, **changes: object) -> Robot:
-    """The robot, one joint changed; one that begins to move by itself is at 0 at home."""
+    """Return the robot with one joint changed; a joint that becomes independent has home 0."""
     home = {
         robot.joints[k].name: q for k, q in zip(robot.independent_joints, robot.home, strict=True)
     }
@@ -33,39 +33,39 @@ def with_joint(robot: Robot, name: str, **changes: object) -> Robot:
 
 
 def with_link(robot: Robot, name: str, **changes: object) -> Robot:
-    """The robot, one link changed."""
+    """Return the robot with one link changed."""
     return robot.with_links([replace(robot.link(name), **changes)])
 
 
 def with_body(name: str, **changes: object) -> Robot:
-    """The sound robot, the mass properties of one link changed."""
-    body = sound().link(name).inertial
+    """Return the valid robot with the mass properties of one link changed."""
+    body = valid_robot().link(name).inertial
     assert body is not None
-    return with_link(sound(), name, inertial=replace(body, **changes))
+    return with_link(valid_robot(), name, inertial=replace(body, **changes))
 
 
 def with_shape(geometry: Geometry, *, visual: bool = True) -> Robot:
-    """The sound robot, its slider's collision shape changed (and drawn, too)."""
+    """Return the valid robot with another collision shape, and visual, of its slider."""
     shapes = (Shape(geometry),)
-    drawn = (*sound().link("slider").visuals, *(shapes if visual else ()))
-    return with_link(sound(), "slider", collisions=shapes, visuals=drawn)
+    drawn = (*valid_robot().link("slider").visuals, *(shapes if visual else ()))
+    return with_link(valid_robot(), "slider", collisions=shapes, visuals=drawn)
 
 
 def with_end(link: Link, joint: Joint) -> Robot:
-    """The sound robot with one more link."""
-    robot = sound()
+    """Return the valid robot with one more link."""
+    robot = valid_robot()
     home = (*robot.home, *([0.0] if joint.is_independent else []))
     return replace(robot, links=(*robot.links, link), joints=(*robot.joints, joint), home=home)
 
 
 def hinge(child: str, **changes: object) -> Joint:
-    """A joint at the end of the slider."""
+    """Return a joint at the end of the slider."""
     joint = Joint(child, "revolute", "slider", child, limits=(-1.0, 1.0), effort=1.0, velocity=1.0)
     return replace(joint, **changes)
 
 
 def _home(position: float) -> Robot:
-    return replace(sound(), home=(position, *sound().home[1:]))
+    return replace(valid_robot(), home=(position, *valid_robot().home[1:]))
 
 
 def _weightless_between() -> Robot:
@@ -78,13 +78,13 @@ def _weightless_between() -> Robot:
 
 
 def _colliding() -> Robot:
-    """The lower rod's shape is laid into the base, two joints away."""
+    """Return a robot whose lower rod overlaps the base, two joints away."""
     block = (Shape(Box((2.0, 2.0, 2.0))),)
-    return with_link(sound(), "lower", collisions=block)
+    return with_link(valid_robot(), "lower", collisions=block)
 
 
 def _with_pads(n: int) -> Robot:
-    robot = sound()
+    robot = valid_robot()
     for i in range(n):
         pad = Joint(f"pad{i}", "fixed", robot.links[-1].name, f"pad{i}")
         robot = replace(robot, links=(*robot.links, Link(f"pad{i}")), joints=(*robot.joints, pad))
@@ -92,14 +92,14 @@ def _with_pads(n: int) -> Robot:
 
 
 ROBOTS: dict[str, Callable[[], Robot]] = {
-    "inertia-missing": lambda: with_link(sound(), "lower", inertial=None),
+    "inertia-missing": lambda: with_link(valid_robot(), "lower", inertial=None),
     "massless-body": lambda: with_end(Link("stub"), hinge("stub")),
     "massless-between": _weightless_between,
     "links-too-many": lambda: _with_pads(130),
     "links-apart": lambda: with_link(
-        sound(), "upper", visuals=(Shape(Sphere(0.02), Pose((0.0, 0.0, 0.15))),)
+        valid_robot(), "upper", visuals=(Shape(Sphere(0.02), Pose((0.0, 0.0, 0.15))),)
     ),
-    "massless-root": lambda: with_link(sound(), "base", inertial=None),
+    "massless-root": lambda: with_link(valid_robot(), "base", inertial=None),
     "mass-invalid": lambda: with_body("lower", mass=-1.0),
     "inertia-without-mass": lambda: with_end(
         Link("pad", Inertial(0.0, inertia=(1.0, 0.0, 0.0, 1.0, 0.0, 1.0))),
@@ -109,17 +109,17 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "inertia-implausible": lambda: with_body("lower", inertia=(1.0, 0.0, 0.0, 1.0, 0.0, 1.0)),
     "com-outside": lambda: with_body("lower", com=(0.0, 0.0, 0.6)),
     "density-implausible": lambda: with_body("lower", mass=100.0),
-    "axis-invalid": lambda: with_joint(sound(), "elbow", axis=(0.0, 0.0, 0.0)),
-    "axis-not-unit": lambda: with_joint(sound(), "extend", axis=(0.0, 0.0, 2.0)),
-    "limits-missing": lambda: with_joint(sound(), "elbow", limits=None),
-    "limits-inverted": lambda: with_joint(sound(), "elbow", limits=(1.0, -1.0)),
-    "limits-empty": lambda: with_joint(sound(), "elbow", limits=(0.5, 0.5)),
-    "limits-on-continuous": lambda: with_joint(sound(), "elbow", kind="continuous"),
-    "limits-wide": lambda: with_joint(sound(), "elbow", limits=(-180.0, 180.0)),
-    "effort-missing": lambda: with_joint(sound(), "elbow", effort=0.0),
-    "velocity-missing": lambda: with_joint(sound(), "elbow", velocity=None),
-    "damping-invalid": lambda: with_joint(sound(), "elbow", damping=-1.0),
-    "friction-invalid": lambda: with_joint(sound(), "elbow", friction=math.nan),
+    "axis-invalid": lambda: with_joint(valid_robot(), "elbow", axis=(0.0, 0.0, 0.0)),
+    "axis-not-unit": lambda: with_joint(valid_robot(), "extend", axis=(0.0, 0.0, 2.0)),
+    "limits-missing": lambda: with_joint(valid_robot(), "elbow", limits=None),
+    "limits-inverted": lambda: with_joint(valid_robot(), "elbow", limits=(1.0, -1.0)),
+    "limits-empty": lambda: with_joint(valid_robot(), "elbow", limits=(0.5, 0.5)),
+    "limits-on-continuous": lambda: with_joint(valid_robot(), "elbow", kind="continuous"),
+    "limits-wide": lambda: with_joint(valid_robot(), "elbow", limits=(-180.0, 180.0)),
+    "effort-missing": lambda: with_joint(valid_robot(), "elbow", effort=0.0),
+    "velocity-missing": lambda: with_joint(valid_robot(), "elbow", velocity=None),
+    "damping-invalid": lambda: with_joint(valid_robot(), "elbow", damping=-1.0),
+    "friction-invalid": lambda: with_joint(valid_robot(), "elbow", friction=math.nan),
     "home-outside-limits": lambda: _home(3.0),
     "mimic-on-fixed": lambda: with_end(
         Link("pad"), Joint("pad", "fixed", "slider", "pad", mimic=Mimic("elbow"))
@@ -133,12 +133,16 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "extent-implausible": lambda: with_shape(Box((20.0, 20.0, 20.0))),
     "visual-collision-scale": lambda: with_shape(Box((2.4e-4, 2.4e-4, 2.4e-4)), visual=False),
     "capsule-in-urdf": lambda: with_shape(Capsule(0.02, 0.1)),
-    "name-characters": lambda: replace(rename(sound(), {"right": "right/pad 1"}), name="an arm"),
-    "name-reserved": lambda: rename(sound(), {"right": "world"}),
-    "frame-name-taken": lambda: replace(sound(), frames=(*sound().frames, Frame("base", "base"))),
+    "name-characters": lambda: replace(
+        rename(valid_robot(), {"right": "right/pad 1"}), name="an arm"
+    ),
+    "name-reserved": lambda: rename(valid_robot(), {"right": "world"}),
+    "frame-name-taken": lambda: replace(
+        valid_robot(), frames=(*valid_robot().frames, Frame("base", "base"))
+    ),
     "self-collision": _colliding,
-    "tool-missing": lambda: replace(sound(), frames=()),
-    "tool-still": lambda: replace(sound(), frames=(Frame("tool", "base"),)),
+    "tool-missing": lambda: replace(valid_robot(), frames=()),
+    "tool-still": lambda: replace(valid_robot(), frames=(Frame("tool", "base"),)),
 }
 
 
@@ -154,7 +158,7 @@ def _triangle(path: Path) -> Path:
 
 
 def _mesh(path: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Robot:
-    """The sound robot with a mesh on its slider, and mass to match where it can be measured."""
+    """Return the valid robot with a mesh on its slider, and the mesh's mass if it has a volume."""
     robot = with_shape(Mesh(path, scale))
     if path.is_file() and path.stem == "ball" and all(map(math.isfinite, scale)) and all(scale):
         return robot.with_links([with_inertia(robot.link("slider"), 1000.0)])
@@ -178,6 +182,6 @@ MESHES: dict[str, Callable[[Path], Robot]] = {
 }
 
 
-def sound_mesh(folder: Path) -> Robot:
-    """The sound robot with a sound mesh."""
+def valid_robot_with_mesh(folder: Path) -> Robot:
+    """Return the valid robot with a valid mesh."""
     return _mesh(_ball(folder / "ball.stl"))

@@ -1,4 +1,4 @@
-"""The NumPy and the torch implementation of kinematics behind one interface, for tests of both."""
+"""The NumPy and torch kinematics behind one interface."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ BACKENDS = ("numpy", "float64", "float32")
 
 
 class NumpyBackend:
-    """One robot at a time."""
+    """NumPy kinematics, one robot at a time."""
 
     tolerance = 1e-9
 
@@ -44,7 +44,7 @@ class NumpyBackend:
 
 @dataclass
 class TorchBackend:
-    """All robots in one padded batch, of which the rows of one robot are asked for."""
+    """Torch kinematics, with all robots in one padded batch."""
 
     robots: list
     dtype: torch.dtype
@@ -56,7 +56,7 @@ class TorchBackend:
         self.joints = max(robot.dof for robot in self.robots)
 
     def rows(self, index, q):
-        """Which robot each row is, and its padded joint positions: here padded with ones."""
+        """Return ``robot_index`` and ``q``, padded with ones, which must not matter."""
         padded = torch.ones(len(q), self.joints, dtype=self.dtype)
         padded[:, : q.shape[1]] = torch.from_numpy(q)
         return torch.full((len(q),), index), padded
@@ -100,7 +100,7 @@ class TorchBackend:
         return found[:, : q.shape[1]].double().numpy(), error.numpy()
 
     def limits(self, robot_index):
-        """Lower and upper limits of every row, each (n, J)."""
+        """Return lower and upper limits of every row, each (n, J)."""
         both = torch.zeros(2, len(self.robots), self.joints, dtype=self.dtype)
         for r, robot in enumerate(self.robots):
             both[:, r, : robot.dof] = torch.from_numpy(joint_limits(robot).T)
@@ -108,7 +108,7 @@ class TorchBackend:
 
 
 def backend(name, robots):
-    """The implementation of a name in ``BACKENDS`` for some robots."""
+    """Return a backend of ``BACKENDS`` for some robots."""
     if name == "numpy":
         return NumpyBackend(robots)
     return TorchBackend(robots, getattr(torch, name))

@@ -8,9 +8,10 @@ from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 
 
 def rod(name: str, length: float = 0.3) -> Link:
-    """A rod along z from its link's origin, of the density of water.
+    """A rod along z from its link's origin, with the density of water.
 
-    It touches nothing near its ends, and is drawn a little beyond them.
+    The collision shape is shorter than the rod, so that adjacent rods do not collide. The visual
+    shape is longer, so that there is no visible gap.
     """
     middle = Pose((0.0, 0.0, length / 2))
     solid = Shape(Cylinder(0.02, length - 0.06), middle, (0.8, 0.4, 0.1, 1.0))
@@ -19,7 +20,7 @@ def rod(name: str, length: float = 0.3) -> Link:
 
 
 def arm() -> Robot:
-    """Base, two hinges, a slide and a mimicking finger pair."""
+    """An arm of two revolute joints and a prismatic one, with a finger and a mimic finger."""
     block = Shape(Box((0.1, 0.1, 0.04)))
     base = with_inertia(Link("base", visuals=(block,), collisions=(block,)), 2000.0)
     foot = Shape(Cylinder(0.02, 0.04), Pose((0.0, 0.0, 0.04)))
@@ -59,7 +60,7 @@ def arm() -> Robot:
 
 
 def finger(mass: float = 2.0) -> Robot:
-    """A ball of 7 mm radius that goes along y and z; at zero its middle is at the origin."""
+    """A ball of 7 mm radius that moves along y and z; at zero its centre is at the origin."""
 
     def heavy(m: float) -> Inertial:
         return Inertial(m, (0.0, 0.0, 0.0), (m * 1e-3, 0.0, 0.0, m * 1e-3, 0.0, m * 1e-3))

@@ -1,4 +1,4 @@
-"""An arm's tokens, and their fields by name."""
+"""Tokens of the arm, and their fields by name."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Joint-space inertia against MuJoCo's, and gains that settle without overshoot."""
+"""Joint-space inertia agrees with MuJoCo, and gains settle without overshoot."""
 
 import mujoco
 import numpy as np
@@ -63,7 +63,7 @@ def mujoco_mass_matrix(robot, q):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_mass_matrix_is_mujocos(seed):
+def test_mass_matrix_equals_that_of_mujoco(seed):
     rng = np.random.default_rng(seed)
     robot = random_robot(rng)
     q = rng.normal(size=robot.dof)
@@ -87,7 +87,7 @@ def test_gains_are_critically_damped():
         assert ratio == pytest.approx(1.0)
 
 
-def test_motors_lift_light_joints_to_a_share_of_the_heaviest_of_their_kind():
+def test_armature_raises_light_joints_to_a_fraction_of_the_largest_inertia():
     robot = arm()
     turning, sliding = [], []
     for k, gain in zip(robot.independent_joints, actuation(robot), strict=True):
@@ -110,7 +110,7 @@ def test_motors_lift_light_joints_to_a_share_of_the_heaviest_of_their_kind():
         ("prismatic", MIN_SLIDING_MASS),
     ],
 )
-def test_gains_take_a_smallest_inertia(kind, least):
+def test_gains_use_a_minimum_inertia(kind, least):
     limits = None if kind == "continuous" else (-1.0, 1.0)
     joint = Joint("moves", kind, "root", "leaf", limits=limits)
     (gain,) = actuation(Robot("light", (Link("root"), Link("leaf")), (joint,), home=(0.0,)))

@@ -39,7 +39,7 @@ def test_closed_form_agrees_with_the_tessellation(shape):
     np.testing.assert_allclose(np.diag(body.matrix), np.diag(mesh.moment_inertia), rtol=0.03)
 
 
-def test_turning_and_moving_a_shape_turns_and_moves_its_inertia():
+def test_a_transformed_shape_has_the_transformed_inertia():
     T = Pose.from_xyz_rpy((0.3, -0.1, 0.2), (0.4, 1.0, -0.7))
     still = inertial_from_density([Shape(Box((0.1, 0.2, 0.3)))], DENSITY)
     moved = inertial_from_density([Shape(Box((0.1, 0.2, 0.3)), T)], DENSITY)
@@ -66,7 +66,7 @@ def test_a_shape_inside_another_adds_nothing():
     assert both.mass == pytest.approx(alone.mass, rel=1e-9)
 
 
-def test_apart_shapes_keep_their_exact_formulas():
+def test_separate_shapes_use_the_closed_forms():
     far = Pose((1.0, 0.0, 0.0))
     body = inertial_from_density([Shape(Sphere(0.1)), Shape(Sphere(0.1), far)], DENSITY)
     one = inertial_from_density([Shape(Sphere(0.1))], DENSITY)
@@ -74,11 +74,11 @@ def test_apart_shapes_keep_their_exact_formulas():
     assert body.inertia[3] == pytest.approx(2 * (one.inertia[3] + one.mass * 0.25))
 
 
-def test_no_shapes_weigh_nothing():
+def test_no_shapes_have_zero_mass():
     assert inertial_from_density([], DENSITY).mass == 0.0
 
 
-def test_bounds_hold_a_turned_box():
+def test_bounding_box_contains_a_rotated_box():
     T = Pose.from_xyz_rpy((0, 0, 0), (0, 0, math.pi / 4))
     low, high = bounding_box([Shape(Box((1.0, 1.0, 0.2)), T)])
     np.testing.assert_allclose(high, [math.sqrt(0.5), math.sqrt(0.5), 0.1], atol=1e-12)

@@ -1,4 +1,4 @@
-"""Damped least squares, NumPy and torch: tools are brought where they can be, within limits."""
+"""Damped least-squares inverse kinematics in NumPy and torch."""
 
 import math
 
@@ -54,7 +54,7 @@ def test_a_step_solves_the_damped_normal_equations(kinematics):
 
 
 @pytest.mark.parametrize("index", range(len(ROBOTS)))
-def test_tools_get_to_positions_within_limits(kinematics, index):
+def test_position_ik_reaches_goals_within_the_limits(kinematics, index):
     body, rng = ROBOTS[index], np.random.default_rng(index)
     low, high = joint_limits(body).T
     q = 0.5 * (low + high) + 0.25 * rng.uniform(-1, 1, (6, body.dof)) * (high - low)
@@ -71,7 +71,7 @@ def test_tools_get_to_positions_within_limits(kinematics, index):
     np.testing.assert_allclose(found[:, idle], q[:, idle], atol=kinematics.tolerance)
 
 
-def test_what_is_out_of_reach_is_reported(kinematics):
+def test_position_ik_reports_the_error_of_unreachable_goals(kinematics):
     goals = np.array([[0.5, 0.2, 0.3], [9.0, 0.0, 0.0]])
     q, error = kinematics.solve_position_ik(0, np.tile(UR5.home, (2, 1)), goals)
     assert np.abs(error[0]).max() < 1e-4
@@ -79,7 +79,7 @@ def test_what_is_out_of_reach_is_reported(kinematics):
     assert np.linalg.norm(error[1]) > 7
 
 
-def test_numpy_and_torch_take_the_same_steps():
+def test_numpy_and_torch_ik_agree():
     q = random_configurations(PANDA, 20, np.random.default_rng(0))
     goals = frame_pose(PANDA, q[::-1])[:, :3, 3]
     ours, batched = (
@@ -106,7 +106,7 @@ def test_a_pose_out_of_reach_is_approached_within_the_limits():
 
 
 class Stepper:
-    """Steps to poses for rows of ``ROBOTS``."""
+    """Iterate ``pose_ik_step`` for rows of ``ROBOTS``."""
 
     def __init__(self, *rows):
         batch = backend("float32", ROBOTS)
@@ -126,7 +126,7 @@ class Stepper:
         )
 
 
-def test_tools_are_moved_first_and_turned_with_what_is_left():
+def test_rotation_uses_the_null_space_of_the_position_task():
     step = Stepper(1, 2, 3)
     q = step.home + 0.2 * (step.limits[1] - step.home).clamp(max=1.0)
     positions, rotations = step.poses(q)
@@ -140,7 +140,7 @@ def test_tools_are_moved_first_and_turned_with_what_is_left():
     assert off[2] > 0.1, "two hinges have nothing left"
 
 
-def test_joints_at_their_limits_leave_it_to_the_others():
+def test_joints_at_their_limits_are_excluded_from_the_step():
     step = Stepper(0)
     q, (low, high) = step.home, step.limits
     positions, rotations = step.poses(q)
@@ -149,7 +149,7 @@ def test_joints_at_their_limits_leave_it_to_the_others():
         assert ((low <= q) & (q <= high)).all()
 
 
-def test_no_joint_turns_the_tool_beyond_its_budget():
+def test_no_joint_exceeds_its_rotation_budget():
     step = Stepper(1)
     q, budget = step.home, torch.full_like(step.home, 0.05)
     positions, rotations = step.poses(q)
@@ -184,7 +184,7 @@ def test_rotation_vectors_are_the_logarithms_of_rotations(angle):
     assert np.abs(found - wanted).max() < 3e-6 * max(angle, 1e-3)
 
 
-def test_quaternions_are_those_of_scipy_and_back():
+def test_quaternions_agree_with_scipy_in_both_directions():
     turns = Rotation.random(200, rng=np.random.default_rng(0))
     R = torch.from_numpy(turns.as_matrix())
     expected = turns.as_quat(canonical=True, scalar_first=True)
@@ -193,7 +193,7 @@ def test_quaternions_are_those_of_scipy_and_back():
     torch.testing.assert_close(matrix_from_quaternion(found), R, atol=1e-12, rtol=0)
 
 
-def test_quaternions_of_half_turns_too():
+def test_quaternions_of_half_turns():
     turns = np.array([np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1])])
     found = quaternion_from_matrix(torch.from_numpy(turns.astype(float))).numpy()
     assert np.abs(found) == pytest.approx(np.eye(4), abs=1e-9)

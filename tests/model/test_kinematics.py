@@ -1,4 +1,4 @@
-"""Forward kinematics: hand-made figures, batches, mimic joints and reach."""
+"""Forward kinematics: closed forms, batches, mimic joints and reach."""
 
 import math
 
@@ -40,7 +40,7 @@ def planar(lengths=(0.5, 0.3)):
     return Robot("planar", links, joints, (tool,), home=(0.0,) * len(lengths))
 
 
-def test_planar_arm_is_where_trigonometry_says():
+def test_planar_arm_agrees_with_trigonometry():
     q = np.array([0.3, -1.1])
     x = 0.5 * math.cos(0.3) + 0.3 * math.cos(0.3 - 1.1)
     y = 0.5 * math.sin(0.3) + 0.3 * math.sin(0.3 - 1.1)
@@ -80,7 +80,7 @@ def test_reach_of_a_planar_arm_is_its_length():
     assert reach(planar((0.5, 0.3, 0.2))) == pytest.approx(1.0, rel=1e-4)
 
 
-def test_random_configurations_stay_in_bounds():
+def test_random_configurations_are_within_the_limits():
     robot = arm()
     q = random_configurations(robot, 1000, np.random.default_rng(0))
     limits = joint_limits(robot)
@@ -108,7 +108,7 @@ def test_jacobians_are_derivatives_of_poses(words):
     assert of_one == pytest.approx(jacobian[1])
 
 
-def test_unwound_configurations_are_those_that_turn_least():
+def test_unwrapped_configurations_are_nearest_to_the_reference():
     body = compose("arm=ur5 ee=plane")
     rng = np.random.default_rng(0)
     start, ends = rng.uniform(-6, 6, 6), random_configurations(body, 200, rng)
@@ -127,6 +127,6 @@ def test_unwound_configurations_are_those_that_turn_least():
     assert (apart < np.abs(ends - start) - 6).any()
 
 
-def test_a_joint_that_another_follows_is_not_turned_back():
+def test_a_joint_with_followers_is_not_unwrapped():
     turns = periodic_joints(compose("arm=panda ee=panda_hand"))
     assert turns.tolist() == [True] * 7 + [False]

@@ -70,7 +70,7 @@ def drawn(index, n=8):
     return random_configurations(ROBOTS[index], n, np.random.default_rng(index))
 
 
-def test_links_are_where_mujoco_has_them(kinematics, index):
+def test_link_poses_agree_with_mujoco(kinematics, index):
     robot, q = ROBOTS[index], drawn(index)
     expected = MujocoKinematics(robot)
     T_root_link = kinematics.link_poses(index, q)
@@ -81,7 +81,7 @@ def test_links_are_where_mujoco_has_them(kinematics, index):
         )
 
 
-def test_axes_and_anchors_are_those_of_mujoco(kinematics, index):
+def test_joint_axes_agree_with_mujoco(kinematics, index):
     robot, q = ROBOTS[index], drawn(index, 1)
     expected = MujocoKinematics(robot)
     expected.frame_pose(q)
@@ -100,7 +100,7 @@ def test_axes_and_anchors_are_those_of_mujoco(kinematics, index):
     assert not axes[0].any()
 
 
-def test_tool_jacobians_are_those_of_mujoco(kinematics, index):
+def test_tool_jacobians_agree_with_mujoco(kinematics, index):
     robot, q = ROBOTS[index], drawn(index)
     expected = MujocoKinematics(robot)
     model, data = expected.model, expected.data
@@ -120,7 +120,7 @@ def test_tool_jacobians_are_those_of_mujoco(kinematics, index):
         np.testing.assert_allclose(J_root_tool, folded, atol=kinematics.tolerance)
 
 
-def test_tool_jacobians_are_those_of_pinocchio(kinematics, index):
+def test_tool_jacobians_agree_with_pinocchio(kinematics, index):
     pinocchio = pytest.importorskip("pinocchio")
     robot, q = ROBOTS[index], drawn(index)
     bare = [replace(link, visuals=(), collisions=()) for link in robot.links]
@@ -151,7 +151,7 @@ def test_tool_jacobians_are_those_of_pinocchio(kinematics, index):
         np.testing.assert_allclose(J[i], folded, atol=kinematics.tolerance)
 
 
-def test_rows_of_different_robots_do_not_touch_each_other():
+def test_rows_of_different_robots_are_independent():
     kinematics = TorchBackend(ROBOTS, torch.float64)
     rows = [kinematics.rows(index, drawn(index)) for index in range(len(ROBOTS))]
     robot_index, q = (torch.cat(each) for each in zip(*rows, strict=True))
@@ -170,7 +170,7 @@ def test_rows_of_different_robots_do_not_touch_each_other():
         np.testing.assert_allclose(J_root_tool[here][..., :dof].numpy(), J[own], atol=1e-14)
 
 
-def test_derivatives_of_poses_are_the_jacobians():
+def test_jacobians_are_the_derivatives_of_poses():
     kinematics = TorchBackend(ROBOTS, torch.float64)
     for index, robot in enumerate(ROBOTS):
         robot_index, q = kinematics.rows(index, drawn(index, 2))
@@ -187,7 +187,7 @@ def test_derivatives_of_poses_are_the_jacobians():
         torch.testing.assert_close(J[:, :3], derivative, atol=1e-12, rtol=0)
 
 
-def test_a_tree_may_have_room_for_more_links():
+def test_a_tree_can_be_padded_to_more_links():
     tree = compile_tree([arm()], max_links=9)
     assert tree.is_link.tolist() == [[True] * 6 + [False] * 3]
     T = forward_kinematics(tree, torch.tensor([0]), torch.tensor([arm().home]))
@@ -197,7 +197,7 @@ def test_a_tree_may_have_room_for_more_links():
         compile_tree([arm()], max_links=3)
 
 
-def test_a_tool_that_nothing_moves_has_a_pose_and_no_velocity():
+def test_an_immobile_tool_has_a_zero_jacobian():
     fixed = replace(arm(), name="fixed", frames=(Frame("tool", "base", Pose((1.0, 2.0, 3.0))),))
     chain = compile_chain([fixed], dtype=torch.float64)
     T, J = frame_jacobian(chain, torch.tensor([0]), torch.tensor([fixed.home]).double())
@@ -205,7 +205,7 @@ def test_a_tool_that_nothing_moves_has_a_pose_and_no_velocity():
     assert not J.any()
 
 
-def test_a_robot_of_one_link_has_a_root_alone():
+def test_a_robot_with_one_link():
     robot = Robot("stone", (Link("a"),))
     T = forward_kinematics(compile_tree([robot]), torch.tensor([0, 0]), torch.zeros(2, 0))
     assert (torch.eye(4) == T).all()

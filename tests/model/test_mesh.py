@@ -116,7 +116,7 @@ def test_collada_units_are_applied_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
-def test_colladas_up_axis_turns_nothing(up: str, tmp_path: Path) -> None:
+def test_the_up_axis_of_collada_is_ignored(up: str, tmp_path: Path) -> None:
     mesh = load_mesh(Mesh(dae(tmp_path / "m.dae", up=up)))
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [1, 2, 3]])
 
@@ -126,7 +126,7 @@ def test_the_scene_graph_is_applied_in_the_files_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.bounds, [[1, 0, 0], [1.1, 0.2, 0.3]], atol=1e-12)
 
 
-def test_a_file_splits_into_one_part_a_colour(tmp_path: Path) -> None:
+def test_a_file_has_one_part_per_colour(tmp_path: Path) -> None:
     path = dae(tmp_path / "m.dae")
     assert mesh_parts(path) == (MeshPart(RED, 1), MeshPart(BLUE, 3))
     red, blue, whole = (load_mesh(Mesh(path, part=part)) for part in (0, 1, None))
@@ -148,7 +148,7 @@ def test_obj_materials_are_parts_and_a_file_without_colour_has_none(
     assert mesh_parts(box) == (MeshPart(None, 12),)
 
 
-def test_a_part_that_is_not_there_is_refused(box: Path) -> None:
+def test_an_unknown_part_is_an_error(box: Path) -> None:
     with pytest.raises(MeshError, match="no part 1; valid: 0 to 0"):
         load_mesh(Mesh(box, part=1))
 
@@ -174,7 +174,7 @@ def test_triangles_without_area_are_dropped(tmp_path: Path) -> None:
         ("a.step", b"x", "valid: .dae"),
     ],
 )
-def test_what_is_no_mesh_is_refused_by_name(
+def test_an_unreadable_file_is_an_error_that_names_it(
     name: str, content: bytes, reason: str, tmp_path: Path
 ) -> None:
     path = tmp_path / name
@@ -187,7 +187,7 @@ def test_what_is_no_mesh_is_refused_by_name(
         assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"lost\.stl: no such file"):
         load_mesh(Mesh(tmp_path / "lost.stl"))
 
@@ -219,7 +219,7 @@ def test_a_flat_mesh_has_no_hull(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["arm_mico", "hand_2finger", "wrist_spherical_2"])
-def test_kinovas_y_up_visuals_are_where_their_stls_are(part: str, data: Path) -> None:
+def test_y_up_visuals_of_the_kinova_match_its_stls(part: str, data: Path) -> None:
     meshes = data / "kinova_description" / "meshes"
     assert "Y_UP" in (meshes / f"{part}.dae").read_text()
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""Rotations agree with SciPy and survive the trip through roll-pitch-yaw."""
+"""Rotations agree with SciPy and round-trip through roll-pitch-yaw."""
 
 import math
 
@@ -15,13 +15,13 @@ RPY = st.tuples(ANGLES, st.floats(-math.pi / 2, math.pi / 2), ANGLES)
 
 
 @given(RPY)
-def test_rpy_is_urdfs_fixed_axis_convention(rpy):
+def test_rpy_follows_the_fixed_axis_convention_of_urdf(rpy):
     ours = np.array(rotation.to_matrix(rotation.from_rpy(rpy)))
     np.testing.assert_allclose(ours, Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-12)
 
 
 @given(RPY)
-def test_rpy_survives_the_quaternion_even_near_the_gimbal_lock(rpy):
+def test_rpy_round_trips_through_quaternions_even_near_gimbal_lock(rpy):
     q = rotation.from_rpy(rpy)
     back = rotation.from_rpy(rotation.to_rpy(q))
     np.testing.assert_allclose(rotation.to_matrix(back), rotation.to_matrix(q), atol=1e-8)
@@ -30,7 +30,7 @@ def test_rpy_survives_the_quaternion_even_near_the_gimbal_lock(rpy):
 @pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
 @pytest.mark.parametrize("roll", [0.0, 0.7, -2.0])
 @pytest.mark.parametrize("yaw", [0.0, 1.1, -3.0])
-def test_rpy_at_the_gimbal_lock_is_the_same_rotation(roll, pitch, yaw):
+def test_rpy_in_gimbal_lock_gives_the_same_rotation(roll, pitch, yaw):
     q = rotation.from_rpy((roll, pitch, yaw))
     back = rotation.from_rpy(rotation.to_rpy(q))
     np.testing.assert_allclose(rotation.to_matrix(back), rotation.to_matrix(q), atol=1e-12)
@@ -45,13 +45,13 @@ def test_product_is_the_product_of_matrices(a, b):
 
 
 @given(RPY)
-def test_matrix_gives_back_the_quaternion_with_positive_w(rpy):
+def test_quaternions_round_trip_through_matrices(rpy):
     q = rotation.from_rpy(rpy)
     assert q[0] >= 0
     back = rotation.from_matrix(rotation.to_matrix(q))
     assert min(np.abs(np.subtract(back, q)).max(), np.abs(np.add(back, q)).max()) < 1e-7
 
 
-def test_a_zero_quaternion_is_refused():
+def test_a_zero_quaternion_is_an_error():
     with pytest.raises(ValueError, match="invalid rotation quaternion"):
         rotation.normalize((0.0, 0.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""A scaled link is the same thing, larger, with all that is on it."""
+"""Scaling links with the joints, frames and shapes on them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ STRAIGHT = np.zeros(4)
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.3, 2.0])
-def test_mass_goes_with_the_third_power_and_inertia_with_the_fifth(factor):
+def test_mass_scales_with_the_third_power_and_inertia_with_the_fifth(factor):
     before, after = (
         arm().link("upper").inertial,
         scale_links(arm(), {"upper": factor}).link("upper").inertial,
@@ -28,7 +28,7 @@ def test_mass_goes_with_the_third_power_and_inertia_with_the_fifth(factor):
     assert after.com == pytest.approx([factor * value for value in before.com])
 
 
-def test_a_scaled_body_is_that_of_its_scaled_shapes():
+def test_scaled_mass_properties_are_those_of_the_scaled_shapes():
     link = scale_links(arm(), {"upper": 1.7}).link("upper")
     solid = inertial_from_density(link.collisions, 1000.0)
     assert link.inertial.mass == pytest.approx(solid.mass)
@@ -36,7 +36,7 @@ def test_a_scaled_body_is_that_of_its_scaled_shapes():
     assert link.inertial.com == pytest.approx(solid.com)
 
 
-def test_joints_and_frames_on_a_link_move_out_and_those_it_hangs_on_do_not():
+def test_joints_and_frames_on_a_scaled_link_move_and_its_own_joint_does_not():
     larger = scale_links(arm(), {"upper": 2.0})
     before, after = forward_kinematics(arm(), STRAIGHT), forward_kinematics(larger, STRAIGHT)
     upper, lower, slider = (arm().link_index[name] for name in ("upper", "lower", "slider"))
@@ -58,7 +58,7 @@ def test_a_robot_scaled_in_every_link_is_the_same_robot_larger():
     assert larger.mass == pytest.approx(1.5**3 * arm().mass)
 
 
-def test_all_kinds_of_shapes_grow_in_all_directions():
+def test_all_kinds_of_shapes_scale_uniformly():
     mesh = Mesh(Path("a.stl"), (0.001, 0.001, -0.001), 2)
     kinds = (Box((1, 2, 3)), Sphere(1.0), Cylinder(1.0, 2.0), Capsule(1.0, 2.0), mesh)
     shapes = tuple(Shape(kind, Pose((1.0, 0.0, 2.0))) for kind in kinds)
@@ -74,20 +74,20 @@ def test_all_kinds_of_shapes_grow_in_all_directions():
     assert {shape.T_link_shape.position for shape in grown} == {(2.0, 0.0, 4.0)}
 
 
-def test_links_that_are_not_named_stay_as_they_are():
+def test_other_links_are_unchanged():
     larger = scale_links(arm(), {"upper": 2.0})
     assert [a == b for a, b in zip(larger.links, arm().links, strict=True)].count(False) == 1
     for same in (scale_links(arm(), {}), scale_links(arm(), {"upper": 1.0})):
         assert (same.links, same.joints, same.frames) == (arm().links, arm().joints, arm().frames)
 
 
-def test_limits_axes_and_names_stay():
+def test_limits_axes_and_names_are_unchanged():
     larger = scale_links(arm(), {link.name: 3.0 for link in arm().links})
     for a, b in zip(larger.joints, arm().joints, strict=True):
         assert (a.name, a.axis, a.limits, a.mimic) == (b.name, b.axis, b.limits, b.mimic)
 
 
-def test_a_link_that_does_not_exist_is_refused():
+def test_an_unknown_link_is_an_error():
     with pytest.raises(RobotError, match="uper"):
         scale_links(arm(), {"uper": 2.0})
 
@@ -96,7 +96,7 @@ FACES = {"upper": (0.02, 0.0, -0.1), "slider": (0.0, 0.01, 0.05)}
 
 
 def face_positions(robot, factors, q):
-    """Where the faces of links lie in the root frame: on the links, and on their parents."""
+    """Return the faces of links in the root frame, as points of the links and of their parents."""
     T = forward_kinematics(robot, q)
     before = forward_kinematics(arm(), np.zeros(4))
     for name, face in FACES.items():
@@ -111,7 +111,7 @@ def face_positions(robot, factors, q):
         )
 
 
-def test_faces_of_links_stay_on_their_parents_whatever_the_factors():
+def test_faces_stay_in_contact_with_the_parent():
     rng = np.random.default_rng(0)
     for _ in range(20):
         names = [link.name for link in arm().links if rng.random() < 0.8]
@@ -121,19 +121,19 @@ def test_faces_of_links_stay_on_their_parents_whatever_the_factors():
             assert on_link == pytest.approx(on_parent, abs=1e-12)
 
 
-def test_without_faces_they_would_not():
+def test_without_faces_the_contact_is_lost():
     factors = {"upper": 1.5}
     robot = scale_links(arm(), factors)
     apart = [np.linalg.norm(a - b) for a, b in face_positions(robot, factors, STRAIGHT)]
     assert max(apart) > 0.05
 
 
-def test_links_of_one_factor_need_no_faces():
+def test_equal_factors_need_no_faces():
     factors = dict.fromkeys((link.name for link in arm().links), 1.3)
     assert scale_links(arm(), factors, FACES).joints == scale_links(arm(), factors).joints
     assert scale_links(arm(), {}, FACES).joints == arm().joints
 
 
-def test_a_face_of_a_link_that_does_not_exist_is_refused():
+def test_a_face_of_an_unknown_link_is_an_error():
     with pytest.raises(RobotError, match="uper"):
         scale_links(arm(), {}, {"uper": (0.0, 0.0, 0.0)})
