@@ -65,7 +65,7 @@ def check_links_apart(robot: Robot) -> Iterator[Finding]:
                 "links-apart",
                 "warning",
                 f"links {robot.links[ancestor].name}, {link.name}",
-                f"at home {1000 * gap:.3g} mm of air are between what one sees of them",
+                f"at home their visual shapes are {1000 * gap:.3g} mm apart",
                 "correct the origin of the joint between them or of a mesh, or a mesh's scale",
             )
 

@@ -186,7 +186,7 @@ def check_mimic(robot: Robot) -> Iterator[Finding]:
                 "mimic-invalid",
                 "error",
                 where,
-                f"it follows as {mimic.multiplier} q + {mimic.offset}",
+                f"its position is {mimic.multiplier} q + {mimic.offset}, which is not finite",
                 "write a finite multiplier and offset",
             )
         elif mimic.multiplier == 0:
@@ -217,7 +217,7 @@ def check_mimic_range(robot: Robot) -> Iterator[Finding]:
                 "mimic-range",
                 "warning",
                 f"joint {follower.name}",
-                f"joint {leader.name} sends it from {low:.4g} to {high:.4g}; its limits are "
+                f"joint {leader.name} drives it from {low:.4g} to {high:.4g}; its limits are "
                 f"{lower:.4g} to {upper:.4g}",
                 "widen its limits, or narrow its leader's",
             )

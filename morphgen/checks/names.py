@@ -23,7 +23,7 @@ def check_names(robot: Robot) -> Iterator[Finding]:
                 "name-characters",
                 "warning",
                 f"{element} {name}",
-                f"its name holds {characters or 'nothing'}: paths, scopes and USD break on that",
+                f"its name contains {characters or 'nothing'}, invalid in paths, scopes and USD",
                 "use letters, digits, '_', '-' and '.'; the repair writes '_'",
                 repair="its name was rewritten with '_' for what loaders dislike",
             )
@@ -36,7 +36,7 @@ def check_reserved(robot: Robot) -> Iterator[Finding]:
             "name-reserved",
             "error",
             f"link {_WORLD}",
-            "MuJoCo keeps the name 'world' for what the root stands on, and this is not the root",
+            "MuJoCo reserves the name 'world' for the world body, and this link is not the root",
             "rename the link, as the repair does",
             repair="it was renamed: MuJoCo keeps that name for the world",
         )
@@ -54,7 +54,7 @@ def check_frame_names(robot: Robot) -> Iterator[Finding]:
                     "frame-name-taken",
                     "error",
                     f"frame {frame.name}",
-                    f"in a URDF it is a {element} {name!r}, and there is one of that name",
+                    f"a URDF represents it by a {element} {name!r}, and that name is taken",
                     "rename the frame or the " + element,
                 )
 

@@ -126,7 +126,7 @@ def compile_tree(
     levels, column, start = [], np.zeros((len(robots), links), dtype=np.int64), 1
     level_column = np.zeros_like(column)  # of each link within its level
     for depth in range(1, max(map(len, levels_of))):
-        members = [own[depth] if depth < len(own) else [] for own in levels_of]
+        members = [rows[depth] if depth < len(rows) else [] for rows in levels_of]
         width = max(map(len, members))
         link, parent = np.zeros((2, len(robots), width), dtype=np.int64)
         for r, robot in enumerate(robots):

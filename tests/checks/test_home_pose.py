@@ -51,7 +51,7 @@ def test_links_that_touch_or_nearly_do_are_not_apart(offset):
 def test_a_gap_is_reported_with_both_links_and_its_width():
     box = Box((0.1, 0.1, 0.1))
     assert found(pair(box, box, Pose((0.0, 0.0, 0.1 + 1.2 * MAX_GAP)))) == [
-        ("links parent, child", "at home 6 mm of air are between what one sees of them")
+        ("links parent, child", "at home their visual shapes are 6 mm apart")
     ]
 
 
@@ -60,7 +60,7 @@ def test_links_without_shapes_are_skipped():
     near, far = (Pose((z, 0.0, 0.0)) for z in (0.1, 0.2))
     assert found(pair(ball, ball, near, between=("a", "b"))) == []
     assert found(pair(ball, ball, far, between=("a", "b"))) == [
-        ("links parent, child", "at home 100 mm of air are between what one sees of them")
+        ("links parent, child", "at home their visual shapes are 100 mm apart")
     ]
 
 
@@ -91,7 +91,7 @@ def test_a_rod_in_the_opening_of_a_ring_is_apart_from_it(tmp_path):
     ring = mesh(tmp_path, "ring.stl", trimesh.creation.annulus(0.05, 0.06, 0.02))
     within = 1000 * (0.05 * np.cos(np.pi / 32) - 0.01)  # to the faces of the ring's 32 sides
     assert found(pair(ring, Cylinder(0.01, 0.5))) == [
-        ("links parent, child", f"at home {within:.3g} mm of air are between what one sees of them")
+        ("links parent, child", f"at home their visual shapes are {within:.3g} mm apart")
     ]
 
 
