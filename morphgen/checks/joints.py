@@ -107,29 +107,23 @@ def check_drive(robot: Robot) -> Iterator[Finding]:
     """Find joints without usable effort or velocity, and negative damping or friction."""
     for joint in _movable(robot):
         where = f"joint {joint.name}"
-        linear = joint.kind == "prismatic"
-        effort = f"{DEFAULT_EFFORT:g} {'N' if linear else 'N m'}"
-        velocity = f"{DEFAULT_VELOCITY:g} {'m/s' if linear else 'rad/s'}"
-        drives = joint.is_independent and not is_locked(robot, joint)
-        if drives and not is_positive(joint.effort):
-            yield Finding(
-                "effort-missing",
-                "warning",
-                where,
-                f"{_describe('effort', joint.effort)}: PyBullet has no force to move it, MuJoCo no "
-                "limit",
-                f"write its largest effort; the repair takes {effort}",
-                repair=f"its effort was set to {effort}",
-            )
-        if drives and not is_positive(joint.velocity):
-            yield Finding(
-                "velocity-missing",
-                "warning",
-                where,
-                _describe("velocity", joint.velocity),
-                f"write its largest velocity; the repair takes {velocity}",
-                repair=f"its velocity was set to {velocity}",
-            )
+        units = ("N", "m/s") if joint.kind == "prismatic" else ("N m", "rad/s")
+        consequence = ": PyBullet has no force to move it, MuJoCo no limit"
+        is_driven = joint.is_independent and not is_locked(robot, joint)
+        for name, value, default, unit, effect in (
+            ("effort", joint.effort, DEFAULT_EFFORT, units[0], consequence),
+            ("velocity", joint.velocity, DEFAULT_VELOCITY, units[1], ""),
+        ):
+            if is_driven and not is_positive(value):
+                fault = f"it has no {name}" if value is None else f"its {name} is {value:g}"
+                yield Finding(
+                    f"{name}-missing",
+                    "warning",
+                    where,
+                    fault + effect,
+                    f"write its largest {name}; the repair takes {default:g} {unit}",
+                    repair=f"its {name} was set to {default:g} {unit}",
+                )
         for name, value in (("damping", joint.damping), ("friction", joint.friction)):
             if not value >= 0 or math.isinf(value):
                 yield Finding(
@@ -265,10 +259,6 @@ def position_range(joint: Joint) -> tuple[float, float]:
 def is_positive(value: float | None) -> bool:
     """Return whether a value is given, finite and above zero."""
     return value is not None and math.isfinite(value) and value > 0
-
-
-def _describe(name: str, value: float | None) -> str:
-    return f"it has no {name}" if value is None else f"its {name} is {value:g}"
 
 
 def _movable(robot: Robot) -> Iterator[Joint]:
