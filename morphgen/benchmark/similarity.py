@@ -92,9 +92,9 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
     {
         measure.name: measure
         for measure in (
-            Measure("cosine", cosine, True, "how parallel the tokens are, laid end to end"),
+            Measure("cosine", cosine, True, "cosine of the concatenated tokens"),
             Measure("tree", tree_distance, False, "edit distance of the kinematic trees"),
-            Measure("workspace", workspace_overlap, True, "overlap of where the tools can go"),
+            Measure("workspace", workspace_overlap, True, "overlap of the tool positions"),
         )
     }
 )

@@ -1,1 +1,1 @@
-"""``Robot`` and what follows from it alone: the ground floor."""
+"""Robot models: kinematic trees, geometry, mass properties, kinematics and dynamics."""
