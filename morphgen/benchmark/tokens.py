@@ -187,22 +187,22 @@ def robot_from_tokens(
         raise BenchmarkError(f"{what}: shape {table.shape}; expected (n_links, {TOKEN_SIZE})")
     layout.require_max_links(len(table), what, max_links)
     layout.require_finite(table, what, [str(i) for i in range(len(table))])
-    rows = [_Token(what, i, numbers) for i, numbers in enumerate(table)]
-    for row in rows:
-        _require_index(row, max_links - 1)
-    parents = [_read_parent(row, max_links - 1) for row in rows]
-    shapes = {f"link{row.index}": shape for row in rows if (shape := _read_shape(row))}
-    tools = [row for row in rows if row.decode(layout.TOOL, layout.decode_flag)]
+    link_tokens = [_Token(what, i, numbers) for i, numbers in enumerate(table)]
+    for token in link_tokens:
+        _require_index(token, max_links - 1)
+    parents = [_read_parent(token, max_links - 1) for token in link_tokens]
+    shapes = {f"link{token.index}": shape for token in link_tokens if (shape := _read_shape(token))}
+    tools = [token for token in link_tokens if token.decode(layout.TOOL, layout.decode_flag)]
     if len(tools) > 1:
         raise tools[1].error(layout.TOOL, f"link {tools[0].index} is flagged, too; only one can")
-    _require_base(rows[0])
-    joints = [_read_joint(row, parents[row.index]) for row in rows[1:]]
-    names = [f"link{row.index}" for row in rows]
+    _require_base(link_tokens[0])
+    joints = [_read_joint(token, parents[token.index]) for token in link_tokens[1:]]
+    names = [f"link{token.index}" for token in link_tokens]
     robot = Robot(
         name,
         tuple(Link(n, collisions=(shapes[n],) if n in shapes else ()) for n in names),
         tuple(joint for joint, _ in joints),
-        tuple(Frame(TOOL, names[row.index]) for row in tools),
+        tuple(Frame(TOOL, names[token.index]) for token in tools),
         tuple(q for joint, q in joints if joint.is_movable),
     )
     return robot, shapes
@@ -250,51 +250,51 @@ class _Token:
                 raise self.error(field, f"it is not zero, but {of}")
 
 
-def _require_index(row: _Token, scale: int) -> None:
-    index = float(row.numbers[layout.INDEX.start])
-    if abs(index * scale - row.index) > layout.TOLERANCE:
-        raise row.error(
+def _require_index(token: _Token, scale: int) -> None:
+    index = float(token.numbers[layout.INDEX.start])
+    if abs(index * scale - token.index) > layout.TOLERANCE:
+        raise token.error(
             layout.INDEX,
-            f"{index:g}, not {row.index}/{scale}: made with another max_links than {scale + 1}, "
+            f"{index:g}, not {token.index}/{scale}: made with another max_links than {scale + 1}, "
             "padded, or out of order",
         )
 
 
-def _read_parent(row: _Token, scale: int) -> int:
+def _read_parent(token: _Token, scale: int) -> int:
     """Decode the index of a link's parent, which precedes the link."""
-    value = float(row.numbers[layout.PARENT.start])
+    value = float(token.numbers[layout.PARENT.start])
     parent = round(value * scale)
-    first, last = (0, row.index - 1) if row.index else (-1, -1)
+    first, last = (0, token.index - 1) if token.index else (-1, -1)
     if abs(value * scale - parent) > layout.TOLERANCE or not first <= parent <= last:
         valid = f"k/{scale}, k = {first} ... {last}" if first < last else f"{first}/{scale}"
-        raise row.error(layout.PARENT, f"{value:g} makes no tree; expected {valid}")
+        raise token.error(layout.PARENT, f"{value:g} makes no tree; expected {valid}")
     return parent
 
 
-def _read_shape(row: _Token) -> Shape | None:
-    primitive = row.decode(layout.GEOMETRY, layout.decode_primitive)
+def _read_shape(token: _Token) -> Shape | None:
+    primitive = token.decode(layout.GEOMETRY, layout.decode_primitive)
     if primitive is None:
-        row.require_zeros(layout.SHAPE_POSE, of="the link has no geometry")
+        token.require_zeros(layout.SHAPE_POSE, of="the link has no geometry")
         return None
-    return Shape(primitive, row.decode(layout.SHAPE_POSE, layout.decode_pose))
+    return Shape(primitive, token.decode(layout.SHAPE_POSE, layout.decode_pose))
 
 
-def _require_base(row: _Token) -> None:
-    joint, _ = _read_joint(row, -1)
+def _require_base(token: _Token) -> None:
+    joint, _ = _read_joint(token, -1)
     if joint.is_movable:
-        raise row.error(layout.KIND, f"{joint.kind}, but the base is fixed")
+        raise token.error(layout.KIND, f"{joint.kind}, but the base is fixed")
     if not np.allclose(joint.T_parent_joint.matrix, np.eye(4), rtol=0, atol=layout.TOLERANCE):
-        raise row.error(layout.ORIGIN, "the base has no parent; expected [0, 0, 0, 1, 0, 0, 0]")
+        raise token.error(layout.ORIGIN, "the base has no parent; expected [0, 0, 0, 1, 0, 0, 0]")
 
 
-def _read_joint(row: _Token, parent: int) -> tuple[Joint, float]:
+def _read_joint(token: _Token, parent: int) -> tuple[Joint, float]:
     """Decode the joint that attaches a link, and its position."""
-    kind = row.decode(layout.KIND, layout.decode_kind)
-    name, child = f"joint{row.index}", f"link{row.index}"
-    origin = row.decode(layout.ORIGIN, layout.decode_pose)
+    kind = token.decode(layout.KIND, layout.decode_kind)
+    name, child = f"joint{token.index}", f"link{token.index}"
+    origin = token.decode(layout.ORIGIN, layout.decode_pose)
     if kind == "fixed":
-        row.require_zeros(layout.AXIS, layout.POSITION, of="the joint is fixed")
+        token.require_zeros(layout.AXIS, layout.POSITION, of="the joint is fixed")
         return Joint(name, kind, f"link{parent}", child, origin), 0.0
-    axis = row.decode(layout.AXIS, layout.decode_axis)
-    q = row.decode(layout.POSITION, layout.decode_position)
+    axis = token.decode(layout.AXIS, layout.decode_axis)
+    q = token.decode(layout.POSITION, layout.decode_position)
     return Joint(name, kind, f"link{parent}", child, origin, axis, (-1.0, 1.0)), q
