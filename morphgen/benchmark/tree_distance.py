@@ -126,8 +126,9 @@ def _node(
         kind = _PRISMATIC if joint.kind == "prismatic" else _ROTATIONAL
         # A joint's motion does not change its own axis, so the child link's rotation serves.
         axis = R_root_link @ np.array(joint.unit_axis)
+    shape_kind = _shape_kind(shape)  # before the extents, because it rejects meshes
     extents = np.zeros(3) if shape is None else _extents(shape)
-    return _Node(kind, axis, length / reach, _shape_kind(shape), extents / reach)
+    return _Node(kind, axis, length / reach, shape_kind, extents / reach)
 
 
 def _shape_kind(shape: Shape | None) -> int:

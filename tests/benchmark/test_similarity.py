@@ -136,7 +136,7 @@ def test_robots_without_a_movable_tool_are_errors(tmp_path):
     robot = arm()
     with pytest.raises(BenchmarkError, match="no frame 'tool'"):
         features(replace(robot, frames=()), {})
-    with pytest.raises(BenchmarkError, match="no link"):
+    with pytest.raises(BenchmarkError, match="unknown link"):
         features(robot, {"nowhere": robot.links[0].collisions[0]})
     with pytest.raises(BenchmarkError, match="a mesh has no token"):
         features(robot, {"base": Shape(Mesh(tmp_path / "a.stl"))})

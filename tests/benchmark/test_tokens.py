@@ -194,7 +194,12 @@ def test_a_robot_of_one_link_has_one_token():
             {},
             "link 'b': joint origin: [inf, 0, 0, 1, 0, 0, 0] is not finite",
         ),
-        (hinge(T_parent_joint=Pose(quaternion=(0, 0, 0, 0))), {}, {}, "link 'b': (0, 0, 0, 0) is"),
+        (
+            hinge(T_parent_joint=Pose(quaternion=(0, 0, 0, 0))),
+            {},
+            {},
+            "link 'b': invalid rotation quaternion: (0, 0, 0, 0)",
+        ),
         (hinge(limits=(1.0, -1.0)), {}, {}, "joint 'j': limits (1, -1) leave no range"),
         (hinge(limits=(1.0, 1.0)), {}, {}, "joint 'j': limits (1, 1) leave no range"),
         (hinge(limits=(-math.inf, math.inf)), {}, {}, "joint 'j': limits (-inf, inf) leave no"),
