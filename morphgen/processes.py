@@ -1,4 +1,4 @@
-"""Do the same to many things, in one process or in several."""
+"""Map a function over items in one process or in several, and connect to Ray."""
 
 from __future__ import annotations
 
@@ -25,102 +25,96 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 Progress = Callable[[int, int], None]
-"""Told how much is done, and of how much."""
+"""Callback with the number of results so far and in total."""
 
 CHUNK_SIZE = 8
-"""Things that a worker does before it reports, unless told otherwise."""
-POLL = 0.2
-"""Seconds between a worker's looks at whether the parent has stopped."""
-PATIENCE = 5.0
-"""Seconds to wait for an answer from a Ray cluster's address; Ray itself waits for minutes."""
+"""Default number of items that a worker processes before it reports."""
+POLL_INTERVAL = 0.2
+"""Interval at which workers check whether the parent has stopped [s]."""
+RAY_TIMEOUT = 5.0
+"""Longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes."""
 
 _work: Callable[[Any], object] | None = None
 _stopped: c_byte | None = None
-"""Whether the parent has stopped; in memory of all its processes."""
+"""Flag that the parent has stopped, in memory that all its processes share."""
 _is_working = False
 
 
 def no_progress(done: int, total: int) -> None:
-    """A progress that is shown to nobody."""
+    """Ignore progress."""
 
 
 def parallel_map(
     work: Callable[[T], R],
-    things: Sequence[T],
+    items: Sequence[T],
     jobs: int,
     progress: Progress = no_progress,
     chunk: int = CHUNK_SIZE,
 ) -> Iterator[R]:
-    """Do work on every thing; results in the order of the things.
+    """Yield ``work(item)`` for every item, in the order of the items.
 
     Args:
-        work: A function that can be pickled, with all that it needs; each process gets it once.
-        things: What it is done to.
-        jobs: Processes. No more are started than there is work for.
-        progress: Told how many results there are, and how many there will be.
-        chunk: Things that a process does before it reports; fewer where one takes long.
+        work: A function that can be pickled; each process receives it once.
+        items: Its arguments.
+        jobs: Largest number of processes.
+        progress: Called after each result.
+        chunk: Items that a process handles before it reports; use fewer for slow work.
 
     Raises:
-        MorphgenError: If ``jobs`` is below 1, what the work raises, or that a process died.
+        MorphgenError: If ``jobs`` is below 1 or a process died. Errors of ``work`` are passed on.
     """
     if jobs < 1:
         raise MorphgenError(f"{jobs} jobs: expected 1 or more")
-    chunks = [things[i : i + chunk] for i in range(0, len(things), chunk)]
+    chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
     jobs = min(jobs, len(chunks))
-    results = map(work, things) if jobs <= 1 else _in_processes(work, chunks, jobs)
+    results = map(work, items) if jobs <= 1 else _in_processes(work, chunks, jobs)
     for done, result in enumerate(results, 1):
-        progress(done, len(things))
+        progress(done, len(items))
         yield result
 
 
 def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
     context = get_context("spawn")
     stopped = context.RawValue("b", 0)
-    pool = ProcessPoolExecutor(jobs, context, _start, (work, stopped))
+    pool = ProcessPoolExecutor(jobs, context, _init_pool_worker, (work, stopped))
     waiting = iter(chunks)
     try:
-        running = deque(_submitted(pool, itertools.islice(waiting, 2 * jobs)))
+        running = deque(_submit(pool, itertools.islice(waiting, 2 * jobs)))
         while running:
-            done: list[R] = _result(running.popleft())
-            running.extend(_submitted(pool, itertools.islice(waiting, 1)))
-            yield from done
+            try:
+                results: list[R] = running.popleft().result()
+            except BrokenProcessPool as error:
+                raise MorphgenError(
+                    "a worker died, perhaps for lack of memory; finished results are kept: run "
+                    "again, or with fewer jobs"
+                ) from error
+            running.extend(_submit(pool, itertools.islice(waiting, 1)))
+            yield from results
     finally:
         stopped.value = 1
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _submitted(
-    pool: ProcessPoolExecutor, chunks: Iterable[Sequence[Any]]
-) -> list[Future[list[Any]]]:
-    """Submit chunks, for which the pool may start processes."""
-    with sigint_blocked():
-        return [pool.submit(_do, chunk) for chunk in chunks]
-
-
-def _result(future: Future[list[R]]) -> list[R]:
-    try:
-        return future.result()
-    except BrokenProcessPool as error:
-        raise MorphgenError(
-            "a worker died, perhaps for want of memory; what is done is kept: run again, or with "
-            "fewer jobs"
-        ) from error
+def _submit(pool: ProcessPoolExecutor, chunks: Iterable[Sequence[Any]]) -> list[Future[list[Any]]]:
+    with sigint_blocked():  # submitting may start processes
+        return [pool.submit(_process_chunk, chunk) for chunk in chunks]
 
 
 @contextmanager
 def sigint_blocked() -> Iterator[None]:
-    """Start processes in this block: Ctrl-C is not for them, from their first moment on.
+    """Block Ctrl-C (SIGINT) in this block, so that processes started in it never receive it.
 
-    They inherit a mask that blocks it. For this process it counts at the end of the block; the mask
-    alone would not do, as another thread may take the signal, which then interrupts this one.
+    They inherit the signal mask. This process handles a Ctrl-C at the end of the block. The mask
+    alone is not enough for that: another thread may receive the signal, and Python then runs the
+    handler in this one.
     """
-    noted: list[int] = []
+    received: list[int] = []
     is_main = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGINT)
     if is_main:
-        signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
+        signal.signal(signal.SIGINT, lambda number, _: received.append(number))
     try:
-        resource_tracker.ensure_running()  # its start would end the mask
+        resource_tracker.ensure_running()  # starting it later would reset the mask
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             yield
@@ -129,18 +123,18 @@ def sigint_blocked() -> Iterator[None]:
     finally:
         if is_main:
             signal.signal(signal.SIGINT, handler or signal.SIG_DFL)
-        if noted:
+        if received:
             signal.raise_signal(signal.SIGINT)
 
 
 def init_worker() -> None:
-    """Prepare a worker: Ctrl-C is for the parent, and without it the worker ends."""
+    """Initialise a worker process: ignore Ctrl-C, and exit when the parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _start(work: Callable[[Any], object], stopped: c_byte) -> None:
-    """Prepare a worker, whose work is interrupted when the parent stops."""
+def _init_pool_worker(work: Callable[[Any], object], stopped: c_byte) -> None:
+    """Initialise a worker of ``parallel_map``, whose work ends when the parent stops."""
     global _work, _stopped
     init_worker()
     _work, _stopped = work, stopped
@@ -149,40 +143,40 @@ def _start(work: Callable[[Any], object], stopped: c_byte) -> None:
 
 
 def _interrupt(*_: object) -> None:
-    """Interrupt the work as Ctrl-C would, so that it tidies up; a worker that waits goes on."""
+    """Interrupt the work as Ctrl-C would, so that it cleans up; an idle worker continues."""
     if _is_working:
         raise KeyboardInterrupt
 
 
 def _interrupt_when_stopped() -> None:
-    """Wait until the parent has stopped: a fit may have minutes to go by then."""
+    """Interrupt the work once the parent has stopped; a fit may still take minutes by then."""
     while _stopped is not None and not _stopped.value:
-        time.sleep(POLL)
+        time.sleep(POLL_INTERVAL)
     _thread.interrupt_main(signal.SIGTERM)
 
 
 def _end_with_parent() -> None:
-    """A killed parent tells its workers nothing, and they would wait for work for ever."""
+    """Exit with the parent: if it is killed, its workers would otherwise wait for work for ever."""
     parent = parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def _do(things: Sequence[Any]) -> list[Any]:
+def _process_chunk(items: Sequence[Any]) -> list[Any]:
     global _is_working
     if _work is None or _stopped is None:
-        raise RuntimeError("the worker was not prepared")
+        raise RuntimeError("the worker was not initialised")
     _is_working = True
     try:
-        # Once the parent has stopped, nobody waits for the results.
-        return [_work(thing) for thing in things if not _stopped.value]
+        # Once the parent has stopped, nobody needs the results.
+        return [_work(item) for item in items if not _stopped.value]
     finally:
         _is_working = False
 
 
 def require_ray() -> ModuleType:
-    """The package ray.
+    """Import and return the package ray.
 
     Raises:
         MissingDependencyError: If it is not installed.
@@ -199,22 +193,22 @@ def require_ray() -> ModuleType:
 
 @contextmanager
 def ray_cluster(address: str | None) -> Iterator[None]:
-    """Be connected to the Ray cluster at an address; without one, to a local Ray.
+    """Connect to the Ray cluster at an address, by default to a local one, in this block.
 
     Raises:
-        MorphgenError: If there is none.
+        MorphgenError: If the cluster cannot be reached.
     """
     ray = require_ray()
-    own = not ray.is_initialized()
+    was_connected = ray.is_initialized()
     host, _, port = (address or "").rpartition(":")
     try:
         if port.isdecimal():
-            socket.create_connection((host.removeprefix("ray://"), int(port)), PATIENCE).close()
+            socket.create_connection((host.removeprefix("ray://"), int(port)), RAY_TIMEOUT).close()
         ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
     except (OSError, OverflowError, RuntimeError, ValueError) as error:
         raise MorphgenError(f"no Ray cluster at {address!r}: {error}") from error
     try:
         yield
     finally:
-        if own:
+        if not was_connected:
             ray.shutdown()

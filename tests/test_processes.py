@@ -13,12 +13,12 @@ from morphgen.processes import CHUNK_SIZE, parallel_map
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("n", [0, 1, CHUNK_SIZE, 5 * CHUNK_SIZE + 3])
 def test_results_come_in_order(jobs, n):
-    told = []
+    counts = []
     results = list(
-        parallel_map(partial(power, 2), range(n), jobs, lambda *counts: told.append(counts))
+        parallel_map(partial(power, 2), range(n), jobs, lambda *count: counts.append(count))
     )
     assert [value for value, _ in results] == [i**2 for i in range(n)]
-    assert told == [(i + 1, n) for i in range(n)]
+    assert counts == [(i + 1, n) for i in range(n)]
     elsewhere = {process for _, process in results} - {os.getpid()}
     assert bool(elsewhere) == (jobs > 1 and n > CHUNK_SIZE)
 
@@ -31,8 +31,8 @@ def test_an_error_of_the_work_is_raised(jobs):
         list(results)
 
 
-def test_a_process_that_dies_is_told():
-    with pytest.raises(MorphgenError, match=r"a worker died.*what is done is kept: run again"):
+def test_a_process_that_dies_is_reported():
+    with pytest.raises(MorphgenError, match=r"a worker died.*finished results are kept: run again"):
         list(parallel_map(die, range(20), 2))
 
 

@@ -15,10 +15,10 @@ from morphgen.errors import FormatError, nearest
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro_engine import thread_engine
 from morphgen.formats.xacro_files import (
-    ElementPlaces,
+    ElementLocations,
     document_text,
+    location_of,
     parse_yaml,
-    place_of,
     read_file,
 )
 from morphgen.formats.xacro_functions import RefusedError
@@ -146,7 +146,7 @@ class Expansion:
         self.given = {name: str(value) for name, value in args.items()}
         self.arguments = _Arguments(self.engine.XacroException, self.given)
         self.declared: set[str] = set()
-        self.places = ElementPlaces()
+        self.locations = ElementLocations()
         self.origin = origin
         self.finder = finder
         self.installed_only = installed_only
@@ -189,16 +189,16 @@ class Expansion:
             yield
         except (self.engine.XacroException, *_FAULTS) as error:
             macros, node = self.engine.macrostack, self.engine.node
-            place = place_of(node) if node is not None else str(self.origin)
+            location = location_of(node) if node is not None else str(self.origin)
             macro = f" in macro {macros[-1].body.getAttribute('name')!r}" if macros else ""
-            inside = place.startswith(str(self.origin))
-            above = "" if inside else f" (included from {self.origin})"
-            raise FormatError(f"{place}: {_reason(error)}{macro}{above}") from error
+            is_included = not location.startswith(str(self.origin))
+            including = "" if not is_included else f" (included from {self.origin})"
+            raise FormatError(f"{location}: {_reason(error)}{macro}{including}") from error
 
     def _parse(self, data: bytes, origin: str) -> minidom.Document:
         for element in parse_xml(data, origin).iter("{*}arg"):
             self.declared.add(element.get("name", ""))
-        return self.places.parse(data, origin)
+        return self.locations.parse(data, origin)
 
     def _parse_include(self, _: object, filename: str) -> minidom.Document:
         files = self.engine.filestack

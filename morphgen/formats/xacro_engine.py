@@ -2,11 +2,12 @@
 
 ``xacro`` keeps the file stack, the arguments and the package lookup in module globals, prints its
 warnings and replaces a method of ``xml.dom.minidom``. Here its module body runs under a private
-name, so that none of this reaches, or is reached by, another user of the package in the process.
+name, which isolates it from other users of the package in the same process.
 
-The package gives text of a document to Python's ``eval`` in one place, ``safe_eval``; it is
-replaced by the allow-list of ``xacro_expressions``. ``is_valid_name`` only parses. YAML is read
-elsewhere (`xacro_files`), so that its tags reach no other constructor.
+Security: the package passes text of a document to Python's ``eval`` in one function, ``safe_eval``.
+The allow-list of ``xacro_expressions`` replaces it. (``is_valid_name`` only parses.) The functions
+that open files are replaced, too: ``xacro.Expansion`` sets them for each expansion, and
+``xacro_files`` reads YAML, so that tags of a document reach no other constructor.
 """
 
 from __future__ import annotations
@@ -27,26 +28,26 @@ from morphgen.formats.xacro_functions import BUILTINS, MATH, Function, RefusedEr
 Engine: TypeAlias = Any
 """A ``xacro`` module, which has no type hints."""
 Untyped: TypeAlias = Any
-"""What such a module passes around: elements and tables of names."""
+"""Elements and symbol tables of the module, which have no type hints either."""
 
 MAX_ELEMENTS = 50_000
-"""Most elements that an expansion may process; the PR2 has 2,734."""
+"""Largest number of elements that an expansion may process; the PR2 has 2,734."""
 MAX_TEXT = 20_000_000
-"""Most text that the substitutions of an expansion may make [characters]."""
+"""Largest text that the substitutions of an expansion may create [characters]."""
 
 _NAME = "morphgen.formats._xacro"
 _READERS = ("parse", "load_yaml", "list_files", "eval_extension")
-"""Names of the module by which a document reaches files; the caller replaces them."""
+"""Functions of the module through which a document accesses files; the caller sets them."""
 _log = logging.getLogger("morphgen.formats.xacro")
 _per_thread = threading.local()
 
 
 def thread_engine() -> Engine:
-    """Return this thread's copy of the ``xacro`` module, without anything of an earlier call.
+    """Return this thread's copy of the ``xacro`` module, reset to its initial state.
 
-    These things differ from the package: expressions are evaluated by an allow-list; a document
-    may make so many elements and so much text only; ``node`` is the element in hand; and
-    warnings go to the logger ``morphgen.formats.xacro`` (level INFO) instead of the terminal.
+    Differences from the package: an allow-list evaluates expressions, the number of elements and
+    the size of text are bounded, ``node`` is the element being processed, and warnings go to the
+    logger ``morphgen.formats.xacro`` (level INFO) instead of the terminal.
     """
     if not hasattr(_per_thread, "engine"):
         _per_thread.engine = _fresh_module()
@@ -56,8 +57,8 @@ def thread_engine() -> Engine:
     engine.substitution_args_context = {}
     engine.verbosity = 0
     engine.node = None
-    for name in _READERS:  # else the last expansion's would still be there
-        setattr(engine, name, _unread)
+    for name in _READERS:  # those of the last expansion must not remain
+        setattr(engine, name, _refuse_access)
     engine.elements = engine.text = 0
     engine._global_symbols = _symbols(engine)
     return engine
@@ -87,7 +88,7 @@ def _safe_eval(
 
 
 def _shortcut(engine: Engine) -> Callable[[str, Any], object]:
-    """Most texts hold nothing to evaluate; the lexer takes a quarter of an expansion's time."""
+    """Skip the lexer, a quarter of an expansion's time, for texts without expressions."""
     eval_text = engine.eval_text
 
     def evaluated(text: str, symbols: Untyped) -> object:
@@ -97,7 +98,7 @@ def _shortcut(engine: Engine) -> Callable[[str, Any], object]:
         if isinstance(result, str):
             engine.text += len(result)
             if engine.text > MAX_TEXT:
-                raise RefusedError(f"the expansion makes more than {MAX_TEXT} characters")
+                raise RefusedError(f"the expansion creates more than {MAX_TEXT} characters")
         return result
 
     return evaluated
@@ -117,7 +118,7 @@ def _counting(engine: Engine) -> Callable[[Any, Any, Any], None]:
 
 
 def _returning(engine: Engine, function: Callable[..., object]) -> Callable[..., object]:
-    """A function that goes elsewhere in the documents, and comes back if nothing fails there."""
+    """Wrap a function so that ``node`` is its element again after it processed other elements."""
 
     def called(node: Untyped, *rest: Untyped) -> object:
         engine.node = node
@@ -137,7 +138,7 @@ def _noting(engine: Engine, function: Callable[..., object]) -> Callable[..., ob
 
 
 def _symbols(engine: Engine) -> dict[str, object]:
-    """What every document may use by name, with and without a namespace."""
+    """Return the names that every document may use, with and without a namespace."""
 
     def space(members: Mapping[str, object]) -> object:
         made = engine.NameSpace()
@@ -176,14 +177,14 @@ def _symbols(engine: Engine) -> dict[str, object]:
 
 
 def _same(dictionary: dict[str, object]) -> dict[str, object]:
-    """``xacro.dotify``: here the entries of any dictionary can be reached by a dot."""
+    """Return a dictionary unchanged, as ``xacro.dotify``: dots reach the entries of all of them."""
     if not isinstance(dictionary, dict):
         raise TypeError("dotify() takes a dictionary")
     return dictionary
 
 
-def _unread(*_: object) -> object:
-    raise RefusedError("there are no files and substitutions here")
+def _refuse_access(*_: object) -> object:
+    raise RefusedError("files and substitutions are not available here")
 
 
 def _record(*words: object, **_: object) -> str:

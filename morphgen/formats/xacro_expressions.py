@@ -1,14 +1,13 @@
 """Evaluate the expressions of xacro files and manifests by an allow-list.
 
 An expression is parsed with ``ast`` and translated, node by node, into the functions of
-``xacro_nodes``. A node that is not listed there is refused; nothing is ever given to ``eval`` or
-``exec``. Names stand for the document's own values and for the functions of ``xacro_functions``; a
-dot reaches entries of dictionaries and xacro's namespaces, and a few methods of texts, lists and
-dictionaries, but no attribute of a Python object.
+``xacro_nodes``. Other nodes are refused, and nothing is passed to ``eval`` or ``exec``. Names refer
+to values of the document and functions of ``xacro_functions``. A dot accesses entries of
+dictionaries and of xacro's namespaces, and some methods of texts, lists and dictionaries, but no
+attribute of a Python object: from ``"".__class__`` a document could reach any code in the process.
 
-The packages ``asteval`` and ``simpleeval`` do not fit: both let a dot read attributes of objects
-unless their name is on a deny-list, which is the design that failed here, and neither bounds the
-size of results in all the operations below.
+The packages ``asteval`` and ``simpleeval`` are not used: they allow attributes of objects unless a
+deny-list names them, and do not bound the size of the results of all operations below.
 """
 
 from __future__ import annotations
@@ -25,20 +24,20 @@ MAX_LENGTH = 10_000
 """Longest expression [characters]."""
 
 _ORIGIN = "<expression>"
-# Python would print what it finds odd about an expression, such as ``2if x else 3``.
+# Python would print warnings about expressions such as ``2if x else 3``.
 warnings.filterwarnings("ignore", category=SyntaxWarning, module=_ORIGIN)
 warnings.filterwarnings("ignore", category=DeprecationWarning, module=_ORIGIN)
 
 
 class Expression:
-    """A translated expression, for any values of its names."""
+    """A translated expression; it can be evaluated for any values of its names."""
 
     def __init__(self, text: str) -> None:
         """Translate.
 
         Raises:
-            SyntaxError: If it is no expression.
-            RefusedError: If it holds what is not allowed, or is too long.
+            SyntaxError: If it is not an expression.
+            RefusedError: If it contains a construct that is not allowed, or is too long.
         """
         if len(text) > MAX_LENGTH:
             raise RefusedError(f"an expression is longer than {MAX_LENGTH} characters")
@@ -53,26 +52,26 @@ class Expression:
     def evaluate(
         self, names: Mapping[str, object], inner: Mapping[str, object] | None = None
     ) -> object:
-        """The value.
+        """Return the value of the expression.
 
         Args:
             names: Values and functions by name.
-            inner: Further ones, which hide those.
+            inner: Further values; they hide those of ``names``.
 
         Raises:
-            RefusedError: If it does too much, or its value is no data.
+            RefusedError: If the evaluation exceeds a bound, or its value is not data.
             NameError: If a name is unknown.
-            Exception: What Python raises for the operation, such as ``ZeroDivisionError``.
+            Exception: Any exception of the operation in Python, such as ``ZeroDivisionError``.
         """
         value = self._node(Scope(names, dict(inner or {})))
         if isinstance(value, Function) or (isinstance(value, dict) and type(value) is not dict):
-            raise RefusedError("its value is a function or namespace, no data")
+            raise RefusedError("its value is a function or namespace, not data")
         return value
 
 
 @lru_cache(maxsize=4096)
 def expression(text: str) -> Expression:
-    """A translated expression; memoised.
+    """Return a translated expression; memoised.
 
     Raises:
         SyntaxError: As ``Expression``.

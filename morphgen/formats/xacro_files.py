@@ -1,4 +1,4 @@
-"""Read and write the documents of an expansion: bounded, and with the place of every element."""
+"""Read and write the documents of an expansion: bounded, with the location of every element."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ MAX_FILE = 16 * 2**20
 MAX_OUTPUT = 20_000_000
 """Largest expanded document [characters]."""
 MAX_CLONES = 200_000
-"""Most elements that an expansion may copy, such as out of macros; the PR2 has 6,978 nodes."""
+"""Largest number of elements that an expansion may copy, as macros do; the PR2 has 6,978 nodes."""
 
 Untyped: TypeAlias = Any
-"""What minidom and xacro have no type hints for."""
+"""Objects of minidom and xacro, which have no type hints."""
 
-_PLACE = "morphgen-place"
+_LOCATION = "morphgen-location"
 
 
 def read_file(path: Path) -> bytes:
-    """The content of a regular file: a device or a pipe might never end.
+    """Return the content of a regular file; a device or a pipe might never end.
 
     Raises:
         OSError: If it cannot be read.
@@ -40,55 +40,56 @@ def read_file(path: Path) -> bytes:
         raise RefusedError(str(error)) from error
 
 
-def place_of(node: Untyped) -> str:
-    """``file:line`` of an element that ``ElementPlaces`` knows, or of a clone of one."""
-    return str(node.getUserData(_PLACE))
+def location_of(node: Untyped) -> str:
+    """Return ``file:line`` of an element that ``ElementLocations`` parsed, or of a clone of it."""
+    return str(node.getUserData(_LOCATION))
 
 
-class ElementPlaces:
-    """Where the elements of an expansion were written; a DOM ``UserDataHandler``.
+class ElementLocations:
+    """Source locations of the elements of an expansion; a DOM ``UserDataHandler``.
 
-    It sees every clone of an element, too: it gives the clone its place, and counts.
+    minidom calls it for every clone of an element, which gets the location of the original. The
+    clones are counted, because macros can multiply them.
     """
 
     def __init__(self) -> None:
         self.clones = 0
 
     def parse(self, data: bytes, origin: str) -> minidom.Document:
-        """Parse XML, noting places."""
+        """Parse XML and store the location of every element."""
         document = _Builder(origin, self).parseString(data)
         assert isinstance(document, minidom.Document)
         return document
 
     def handle(
-        self, operation: int, key: str, place: object, source: object, clone: Untyped
+        self, operation: int, key: str, location: object, source: object, clone: Untyped
     ) -> None:
-        """Note the place of a clone; minidom calls it.
+        """Store the location of a clone; minidom calls this.
 
         Raises:
-            RefusedError: If there are too many.
+            RefusedError: If there are more than ``MAX_CLONES``.
         """
         del operation, source
-        clone.setUserData(key, place, self)
+        clone.setUserData(key, location, self)
         self.clones += 1
         if self.clones > MAX_CLONES:
             raise RefusedError(f"the expansion copies more than {MAX_CLONES} elements")
 
 
 class _Builder(expatbuilder.ExpatBuilderNS):
-    def __init__(self, origin: str, places: ElementPlaces) -> None:
+    def __init__(self, origin: str, locations: ElementLocations) -> None:
         super().__init__()
         self.origin = origin
-        self.places = places
+        self.locations = locations
 
     def start_element_handler(self, name: Untyped, attributes: Untyped) -> None:
         super().start_element_handler(name, attributes)
-        place = f"{self.origin}:{self.getParser().CurrentLineNumber}"
-        self.curNode.setUserData(_PLACE, place, self.places)
+        location = f"{self.origin}:{self.getParser().CurrentLineNumber}"
+        self.curNode.setUserData(_LOCATION, location, self.locations)
 
 
 def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
-    """The content of a YAML file: texts, numbers, lists and dictionaries.
+    """Parse a YAML file of texts, numbers, lists and dictionaries.
 
     Args:
         data: The file's content.
@@ -97,11 +98,11 @@ def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
 
     Raises:
         FormatError: If it is invalid YAML.
-        RefusedError: If it is too large with all its aliases followed.
+        RefusedError: If it is too large with all aliases expanded.
     """
 
     class Loader(yaml.SafeLoader):
-        """YAML with xacro's unit tags, which the shared loader must not learn."""
+        """Safe YAML with xacro's unit tags, which must not be added to the shared loader."""
 
         def flatten_mapping(self, node: yaml.MappingNode) -> None:
             super().flatten_mapping(node)
@@ -116,8 +117,8 @@ def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
         content = yaml.load(data, Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        place = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
-        raise FormatError(f"{path}{place}: invalid YAML: {error.problem}") from error
+        location = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
+        raise FormatError(f"{path}{location}: invalid YAML: {error.problem}") from error
     except yaml.YAMLError as error:
         raise FormatError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
     size_of(content)
@@ -132,7 +133,7 @@ def _refuse_tag(loader: yaml.SafeLoader, node: yaml.Node) -> object:
 
 
 def document_text(document: minidom.Document) -> str:
-    """A document as text.
+    """Return a document as text.
 
     Raises:
         RefusedError: If it is too long.
@@ -148,7 +149,7 @@ def document_text(document: minidom.Document) -> str:
 
 
 def _serialised(node: minidom.Node | None) -> Iterator[str]:
-    """Write a DOM; ``minidom``'s own writer may have been replaced by somebody else."""
+    """Serialise a DOM; another user of xacro may have replaced ``minidom``'s own writer."""
     if isinstance(node, minidom.Text):
         yield escape(node.data)
     elif isinstance(node, minidom.Element):

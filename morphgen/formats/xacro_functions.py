@@ -1,7 +1,7 @@
-"""What an expression of a xacro or a manifest may call, and operators that know their bounds.
+"""Functions and bounded operators for the expressions of xacro files and manifests.
 
-Every value that an expression makes is small (`MAX_SIZE`, `MAX_BITS`), and what would not be is
-refused before it is made. So no single operation takes long or needs much memory.
+Values are bounded by ``MAX_SIZE`` and ``MAX_BITS``. An operation with a larger result is refused
+before it is executed, so that no single operation takes long or needs much memory.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _CONVERSION = re.compile(r"%[-+ #0]*(\(|\*|\d*)(?:\.(\*|\d*))?")
 
 
 Value: TypeAlias = Any
-"""What an expression computes with: a number, a text, a list, ..., or a symbol for one."""
+"""Value of an expression: a number, a text, a list, ..., or a symbol for one."""
 
 
 class RefusedError(ValueError):
-    """A document asks for what is not allowed, or for too much."""
+    """A document asks for something that is not allowed, or exceeds a bound."""
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,20 @@ class Function:
     name: str
     call: Callable[..., object]
     applies: bool = False
-    """Whether it takes another function, to apply it: ``call`` then gets a caller first."""
+    """Whether its first argument is a function; ``call`` then receives a caller of functions first."""
 
     def __str__(self) -> str:
-        """Its name, for messages."""
+        """Return its name, for messages."""
         return f"{self.name}()"
 
 
 def size_of(value: object) -> int:
-    """Characters and entries of a value, nested ones included: the work of copying or printing it.
+    """Count the characters and entries of a value, nested ones included.
+
+    This is the work of copying or printing it.
 
     Raises:
-        RefusedError: If there are more than ``MAX_SIZE``; a value that holds itself has.
+        RefusedError: If there are more than ``MAX_SIZE``; a value that contains itself has.
     """
     size = 0
     waiting = [value]
@@ -73,7 +75,7 @@ def size_of(value: object) -> int:
 
 
 def checked(value: object) -> object:
-    """The value.
+    """Return a value unchanged if it is small enough.
 
     Raises:
         RefusedError: If it is too large.
@@ -91,7 +93,7 @@ def _require(size: float, limit: int, what: str) -> None:
         raise RefusedError(f"{what} is beyond {limit}")
 
 
-def _multiplied(left: Value, right: Value) -> object:
+def _multiply(left: Value, right: Value) -> object:
     for value, times in ((left, right), (right, left)):
         if isinstance(value, str | list | tuple) and isinstance(times, int):
             _require(size_of(value) * times, MAX_SIZE, "the length of a repetition")
@@ -103,11 +105,11 @@ def _power(left: Value, right: Value) -> object:
         _require(left.bit_length() * right, 2 * MAX_BITS, "the bits of a power")
     result = left**right
     if isinstance(result, complex):
-        raise RefusedError(f"{left} ** {right} is no real number")
+        raise RefusedError(f"{left} ** {right} is not a real number")
     return result
 
 
-def _shifted(left: Value, right: Value) -> object:
+def _shift(left: Value, right: Value) -> object:
     _require(right, MAX_BITS, "a shift")
     return left << right
 
@@ -124,20 +126,20 @@ def _modulo(left: Value, right: Value) -> object:
                     f"the format {left[:40]!r} is not allowed: no keys, no *, at most "
                     f"{MAX_DIGITS} digits"
                 )
-    most = conversions * (MAX_DIGITS + size_of(right))
-    _require(most, 10 * MAX_SIZE, "the length of a formatted text")
+    max_length = conversions * (MAX_DIGITS + size_of(right))
+    _require(max_length, 10 * MAX_SIZE, "the length of a formatted text")
     return left % right
 
 
 OPERATORS: Mapping[str, Callable[[Value, Value], object]] = {
     "Add": operator.add,
     "Sub": operator.sub,
-    "Mult": _multiplied,
+    "Mult": _multiply,
     "Div": operator.truediv,
     "FloorDiv": operator.floordiv,
     "Mod": _modulo,
     "Pow": _power,
-    "LShift": _shifted,
+    "LShift": _shift,
     "RShift": operator.rshift,
     "BitAnd": operator.and_,
     "BitOr": operator.or_,
@@ -170,7 +172,7 @@ def _sum(numbers: Iterable[Value], start: Value = 0) -> object:
 def _prod(numbers: Iterable[Value], *, start: Value = 1) -> object:
     product = start
     for number in numbers:
-        product = checked(_multiplied(product, number))
+        product = checked(_multiply(product, number))
     return product
 
 
@@ -193,27 +195,27 @@ def _sorted(items: Iterable[Value], *, reverse: bool = False) -> list[Value]:
     return sorted(items, reverse=reverse)
 
 
-def _replaced(text: str, old: str, new: str, count: int = -1) -> str:
-    found = text.count(old)
-    times = found if count < 0 else min(count, found)
+def _replace(text: str, old: str, new: str, count: int = -1) -> str:
+    occurrences = text.count(old)
+    times = occurrences if count < 0 else min(count, occurrences)
     _require(len(text) + times * len(new), MAX_SIZE, "the length of a replacement")
     return text.replace(old, new, count)
 
 
-def _joined(separator: str, items: Iterable[str]) -> str:
+def _join(separator: str, items: Iterable[str]) -> str:
     texts = list(items)
     length = len(separator) * len(texts) + sum(map(len, texts))
     _require(length, MAX_SIZE, "the length of a joined text")
     return separator.join(texts)
 
 
-def _filled(text: str, width: int) -> str:
+def _zfill(text: str, width: int) -> str:
     _require(width, MAX_DIGITS, "a width")
     return text.zfill(width)
 
 
-def _listed(call: Callable[..., Iterable[object]]) -> Callable[..., list[object]]:
-    """A function that gives a list where Python's gives an iterator."""
+def _as_list(call: Callable[..., Iterable[object]]) -> Callable[..., list[object]]:
+    """Wrap a function to return a list instead of an iterator."""
     return lambda *operands, **named: list(call(*operands, **named))
 
 
@@ -255,7 +257,7 @@ _CALLS: Mapping[str, Callable[..., object]] = {
     "bool": bool,
     "dict": dict,
     "divmod": divmod,
-    "enumerate": _listed(enumerate),
+    "enumerate": _as_list(enumerate),
     "float": float,
     "int": int,
     "len": len,
@@ -263,13 +265,13 @@ _CALLS: Mapping[str, Callable[..., object]] = {
     "max": lambda *items: max(*items),
     "min": lambda *items: min(*items),
     "range": _range,
-    "reversed": _listed(reversed),
+    "reversed": _as_list(reversed),
     "round": _round,
     "sorted": _sorted,
     "str": lambda value="": str(value),
     "sum": _sum,
     "tuple": tuple,
-    "zip": _listed(zip),
+    "zip": _as_list(zip),
 }
 
 BUILTINS: Mapping[str, Function] = {
@@ -289,17 +291,17 @@ METHODS: Mapping[type, Mapping[str, Callable[..., object]]] = {
                 "rsplit rstrip split splitlines startswith strip swapcase title upper"
             ).split()
         },
-        "join": _joined,
-        "replace": _replaced,
-        "zfill": _filled,
+        "join": _join,
+        "replace": _replace,
+        "zfill": _zfill,
     },
     list: {"count": list.count, "index": list.index},
     tuple: {"count": tuple.count, "index": tuple.index},
     dict: {
         "get": dict.get,
-        "items": _listed(dict.items),
-        "keys": _listed(dict.keys),
-        "values": _listed(dict.values),
+        "items": _as_list(dict.items),
+        "keys": _as_list(dict.keys),
+        "values": _as_list(dict.values),
     },
 }
 """Methods that expressions may call, by the exact type of the value."""

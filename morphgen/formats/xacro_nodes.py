@@ -1,4 +1,4 @@
-"""Translate the nodes of a parsed expression, each kind that is allowed, into Python functions."""
+"""Translate the allowed nodes of a parsed expression into Python functions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from morphgen.formats.xacro_functions import (
 )
 
 MAX_WORK = 1_000_000
-"""Most that one evaluation may touch [characters, entries and rounds of comprehensions]."""
+"""Largest work of one evaluation [characters, entries and rounds of comprehensions]."""
 
 _SCALARS = frozenset({int, float, bool, str, type(None)})
 _NUMBERS = frozenset({int, float, bool})
@@ -45,7 +45,7 @@ _SIGNS: Mapping[type, Callable[[Value], Value]] = {
 
 @dataclass
 class Scope:
-    """What one evaluation knows, and how much it may still do."""
+    """Names and remaining work of one evaluation."""
 
     names: Mapping[str, object]
     inner: dict[str, object] = field(default_factory=dict)
@@ -53,17 +53,17 @@ class Scope:
     work: int = MAX_WORK
 
     def spend(self, work: int) -> None:
-        """Count work.
+        """Subtract work from the remaining work.
 
         Raises:
-            RefusedError: If there was too much.
+            RefusedError: If none remains.
         """
         self.work -= work
         if self.work < 0:
             raise RefusedError(f"it takes more than {MAX_WORK} steps")
 
     def result(self, value: object) -> object:
-        """A value that was made, small enough and paid for."""
+        """Return a new value after checking its size and counting it as work."""
         if type(value) is float:
             return value
         if type(value) in _NUMBERS:
@@ -76,25 +76,25 @@ Node: TypeAlias = Callable[[Scope], Value]
 
 
 class Translation:
-    """Translates the nodes of one expression; a method for each kind that is allowed."""
+    """Translates the nodes of one expression, with one method for each allowed kind of node."""
 
     def __init__(self, text: str) -> None:
         self.text = text
 
     def of(self, node: ast.AST) -> Node:
-        """The function for a node.
+        """Return the function that evaluates a node.
 
         Raises:
-            RefusedError: If its kind is not allowed, or that of one inside it.
+            RefusedError: If the node or one inside it is of a kind that is not allowed.
         """
         translate = getattr(self, f"_{type(node).__name__.lower()}", None)
         if translate is None:
             raise self.refused(node)
-        made: Node = translate(node)
-        return made
+        function: Node = translate(node)
+        return function
 
     def refused(self, node: ast.AST) -> RefusedError:
-        """The error for a construct that is not on the list."""
+        """Return the error for a construct that is not allowed."""
         source = ast.get_source_segment(self.text, node) or self.text
         return RefusedError(f"{type(node).__name__} {source[:80]!r} is not allowed")
 
@@ -159,10 +159,10 @@ class Translation:
         ]
 
         def compare(scope: Scope) -> object:
-            left = _paid(first(scope), scope)
+            left = _charged(first(scope), scope)
             value: object = True
             for apply, operand in rest:
-                right = _paid(operand(scope), scope)
+                right = _charged(operand(scope), scope)
                 value = apply(left, right)
                 if not value:
                     break
@@ -192,7 +192,7 @@ class Translation:
         return lambda scope: entry(owner(scope))
 
     def _entry(self, node: ast.Attribute) -> Callable[[Value], Value]:
-        """What stands behind the dot, of a dictionary or namespace."""
+        """Return a function for the entry after the dot of a dictionary or namespace."""
         name = node.attr
         if name.startswith("__"):
             raise self.refused(node)
@@ -216,12 +216,14 @@ class Translation:
             function, owners = find(scope)
             if not isinstance(function, Function):
                 raise self.refused(node)
-            return _called(scope, function, [*owners, *arguments(scope)], _named(keywords, scope))
+            return _call_function(
+                scope, function, [*owners, *arguments(scope)], _keywords(keywords, scope)
+            )
 
         return call
 
     def _callee(self, node: ast.expr) -> Callable[[Scope], tuple[object, tuple[object, ...]]]:
-        """The function of a call, and the value that it is a method of, if it is one."""
+        """Return a function for the callee of a call, and for the owner if it is a method."""
         if not isinstance(node, ast.Attribute):
             function = self.of(node)
             return lambda scope: (function(scope), ())
@@ -249,13 +251,13 @@ class Translation:
         ]
 
         def build(scope: Scope) -> object:
-            made: dict[object, object] = {}
+            result: dict[object, object] = {}
             for key, value in entries:
                 if key is None:
-                    made.update(_paid(value(scope), scope))
+                    result.update(_charged(value(scope), scope))
                 else:
-                    made[key(scope)] = _data(value(scope))
-            return scope.result(made)
+                    result[key(scope)] = _data(value(scope))
+            return scope.result(result)
 
         return build
 
@@ -268,7 +270,7 @@ class Translation:
                 yield _data(element(scope))
                 return
             names, items, tests = rounds[depth]
-            for item in _paid(items(scope), scope):
+            for item in _charged(items(scope), scope):
                 scope.spend(1)
                 scope.inner.update(names(item))
                 if all(test(scope) for test in tests):
@@ -289,10 +291,10 @@ class Translation:
     def _round(
         self, generator: ast.comprehension
     ) -> tuple[Callable[[Value], dict[str, object]], Node, list[Node]]:
-        """One ``for ... in ... if ...``: names of an item, the items, the conditions."""
+        """Translate ``for ... in ... if ...``: variables of an item, the items, the conditions."""
         target = generator.target
         targets = target.elts if isinstance(target, ast.Tuple) else [target]
-        names = [each.id for each in targets if isinstance(each, ast.Name)]
+        names = [name.id for name in targets if isinstance(name, ast.Name)]
         if len(names) != len(targets) or generator.is_async:
             raise self.refused(target)
 
@@ -305,7 +307,7 @@ class Translation:
         return named, self.of(generator.iter), [self.of(test) for test in generator.ifs]
 
     def _items(self, nodes: list[ast.expr]) -> Callable[[Scope], Iterator[Value]]:
-        """Elements or arguments, of which some may be starred."""
+        """Translate elements or arguments, some of them starred."""
         items = [
             (self.of(node.value), True) if isinstance(node, ast.Starred) else (self.of(node), False)
             for node in nodes
@@ -314,50 +316,50 @@ class Translation:
         def values(scope: Scope) -> Iterator[Value]:
             for item, starred in items:
                 if starred:
-                    yield from _paid(item(scope), scope)
+                    yield from _charged(item(scope), scope)
                 else:
                     yield item(scope)
 
         return values
 
 
-def _named(keywords: list[tuple[str | None, Node]], scope: Scope) -> dict[str, object]:
+def _keywords(keywords: list[tuple[str | None, Node]], scope: Scope) -> dict[str, object]:
     named: dict[str, object] = {}
     for name, value in keywords:
-        named.update(_paid(value(scope), scope) if name is None else {name: value(scope)})
+        named.update(_charged(value(scope), scope) if name is None else {name: value(scope)})
     return named
 
 
-def _called(
+def _call_function(
     scope: Scope, function: Function, operands: list[Value], named: dict[str, Value]
 ) -> object:
-    """The result of a function, paid for by what it reads and makes."""
+    """Call a function; its operands and its result count as work."""
     scope.spend(1)
     for operand in (*operands, *named.values()):
         if not (function.applies and isinstance(operand, Function)):
-            _paid(operand, scope)
+            _charged(operand, scope)
     if not function.applies:
         return scope.result(function.call(*operands, **named))
 
     def apply(inner: object, *items: object) -> object:
         if not isinstance(inner, Function) or inner.applies:
             raise TypeError(f"{function} applies one of the listed functions")
-        return _called(scope, inner, list(items), {})
+        return _call_function(scope, inner, list(items), {})
 
     return scope.result(function.call(apply, *operands, **named))
 
 
 def _data(value: Value) -> Value:
-    """The value, which is no function or namespace."""
+    """Return a value unchanged if it is neither a function nor a namespace."""
     if type(value) in _NUMBERS:
         return value
     if isinstance(value, Function) or (isinstance(value, dict) and type(value) is not dict):
-        raise TypeError(f"{value if isinstance(value, Function) else 'a namespace'} is no data")
+        raise TypeError(f"{value if isinstance(value, Function) else 'a namespace'} is not data")
     return value
 
 
-def _paid(value: Value, scope: Scope) -> Value:
-    """The value, which is data and will be read as a whole."""
+def _charged(value: Value, scope: Scope) -> Value:
+    """Return a value unchanged if it is data; reading all of it counts as work."""
     if type(value) not in _NUMBERS:
         scope.spend(size_of(_data(value)))
     return value

@@ -257,7 +257,7 @@ PROPERTIES = "".join(
         ),
         (
             f'<xacro:property name="p0" value="aaaaaaaaaa"/>{PROPERTIES}{link("p12")}',
-            "the expansion makes more than 20000000 characters",
+            "the expansion creates more than 20000000 characters",
         ),
         ("<a>" * 5000 + "</a>" * 5000, "Excessive depth"),
         ('<xacro:macro name="m"><a><xacro:m/></a></xacro:macro><xacro:m/>', "endless"),
