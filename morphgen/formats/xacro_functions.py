@@ -42,7 +42,7 @@ class Function:
     name: str
     call: Callable[..., object]
     applies: bool = False
-    """Whether its first argument is a function; ``call`` then receives a caller of functions first."""
+    """Whether its first argument is a function; ``call`` then gets a caller of functions first."""
 
     def __str__(self) -> str:
         """Return its name, for messages."""
