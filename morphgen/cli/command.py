@@ -7,6 +7,7 @@ import math
 import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
@@ -70,11 +71,8 @@ def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
     valid = f"{least} or more" if most is None else f"{least} to {most}"
 
     def parse(text: str) -> int:
-        try:
-            number = float(text)
-        except ValueError:
-            number = math.nan
-        if not (number.is_integer() and least <= number <= (math.inf if most is None else most)):
+        number = _number(text)
+        if not (number % 1 == 0 and least <= number <= (math.inf if most is None else most)):
             raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
         return int(number)
 
@@ -83,13 +81,18 @@ def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
 
 def positive(text: str) -> float:
     """Read a number above 0; a type for argparse."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
+    number = _number(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: expected a number above 0")
     return number
+
+
+def _number(text: str) -> float:
+    """Read a number, exactly if it is whole; nan if the text is something else."""
+    for convert in (int, float):
+        with suppress(ValueError):
+            return convert(text)
+    return math.nan
 
 
 Options: TypeAlias = "Sequence[Option | tuple[Option, ...]]"

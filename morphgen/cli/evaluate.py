@@ -13,6 +13,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
 from morphgen.cli.progress import TrainingProgress
 from morphgen.cli.train import SIDES, SPLIT_HELP, require_split_for_options, robots_to_train
+from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
 
 if TYPE_CHECKING:
@@ -81,7 +82,6 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
-    from morphgen.errors import TaskError
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
 
     name = args.checkpoint

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option
 from morphgen.cli.progress import bar, print_line, status, track
+from morphgen.errors import FitError, FormatError, MorphgenError
 
 if TYPE_CHECKING:
     from morphgen.fitting.agreement import Agreement
@@ -92,7 +93,6 @@ class Target:
 )
 def fit(args: argparse.Namespace) -> None:
     """Fit, print the table and write bundles."""
-    from morphgen.errors import MorphgenError
     from morphgen.fitting.link_fit import FitOptions
     from morphgen.model.geometry import MESH_SUFFIXES
 
@@ -126,7 +126,6 @@ def fit(args: argparse.Namespace) -> None:
 
 
 def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> None:
-    from morphgen.errors import FitError, MorphgenError
     from morphgen.fitting.link_fit import fit_shapes
     from morphgen.model.geometry import Mesh, Shape
 
@@ -172,7 +171,6 @@ def _folder(args: argparse.Namespace, target: Target, *, several: bool) -> Path:
     Raises:
         FormatError: If the bundle cannot be written there; better now than after the fit.
     """
-    from morphgen.errors import FormatError
     from morphgen.formats.bundle import bundle_folder, require_replaceable
 
     parent, name = (args.out, target.robot.name) if several else (args.out.parent, args.out.name)
@@ -223,7 +221,6 @@ def _fit_robot(
 
 
 def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) -> FitReport:
-    from morphgen.errors import FitError
     from morphgen.fitting.robot_fit import fit_links
     from morphgen.formats.fits import shapes_to_fit
 
@@ -234,7 +231,6 @@ def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) ->
 
 
 def _fit_all_parts(args: argparse.Namespace) -> None:
-    from morphgen.errors import MorphgenError
     from morphgen.fitting.part_fits import parts_with_meshes, store_parts
 
     given = {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option
 from morphgen.cli.progress import bar, status
+from morphgen.errors import BenchmarkError
 from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certifi
 )
 def goals(args: argparse.Namespace) -> int:
     """Sample goal sets and print a table with the failures."""
-    from morphgen.errors import BenchmarkError
     from morphgen.tasks.env_specs import GoalConfig
 
     if args.task is None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
+from morphgen.errors import FormatError, GrammarError, MorphgenError
 from morphgen.tasks.registry import SIMULATORS, TASKS
 
 if TYPE_CHECKING:
@@ -96,7 +97,6 @@ def sources_of(args: argparse.Namespace) -> list[RobotSource]:
     Raises:
         MorphgenError: If a word names no robot, or ``--root`` is given for a composed robot.
     """
-    from morphgen.errors import FormatError
     from morphgen.grammar.robot_source import find_robots
 
     sources = find_robots(args.words, library_of(args))
@@ -148,7 +148,6 @@ def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> G
     Raises:
         GrammarError: If the grammar is unknown, malformed, or ``sound`` and it has faults.
     """
-    from morphgen.errors import GrammarError
     from morphgen.grammar.analysis import check_grammar
     from morphgen.grammar.grammar_file import find_grammar, load_grammar
 
@@ -168,7 +167,5 @@ def reject_idle(options: dict[str, Any], reason: str) -> None:
     Raises:
         MorphgenError: If one was given.
     """
-    from morphgen.errors import MorphgenError
-
     if idle := [name for name, is_given in options.items() if is_given]:
         raise MorphgenError(f"{' '.join(idle)}: {reason}")

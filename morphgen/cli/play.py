@@ -14,6 +14,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, positive
 from morphgen.cli.progress import print_line, status
 from morphgen.rl.baselines import BASELINES
+from morphgen.tasks.registry import SIMULATORS, TASKS
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Episode
@@ -64,7 +65,6 @@ def play(args: argparse.Namespace) -> None:
     with status(args, "loading"):
         from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
         from morphgen.tasks.gym_env import TaskEnv
-        from morphgen.tasks.registry import TASKS
         from morphgen.tasks.renderer import require_video_path, write_video
 
     require_policy(args.policy, args.task)
@@ -134,7 +134,6 @@ def speed(args: argparse.Namespace) -> None:
 
     with status(args, "loading"):
         from morphgen.tasks.make import make_batch
-        from morphgen.tasks.registry import SIMULATORS
         from morphgen.tasks.speed import measure_speed
 
     robot = " ".join(args.words)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, repeated
 from morphgen.cli.progress import status
+from morphgen.errors import CompositionError, FormatError
 
 if TYPE_CHECKING:
     from morphgen.model.robot import Joint, Robot
@@ -80,7 +81,6 @@ def compose(args: argparse.Namespace) -> int:
 )
 def import_robot(args: argparse.Namespace) -> int:
     """Import a description, check it and write its bundle."""
-    from morphgen.errors import FormatError
     from morphgen.formats.bundle import bundle_folder
     from morphgen.grammar.robot_source import import_robot
 
@@ -171,7 +171,6 @@ def list_parts(args: argparse.Namespace) -> None:
 )
 def show(args: argparse.Namespace) -> None:
     """Print the link tree of one robot."""
-    from morphgen.errors import CompositionError
     from morphgen.grammar.robot_source import read_source
 
     sources = opt.sources_of(args)

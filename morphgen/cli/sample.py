@@ -12,6 +12,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, repeated
 from morphgen.cli.grammar import GRAMMAR
 from morphgen.cli.progress import bar, status, track
+from morphgen.errors import FormatError
 
 if TYPE_CHECKING:
     from morphgen.grammar.derivation import Derivation
@@ -127,7 +128,6 @@ def derive(args: argparse.Namespace) -> int:
 )
 def mutate(args: argparse.Namespace) -> None:
     """Write neighbours as bundles and print what differs."""
-    from morphgen.errors import FormatError
     from morphgen.formats.bundle import write_bundle
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import difference
@@ -168,7 +168,6 @@ def mutate(args: argparse.Namespace) -> None:
 
 def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> str:
     """Return the URDF that a derivation gives, as in a bundle or in a light set."""
-    from morphgen.errors import FormatError
     from morphgen.fitting.replace_collision import as_primitives
     from morphgen.formats.bundle import CARD, URDF, write_bundle
     from morphgen.grammar.compose import compose
@@ -191,7 +190,6 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
 
 
 def _derivation(folder: Path) -> Derivation:
-    from morphgen.errors import FormatError
     from morphgen.formats.bundle import CARD
     from morphgen.formats.data_files import read_text
     from morphgen.grammar.derivation import parse_derivation
@@ -211,7 +209,6 @@ def _derivation(folder: Path) -> Derivation:
 
 
 def _card(folder: Path) -> dict[str, Any]:
-    from morphgen.errors import FormatError
     from morphgen.formats.bundle import CARD
     from morphgen.formats.data_files import read_json
 
@@ -222,7 +219,6 @@ def _card(folder: Path) -> dict[str, Any]:
 
 
 def _require_folder(folder: Path) -> None:
-    from morphgen.errors import FormatError
 
     if not folder.exists():
         raise FormatError(f"{folder}: no such file or folder")

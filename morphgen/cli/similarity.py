@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, option, path_option
 from morphgen.cli.progress import bar, track
+from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
     from morphgen.benchmark.similarity import Features
@@ -69,8 +70,6 @@ def similarity(args: argparse.Namespace) -> None:
 
 def _require_writable(args: argparse.Namespace) -> None:
     """Refuse files that cannot be written, before the long work."""
-    from morphgen.errors import BenchmarkError
-
     for option_name, path in (
         ("--heatmap", args.heatmap),
         ("--map", args.map),
@@ -88,7 +87,6 @@ def _require_writable(args: argparse.Namespace) -> None:
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
     """Return the features of the robots and their names; equal names are replaced by labels."""
     from morphgen.benchmark.similarity import features
-    from morphgen.errors import BenchmarkError
     from morphgen.fitting.token_shapes import token_shapes
 
     pairs, folders = opt.read_robots(args), opt.library_of(args).folders

@@ -12,6 +12,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option
 from morphgen.cli.goals import make_goals, read_split_or_folder
 from morphgen.cli.progress import bar
+from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
     from morphgen.benchmark.audit import Audit, NearThresholds
@@ -66,7 +67,6 @@ def audit(args: argparse.Namespace) -> int:
 
 def _near(text: str | None) -> NearThresholds:
     from morphgen.benchmark.audit import NEAR_THRESHOLDS, NearThresholds
-    from morphgen.errors import BenchmarkError
 
     if text is None:
         return NEAR_THRESHOLDS
@@ -172,7 +172,6 @@ def build(args: argparse.Namespace) -> None:
     from morphgen.benchmark.split_build import build_split, split_folder_path
     from morphgen.benchmark.split_file import read_split
     from morphgen.benchmark.split_folder_files import BuildSettings
-    from morphgen.errors import BenchmarkError
 
     if args.light and args.picture:
         raise BenchmarkError("--light writes no pictures; say --light or --picture")

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import Command, Option, flag, number, option, path_option, repeated
 from morphgen.cli.progress import bar
+from morphgen.errors import BenchmarkError, nearest
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.benchmark.generate import SplitRequest
@@ -131,8 +133,6 @@ def _subject(args: argparse.Namespace) -> str:
 def _order(args: argparse.Namespace) -> SplitRequest:
     from morphgen.benchmark.generate import SplitRequest
     from morphgen.benchmark.token_layout import MAX_LINKS
-    from morphgen.errors import BenchmarkError, nearest
-    from morphgen.tasks.registry import TASKS
 
     tasks = [text.strip() for text in args.task.split(",")]
     for i, task in enumerate(tasks):
@@ -164,7 +164,6 @@ def _paths(out: Path, splits: Sequence[Split]) -> list[Path]:
 def _write(splits: Sequence[Split], paths: Sequence[Path]) -> None:
     """Write all files, or none if one of them exists with another content."""
     from morphgen.benchmark.split_file import split_text, write_split
-    from morphgen.errors import BenchmarkError
 
     for split, path in zip(splits, paths, strict=True):
         if path.is_file() and path.read_bytes() != split_text(split).encode():

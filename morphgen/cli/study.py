@@ -12,6 +12,7 @@ from morphgen.cli.command import command, flag, number, option, path_option
 from morphgen.cli.options import LIBRARY, RAY
 from morphgen.cli.progress import training_progress
 from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
+from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
 
 if TYPE_CHECKING:
@@ -73,7 +74,6 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     Raises:
         MorphgenError: If a split, agent or seed is invalid, or a run could not begin.
     """
-    from morphgen.errors import TaskError
     from morphgen.rl.agent_spec import parse_agents
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.robot_source import other_side
@@ -109,8 +109,6 @@ def _seeds(text: str) -> list[int]:
     Raises:
         TaskError: If the text is something else.
     """
-    from morphgen.errors import TaskError
-
     seeds: list[int] = []
     for part in text.split(","):
         first, dots, last = part.partition("..")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, option, path_option
 from morphgen.cli.progress import track
+from morphgen.errors import BenchmarkError
 
 if TYPE_CHECKING:
     from morphgen.model.geometry import Shape
@@ -42,7 +43,6 @@ HEADERS = (
 def tokens(args: argparse.Namespace) -> None:
     """Print the tokens of the robots, or write those of one."""
     from morphgen.benchmark.tokens import tokens, tokens_npz
-    from morphgen.errors import BenchmarkError
     from morphgen.fitting.token_shapes import token_shapes
     from morphgen.formats.files import write_file
 

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import status, training_progress
+from morphgen.errors import BenchmarkError, TaskError
 from morphgen.rl.agents import AGENTS
+from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.rl.agent_spec import AgentSpec
@@ -164,7 +166,6 @@ def train(args: argparse.Namespace) -> None:
 )
 def finetune(args: argparse.Namespace) -> None:
     """Train and print the path of the checkpoint."""
-    from morphgen.errors import TaskError
     from morphgen.rl.training import checkpoint_files
 
     require_split_for_options(args)
@@ -194,8 +195,6 @@ def require_split_for_options(args: argparse.Namespace) -> None:
     Raises:
         TaskError: If it is missing.
     """
-    from morphgen.errors import TaskError
-
     for name in ("obstacles", "library", "goal_seed"):
         if not args.words and getattr(args, name) not in (None, False, []):
             raise TaskError(f"--{name.replace('_', '-')} goes with --split")
@@ -210,9 +209,7 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
         MorphgenError: If the split or the robot is unknown.
     """
     from morphgen.cli.goals import read_split_or_folder
-    from morphgen.errors import BenchmarkError, TaskError
     from morphgen.rl.robot_source import robot_source, split_source
-    from morphgen.tasks.registry import TASKS
     from morphgen.tasks.split_goals import has_goals, read_split_goals
 
     seed, library = args.goal_seed or 0, tuple(args.library)
@@ -307,9 +304,7 @@ def _task_configs(source: RobotSource, num_goals: int | None) -> tuple[TaskConfi
     Raises:
         TaskError: If the split ships its own goals.
     """
-    from morphgen.errors import TaskError
     from morphgen.rl.robot_source import tasks_of
-    from morphgen.tasks.registry import TASKS
 
     names = dict.fromkeys((*TASKS.builtin, *tasks_of(source)))
     configs: list[TaskConfig] = [TASKS[name].config_type() for name in names]
@@ -331,7 +326,6 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
     Raises:
         TaskError: If an option has no effect.
     """
-    from morphgen.errors import TaskError
     from morphgen.rl.agent_spec import owners_of, parse_constants
 
     agent = config.policy.agent
@@ -350,7 +344,6 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
 
 
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
-    from morphgen.errors import TaskError
     from morphgen.rl.agent_spec import parse_constants
     from morphgen.rl.config import PPOConfig
     from morphgen.rl.robot_source import other_side

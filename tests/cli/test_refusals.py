@@ -1,5 +1,6 @@
 """What is wrong is refused in one line, and nothing half-written is left."""
 
+import argparse
 import json
 import signal
 import time
@@ -12,6 +13,7 @@ from helpers.commands import start, tree
 from helpers.parts import write_part
 from helpers.robots import arm
 from morphgen import cli
+from morphgen.cli.command import whole_number
 from morphgen.formats import bundle
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar import library
@@ -223,6 +225,19 @@ def test_ctrl_c_while_the_commands_are_imported_is_one_line(run, monkeypatch):
 )
 def test_a_misspelt_word_names_the_nearest_valid_one(refused, argv, message):
     assert message in refused(*argv.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("2e6", 2_000_000), ("7", 7), (str(2**60 + 1), 2**60 + 1)]
+)
+def test_a_whole_number_is_read_exactly(text, value):
+    assert whole_number(0)(text) == value
+
+
+@pytest.mark.parametrize("text", ["1.5", "nan", "inf", "1e999", "x", "", "-1"])
+def test_what_is_not_a_whole_number_is_refused(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="expected a whole number, 0 or more"):
+        whole_number(0)(text)
 
 
 def test_ctrl_c_that_a_package_makes_another_error_of_is_ctrl_c(run, monkeypatch):
