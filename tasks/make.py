@@ -85,7 +85,7 @@ def make_batch(
     with_obstacles: list[bool] = _one_for_each("obstacles", obstacles, robots)
     config = GoalConfig(goal_seed, tuple(configs))
     loaded = {source: load_robot(source, library=folders) for source in dict.fromkeys(robots)}
-    specs = []
+    specs: list[EnvSpec] = []
     for source, name, has_obstacles in zip(robots, tasks, with_obstacles, strict=True):
         progress(len(specs), len(robots))
         robot = loaded[source]
@@ -131,7 +131,7 @@ def make_split_batch(
     members = split.side(side)
     _require_env_for_each(num_envs, len(members))
     sets = read_goals(goals, side) if goals is not None else None
-    specs = []
+    specs: list[EnvSpec] = []
     for member in members:
         progress(len(specs), len(members))
         shipped = shipped_goal_set(sets, member.name, goals)
