@@ -20,7 +20,7 @@ POSITION_TOLERANCE = 1e-5
 """Largest accepted distance between a loader's tool and morphgen's [m]."""
 ROTATION_TOLERANCE = 1e-5
 """Largest accepted angle between a loader's tool and morphgen's [rad]."""
-LARGEST_POSITION = 10.0
+MAX_POSITION = 10.0
 """Bound of the compared joint positions [rad or m], because PyBullet uses single precision."""
 MASS_TOLERANCE = 1e-6
 """Largest accepted relative difference between a loader's total mass and morphgen's.
@@ -90,7 +90,7 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
         robot = replace(robot, frames=(frame,))
     q = random_configurations(robot, samples, np.random.default_rng(seed))
-    q = np.clip(q, -LARGEST_POSITION, LARGEST_POSITION)
+    q = np.clip(q, -MAX_POSITION, MAX_POSITION)
     rows = tuple(_row(robot, folder, loader, frame.name, q) for loader in LOADERS)
     passed = all(row.passed is not False for row in rows)
     return ConformanceReport(robot.name, frame.name, samples, seed, passed, rows)
@@ -109,13 +109,12 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
     position_offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
     position_error = float(np.linalg.norm(position_offset, axis=1).max(initial=0.0))
     rotation_error = _max_angle(reading.T_root_frame[:, :3, :3], expected[:, :3, :3])
-    ours = {robot.joints[k].name for k in robot.movable_joints}
-    theirs = set(reading.joints)
+    expected_joints, joints = set(names), set(reading.joints)
     faults = []
-    if missing := sorted(ours - theirs):
+    if missing := sorted(expected_joints - joints):
         faults.append(f"lacks joints {', '.join(missing)}")
-    if surplus := sorted(theirs - ours):
-        faults.append(f"has joints {', '.join(surplus)} that we have not")
+    if surplus := sorted(joints - expected_joints):
+        faults.append(f"has additional joints {', '.join(surplus)}")
     slack = MASS_TOLERANCE * robot.mass + BOUND_MASS * (len(robot.links) + len(robot.frames))
     if abs(reading.mass - robot.mass) > slack:
         faults.append(f"weighs {reading.mass:.9g} kg, not {robot.mass:.9g} kg")
@@ -126,7 +125,7 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
     return ConformanceRow(
         loader.name,
         passed=not faults,
-        joints=ours == theirs,
+        joints=joints == expected_joints,
         mass=reading.mass,
         position_error=position_error,
         rotation_error=rotation_error,

@@ -71,6 +71,7 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
             body = pybullet.loadURDF(str(folder / "robot.urdf"), physicsClientId=client)
             indices = range(pybullet.getNumJoints(body, physicsClientId=client))
             infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in indices]
+            # In PyBullet's joint infos, 1 is the name, 2 the type and 12 the name of the child link.
             movable = {
                 info[1].decode(): i
                 for i, info in zip(indices, infos, strict=True)
@@ -92,6 +93,7 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
                         pybullet.resetJointState(
                             body, index, float(q[name][i]), physicsClientId=client
                         )
+                # Items 4 and 5 of a link state are the pose of the link's URDF frame.
                 position, (x, y, z, w) = pybullet.getLinkState(
                     body, links[frame], computeForwardKinematics=1, physicsClientId=client
                 )[4:6]
@@ -125,6 +127,7 @@ def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> 
         for name in names:
             if name in q:
                 v[column[name]] = q[name][i]
+        # Continuous joints have a cosine and a sine in Pinocchio's q, so integrate their angle.
         configuration = pinocchio.integrate(model, pinocchio.neutral(model), v)
         pinocchio.framesForwardKinematics(model, data, configuration)
         poses[i] = data.oMf[index].homogeneous

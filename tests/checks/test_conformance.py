@@ -118,7 +118,7 @@ def test_a_renamed_joint_is_noticed(tmp_path):
     joints = (replace(robot.joints[0], name="hip"), *robot.joints[1:])
     for row in rows_of(replace(robot, joints=joints), folder).values():
         assert row.joints is False
-        assert "lacks joints hip; has joints shoulder" in row.message
+        assert "lacks joints hip; has additional joints shoulder" in row.message
 
 
 def test_a_missing_tool_is_noticed(tmp_path):
