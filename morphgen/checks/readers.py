@@ -71,7 +71,7 @@ def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> R
             body = pybullet.loadURDF(str(folder / "robot.urdf"), physicsClientId=client)
             indices = range(pybullet.getNumJoints(body, physicsClientId=client))
             infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in indices]
-            # In PyBullet's joint infos, 1 is the name, 2 the type and 12 the name of the child link.
+            # In PyBullet's joint infos, 1 is the name, 2 the type and 12 the child link's name.
             movable = {
                 info[1].decode(): i
                 for i, info in zip(indices, infos, strict=True)
