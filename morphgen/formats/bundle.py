@@ -1,4 +1,4 @@
-"""The bundle: a robot as a folder that loads anywhere."""
+"""Read and write bundles: a robot as a folder that every loader can read."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 
 
 def bundle_folder(parent: Path, name: str) -> Path:
-    """The folder of a robot's bundle: the name below ``parent``.
+    """Return the folder of a robot's bundle below ``parent``.
 
     Raises:
-        FormatError: If the name would make another folder of it, or an odd one.
+        FormatError: If the name is not a plain folder name.
     """
     if not _NAME.fullmatch(name):
         raise FormatError(
@@ -54,31 +54,31 @@ def bundle_folder(parent: Path, name: str) -> Path:
 
 
 def require_replaceable(folder: Path) -> None:
-    """Require that a bundle can be written to a folder: it is not there, or is a bundle.
+    """Require that a folder does not exist or is a bundle, so that a bundle may replace it.
 
     Raises:
         FormatError: If it is something else.
     """
     if folder.exists() and not (folder / CARD).is_file():
-        raise FormatError(f"{folder} exists and is no bundle (no {CARD}); choose another name")
+        raise FormatError(f"{folder} exists and is not a bundle (no {CARD}); choose another name")
 
 
 def write_bundle(
     robot: Robot, folder: Path, findings: Iterable[Finding] = (), *, picture: bool = True
 ) -> Path:
-    """Write a robot's bundle to a temporary folder and move it into place.
+    """Write a robot's bundle atomically.
 
     Args:
-        robot: The body.
-        folder: The bundle; a bundle that is there is replaced.
-        findings: What the checks say, for the card.
+        robot: The robot.
+        folder: The folder to write; an existing bundle is replaced.
+        findings: Findings of the checks, for the card.
         picture: Whether to draw ``preview.png``.
 
     Returns:
         ``folder``.
 
     Raises:
-        FormatError: If the folder cannot be written, or is there and no bundle.
+        FormatError: If the folder cannot be written, or exists and is not a bundle.
         MissingDependencyError: If a picture is wanted and nothing can draw it.
     """
     require_replaceable(folder)
@@ -101,15 +101,15 @@ def write_bundle(
 
 
 def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
-    """Read a bundle back.
+    """Read a robot from its bundle.
 
     Args:
         folder: The bundle.
-        root: A folder that its meshes may come from, besides its own.
+        root: A folder from which meshes may be read, besides the bundle's own.
 
     Raises:
-        FormatError: If it is no bundle, or broken. That a file is not the one that the card was
-            written for is no error here: ``file_findings`` tells.
+        FormatError: If it is not a bundle or is invalid. Files that differ from the card's hashes
+            are not an error here; ``file_findings`` reports them.
     """
     card = _read_card(folder)
     robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
@@ -128,9 +128,9 @@ def _read_fits(folder: Path) -> StoredFits:
 def _read_card(folder: Path) -> dict[str, Any]:
     card_path = folder / CARD
     if not card_path.is_file():
-        light = (folder / URDF).is_file()
-        what = f"; name its {URDF}, or make it again without --light" if light else ""
-        raise FormatError(f"{folder} is no bundle: it has no {CARD}{what}")
+        is_light = (folder / URDF).is_file()
+        hint = f"; name its {URDF}, or sample it again without --light" if is_light else ""
+        raise FormatError(f"{folder} is not a bundle: it has no {CARD}{hint}")
     card = read_json(card_path)
     if not isinstance(card, dict):
         raise FormatError(f"{card_path}: expected an object, not {type(card).__name__}")
@@ -138,33 +138,33 @@ def _read_card(folder: Path) -> dict[str, Any]:
 
 
 def file_findings(folder: Path) -> tuple[Finding, ...]:
-    """Files of a bundle that are not as its card says: changed since, or missing.
+    """Return findings about files of a bundle that are missing or differ from the card's hashes.
 
     Raises:
         FormatError: If the folder has no readable card.
     """
-    found = []
+    findings = []
     hashes = _read_card(folder).get("hashes")
     if not isinstance(hashes, dict):
         raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
     for name, expected in hashes.items():
         path = folder / name
         try:
-            is_own = path.resolve().is_relative_to(folder.resolve())
-            is_there = is_own and path.is_file()
-        except (OSError, ValueError):  # a name that no file system takes
-            is_own, is_there = True, False
-        if not is_own:
+            is_inside = path.resolve().is_relative_to(folder.resolve())
+            exists = is_inside and path.is_file()
+        except (OSError, ValueError):  # not a valid file name
+            is_inside, exists = True, False
+        if not is_inside:
             raise FormatError(f"{folder / CARD}: hashes: {name!r} leads out of the folder")
-        if not is_there:
-            code, why = "file-missing", "the card names it, but it is not there"
+        if not exists:
+            code, why = "file-missing", "the card names it, but it does not exist"
         elif hashlib.sha256(path.read_bytes()).hexdigest() != expected:
-            code, why = "file-changed", "its content is not what the card was written for"
+            code, why = "file-changed", "its content differs from the card's hash"
         else:
             continue
         fix = "compose or import the robot again, or read the URDF alone"
-        found.append(Finding(code, "warning", f"file {name}", why, fix))
-    return tuple(found)
+        findings.append(Finding(code, "warning", f"file {name}", why, fix))
+    return tuple(findings)
 
 
 def read_robot(
@@ -175,11 +175,11 @@ def read_robot(
     Args:
         path: The file or folder.
         args: xacro arguments.
-        root: A folder that meshes, includes and YAML may come from, besides the description's own
-            folder and package.
+        root: A folder from which meshes, includes and YAML may be read, besides the description's
+            own folder and package.
 
     Raises:
-        FormatError: If it is none of them, or broken.
+        FormatError: If it is neither of these, or invalid.
     """
     if path.is_dir():
         return read_bundle(path, root=root)
@@ -190,16 +190,16 @@ def read_robot(
 
 
 def split_colours(robot: Robot) -> Robot:
-    """One visual per colour for every visual mesh that has several colours of its own.
+    """Split every visual mesh of several colours into one visual shape per colour.
 
-    A colour of a single triangle is left out: MuJoCo reads no mesh of three vertices.
+    A part of a single triangle is dropped, because MuJoCo refuses meshes of three vertices.
     """
     return replace(robot, links=tuple(_split_link(link) for link in robot.links))
 
 
 def _split_link(link: Link) -> Link:
     visuals = tuple(piece for shape in link.visuals for piece in _split_shape(shape))
-    return link if visuals == link.visuals else replace(link, visuals=visuals)
+    return replace(link, visuals=visuals)
 
 
 def _split_shape(shape: Shape) -> tuple[Shape, ...]:
@@ -218,7 +218,7 @@ def _split_shape(shape: Shape) -> tuple[Shape, ...]:
 
 
 def _write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
-    """Write every mesh once, in metres; return its path in the bundle."""
+    """Write every mesh once, in metres; return the paths in the bundle."""
     files: dict[Mesh, str] = {}
     for link in robot.links:
         for shape in (*link.visuals, *link.collisions):
@@ -235,9 +235,9 @@ def _write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
 
 
 def _write_fits(robot: Robot, folder: Path) -> None:
-    """Write what is known of the collision shapes, under the keys that these have once read back.
+    """Write the fits of the collision shapes under the keys of the rewritten meshes.
 
-    Meshes are rewritten, so that the keys of the robot's own fits do not find them any more.
+    The bundle's meshes have other content than the robot's, and with it other keys.
     """
     if not robot.fits:
         return
@@ -252,7 +252,7 @@ def _write_fits(robot: Robot, folder: Path) -> None:
 
 
 def _mesh_bytes(mesh: trimesh.Trimesh) -> tuple[bytes, str]:
-    """Binary STL, which every loader reads; OBJ beyond the size of STL that MuJoCo reads."""
+    """Return binary STL and its suffix, or OBJ for meshes too large for MuJoCo's STL reader."""
     if len(mesh.faces) <= MAX_STL_FACES:
         return export_stl(mesh), "stl"
     return export_obj(mesh, include_normals=False, header=None).encode(), "obj"

@@ -1,4 +1,4 @@
-"""The card: everything about a robot that is not geometry, as plain data."""
+"""The card of a bundle: everything about a robot except its geometry, as plain data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PROVENANCE = (
     "accepted",
     "primitives",
 )
-"""Keys of a card that become the robot's provenance."""
+"""Keys of a card that become the robot's ``provenance``."""
 
 
 class _CardRecord(Record, frozen=True):
@@ -57,17 +57,15 @@ def robot_card(
     hashes: Mapping[str, str],
     versions: Mapping[str, str],
 ) -> dict[str, object]:
-    """Describe a robot.
+    """Return the data of a robot's ``card.json``.
+
+    It contains no time and no path, so that the same robot gives the same bytes on any machine.
 
     Args:
-        robot: The body.
-        findings: What the checks say of it.
-        hashes: SHA-256 of its files, by name.
-        versions: Versions of what made it.
-
-    Returns:
-        Data for ``card.json``; it holds no time and no path, so the same robot gives the same
-        bytes anywhere.
+        robot: The robot.
+        findings: Findings of the checks.
+        hashes: SHA-256 of the bundle's files, by name.
+        versions: Versions of the software that wrote the bundle, by name.
     """
     has_tool = any(frame.name == "tool" for frame in robot.frames)
     joints = [robot.joints[k] for k in robot.independent_joints]
@@ -105,7 +103,7 @@ def robot_card(
 
 
 def card_text(card: Mapping[str, object]) -> str:
-    """A card as JSON text."""
+    """Return a card as JSON text."""
     return json.dumps(card, indent=2, ensure_ascii=False) + "\n"
 
 

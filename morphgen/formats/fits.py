@@ -1,8 +1,8 @@
-"""Fitted primitives on disk: beside every real part's manifest, and in every bundle with meshes.
+"""Files of fitted primitives: beside every real part's manifest, and in every bundle with meshes.
 
-Fits are found by the content of the shapes that they stand for, so that an edited mesh is never
-given the fit of the one before. Primitives grow with these shapes, so they are kept for shapes at
-unit scale, and serve links that are scaled as a whole.
+The key of a fit is a hash of the content of the fitted shapes, so that an edited mesh never gets
+the fit of its predecessor. Shapes are hashed at unit scale and the primitives scaled with them, so
+that one entry serves a link at any uniform scale.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class _FileRecord(Record, frozen=True):
 
 
 def stored_fit(shapes: Sequence[Shape], stored: StoredFits) -> StoredFit | None:
-    """What is stored for shapes, or for the same ones at another scale.
+    """Return the stored fit of shapes, scaled to them; None if there is none.
 
     Raises:
         FormatError: If a mesh file cannot be read.
@@ -117,7 +117,7 @@ def stored_fit(shapes: Sequence[Shape], stored: StoredFits) -> StoredFit | None:
 
 
 def find_fit(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> StoredFit | None:
-    """The fit of a link's collision shapes: what its robot brings, or for meshes what is stored.
+    """Return the fit of a link's collision shapes: the robot's own, else for meshes a stored one.
 
     Raises:
         FormatError: If a mesh file cannot be read.
@@ -129,7 +129,7 @@ def find_fit(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> Store
 
 
 def shapes_scale(shapes: Sequence[Shape]) -> float:
-    """The scale of the first mesh; 1 if it is not the same in all directions, or there is none."""
+    """Return the scale of the first mesh; 1 if it is not uniform or there is no mesh."""
     for shape in shapes:
         if isinstance(shape.geometry, Mesh):
             x, y, z = shape.geometry.scale
@@ -138,9 +138,7 @@ def shapes_scale(shapes: Sequence[Shape]) -> float:
 
 
 def shapes_key(shapes: Sequence[Shape]) -> str:
-    """A hash of shapes by their content: the same meshes at the same places, the same hash.
-
-    Shapes that are scaled as a whole have the hash of those at unit scale.
+    """Return a hash of the content and poses of shapes at unit scale.
 
     Raises:
         FormatError: If a mesh file cannot be read.
@@ -166,20 +164,20 @@ def shapes_to_fit(link: Link) -> tuple[Shape, ...]:
 
 
 def read_stored_fits(folders: Iterable[Path]) -> dict[str, StoredFit]:
-    """All fits in folders of parts, but for those of another version of the fitter.
+    """Return all fits in folders of parts, except those of another version of the fitter.
 
     Raises:
         FormatError: If a file is malformed.
     """
-    found: dict[str, StoredFit] = {}
+    fits: dict[str, StoredFit] = {}
     for folder in folders:
         for path in sorted(folder.rglob(f"*{SUFFIX}")):
-            found |= read_fits(path)
-    return found
+            fits |= read_fits(path)
+    return fits
 
 
 def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
-    """The robot with what folders of parts store of its collision meshes.
+    """Return the robot with the fits of its collision meshes that folders of parts contain.
 
     Raises:
         FormatError: If a file of fits is malformed, or a mesh file cannot be read.
@@ -193,7 +191,7 @@ def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
 
 
 def read_fits(path: Path) -> dict[str, StoredFit]:
-    """The fits of one file; none if it was written by another version of the fitter.
+    """Return the fits of one file; none if another version of the fitter wrote it.
 
     Raises:
         FormatError: If it cannot be read or is malformed.
@@ -205,7 +203,7 @@ def read_fits(path: Path) -> dict[str, StoredFit]:
 
 
 def fits_text(fits: Mapping[str, StoredFit]) -> str:
-    """The file of a part."""
+    """Return the text of a file of fits."""
     links = [
         {
             "link": fit.link,
@@ -222,7 +220,7 @@ def fits_text(fits: Mapping[str, StoredFit]) -> str:
 
 
 def shape_to_data(shape: Shape) -> dict[str, object]:
-    """A box, cylinder or sphere as plain data: metres, (x, y, z) and (w, x, y, z)."""
+    """Return the data of a ``ShapeRecord`` for a box, cylinder or sphere."""
     size: dict[str, object]
     match shape.geometry:
         case Box(edges):
@@ -232,14 +230,14 @@ def shape_to_data(shape: Shape) -> dict[str, object]:
         case Sphere(radius):
             size = {"sphere": [radius]}
         case other:
-            raise ValueError(f"{type(other).__name__} is no box, cylinder or sphere")
+            raise ValueError(f"{type(other).__name__} is not a box, cylinder or sphere")
     pose = shape.T_link_shape
     return size | {"xyz": list(pose.position), "quaternion": list(pose.quaternion)}
 
 
 @lru_cache(maxsize=256)
 def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
-    """The fits of a file as it is at its stamp."""
+    """Read the fits of a file; ``stamp`` makes the cache read it again after a change."""
     del stamp
     data = read_json(path)
     if isinstance(data, dict) and data.get("fitter", FITTER_VERSION) != FITTER_VERSION:

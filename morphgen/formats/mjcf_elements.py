@@ -1,4 +1,4 @@
-"""What MJCF documents are made of: numbers, poses, joints, geoms and mesh assets."""
+"""Elements of MJCF documents: numbers, poses, joints, geoms and mesh assets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from morphgen.typing import Array
 
 MeshFile = Callable[[Mesh], str]
 FLAT = 1e-5
-"""Extent below which a collision hull counts as flat, metres; MuJoCo refuses flat hulls."""
+"""Extent below which a collision hull counts as flat [m]; MuJoCo refuses flat hulls."""
 FLAT_THICKNESS = 1e-4
-"""Thickness that a flat collision hull is given, metres."""
+"""Thickness that a flat collision hull gets [m]."""
 
 
 class Meshes:
-    """The mesh assets that a document refers to, in order of first use."""
+    """Mesh assets of a document, in order of first use."""
 
     def __init__(self, mesh_file: MeshFile | None) -> None:
         self._mesh_file = mesh_file
@@ -32,7 +32,7 @@ class Meshes:
         self._vertices: dict[str, Array] = {}
 
     def name(self, mesh: Mesh, *, collision: bool) -> str:
-        """Asset name of a mesh, drawn as it is or collided with as its hull."""
+        """Return the asset name of a mesh, for collision the name of its hull."""
         key = (mesh, collision)
         if key not in self._names:
             self._names[key] = self._add(mesh, collision)
@@ -65,10 +65,10 @@ class Meshes:
 
     def _add(self, mesh: Mesh, collision: bool) -> str:
         if collision:
-            thick = _thickened(np.asarray(load_mesh(mesh).vertices, dtype=np.float64))
-            if thick is not None:
+            corners = _thickened(np.asarray(load_mesh(mesh).vertices, dtype=np.float64))
+            if corners is not None:
                 name = self._free_name(mesh.path.stem + "_flat")
-                self._vertices[name] = thick
+                self._vertices[name] = corners
                 return name
         if self._mesh_file is None:
             return self._free_name(mesh.path.stem)
@@ -90,7 +90,7 @@ class Meshes:
 
 
 def geom_attributes(shape: Shape, meshes: Meshes, *, collision: bool) -> dict[str, str]:
-    """Attributes of the ``<geom>`` of a shape: type, size or mesh, pose."""
+    """Return the type, size or mesh, and pose attributes of a shape's ``<geom>``."""
     match shape.geometry:
         case Box(size):
             form = {"type": "box", "size": join(edge / 2 for edge in size)}
@@ -106,13 +106,13 @@ def geom_attributes(shape: Shape, meshes: Meshes, *, collision: bool) -> dict[st
 
 
 def joint_attributes(joint: Joint) -> dict[str, str]:
-    """Attributes of a movable joint that say how it moves: name, type, axis."""
+    """Return the name, type and axis attributes of a movable joint."""
     kind = "slide" if joint.kind == "prismatic" else "hinge"
     return {"name": joint.name, "type": kind, "axis": join(joint.unit_axis)}
 
 
 def pose_attributes(pose: Pose) -> dict[str, str]:
-    """Attributes that place an element; none for the identity."""
+    """Return the pose attributes of an element; none for the identity."""
     attributes = {}
     position, quaternion = join(pose.position), join(pose.quaternion)
     if position != "0 0 0":
@@ -123,12 +123,12 @@ def pose_attributes(pose: Pose) -> dict[str, str]:
 
 
 def join(values: Iterable[float], zero: float = 1e-12) -> str:
-    """Numbers with 12 significant digits; what is smaller than ``zero`` is zero."""
+    """Return numbers with 12 significant digits; magnitudes below ``zero`` are zero."""
     return " ".join("0" if abs(value) < zero else f"{value:.12g}" for value in values)
 
 
 def _thickened(vertices: Array) -> Array | None:
-    """Corners of a thin solid around flat vertices; None if they are not flat."""
+    """Return the corners of a thin solid around flat vertices; None if they are not flat."""
     centred = vertices - vertices.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     if np.ptp(centred @ axes[:, 0]) >= FLAT:

@@ -1,4 +1,4 @@
-"""MuJoCo's forward kinematics of a robot: a second opinion on ``morphgen.model.kinematics``."""
+"""MuJoCo's forward kinematics of a robot, to verify ``morphgen.model.kinematics``."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from morphgen.typing import Array
 
 
 class MujocoKinematics:
-    """The kinematic tree of a robot in MuJoCo, without any shapes.
+    """The kinematic tree of a robot in MuJoCo, without shapes.
 
     Attributes:
         model: The compiled model; bodies have the names of links, sites those of frames.
-        data: Its state after the last configuration.
+        data: The state of the model at the last configuration.
     """
 
     def __init__(self, robot: Robot) -> None:

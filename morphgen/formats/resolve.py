@@ -35,32 +35,33 @@ _NAME_TAG = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 
 @dataclass(frozen=True)
 class PackageFinder:
-    """Where ROS packages may lie, besides around the file that names them."""
+    """Finds ROS packages around the file that names them and in further folders."""
 
     roots: tuple[Path, ...] = ()
-    """Folders that hold package folders, in the order of search."""
+    """Folders that contain packages, in search order."""
     packages: tuple[tuple[str, Path], ...] = ()
-    """Packages whose folder is known: (name, folder)."""
+    """Name and folder of known packages."""
     root: Path | None = None
-    """A folder that files may come from, besides the description's own folder and package."""
+    """A folder from which files may be read, besides the description's own folder and package."""
 
     def find(self, package: str, *files: Path) -> Path:
         """Return the folder of a package.
 
-        The first of these that exists: a folder given for that name; around each of ``files``, from
-        the file upwards, a folder that is the package (by its ``package.xml`` or its own name) or
-        that holds it as a direct child; under each root, a folder of that name or, up to two
-        levels down, one whose ``package.xml`` says so. Descriptions are often copied into a folder
-        named without ROS's suffix, so a package ``x_description`` or ``x_support`` that is nowhere
-        is then sought as a folder ``x``. Names are case-sensitive and the root of the file system
-        holds no packages.
+        The search order is: the folder in ``packages``; for each of ``files``, from the file
+        upwards, a folder that is the package (by its ``package.xml`` or its name) or contains it
+        directly; in each root, a folder of that name or, up to two levels down, one whose
+        ``package.xml`` has that name. Descriptions are often copied into a folder without ROS's
+        suffix, so ``x_description`` and ``x_support`` are then searched as ``x``. Names are
+        case-sensitive, and the root of the file system is not searched.
 
         Raises:
-            FormatError: The name is not a package name, or no folder was found.
+            FormatError: The name is invalid, or no folder was found.
         """
         place = f"{files[0]}: " if files else ""
         if not _PACKAGE_NAME.match(package):
-            raise FormatError(f"{place}{package!r} is no package name (letters, digits, _ and -)")
+            raise FormatError(
+                f"{place}{package!r} is not a package name (letters, digits, _ and -)"
+            )
         for name, folder in self.packages:
             if name == package:
                 return _absolute(folder)
@@ -102,42 +103,41 @@ def default_finder(
     Args:
         roots: Folders that hold packages, searched first.
         packages: Folders of packages by name.
-        root: A folder that files may come from, besides the description's own folder and package;
-            it is searched for packages, too.
+        root: A folder from which files may be read, besides the description's own folder and
+            package; it is also searched for packages.
 
     Returns:
-        A finder that has read ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` once, now.
+        A finder with the present values of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
     Raises:
-        FormatError: If ``root`` is no folder.
+        FormatError: If ``root`` is not a folder.
     """
     if root is not None:
         if not root.is_dir():
-            raise FormatError(f"root {root}: there is no such folder")
+            raise FormatError(f"root {root}: no such folder")
         root = _absolute(root)
         roots = (root, *roots)
     shares = (prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH"))
-    found = map(_absolute, (*roots, *_path_list("ROS_PACKAGE_PATH"), *shares, *_data_roots()))
+    folders = map(_absolute, (*roots, *_path_list("ROS_PACKAGE_PATH"), *shares, *_data_roots()))
     named = sorted((name, _absolute(folder)) for name, folder in (packages or {}).items())
-    return PackageFinder(tuple(dict.fromkeys(found)), tuple(named), root)
+    return PackageFinder(tuple(dict.fromkeys(folders)), tuple(named), root)
 
 
 def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
-    """Return the file that a URI inside a robot description means.
+    """Return the file that a URI inside a robot description refers to.
 
-    Understood are ``package://`` and ``model://`` (looked up by the finder), ``file://``, absolute
+    Supported are ``package://`` and ``model://`` (looked up by the finder), ``file://``, absolute
     and relative paths (from the description's folder, then from the finder's ``root``). A name is
     tried as written, then with its ``%`` escapes decoded; backslashes count as slashes; letter case
     matters.
 
-    A description may name files of ROS packages and of its own tree, nothing else. Its tree is the
-    nearest folder above it with a ``package.xml``, else the nearest named ``*_description`` or
-    ``*_support``, else the folder above its own (so that ``urdf/robot.urdf`` reaches
-    ``meshes/``). A relative path that climbs out is refused, also when the file exists: on another
-    machine it would mean another file, unless it leads into the finder's ``root``. So is an
-    absolute path that lies neither in the tree nor in one of the finder's folders nor in any ROS
-    package; name its folder as the root to allow it. All of this holds for what a symbolic link
-    leads to as well.
+    Security: a description may only refer to files of ROS packages and of its own tree, because a
+    stranger's file could otherwise copy private files into a bundle. The tree is the nearest folder
+    above it with a ``package.xml``, else the nearest named ``*_description`` or ``*_support``, else
+    the folder above its own (so that ``urdf/robot.urdf`` reaches ``meshes/``). A relative path that
+    leaves the tree is refused unless it leads into the finder's ``root``. An absolute path outside
+    the tree, the finder's folders and all ROS packages is refused, too; name its folder as the root
+    to allow it. The targets of symbolic links must meet the same rules.
 
     Args:
         uri: As written in the description.
@@ -145,7 +145,7 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         finder: Where packages may lie.
 
     Raises:
-        FormatError: The URI is malformed, leaves its tree, or names no file.
+        FormatError: The URI is malformed, leaves its tree, or the file does not exist.
     """
     base = _absolute(base_file)
     text = uri.strip().replace("\\", "/")
@@ -167,7 +167,7 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         absolute = scheme in ("file", "") and Path(name).is_absolute()
         path = Path(os.path.normpath(name if absolute else near / name.lstrip("/")))
         inside = path.is_relative_to(boundary) or _is_in(path, [finder.root])
-        if not inside and not (absolute and _may_name(path, finder)):
+        if not inside and not (absolute and _is_in_package(path, finder)):
             raise FormatError(
                 f"{base}: {uri!r} leaves {boundary}, the folder of its description;"
                 f" move the file inside, refer to it by package://, or {_WIDEN}"
@@ -175,32 +175,32 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         if path.is_file():
             real = path.resolve()
             trees = (boundary, _tree(base.resolve()), finder.root)
-            if not _is_in(real, trees) and not _may_name(real, finder):
+            if not _is_in(real, trees) and not _is_in_package(real, finder):
                 raise FormatError(
                     f"{base}: {uri!r} is a symbolic link that leaves {boundary}, the folder of its"
                     f" description; put the file itself there, or {_WIDEN}"
                 )
             return path
         missing.append(path)
-    raise FormatError(f"{base}: {uri!r} names no file: looked for {_listed(missing)}")
+    raise FormatError(f"{base}: {uri!r} does not exist: looked for {_listed(missing)}")
 
 
 def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> None:
-    """Require that a xacro may read a text file or list a folder, which it could copy into a robot.
+    """Require that a xacro may read a text file or list a folder.
 
-    It may in the package (the nearest folder above with a ``package.xml``, else the nearest named
-    ``*_description`` or ``*_support``) of the files that it consists of; without one, in their own
-    folders, and the folder above one that is named ``urdf`` or the like. It may in every folder
-    with a ``package.xml``, in the finder's folders and in its root. What counts is where the path
-    leads, through symbolic links.
+    Security: a xacro can copy text into the robot, so it must not read private files. Allowed is
+    the package (the nearest folder above with a ``package.xml``, else the nearest named
+    ``*_description`` or ``*_support``) of the xacro's files; without one, their own folders, and
+    the folder above one that is named ``urdf`` or similar. Also allowed are folders with a
+    ``package.xml``, the finder's folders and its root. Symbolic links are resolved first.
 
     Args:
-        path: What is read.
-        finder: Where packages may lie.
-        *files: The description, and the included file that asks.
+        path: The file or folder.
+        finder: Finds packages.
+        *files: The description, and the included file that refers to the path.
 
     Raises:
-        RefusedError: If it lies elsewhere.
+        RefusedError: If the path is elsewhere.
     """
     real = path.resolve()
     if _is_in(real, (*finder.roots, *(folder for _, folder in finder.packages), finder.root)):
@@ -215,12 +215,12 @@ def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> Non
 
 
 def is_installed(path: Path) -> bool:
-    """Whether a file came with morphgen or with one of the data packages."""
+    """Return whether a file was installed with morphgen or one of the data packages."""
     return _is_in(path.resolve(), (*_own_folders(), *_data_roots()))
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """What changes when a file does: its time and size; zeros if there is none."""
+    """Return modification time [ns] and size [bytes] of a file; zeros if it does not exist."""
     if not path.is_file():
         return (0, 0)
     status = path.stat()
@@ -228,9 +228,10 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def portable_uri(path: Path) -> str:
-    """The ``package://`` URI of a file in a ROS package, which names it on any machine.
+    """Return the ``package://`` URI of a file in a ROS package, which is valid on any machine.
 
-    A file in no package (no folder above has a ``package.xml`` or ROS's suffix) keeps its path.
+    A file outside of packages (no folder above has a ``package.xml`` or ROS's suffix) keeps
+    its path.
     """
     for folder in path.parents:
         if (folder / "package.xml").is_file() or _PACKAGE_SUFFIX.search(folder.name):
@@ -268,7 +269,7 @@ def distribution_file(package: str, relative: str) -> Path:
 
 
 def _tree(base: Path) -> Path:
-    """The folder that a description's relative paths must stay in."""
+    """Return the folder that a description's relative paths must not leave."""
     ancestors = _ancestors(base)
     declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
     named = [folder for folder in ancestors if _has_suffix(folder)]
@@ -276,10 +277,10 @@ def _tree(base: Path) -> Path:
 
 
 def _text_tree(file: Path) -> Path:
-    """The folder that a xacro's includes and YAML must stay in: none that only happens to be near.
+    """Return the folder that a xacro's includes and YAML must not leave.
 
-    Meshes may come from any folder above (``_tree``); but text would be copied word for word, and
-    the folder above a download is somebody's home.
+    It is stricter than ``_tree``, which is for meshes: text would be copied literally, and the
+    folder above a download may be the user's home.
     """
     ancestors = _ancestors(file)
     declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
@@ -289,15 +290,15 @@ def _text_tree(file: Path) -> Path:
 
 
 def _is_in(path: Path, folders: Iterable[Path | None]) -> bool:
-    """Whether a path lies in one of some folders, as they are written or as links lead to them."""
+    """Return whether a path is in one of the folders, as written or with links resolved."""
     given = [folder for folder in folders if folder is not None]
     return any(path.is_relative_to(folder) for folder in given) or any(
         path.is_relative_to(folder.resolve()) for folder in given
     )
 
 
-def _may_name(path: Path, finder: PackageFinder) -> bool:
-    """Whether an absolute path lies in one of the finder's folders or in some ROS package."""
+def _is_in_package(path: Path, finder: PackageFinder) -> bool:
+    """Return whether an absolute path is in one of the finder's folders or in a ROS package."""
     known = (*finder.roots, *(folder for _, folder in finder.packages))
     return _is_in(path, known) or any(
         _has_suffix(folder) or (folder / "package.xml").is_file() for folder in path.parents
@@ -309,7 +310,7 @@ def _has_suffix(folder: Path) -> bool:
 
 
 def _ancestors(file: Path) -> list[Path]:
-    """Folders above a file, nearest first, without the root of the file system."""
+    """Return the folders above a file, nearest first, without the root of the file system."""
     return [folder for folder in _absolute(file).parents if folder != folder.parent]
 
 
@@ -322,7 +323,7 @@ def _path_list(variable: str) -> list[Path]:
 
 
 def _declared_name(folder: Path) -> str | None:
-    """The name in a folder's ``package.xml``, if it has one."""
+    """Return the name in a folder's ``package.xml``, if it has one."""
     manifest = folder / "package.xml"
     if not manifest.is_file():
         return None
@@ -337,13 +338,13 @@ def _read_name(manifest: Path, mtime_ns: int) -> str | None:
 
 @lru_cache(maxsize=1)
 def _own_folders() -> tuple[Path, ...]:
-    """Folders of morphgen's own parts."""
+    """Return the folders of morphgen's own parts."""
     return tuple(Path(str(files(package))).resolve() for package in _OWN_PACKAGES)
 
 
 @lru_cache(maxsize=1)
 def _data_roots() -> tuple[Path, ...]:
-    """Folders with packages in those pip data packages that are installed."""
+    """Return the folders of ROS packages in the installed pip data packages."""
     roots = []
     for name, folders in _DATA_ROOTS.items():
         try:
@@ -355,7 +356,7 @@ def _data_roots() -> tuple[Path, ...]:
 
 
 def _listed(paths: list[Path]) -> str:
-    """Missing paths, with the name in the same folder that comes closest to the last."""
+    """Return missing paths as text, with the most similar file name in the folder of the last."""
     text = " and ".join(map(str, paths))
     folder, name = paths[-1].parent, paths[-1].name
     names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []

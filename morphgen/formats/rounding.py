@@ -1,8 +1,8 @@
-"""A robot's numbers as files hold them: the same robot whether composed or read back.
+"""Round a robot's numbers as its files do, so that a composed robot equals the one read back.
 
-Rounding twice is rounding once. Rotations are the hard ones, because a URDF has them as roll, pitch
-and yaw: they are put on a grid that is coarser than what these twelve digits lose, so that the
-rotation that is read back is on the same point of it.
+Rounding is idempotent. That is difficult for rotations only, because a URDF holds them as roll,
+pitch and yaw with twelve digits. They are rounded to a grid of quaternions that is coarser than the
+error of these digits, so that the rotation read back rounds to the same point of the grid.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from morphgen.model.robot import (
 from morphgen.model.rotation import Vec3, normalize
 
 _TURN_DECIMALS = 10
-"""Decimals of a quaternion over its largest entry. Three angles of 12 digits lose up to 1.5e-11."""
+"""Decimals of a quaternion divided by its largest entry; angles of 12 digits err up to 1.5e-11."""
 _LARGEST = 1e-6
-"""Entries of a quaternion that are within it of the largest count as equal; the first is taken."""
+"""Entries of a quaternion that differ by less from the largest count as equal to it."""
 _UNIT = 1e-9
-"""How far the length of a unit axis may be from 1 once it was rounded."""
+"""Largest difference of a rounded unit axis's length from 1."""
 
 
 def format_number(value: float) -> str:
-    """A number with 12 significant digits; what is smaller than 1e-12 is zero."""
+    """Return a number with 12 significant digits; magnitudes below 1e-12 are zero."""
     return "0" if abs(value) < 1e-12 else f"{value:.12g}"
 
 
 def format_inertia(value: float) -> str:
-    """Inertias of finger-sized bodies are far below ``number``'s zero."""
+    """Return an inertia with 12 digits; those of fingers are far below ``format_number``'s zero."""
     return f"{value:.12g}" if abs(value) > 1e-18 else "0"
 
 
@@ -55,21 +55,22 @@ def round_number(value: float) -> float:
 
 
 def rounded_pose(pose: Pose) -> Pose:
-    """A pose whose rotation survives being written as roll, pitch and yaw.
+    """Round a pose so that writing its rotation as roll, pitch and yaw does not change it.
 
-    What is no rotation stays, for others to refuse.
+    An invalid rotation is returned unchanged; the checks report it.
     """
     entries = pose.quaternion
-    most = max(map(abs, entries))
-    if not all(map(math.isfinite, entries)) or most == 0:
+    largest = max(map(abs, entries))
+    if not all(map(math.isfinite, entries)) or largest == 0:
         return pose
-    lead = next(value for value in entries if abs(value) > most - _LARGEST)
+    # The first of nearly equal entries, so that rounding errors do not change the choice.
+    lead = next(value for value in entries if abs(value) > largest - _LARGEST)
     w, x, y, z = (round(value / lead, _TURN_DECIMALS) for value in entries)
     return Pose(_vector(pose.position), normalize((w, x, y, z)))
 
 
 def rounded_axis(joint: Joint) -> Vec3:
-    """The unit axis of a joint to 12 digits; one that was rounded before stays.
+    """Return the unit axis of a joint with 12 digits; a rounded one is not normalised again.
 
     Raises:
         RobotError: If the axis is zero.
@@ -79,7 +80,7 @@ def rounded_axis(joint: Joint) -> Vec3:
 
 
 def urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
-    """A capsule, which URDF lacks, as a cylinder and two spheres; any other shape as itself."""
+    """Return a capsule, which URDF lacks, as a cylinder and two spheres, other shapes unchanged."""
     if not isinstance(shape.geometry, Capsule):
         return (shape,)
     radius, length = shape.geometry.radius, shape.geometry.length
@@ -92,10 +93,10 @@ def urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
 
 
 def as_written(robot: Robot) -> Robot:
-    """The robot that is read back from its bundle, meshes and all that is only seen apart.
+    """Return the robot as read back from its bundle, except for meshes and visual shapes.
 
-    What a file must name and the robot leaves open has the default. The result does not change if
-    it is taken again, or of the robot that was read back.
+    Values that a file must contain and the robot does not specify get their default. The function
+    is idempotent, and gives the same for the robot that was read back.
 
     Raises:
         RobotError: If an axis is zero.
@@ -110,7 +111,7 @@ def as_written(robot: Robot) -> Robot:
 
 
 def rounded_shapes(shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
-    """Shapes as a URDF holds them; meshes keep their files and scales."""
+    """Return shapes as a URDF holds them; meshes keep their files and scales."""
     return tuple(
         replace(
             piece, geometry=_geometry(piece.geometry), T_link_shape=rounded_pose(piece.T_link_shape)
@@ -128,11 +129,11 @@ def _link(link: Link) -> Link:
     )
 
 
-def _inertial(body: Inertial | None) -> Inertial | None:
-    if body is None or body.mass == 0:
+def _inertial(inertial: Inertial | None) -> Inertial | None:
+    if inertial is None or inertial.mass == 0:
         return None
-    xx, xy, xz, yy, yz, zz = (float(format_inertia(value)) for value in body.inertia)
-    return Inertial(round_number(body.mass), _vector(body.com), (xx, xy, xz, yy, yz, zz))
+    xx, xy, xz, yy, yz, zz = (float(format_inertia(value)) for value in inertial.inertia)
+    return Inertial(round_number(inertial.mass), _vector(inertial.com), (xx, xy, xz, yy, yz, zz))
 
 
 def _geometry(geometry: Geometry) -> Geometry:
@@ -148,17 +149,19 @@ def _geometry(geometry: Geometry) -> Geometry:
 
 
 def _joint(joint: Joint) -> Joint:
-    placed = rounded_pose(joint.T_parent_joint)
+    T_parent_joint = rounded_pose(joint.T_parent_joint)
     if not joint.is_movable:
-        return Joint(joint.name, joint.kind, joint.parent, joint.child, placed)
-    endless = joint.kind == "continuous" or (joint.kind == "revolute" and joint.limits is None)
-    limits = None if endless or joint.limits is None else joint.limits
+        return Joint(joint.name, joint.kind, joint.parent, joint.child, T_parent_joint)
+    is_continuous = joint.kind == "continuous" or (
+        joint.kind == "revolute" and joint.limits is None
+    )
+    limits = None if is_continuous or joint.limits is None else joint.limits
     return Joint(
         joint.name,
-        "continuous" if endless else joint.kind,
+        "continuous" if is_continuous else joint.kind,
         joint.parent,
         joint.child,
-        placed,
+        T_parent_joint,
         rounded_axis(joint),
         limits and (round_number(limits[0]), round_number(limits[1])),
         DEFAULT_EFFORT if joint.effort is None else round_number(joint.effort),

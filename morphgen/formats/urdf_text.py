@@ -1,4 +1,4 @@
-"""``Robot`` to URDF text."""
+"""Write a robot as URDF text."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ MeshUri = Callable[[Mesh], str]
 def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     """Write a robot as URDF; the same robot gives the same bytes.
 
-    Frames become massless links of their own name on fixed joints. Links without mass get an
+    Frames become massless links of the same name on fixed joints. Links without mass get an
     explicit zero ``<inertial>``, because PyBullet reads a missing one as 1 kg. A ``<mujoco>``
-    element tells MuJoCo to keep names, masses and mesh paths. Capsules, which URDF lacks,
-    become a cylinder and two spheres. A hinge without limits becomes ``continuous``, and a missing
-    effort or velocity the default: with half a ``<limit>`` Pinocchio refuses the file and PyBullet
-    reads zeros.
+    element makes MuJoCo keep names, masses and mesh paths. Capsules, which URDF lacks, become a
+    cylinder and two spheres. A revolute joint without limits becomes ``continuous``. A missing
+    effort or velocity becomes the default, because Pinocchio refuses an incomplete ``<limit>`` and
+    PyBullet reads it as zero.
 
-    A ``<morphgen>`` element, which loaders pass over, holds what URDF has no word for: the home,
-    and which links are frames.
+    A ``<morphgen>`` element, which loaders ignore, holds what URDF cannot express: the home
+    configuration, and which links are frames.
 
     Args:
-        robot: The body.
-        mesh_uri: File name to write for a mesh.
+        robot: The robot.
+        mesh_uri: Maps a mesh to the file name to write.
 
     Raises:
-        FormatError: If a slide has no limits.
+        FormatError: If a prismatic joint has no limits.
     """
     root = etree.Element("robot", name=robot.name)
     etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", _MUJOCO_COMPILER)
@@ -130,7 +130,7 @@ def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshU
         case Mesh():
             etree.SubElement(element, "mesh", filename=mesh_uri(geometry))
         case Capsule():
-            raise FormatError("a capsule has no URDF element; it is written as its pieces")
+            raise FormatError("URDF has no capsule; write the pieces of urdf_pieces")
 
 
 def _write_joint(root: etree._Element, joint: Joint) -> None:
@@ -147,7 +147,9 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     limit = {"effort": format_number(effort), "velocity": format_number(velocity)}
     if kind != "continuous":
         if joint.limits is None:
-            raise FormatError(f"joint {joint.name!r} slides without limits; a URDF must name them")
+            raise FormatError(
+                f"joint {joint.name!r} is prismatic without limits; a URDF needs them"
+            )
         lower, upper = joint.limits
         limit = {"lower": format_number(lower), "upper": format_number(upper)} | limit
     etree.SubElement(element, "limit", limit)

@@ -1,4 +1,4 @@
-"""Read XML that comes from anywhere: no entities, no surprises, errors with a place."""
+"""Parse XML from untrusted sources: without entities, with errors that name line and column."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _START_TAG = re.compile(rb"<[A-Za-z_][^\s/>]*")
 _UNDECLARED = re.compile(r"Namespace prefix ([A-Za-z_][\w.-]*) ", re.ASCII)
 _BOM = b"\xef\xbb\xbf"
 _MOST_PREFIXES = 20
-"""Undeclared prefixes of the strangest document that is still read."""
+"""Largest number of undeclared prefixes in a document that is read."""
 
 
 def parse_xml(data: bytes, origin: str) -> etree._Element:
     """Parse a document strictly and return its root element.
 
-    A document type declaration is refused, and with it every way to define an entity: neither an
-    entity bomb nor a reference to another file gets through. Comments and processing instructions
-    are dropped, so that text on both sides of one is a single string.
+    Document type declarations are refused, because entities are defined there: they could expand
+    without bound ("billion laughs") or include other files. Comments and processing instructions
+    are dropped, so that the text around them is a single string.
 
     Args:
         data: The document's bytes; its own encoding declaration is respected.
-        origin: What to call the document in errors, usually its path.
+        origin: Name of the document in errors, usually its path.
 
     Raises:
         FormatError: The document is broken (``origin:line:column: reason``) or has a DOCTYPE.
@@ -47,18 +47,18 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
 
 
 def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[Finding, ...]]:
-    """Parse a robot description as robot software does, which is less strict than XML.
+    """Parse a robot description as tolerantly as robot software does.
 
-    Three faults that ROS and PyBullet read over are mended: blank space before the XML declaration,
-    a declared version that does not exist, and prefixes that no namespace is declared for. The
-    mended document is parsed by ``parse_xml``.
+    Three faults that ROS and PyBullet tolerate are repaired: white space before the XML
+    declaration, an unknown declared version, and prefixes without a declared namespace. Then
+    ``parse_xml`` parses the document.
 
     Args:
         data: The document's bytes.
-        origin: What to call the document in errors, usually its path.
+        origin: Name of the document in errors, usually its path.
 
     Returns:
-        The root element, and a warning for everything that was mended.
+        The root element, and a warning for every repair.
 
     Raises:
         FormatError: As ``parse_xml``.
@@ -95,14 +95,14 @@ def _parser() -> etree.XMLParser:
 
 
 def _with_sound_declaration(data: bytes, origin: str) -> tuple[bytes, list[Finding]]:
-    """The document with its XML declaration at the start and of a version that exists."""
+    """Return the document with its XML declaration at the start and an existing version."""
     findings = []
     body = data.removeprefix(_BOM)
     blank = body[: len(body) - len(body.lstrip())]
-    found = _DECLARATION.match(body, len(blank))
-    if found is None:
+    match = _DECLARATION.match(body, len(blank))
+    if match is None:
         return data, []
-    declaration, rest = found[0], body[found.end() :]
+    declaration, rest = match[0], body[match.end() :]
     version = _VERSION.match(declaration)
     if version is not None and not re.fullmatch(rb"1\.[0-9]+", version[2]):
         declaration = version[1] + b"1.0" + declaration[version.end() :]
@@ -122,23 +122,23 @@ def _with_sound_declaration(data: bytes, origin: str) -> tuple[bytes, list[Findi
                 "xml-declaration",
                 "warning",
                 f"{origin}:1 document",
-                "blank space stands before the XML declaration",
+                "there is white space before the XML declaration",
                 "begin the file with <?xml",
-                "blank space before the XML declaration was left out",
+                "white space before the XML declaration was left out",
             )
         )
-    # The blank space moves behind the declaration, so that line numbers stay as they are.
+    # The white space moves behind the declaration, so that line numbers do not change.
     return (declaration + blank + rest, findings) if findings else (data, [])
 
 
 def _undeclared_prefixes(data: bytes) -> list[str]:
-    """Prefixes without a namespace, in order; none if there are too many to be an oversight."""
+    """Return prefixes without a namespace, in order; none if there are too many."""
     prefixes: list[str] = []
     while len(prefixes) <= _MOST_PREFIXES:
         parser = _parser()
         with suppress(etree.XMLSyntaxError):
             etree.fromstring(_with_prefixes(data, prefixes), parser)
-        # The log ends after 100 errors, so that some prefixes may show the next time only.
+        # The log ends after 100 errors; further prefixes appear in the next round.
         matches = [_UNDECLARED.match(entry.message or "") for entry in parser.error_log]
         names = dict.fromkeys(match[1] for match in matches if match is not None)
         new = [name for name in names if name not in prefixes]
@@ -149,7 +149,7 @@ def _undeclared_prefixes(data: bytes) -> list[str]:
 
 
 def _with_prefixes(data: bytes, prefixes: list[str]) -> bytes:
-    """The document with prefixes declared in its first start tag."""
+    """Return the document with prefixes declared in its first start tag."""
     at = 0
     while prefixes:
         at = data.find(b"<", at)

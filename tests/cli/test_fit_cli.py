@@ -405,7 +405,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced_nor_anything_fitted(
     (tmp_path / "made" / "thesis.txt").write_text("years of work")
     target = robot_urdf(arm()) if source == "robot" else "plane"
     words = ("--out", "made", "--no-picture", "--configurations", "1")
-    assert "made exists and is no bundle" in refused("fit", target, *words)
+    assert "made exists and is not a bundle" in refused("fit", target, *words)
 
 
 @pytest.mark.parametrize("named", ["source", "source/", "./source", "source/robot.urdf"])

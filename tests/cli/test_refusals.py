@@ -185,7 +185,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(refused, tmp_path):
     (tmp_path / "out" / "gantry-plane").mkdir(parents=True)
     (tmp_path / "out" / "gantry-plane" / "thesis.txt").write_text("years of work")
     words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
-    assert "out/gantry-plane exists and is no bundle" in refused(*words)
+    assert "out/gantry-plane exists and is not a bundle" in refused(*words)
 
 
 def interrupt(*_):

@@ -92,10 +92,10 @@ def test_an_interrupted_replacement_leaves_the_old_one(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["arm"]
 
 
-def test_a_folder_that_is_no_bundle_is_not_replaced(tmp_path):
+def test_a_folder_that_is_not_a_bundle_is_not_replaced(tmp_path):
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "thesis.txt").write_text("years of work")
-    with pytest.raises(FormatError, match="no bundle"):
+    with pytest.raises(FormatError, match="not a bundle"):
         write_bundle(arm(), tmp_path / "precious")
     assert (tmp_path / "precious" / "thesis.txt").exists()
 

@@ -197,7 +197,7 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path, capsys):
         refused(path, capsys, tmp_path)
     os.mkfifo(tmp_path / "m.stl")
     (tmp_path / "x.urdf").write_text(MESH.format("m.stl"))
-    assert "names no file" in refused(tmp_path / "x.urdf", capsys, tmp_path)
+    assert "does not exist" in refused(tmp_path / "x.urdf", capsys, tmp_path)
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads all")

@@ -126,7 +126,7 @@ def test_a_key_changes_with_the_file(files):
         ("{uploads}/ab/a.urdf:3: bad", "upload:ab/a.urdf:3: bad"),
         ("{uploads}: bad", "upload:: bad"),
         ("{root}/robots/a: bad", "robots/a: bad"),
-        ("{root} is no bundle", ". is no bundle"),
+        ("{root} is not a bundle", ". is not a bundle"),
         ("{temporary}/tmpa1_b2/robot/robot.urdf: bad", "robot.urdf: bad"),
         ("{temporary}/tmpa1_b2/episode.mp4: bad", "episode.mp4: bad"),
         ("{temporary}/morphgen-uploads-x/a: bad", "a: bad"),
