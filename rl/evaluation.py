@@ -26,7 +26,7 @@ from morphgen.rl.training import checkpoint_files
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, default_configs
 from morphgen.tasks.make import batch_from_specs
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 MAX_ENVS_PER_ROBOT = 34
@@ -57,7 +57,7 @@ class EvalConfig:
 
     episodes: int = 34
     """Least number of episodes per robot; all episodes count, from start to end."""
-    sim: str = "pybullet"
+    sim: str = field(default_factory=default_simulator)
     """Simulator."""
     seed: int = 0
     """Seed of the episodes."""

@@ -21,7 +21,7 @@ from morphgen.rl.robot_source import RobotSource, most_obstacles
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 from morphgen.tasks.task import TaskConfig
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
@@ -55,7 +55,7 @@ class RunConfig:
     """Constants of the algorithm."""
     seed: int = 0
     """Seed of weights, actions, minibatches and episodes."""
-    sim: str = "pybullet"
+    sim: str = field(default_factory=default_simulator)
     """Simulator."""
     num_envs: int = 128
     """Number of parallel environments, which the robots share."""

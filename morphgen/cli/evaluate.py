@@ -51,7 +51,7 @@ if TYPE_CHECKING:
             default=10_000,
         ),
     ),
-    opt.sim_option(None),
+    opt.sim_option("that of the training"),
     opt.WORKERS,
     opt.DEVICE,
     opt.SEED,
@@ -83,6 +83,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
+    from morphgen.tasks.registry import default_simulator
 
     name = args.checkpoint
     if not args.words:
@@ -90,7 +91,9 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
     if args.mode or args.device != "cpu":
         raise TaskError(f"{'--mode' if args.mode else '--device'} is for policies; {name} has none")
     sources = _sources(args)
-    config = EvalConfig(_num_episodes(args), args.sim or "pybullet", args.seed, args.workers)
+    config = EvalConfig(
+        _num_episodes(args), args.sim or default_simulator(), args.seed, args.workers
+    )
     return {
         name: [
             score

@@ -67,15 +67,14 @@ TASK_NAMES = f"{', '.join(TASKS.builtin)}, or a task of an installed package"
 TASK = option("task", choices=TASKS, metavar="TASK", help=TASK_NAMES)
 
 
-def sim_option(default: str | None = "pybullet") -> Option:
-    """Return the option ``--sim``; without a default the simulator is the checkpoint's."""
+def sim_option(default: str = "pybullet, or mujoco where it is not installed") -> Option:
+    """Return the option ``--sim``, None by default: the command decides what ``default`` says."""
     names = f"{', '.join(SIMULATORS.builtin)}, or a simulator of an installed package"
     return option(
         "--sim",
         choices=SIMULATORS,
         metavar="SIM",
-        default=default,
-        help=f"{names} (default: {default or 'that of the training'})",
+        help=f"{names} (default: {default})",
     )
 
 

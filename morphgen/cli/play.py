@@ -14,7 +14,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, positive
 from morphgen.cli.progress import print_line, status
 from morphgen.rl.baselines import BASELINES
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 
 if TYPE_CHECKING:
     from morphgen.rl.rollouts import Episode
@@ -136,27 +136,27 @@ def speed(args: argparse.Namespace) -> None:
         from morphgen.tasks.make import make_batch
         from morphgen.tasks.speed import measure_speed
 
-    robot = " ".join(args.words)
+    robot, sim = " ".join(args.words), args.sim or default_simulator()
     with status(args, f"preparing {robot} and its goals"):
         batch = make_batch(
             args.task,
             [robot],
             args.envs,
-            sim=args.sim,
+            sim=sim,
             workers=args.workers,
             obstacles=args.obstacles,
             max_links=None,
             library=args.library,
         )
     with closing(batch), status(args, "measuring"):
-        module, step = SIMULATORS[args.sim].native_step
+        module, step = SIMULATORS[sim].native_step
         own = [(import_module(module), step)] if args.workers == 1 else []
         result = measure_speed(batch, args.seconds, own=own)
 
     def text() -> str:
         shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
         return (
-            f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {args.sim}, "
+            f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {sim}, "
             f"{args.workers} worker(s)\n"
             f"environment steps per second: {result.steps_per_second:,.0f}\n"
             f"physics steps per second:     {result.substeps_per_second:,.0f}\n"

@@ -80,13 +80,16 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
     from morphgen.rl.training import require_device, require_runnable, subruns_of
     from morphgen.tasks.env_specs import default_configs
+    from morphgen.tasks.registry import default_simulator
 
     if args.gpus is not None and args.ray is None:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")
     if args.ray is None and not args.report:
         require_device(args.device)
     episode_steps = max(config.max_episode_steps for config in default_configs())
-    eval_config = EvalConfig(episodes_for(args.eval_steps, episode_steps), args.sim)
+    eval_config = EvalConfig(
+        episodes_for(args.eval_steps, episode_steps), args.sim or default_simulator()
+    )
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
     cells: list[Cell] = []

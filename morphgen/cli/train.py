@@ -143,7 +143,7 @@ def train(args: argparse.Namespace) -> None:
     option("--on", choices=SIDES, default="test", help="side of the split"),
     opt.OBSTACLES,
     opt.SEED,
-    opt.sim_option(None),
+    opt.sim_option("that of the training"),
     number("--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0),
     path_option(
         "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
@@ -265,6 +265,7 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     from morphgen.rl.agent_spec import configs_of, parse_constants
     from morphgen.rl.robot_source import tasks_of
     from morphgen.rl.runs import RunConfig
+    from morphgen.tasks.registry import default_simulator
 
     changes = {**parse_constants(args.set), "bf16": args.bf16, "compile": args.compile}
     policy, ppo = configs_of(spec, tasks_of(source), changes, args.steps)
@@ -273,7 +274,7 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
         policy,
         ppo,
         seed=args.seed,
-        sim=args.sim,
+        sim=args.sim or default_simulator(),
         num_envs=args.envs,
         device=args.device,
         full_budget=args.whole and AGENTS[spec.agent].per_robot,
