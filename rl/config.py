@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING, dataclass, fields, replace
+from typing import Any, get_type_hints
 
-from morphgen.errors import TaskError
+import msgspec
+
+from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS, NetworkConfig
 from morphgen.tasks.actions import ActionKind
 
@@ -62,16 +64,65 @@ class PolicyConfig:
         return self.proprioceptive_only or AGENTS[self.agent].proprioceptive_only
 
 
-def policy_from(stored: Mapping[str, Any]) -> PolicyConfig:
-    """Return the policy config that ``dataclasses.asdict`` made a dictionary of.
+def read_fields(
+    data: object, kind: type, where: str, given: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return stored values of a dataclass's fields, converted to the types that these declare.
+
+    Args:
+        data: Plain data of JSON or of a checkpoint.
+        kind: The dataclass.
+        where: Place of the data, for messages.
+        given: Fields that are read elsewhere.
 
     Raises:
-        TaskError: If the agent is unknown, or a value is out of its range.
+        TaskError: If a field is unknown or missing, or its value of another type.
     """
-    own = dict(stored)
-    sizes = own.pop("network", None) or {}
-    agent = own.get("agent", PolicyConfig.agent)
-    return PolicyConfig(**own, network=AGENTS[agent].config(**sizes))
+    if not isinstance(data, Mapping):
+        raise TaskError(f"{where}: invalid value {shown(data)}; expected keys and values")
+    hints, values = get_type_hints(kind), {}
+    known = {each.name: each for each in fields(kind) if each.name not in given}
+    for name, value in data.items():
+        if name not in known:
+            raise TaskError(f"{where}: unknown key {shown(name)}{nearest(str(name), known)}")
+        try:
+            values[name] = msgspec.convert(value, hints[name], strict=True)
+        except msgspec.ValidationError as error:
+            expected = str(error).partition(", got")[0].replace("`", "").replace("E", "e", 1)
+            raise TaskError(f"{where}: {name}: invalid value {shown(value)}; {expected}") from error
+    for name, each in known.items():
+        if name not in data and each.default is MISSING and each.default_factory is MISSING:
+            raise TaskError(f"{where}: missing key {name!r}")
+    return values
+
+
+def shown(value: object) -> str:
+    """Return a value for a message, shortened."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."
+
+
+def policy_from(stored: object, where: str = "policy") -> PolicyConfig:
+    """Return the policy config that ``dataclasses.asdict`` made a dictionary of.
+
+    Args:
+        stored: The dictionary.
+        where: Its place, for messages.
+
+    Raises:
+        TaskError: If the agent is unknown, or an entry is unknown, of another type or out of range.
+    """
+    data = dict(stored) if isinstance(stored, Mapping) else stored
+    sizes = data.pop("network", None) if isinstance(data, dict) else None
+    values = read_fields(data, PolicyConfig, where)
+    try:
+        policy = PolicyConfig(**values)
+    except TaskError as error:
+        raise TaskError(f"{where}: {error}") from error
+    if sizes is None:
+        return policy
+    config = AGENTS[policy.agent].config
+    return replace(policy, network=config(**read_fields(sizes, config, where)))
 
 
 @dataclass(frozen=True)

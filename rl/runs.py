@@ -14,9 +14,9 @@ from morphgen.errors import FormatError, TaskError, nearest
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import LOCK, partial_path, write_atomic
 from morphgen.rl.aliases import current_learner, current_run
-from morphgen.rl.checkpoint_content import require_fields, require_learner, require_policy
+from morphgen.rl.checkpoint_content import require_learner
 from morphgen.rl.checkpoint_file import packed, unpacked, warn_of_no_hash
-from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from
+from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields, shown
 from morphgen.rl.robot_source import RobotSource, most_obstacles
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
@@ -179,30 +179,24 @@ def config_from(data: object) -> RunConfig:
         TaskError: If an entry is missing, unknown, of another type or out of its range.
     """
     if not isinstance(data, Mapping):
-        raise TaskError("run: expected a table")
+        raise TaskError(f"run: invalid value {shown(data)}; expected keys and values")
     own = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
     constants = {name: own.pop(name) for name in list(own) if name in TASKS}
     if "tasks" in own:  # a field, but in files each task has an entry of its own
-        raise TaskError("run: unknown entry 'tasks'")
-    require_fields(RunConfig, own, "run")
+        raise TaskError("run: unknown key 'tasks'")
     for name in TASKS.builtin:
         if name not in constants:
-            raise TaskError(f"run: no {name}")
+            raise TaskError(f"run: missing key {name!r}")
     for name, values in constants.items():
-        require_fields(TASKS[name].config_type, config_fields(name, values), name)
-    made = {"source": RobotSource, "policy": PolicyConfig, "ppo": PPOConfig}
-    for name, kind in made.items():
-        if name not in own:
-            raise TaskError(f"run: no {name}")
-        require_fields(kind, own[name], name)
-    require_policy(own["policy"], "policy")
-    source = _tuples(own.pop("source"))
+        read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
+    stored = {name: own.pop(name) for name in ("source", "policy", "ppo") if name in own}
+    values = read_fields(own, RunConfig, "run", given=stored)
     return RunConfig(
-        RobotSource(**source),
-        policy_from(own.pop("policy")),
-        PPOConfig(**own.pop("ppo")),
+        RobotSource(**read_fields(stored["source"], RobotSource, "run: source")),
+        policy_from(stored["policy"], "run: policy"),
+        PPOConfig(**read_fields(stored["ppo"], PPOConfig, "run: ppo")),
         tasks=task_configs(constants),
-        **own,
+        **values,
     )
 
 
@@ -257,10 +251,6 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
             f"{path} has format {data['format']!r}; expected {' or '.join(map(str, READABLE))}: it "
             "was written by another version of morphgen"
         )
-
-
-def _tuples(data: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: tuple(v) if isinstance(v, list) else v for key, v in data.items()}
 
 
 def _require_same(folder: Path, stored: RunConfig, asked: RunConfig) -> None:

@@ -103,7 +103,7 @@ def test_a_key_under_both_names_is_refused(tmp_path):
     data = json.loads((tmp_path / CONFIG).read_text())
     data["ppo"]["lam"] = 0.5
     (tmp_path / CONFIG).write_text(json.dumps(data))
-    with pytest.raises(TaskError, match="ppo: unknown entry 'lam'"):
+    with pytest.raises(TaskError, match="ppo: unknown key 'lam'"):
         read_config(tmp_path)
 
 

@@ -121,20 +121,23 @@ def nested(levels, wide):
         ),
         (
             put("policy", "network", "mlp_width", value="abc"),
-            "policy: mlp_width 'abc': expected int",
+            "policy: mlp_width: invalid value 'abc'; expected int",
         ),
         (
             put("policy", "agent", value="hal"),
             "policy: unknown agent 'hal'; ",
         ),
-        (put("policy", "colour", value=1), "policy: unknown entry 'colour'"),
-        (put("config", "gamma", value="big"), "config: gamma 'big': expected float"),
+        (put("policy", "colour", value=1), "policy: unknown key 'colour'"),
+        (
+            put("config", "gamma", value="big"),
+            "config: gamma: invalid value 'big'; expected float",
+        ),
         (
             put("layout", "links", value=10**12),
             "layout: links 1000000000000: expected 0 to 100,000",
         ),
         (put("layout", "links", value=-4), "layout: links -4: expected 0 to 100,000"),
-        (put("layout", "channels", value=5), "layout: channels 5: expected tuple[str, ...]"),
+        (put("layout", "channels", value=5), "layout: channels: invalid value 5; expected array"),
         (
             put("optimiser", "state", 0, "exp_avg", value=torch.ones(2)),
             "exp_avg of parameter 0 is not of shape (4, 4)",
@@ -155,14 +158,17 @@ def nested(levels, wide):
             put("batch", value=torch.empty(10**12, device="meta")),
             "_rebuild_meta_tensor_no_storage', which",
         ),
-        (put_run("num_envs", value="many"), "run: num_envs 'many': expected int"),
-        (put_run("policy", value=[1]), "run: policy [1]: expected PolicyConfig"),
+        (
+            put_run("num_envs", value="many"),
+            "run: num_envs: invalid value 'many'; expected int",
+        ),
+        (put_run("policy", value=[1]), "run: policy: invalid value [1]; expected keys and values"),
         (
             put_run("sim", value="gazebo"),
             "unknown simulator 'gazebo'; valid: mujoco, pybullet",
         ),
-        (put_run("ppo", "colour", value=1), "ppo: unknown entry 'colour'"),
-        (lambda whole, _: whole["run"].pop("source"), "run: no source"),
+        (put_run("ppo", "colour", value=1), "ppo: unknown key 'colour'"),
+        (lambda whole, _: whole["run"].pop("source"), "run: missing key 'source'"),
         (lambda whole, _: whole.pop("run"), "is not a checkpoint of morphgen train"),
     ],
 )

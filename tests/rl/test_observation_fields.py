@@ -22,7 +22,7 @@ class WindyLine(OnALine):
     """The point on a line, with a field that only a task of another package has."""
 
     def observe(self):
-        wind = torch.ones(self.num_envs, 3) * self.elapsed[:, None]
+        wind = torch.ones(self.num_envs, 3) * self.episode_step[:, None]
         return {**super().observe(), "wind": wind}
 
 
