@@ -63,7 +63,7 @@ CASES: tuple[tuple[str, str, str], ...] = (
 )
 """Task, robot, and the panda-gym environment of the same task."""
 RAW = "raw PyBullet"
-EPISODE = ReachConfig.steps
+EPISODE = ReachConfig.max_episode_steps
 """Episode length [control steps]; every row runs whole episodes."""
 
 

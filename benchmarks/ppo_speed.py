@@ -338,7 +338,7 @@ class _RandomBatch:
             reward=reward,
             terminated=self._never,
             truncated=self._never,
-            unstable=self._never,
+            diverged=self._never,
             final_observation=self._seen,
             success=self._never,
             distance=self._score,

@@ -132,8 +132,9 @@ class ScriptedPush:
         lost = (error > LOST * self._edge) & (self._still > MIN_PUSH_STEPS)
         slow = self._still > PATIENCE + self._gap / SPEED
         astray = (block[:, 0] - self._begun).abs() > ASTRAY * self._edge
-        failed: torch.Tensor = slow | lost | astray | (self._stuck > MIN_PUSH_STEPS)
-        return failed & self._active & self.pushing
+        failed = slow | lost | astray | (self._stuck > MIN_PUSH_STEPS)
+        failing: torch.Tensor = failed & self._active & self.pushing
+        return failing
 
     def _blocked(self, task: TaskBatch) -> torch.Tensor:
         """Return where a pushing arm's targets collide with anything but the block, (n,), bool."""
