@@ -293,7 +293,7 @@ def _learners(device: str, envs: int, rounds: int) -> list[Row]:
 class _RandomBatch:
     """A replacement of ``TaskBatch`` with random observations and rewards."""
 
-    kind = "discrete"
+    action_kind = "discrete"
 
     def __init__(self, envs: int, device: str) -> None:
         self.num_envs, self.device = envs, torch.device(device)
