@@ -1,9 +1,9 @@
-"""Connected components of free configuration space, as far as one or two joints divide it.
+"""Connected components of free configuration space that one or two joints divide.
 
 Two links that touch in the middle of joints' ranges divide the free configurations into components
-that a robot never leaves. Whether two links touch depends on the joints between them. Where these
-are one or two joints that move the tool, their plane is tested on a grid and labelled. Components
-due to the ground, to obstacles or to links with more joints between them are not found.
+that no path leaves. Whether two links touch depends on the joints between them. If these are one or
+two joints that move the tool, a grid over their plane is tested and labelled. Components due to the
+ground, to obstacles or to links with more joints between them are not detected.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from morphgen.model.robot import TOOL, Pair, Robot
 from morphgen.typing import Array
 
 CELL = 0.1
-"""Width of a grid cell, rad or m."""
+"""Width of a grid cell [rad or m]."""
 FEWEST, MOST = 16, 128
 """Smallest and largest number of cells along a joint."""
 SAMPLES = 256
-"""Number of random configurations by which links that touch are found."""
+"""Number of random configurations that reveal which links touch."""
 OFTEN = 0.02
-"""Share of these in which two links must touch for their plane to be tested."""
+"""Fraction of these in which two links must touch for their plane to be tested."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointPlane:
-    """Free configurations of one or two joints that fall into several components."""
+    """Plane of one or two joints in which free configurations form several components."""
 
     pairs: tuple[Pair, ...]
     """Pairs of links that touch between the components."""
     joints: tuple[int, ...]
     """Indices of the independent joints, one or two."""
     lower: Array
-    """Lower end of the grid for each of the joints, rad or m."""
+    """Lower end of the grid for each joint [rad or m]."""
     upper: Array
-    """Upper end of the grid for each of the joints, rad or m."""
+    """Upper end of the grid for each joint [rad or m]."""
     main: NDArray[np.bool_]
-    """Cells of the largest component, an axis for each of the joints."""
+    """Cells of the largest component, an axis for each joint."""
     turns: tuple[float, ...]
-    """Period of each of the joints, rad; 0 if it has none."""
+    """Period of each joint [rad]; 0 if it does not wrap."""
 
 
 def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
-    """Find the joint planes in which a robot's free configurations fall into components.
+    """Find the joint planes in which a robot's free configurations form several components.
 
     Args:
         robot: The robot, with a tool.
@@ -67,50 +67,51 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
     Raises:
         MeshError: If a collision mesh cannot be read.
     """
-    tested = SelfCollisionChecker(robot, untested_pairs(robot))
+    checker = SelfCollisionChecker(robot, untested_pairs(robot))
     q = random_configurations(robot, SAMPLES, np.random.default_rng(0))
-    times = Counter(pair for found in tested.penetrations(q) for pair in found)
-    between: dict[tuple[int, ...], list[Pair]] = defaultdict(list)
-    for pair in sorted(pair for pair, count in times.items() if count >= OFTEN * SAMPLES):
-        between[_between(robot, *pair)].append(pair)
-    of_tool = {*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))}
-    candidates = [(k, pairs) for k, pairs in between.items() if 0 < len(k) <= 2 and {*k} <= of_tool]
-    planes = [_plane(robot, tested, k, pairs) for k, pairs in candidates]
-    return tuple(each for each in planes if each is not None)
+    counts = Counter(pair for contacts in checker.penetrations(q) for pair in contacts)
+    pairs_of: dict[tuple[int, ...], list[Pair]] = defaultdict(list)
+    for a, b in sorted(pair for pair, count in counts.items() if count >= OFTEN * SAMPLES):
+        chains = {*robot.joint_chain(a)} ^ {*robot.joint_chain(b)}
+        pairs_of[driving_joints(robot, chains)].append((a, b))
+    tool_joints = {*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))}
+    planes = [
+        _plane(robot, checker, joints, pairs)
+        for joints, pairs in pairs_of.items()
+        if 0 < len(joints) <= 2 and {*joints} <= tool_joints
+    ]
+    return tuple(plane for plane in planes if plane is not None)
 
 
 def in_other_component(planes: Sequence[JointPlane], q: Array) -> NDArray[np.bool_]:
     """Return in which planes a free configuration is outside of the largest component.
 
     Args:
-        planes: Of the robot.
-        q: Joint positions, shape (dof,), rad or m.
+        planes: Joint planes of the robot.
+        q: Joint positions, shape (dof,) [rad or m].
 
     Returns:
         Shape (number of planes,).
     """
-    return np.array([_is_outside(each, q) for each in planes], dtype=np.bool_)
+    return np.array([_is_outside(plane, q) for plane in planes], dtype=np.bool_)
 
 
 def _is_outside(plane: JointPlane, q: Array) -> bool:
-    """Return whether it is, however many turns are added to the joints within their bounds."""
-    own, count = q[[*plane.joints]], np.array(plane.main.shape)
+    """Return whether no equivalent of q within the limits, up to full turns, is in ``main``."""
+    position, count = q[[*plane.joints]], np.array(plane.main.shape)
     for times in product(*((-2, -1, 0, 1, 2) if turn else (0,) for turn in plane.turns)):
-        share = (own + np.multiply(times, plane.turns) - plane.lower) / (plane.upper - plane.lower)
-        if ((share >= 0) & (share <= 1)).all():
-            cell = np.minimum((share * count).astype(int), count - 1)
+        fraction = (position + np.multiply(times, plane.turns) - plane.lower) / (
+            plane.upper - plane.lower
+        )
+        if ((fraction >= 0) & (fraction <= 1)).all():
+            cell = np.minimum((fraction * count).astype(int), count - 1)
             if plane.main[tuple(cell.tolist())]:
                 return False
     return True
 
 
-def _between(robot: Robot, a: str, b: str) -> tuple[int, ...]:
-    """Return the independent joints that move one of two links relative to the other."""
-    return driving_joints(robot, {*robot.joint_chain(a)} ^ {*robot.joint_chain(b)})
-
-
 def _plane(
-    robot: Robot, tested: SelfCollisionChecker, joints: tuple[int, ...], pairs: Sequence[Pair]
+    robot: Robot, checker: SelfCollisionChecker, joints: tuple[int, ...], pairs: Sequence[Pair]
 ) -> JointPlane | None:
     columns = [*joints]
     lower, upper = joint_limits(robot).T[:, columns]
@@ -121,9 +122,8 @@ def _plane(
     ]
     q = np.tile(robot.home, (int(count.prod()), 1))
     q[:, columns] = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(len(q), -1)
-    free = np.array([not found.keys() & {*pairs} for found in tested.penetrations(q)]).reshape(
-        count
-    )
+    free = np.array([not contacts.keys() & {*pairs} for contacts in checker.penetrations(q)])
+    free = free.reshape(count)
     continuous = [robot.joints[robot.independent_joints[j]].kind == "continuous" for j in joints]
     components = _components(free, continuous)
     if components.max() < 2:
@@ -139,8 +139,8 @@ def _components(free: NDArray[np.bool_], continuous: Sequence[bool]) -> NDArray[
     """Label the component of each free cell, from 1; continuous joints wrap around."""
     labels, count = ndimage.label(free, np.ones((3,) * free.ndim))
     same = np.arange(count + 1)
-    for axis, goes_on in enumerate(continuous):
-        if goes_on:
+    for axis, wraps in enumerate(continuous):
+        if wraps:
             first, last = (np.take(labels, i, axis=axis) for i in (0, -1))
             for a, b in zip(np.ravel(first).tolist(), np.ravel(last).tolist(), strict=True):
                 if a and b:

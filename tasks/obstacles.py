@@ -1,4 +1,4 @@
-"""Boxes in a robot's way: where it works, but neither at home nor everywhere."""
+"""Obstacles: random boxes in a robot's workspace that leave it room to move."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 
 KEPT = 0.5
-"""Share of otherwise free configurations that obstacles must leave free."""
+"""Fraction of otherwise free configurations that obstacles must leave free."""
 PROBES = 128
-"""Free configurations at which that is tested."""
+"""Number of free configurations that test it."""
 CANDIDATES = 16
-"""Boxes drawn for each that is wanted."""
+"""Number of random boxes per required one."""
 
 
 def draw_obstacles(
@@ -30,25 +30,25 @@ def draw_obstacles(
     *,
     ground: float = 0.0,
 ) -> tuple[Block, ...]:
-    """Place boxes where the tool goes.
+    """Draw random boxes around positions of the tool.
 
-    Edges are uniform in ``size`` times reach: the largest distance of the tool from the robot's
-    shoulder (``workspace``), which neither a pedestal nor the position of a rail changes. Each box
-    is centred on the tool at a random free configuration, turned about the vertical at random; one
-    that would cut the ground rests on it. Boxes are taken in the order in which they are drawn, and
-    passed over if the robot touches them at home, its base included, or if with those before they
-    leave less than ``KEPT`` of the free configurations. Two may overlap.
+    Edges are uniform in ``size`` times the reach, the largest distance of the tool from the robot's
+    shoulder (``workspace``), which depends neither on a pedestal nor on the position of a rail.
+    Each box is centred on the tool at a random free configuration and turned about the vertical at
+    random; one that would cut the ground rests on it. Boxes are accepted in the order in which they
+    are drawn, unless the robot with its base touches them at home, or they and those before leave
+    less than ``KEPT`` of the free configurations. Boxes may overlap.
 
     Args:
-        robot: The body, with a tool.
-        count: How many boxes.
-        size: Range of their edges, relative to the reach.
-        rng: Where they come from.
-        ground: Height of the ground in the root frame, metres.
+        robot: The robot, with a tool.
+        count: Number of boxes.
+        size: Range of their edge lengths, relative to the reach.
+        rng: Source of random numbers.
+        ground: Height of the ground in the root frame [m].
 
     Raises:
-        BenchmarkError: If count or size is none, the robot has no workspace or hardly a free
-            configuration, or too few of the boxes drawn could be taken.
+        BenchmarkError: If count or size is invalid, the robot has no workspace or hardly a free
+            configuration, or too few of the boxes can be accepted.
         MeshError: If a collision mesh cannot be read.
     """
     low, high = size
@@ -56,35 +56,38 @@ def draw_obstacles(
         raise BenchmarkError(
             f"{count} obstacles of size {size}: at least one, and 0 < lowest <= highest"
         )
-    drawn = CANDIDATES * count
-    edges = rng.uniform(low, high, (drawn, 3)) * workspace(robot).reach
-    turns = rng.uniform(-math.pi, math.pi, drawn)
-    q, _ = FreeSpace(Scene(robot, ground=ground)).sample(PROBES + drawn, rng)
+    num_boxes = CANDIDATES * count
+    edges = rng.uniform(low, high, (num_boxes, 3)) * workspace(robot).reach
+    turns = rng.uniform(-math.pi, math.pi, num_boxes)
+    q, _ = FreeSpace(Scene(robot, ground=ground)).sample(PROBES + num_boxes, rng)
     tools = frame_pose(robot, q[PROBES:], TOOL)
     boxes = [
-        _box(place, edge, turn, ground)
-        for place, edge, turn in zip(tools[:, :3, 3].tolist(), edges.tolist(), turns, strict=True)
+        _box(position, edge, turn, ground)
+        for position, edge, turn in zip(
+            tools[:, :3, 3].tolist(), edges.tolist(), turns, strict=True
+        )
     ]
     space = FreeSpace(Scene(robot, obstacles=tuple(boxes), ground=ground))
     at_home = space.obstacle_hits([robot.home])[0]
     hits = space.obstacle_hits(q[:PROBES])
-    taken: list[Block] = []
-    lost = np.zeros(PROBES, dtype=np.bool_)
+    accepted: list[Block] = []
+    blocked = np.zeros(PROBES, dtype=np.bool_)
     for box, home, hit in zip(boxes, at_home, hits.T, strict=True):
-        if len(taken) < count and not home and np.mean(~(lost | hit)) >= KEPT:
-            taken.append(box)
-            lost |= hit
-    if len(taken) < count:
+        if len(accepted) < count and not home and np.mean(~(blocked | hit)) >= KEPT:
+            accepted.append(box)
+            blocked |= hit
+    if len(accepted) < count:
         raise BenchmarkError(
-            f"robot {robot.name!r}: of {drawn} boxes in its workspace only {len(taken)} are clear "
+            f"robot {robot.name!r}: of {num_boxes} boxes in its workspace only "
+            f"{len(accepted)} are clear "
             f"of it at home and leave {KEPT:.0%} of its free configurations; {count} are asked "
             "for: take fewer or smaller obstacles"
         )
-    return tuple(taken)
+    return tuple(accepted)
 
 
 def _box(centre: list[float], size: list[float], turn: float, ground: float) -> Block:
     x, y, z = centre
     a, b, c = size
-    at = (x, y, max(z, ground + c / 2))
-    return Block((a, b, c), Pose.from_xyz_rpy(at, (0.0, 0.0, float(turn))))
+    position = (x, y, max(z, ground + c / 2))
+    return Block((a, b, c), Pose.from_xyz_rpy(position, (0.0, 0.0, float(turn))))

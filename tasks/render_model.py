@@ -1,4 +1,4 @@
-"""A scene as a MuJoCo model that is drawn and never simulated: visuals, ground and markers."""
+"""A scene as a MuJoCo model for rendering, never simulated: visuals, ground and markers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 @dataclass(frozen=True, eq=False)
 class RenderModel:
-    """A MuJoCo model that is drawn and never simulated, and where its state is."""
+    """A MuJoCo model for rendering, and indices into its state."""
 
     model: mujoco.MjModel
     q_at: NDArray[np.int64]
@@ -42,19 +42,19 @@ class RenderModel:
     mocap: dict[str, int]
     """Mocap indices of the markers and, if there is one, of ``block``."""
     points: Array
-    """Points that are to be in view, shape (n, 3), metres."""
+    """Points that must be in view, shape (n, 3) [m]."""
 
 
 def render_model(
     scene: Scene, markers: Sequence[Marker], configurations: Array, points: Array
 ) -> RenderModel:
-    """Compile what is drawn of a scene, whose robot stands at the origin.
+    """Compile a scene whose robot stands at the origin for rendering.
 
     Args:
         scene: Robot, ground, obstacles and block.
         markers: Shapes that show a goal.
-        configurations: Joint positions at which the robot is to be in view, shape (n, dof).
-        points: Points that are to be in view, too, shape (m, 3), metres.
+        configurations: Joint positions at which the robot must be in view, shape (n, dof).
+        points: Further points that must be in view, shape (m, 3) [m].
 
     Raises:
         MeshError: If a mesh cannot be read.
@@ -66,7 +66,7 @@ def render_model(
     )
     if scene.ground is not None:
         points = points[points[:, 2] >= scene.ground - 1e-6]
-    spec = to_spec(_as_seen(robot))
+    spec = to_spec(_visible(robot))
     _add_surroundings(spec, scene, float(np.ptp(points, axis=0).max()))
     bodies = {}
     if scene.block is not None:
@@ -80,8 +80,8 @@ def render_model(
     return RenderModel(model, np.array(at, dtype=np.int64), mocap, points)
 
 
-def _as_seen(robot: Robot) -> Robot:
-    """The robot with nothing but what is to be drawn: visuals, or collision shapes without."""
+def _visible(robot: Robot) -> Robot:
+    """Return the robot with visuals only; collision shapes where a link has no visuals."""
     coloured = split_colours(robot)
     links = tuple(
         replace(link, visuals=link.visuals or link.collisions, collisions=())
@@ -98,7 +98,7 @@ def _as_seen(robot: Robot) -> Robot:
 
 
 def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
-    """Sky, light, ground and obstacles."""
+    """Add sky, light, ground and obstacles."""
     spec.add_texture(
         name="morphgen/sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -124,7 +124,7 @@ def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
 
 
 def _add_ground(spec: mujoco.MjSpec, height: float) -> None:
-    """A plane with squares of 0.1 m in groups of five."""
+    """Add a plane with squares of 0.1 m in groups of five."""
     spec.add_texture(
         name="morphgen/squares",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -170,16 +170,16 @@ def _add_marker(spec: mujoco.MjSpec, marker: Marker) -> mujoco.MjsBody:
 
 
 def _robot_corners(robot: Robot, q: Array) -> Array:
-    """Corners of the boxes around the links' shapes in configurations (n, dof), shape (m, 3)."""
+    """Return corners of the links' bounding boxes in configurations (n, dof), shape (m, 3)."""
     T_root_link = forward_kinematics(robot, q)
-    found = [np.zeros((0, 3))]
+    points = [np.zeros((0, 3))]
     for i, link in enumerate(robot.links):
         if link.visuals or link.collisions:
             corners = np.array(list(product(*bounding_box(link.visuals or link.collisions).T)))
             T = T_root_link[:, i]
             at = corners @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
-            found.append(at.reshape(-1, 3))
-    return np.concatenate(found)
+            points.append(at.reshape(-1, 3))
+    return np.concatenate(points)
 
 
 def _corners(block: Block) -> Array:

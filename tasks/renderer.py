@@ -1,4 +1,4 @@
-"""Pictures of environments, drawn without display or GPU, and films of them."""
+"""Pictures of environments, rendered without display or GPU, and videos of them."""
 
 from __future__ import annotations
 
@@ -30,40 +30,42 @@ from morphgen.tasks.task import EnvSpec, Marker
 Frame = NDArray[np.uint8]
 
 SIZE = (640, 480)
-"""Width and height of a frame, pixels."""
+"""Width and height of a frame [pixels]."""
 SUFFIXES = (".mp4", ".gif")
-"""What a film's file may end in."""
+"""Suffixes of video files."""
 
 _FOV = 35.0
+"""Vertical field of view [degrees]."""
 _AZIMUTH, _ELEVATION = 220.0, -25.0
-"""Degrees, as MuJoCo has them: from ahead and the left, where a block comes from behind a tool."""
+"""MuJoCo camera angles [degrees]: from ahead and the left, so that no tool hides the block."""
 _MARGIN = 0.92
+"""Fraction of the picture that the points in view fill."""
 _SHADOW_SIZE = 2048
-"""Of the map that says where it is dark, pixels. Shadows say how high a tool is. Without a GPU they
-take half of the time; smoothed edges would take as long again, and are hardly seen in a film."""
+"""Size of the shadow map [pixels]. Shadows show how high a tool is. Without a GPU they take half of
+the time; smoothed edges would take as long again, and are hardly visible in a video."""
 _AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
-"""Pose of what is not drawn."""
+"""Pose of bodies that must not be visible."""
 _STARTS = 32
-"""Number of configurations of a goal set that are to be in view."""
+"""Number of configurations of a goal set that must be in view."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderState:
-    """The state of an environment that is drawn."""
+    """State of an environment for a picture."""
 
     q: NDArray[np.float32]
-    """Positions of the robot's independent joints, shape (dof,), rad or m."""
+    """Positions of the robot's independent joints, shape (dof,) [rad or m]."""
     block: NDArray[np.float32] | None = None
-    """Pose of the block, (x, y, z, qw, qx, qy, qz), if there is one."""
+    """Pose of the block, (x, y, z, qw, qx, qy, qz), or None."""
     markers: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """Poses of the markers by name; others are not drawn."""
+    """Poses of the markers by name; markers without a pose are invisible."""
 
 
 class Renderer:
-    """Draws a scene, seen by a camera that does not move.
+    """Renders a scene from a fixed camera.
 
-    MuJoCo's OpenGL draws it, by EGL or OSMesa, whichever simulator moves it. PyBullet's software
-    renderer needs no library of the system, but it draws nothing translucent.
+    MuJoCo renders it with EGL or OSMesa, whichever simulator steps it. PyBullet's software renderer
+    would need no system library, but cannot draw translucent shapes.
     """
 
     def __init__(
@@ -74,18 +76,18 @@ class Renderer:
         points: NDArray[np.float64],
         size: tuple[int, int] = SIZE,
     ) -> None:
-        """Prepare.
+        """Compile the scene and place the camera.
 
         Args:
-            scene: The robot, which stands at the origin, and what is around it.
+            scene: Scene of a robot that stands at the origin.
             markers: Shapes that show a goal.
-            configurations: Joint positions at which the robot is to be in view, shape (n, dof).
-            points: Points that are to be in view, too, shape (m, 3), metres.
-            size: Width and height of frames, pixels.
+            configurations: Joint positions at which the robot must be in view, shape (n, dof).
+            points: Further points that must be in view, shape (m, 3) [m].
+            size: Width and height of frames [pixels].
 
         Raises:
             MeshError: If a mesh cannot be read.
-            MissingDependencyError: If there is no offscreen OpenGL.
+            MissingDependencyError: If offscreen OpenGL is missing.
         """
         self.size, self._robot = size, scene.robot
         self._model = render_model(scene, markers, configurations, points)
@@ -110,14 +112,14 @@ class Renderer:
 
     @classmethod
     def of_spec(cls, spec: EnvSpec, size: tuple[int, int] = SIZE) -> Renderer:
-        """Return a renderer that shows the robot at home and at starts, and all of its goals."""
+        """Return a renderer with a view of the robot at home and at starts, and of all goals."""
         task = TASKS[spec.task]
         configurations = np.concatenate([[spec.robot.home], spec.goals.q[:_STARTS]])
         markers = task.markers(spec.config, spec.goals)
         return cls(spec.scene, markers, configurations, task.points_in_view(spec.goals), size)
 
-    def frame(self, moment: RenderState) -> Frame:
-        """Draw a moment.
+    def frame(self, state: RenderState) -> Frame:
+        """Render a state.
 
         Returns:
             Shape (height, width, 3).
@@ -128,10 +130,10 @@ class Renderer:
         if self._closed:
             raise ValueError("this renderer is closed")
         model, data = self._model.model, self._data
-        data.qpos[self._model.q_at] = movable_positions(self._robot, moment.q)
-        poses = dict(moment.markers)
-        if moment.block is not None:
-            poses[BLOCK] = moment.block
+        data.qpos[self._model.q_at] = movable_positions(self._robot, state.q)
+        poses = dict(state.markers)
+        if state.block is not None:
+            poses[BLOCK] = state.block
         for name, index in self._model.mocap.items():
             pose = np.asarray(poses.get(name, _AWAY))
             data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
@@ -140,17 +142,17 @@ class Renderer:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         options = mujoco.MjvOption()
         mujoco.mjv_updateScene(model, data, options, None, self._camera, everything, self._scene)
-        return self._drawn()
+        return self._pixels()
 
     def close(self) -> None:
-        """Free the OpenGL context; a second time does nothing."""
+        """Free the OpenGL context; a second call does nothing."""
         if not self._closed:
             self._closed = True
             self._context.make_current()
             self._gpu.free()
             self._context.free()
 
-    def _drawn(self) -> Frame:
+    def _pixels(self) -> Frame:
         width, height = self.size
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         rectangle = mujoco.MjrRect(0, 0, width, height)
@@ -161,7 +163,7 @@ class Renderer:
 
 
 def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
-    """Return the state of an environment of a batch as it is now."""
+    """Return the current state of an environment of a batch."""
     spec = batch.specs[int(batch.env_robot_index[env])]
     block = None if spec.scene.block is None else _copied(batch.simulation.block_pose[env])
     return RenderState(
@@ -174,36 +176,36 @@ def _copied(values: torch.Tensor) -> NDArray[np.float32]:
 
 
 def require_video_path(path: Path) -> None:
-    """Require that a film can be written there, before anything is drawn.
+    """Require that a video can be written to a path, before anything is rendered.
 
     Raises:
-        FormatError: If the suffix is of no film, or there is no such folder.
+        FormatError: If the suffix is not one of ``SUFFIXES``, or the folder does not exist.
     """
     if path.suffix not in SUFFIXES:
-        raise FormatError(f"{path}: a film ends in {' or '.join(SUFFIXES)}")
+        raise FormatError(f"{path}: the name of a video ends in {' or '.join(SUFFIXES)}")
     if not path.parent.is_dir():
         raise FormatError(f"cannot write {path}: there is no folder {path.parent}")
 
 
 def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
-    """Write frames as they come: H.264 in ``.mp4``, or an endless ``.gif``.
+    """Write a video: H.264 in ``.mp4``, or an endless ``.gif``.
 
-    Nothing is there until all is written. The same frames give the same bytes.
+    The file appears when it is complete. The same frames give the same bytes.
 
     Args:
-        frames: At least one, shape (height, width, 3) each, even numbers for ``.mp4``.
-        path: Where to.
-        fps: Frames a second.
+        frames: At least one frame, shape (height, width, 3) each; even sizes for ``.mp4``.
+        path: Path of the video.
+        fps: Frames per second.
 
     Raises:
-        FormatError: If it cannot be written there, or ffmpeg is missing, fails or is killed; then
-            nothing is left.
+        FormatError: If it cannot be written, or ffmpeg is missing, fails or is killed; then no file
+            is left.
     """
     require_video_path(path)
     written = 0
     try:
         with replacing_file(path) as partial:
-            # In memory, a GIF's writer cannot fail a second time when Python disposes of it.
+            # In memory, a GIF's writer cannot fail again when Python deletes it.
             image = io.BytesIO() if path.suffix == ".gif" else None
             writer: Any = imageio.get_writer(image or partial, **_writing(path.suffix, fps))
             with writer:
@@ -213,7 +215,7 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
             if image:
                 partial.write_bytes(image.getvalue())
             else:
-                _require_whole(partial, written)
+                _require_complete(partial, written)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
     except VideoError as error:
@@ -221,7 +223,7 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
 
 
 class VideoError(Exception):
-    """Why ffmpeg did not write a film."""
+    """Reason why ffmpeg did not write a video."""
 
 
 def _append(
@@ -240,17 +242,17 @@ def _append(
         raise VideoError(str(error)) from error
 
 
-def _require_whole(film: Path, frames: int) -> None:
-    """Require that a film has all frames: ffmpeg's exit code is not known, and it may have failed.
+def _require_complete(video: Path, frames: int) -> None:
+    """Require that a video has all frames: imageio does not report ffmpeg's exit code.
 
     Raises:
-        VideoError: If it has not, as on a full disk.
+        VideoError: If frames are missing, as on a full disk.
     """
     try:
-        count, _ = imageio_ffmpeg.count_frames_and_secs(str(film))
+        count, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
     except RuntimeError as error:
         raise VideoError(
-            "ffmpeg left a film that cannot be read; is the disk full, or was ffmpeg ended?"
+            "ffmpeg left a video that cannot be read; is the disk full, or was ffmpeg ended?"
         ) from error
     if count != frames:
         raise VideoError(
@@ -274,11 +276,12 @@ def _writing(suffix: str, fps: float) -> dict[str, Any]:
 
 
 def _camera(points: NDArray[np.float64], aspect: float) -> mujoco.MjvCamera:
-    """The nearest view from its direction that holds all points, shape (n, 3).
+    """Return the nearest camera in the fixed direction that sees all points, shape (n, 3).
 
-    Seen from a place c on an axis v across the view, at distance d before the origin, a point is in
-    view if ``|v - c| <= t (a + d)``: a is how far ahead it is, t half the view's width at 1 m. So
-    ``d >= p - c / t`` and ``d >= n + c / t`` for the largest p = v / t - a and n = -v / t - a.
+    A camera at coordinate c on an axis v across the view, at distance d before the origin, sees a
+    point if ``|v - c| <= t (a + d)``, with the point's coordinate a along the view and half the
+    view's width t at 1 m. So ``d >= p - c / t`` and ``d >= n + c / t`` for the largest
+    p = v / t - a and n = -v / t - a.
     """
     turn = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True).as_matrix()
     across, ahead, up = (points @ turn).T

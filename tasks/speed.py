@@ -1,4 +1,4 @@
-"""How fast a batch is, and where its time goes."""
+"""Speed of a batch, and where its time goes."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.sim.base import SUBSTEPS
 
 WARM_UP = 20
-"""Control steps before the clock starts."""
+"""Number of control steps before the measurement."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Of a batch under random actions."""
+    """Speed of a batch under random actions."""
 
     steps_per_second: float
-    """Control steps of all environments together, episodes' beginnings included."""
+    """Control steps per second of all environments together, resets included."""
     shares: dict[str, float]
-    """Of the time, by what it was spent on; they sum up to 1."""
+    """Fractions of the time by activity; they add up to 1."""
 
     @property
     def substeps_per_second(self) -> float:
-        """Physics steps of all environments together."""
+        """Physics steps per second of all environments together."""
         return self.steps_per_second * SUBSTEPS
 
 
 def random_actions(batch: TaskBatch, count: int, seed: int) -> list[torch.Tensor]:
-    """Actions drawn evenly from all there are."""
+    """Return uniformly random actions, shape (n, L) each."""
     generator = torch.Generator().manual_seed(seed)
     shape = (count, *batch.action_mask.shape)
     if batch.action_kind == "discrete":
@@ -52,19 +52,19 @@ def measure_speed(
     own: Sequence[tuple[Any, str]] = (),
     clock: Callable[[], float] = time.perf_counter,
 ) -> Speed:
-    """Step a batch for some time, under other random actions in every step of an episode.
+    """Measure the speed of a batch under random actions.
 
-    Time is rounded up to whole episodes: what contacts cost depends on how long ago they began, and
-    what is faster would otherwise get farther into them. Episodes are those of the seed, the same
-    for all simulators: some cost a tenth more than others.
+    The measurement covers whole episodes: the cost of contacts depends on the time since they
+    began, and a faster simulator would otherwise get further into them. The seed gives all
+    simulators the same episodes, since some cost a tenth more than others.
 
     Args:
         batch: Environments; they are reset first.
-        seconds: How long, at least.
-        seed: Of actions and episodes.
-        own: The simulator's own step, as module and name of its function; what is spent in it is
-            told apart from what is spent around it. Only if it runs in this thread alone.
-        clock: Tells the time, seconds.
+        seconds: Least duration of the measurement [s].
+        seed: Seed of actions and episodes.
+        own: The simulator's native step functions, as modules and names; their time is reported
+            apart from the time around them. Only if they run in this thread alone.
+        clock: Function that returns the time [s].
     """
     spent: dict[str, float] = {}
     parts: dict[str, list[tuple[Any, str]]] = {
@@ -107,7 +107,7 @@ def _timed(
     spent: dict[str, float],
     clock: Callable[[], float],
 ) -> Iterator[None]:
-    """Add up what is spent in a function while this lasts."""
+    """Add up the time that is spent in a function within this context."""
     inner = getattr(owner, name)
     shadowed = name in vars(owner)
 

@@ -1,4 +1,4 @@
-"""All that a task knows of physics: scenes, and a batch of them that steps together."""
+"""The interface of simulators: scenes, and a batch of them that steps together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SUBSTEPS = 4
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS
 """Duration of a control step: actions come at 50 Hz [s]."""
 GRAVITY = 9.81
-"""m/s^2, along -z. Robots carry their own weight, as the controllers of real arms see to it."""
+"""Gravity along -z [m/s^2]. Robots carry their own weight, as controllers of real arms ensure."""
 
 
 @dataclass(frozen=True)
@@ -28,77 +28,79 @@ class Block:
     """A box in a scene, in the world frame."""
 
     size: Vec3
-    """Edges, metres."""
+    """Edge lengths [m]."""
     pose: Pose = IDENTITY
+    """Pose of its centre in the world."""
     mass: float = 0.0
-    """Kilograms; a block without mass does not move."""
+    """Mass [kg]; a block without mass does not move."""
     friction: float = 1.0
+    """Friction coefficient."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What one environment holds: a robot whose root is held, what it may move, what it may not."""
+    """Content of an environment: a robot with a fixed root, a movable block and obstacles."""
 
     robot: Robot
     T_world_root: Pose = IDENTITY
     block: Block | None = None
-    """The one thing that can be moved."""
+    """The only object that can be moved."""
     obstacles: tuple[Block, ...] = ()
     ground: float | None = 0.0
-    """Height of a plane, metres, if there is one; the root link does not touch it."""
+    """Height of a ground plane, or None without one [m]; the root link does not collide with it."""
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """What may touch what."""
+    """Pairs of things that collide."""
 
     scene: bool = True
-    """The robot touches the ground, the block and obstacles."""
+    """Whether the robot collides with the ground, the block and obstacles."""
     self_collision: bool = True
-    """Links touch each other, but for neighbours and ``Robot.ignore_pairs``."""
+    """Whether links collide with each other, except neighbours and ``Robot.ignore_pairs``."""
 
 
 class Simulation(Protocol):
-    """Environments, each with its scene, stepped together.
+    """Environments with a scene each, stepped together.
 
-    Tensors live on ``device``, float32, and are padded to the largest number of independent joints,
-    J; padding is zero. They are views that the next call may overwrite. Environments do not
-    influence each other: one gives the same numbers whatever else is in the batch.
+    Tensors are float32 on ``device``, padded with zeros to the largest number of independent
+    joints, J. They are views that the next call may overwrite. Environments do not influence each
+    other: each gives the same numbers whatever else is in the batch.
     """
 
     device: torch.device
 
     @property
     def scenes(self) -> Sequence[Scene]:
-        """One for every environment."""
+        """Scene of each environment."""
 
     @property
     def q(self) -> torch.Tensor:
-        """Positions of the independent joints, shape (n, J), rad or m."""
+        """Positions of the independent joints, shape (n, J) [rad or m]."""
 
     @property
     def qd(self) -> torch.Tensor:
-        """Their velocities, shape (n, J)."""
+        """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
 
     @property
     def block_pose(self) -> torch.Tensor:
-        """Pose of the block in the world, (x, y, z, qw, qx, qy, qz), (n, 7); zeros if none."""
+        """Poses of the blocks in the world: x, y, z, qw, qx, qy, qz, (n, 7); zeros without one."""
 
     @property
     def block_velocity(self) -> torch.Tensor:
-        """Linear and angular velocity of the block in the world, shape (n, 6); zeros if none."""
+        """Linear and angular velocities of the blocks in the world, (n, 6); zeros without one."""
 
     def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
-        """Put some environments at rest; nothing of their past has an influence any more.
+        """Put some environments at rest; their past has no influence any more.
 
         Args:
-            envs: Indices, shape (k,), int64.
+            envs: Indices of environments, shape (k,), int64.
             q: Positions of their independent joints, which become the targets, shape (k, J).
-            block_pose: Poses of their blocks, shape (k, 7); ignored where there is none.
+            block_pose: Poses of their blocks, shape (k, 7); ignored without a block.
         """
 
     def step(self, targets: torch.Tensor) -> None:
-        """Move all by one control step.
+        """Advance all environments by one control step.
 
         Args:
             targets: Target positions of the independent joints, shape (n, J).
@@ -110,19 +112,20 @@ class Simulation(Protocol):
         """
 
     def close(self) -> None:
-        """Free everything; a second time does nothing."""
+        """Free everything; a second call does nothing."""
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulator behind the registry ``morphgen.tasks.registry.SIMULATORS``."""
+    """A simulator of the registry ``morphgen.tasks.registry.SIMULATORS``."""
 
     name: str
+    """Name in the registry and on the command line."""
     load: Callable[[Sequence[Scene], Contacts | None, int], Simulation]
-    """Loads scenes: one for each environment, what may touch what, and the number of workers.
+    """Function that loads a scene for each environment, with contacts and a number of workers.
 
     It raises a SimulationError if the simulator cannot hold a scene."""
     native_step: tuple[str, str]
-    """Names of the module and function of the library's own step, which ``speed`` times."""
+    """Module and function of the library's own step, which ``speed`` measures."""
     max_envs: int
-    """Number of environments that are held at once at most, where a task can be divided."""
+    """Largest number of environments to hold at once, where work can be divided."""

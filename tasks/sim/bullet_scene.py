@@ -25,68 +25,70 @@ except ImportError as error:
     ) from error
 
 MAX_CLIENTS = 1024
-"""Clients that PyBullet has in a process."""
+"""Number of clients that PyBullet supports in a process."""
 UNLIMITED = 1e6
-"""Effort of a joint without a largest one, N m or N."""
+"""Effort of a joint without an effort limit [N m or N]."""
 FRICTION = 1.0
-"""Of the ground, robots and obstacles. PyBullet multiplies two: a block's own is what acts."""
+"""Friction coefficient of ground, robots and obstacles. PyBullet multiplies the coefficients of two
+bodies, so that the block's own coefficient acts."""
 VELOCITY_GAIN = 0.6
-"""Share of the missing velocity that motors make up in a physics step: all of it at once would ask
-for more than their effort, a small one would leave Coriolis forces to themselves."""
+"""Fraction of the velocity error that motors correct in a physics step: 1 would exceed their
+effort, a small fraction would leave Coriolis forces uncompensated."""
 ITERATIONS = 200
-"""Of the constraint solver; with PyBullet's 50 light chains and wrists are centimetres off."""
+"""Iterations of the constraint solver; with PyBullet's 50, light chains and wrists are centimetres
+off."""
 RESIDUAL = 1e-4
-"""Sum of squares, of what is left to do of an iteration, at which the solver is done (m/s, rad/s):
-tools are within a tenth of a millimetre of where all iterations bring them, in half of the time."""
+"""Sum of squared residuals at which the solver stops [m/s, rad/s]: tools are within a tenth of a
+millimetre of their positions after all iterations, in half of the time."""
 OVERSPEED = 1.5
-"""How fast what happens to a joint can make it, of what the robot's fastest joint may do. A joint
-without a speed limit may be as fast as PyBullet lets it, 100 rad/s or m/s, and then all may."""
+"""Largest speed of joints under contact, relative to the robot's fastest joint. If a joint has no
+speed limit, all joints of the robot get PyBullet's limit, 100 rad/s or m/s."""
 _LINKS, _ROOT, _STATIC, _BLOCK = 1, 2, 4, 8
-"""Collision groups: what moves of the robot, what is held of it, ground and obstacles, block."""
+"""Collision groups: movable links, fixed links, ground and obstacles, block."""
 
 
 class BulletScene:
-    """A robot with what surrounds it.
+    """A scene in its own PyBullet client.
 
-    Motors. PyBullet's position control, v' = v - kd v + kp e / dt at every physics step, is the
-    wanted law only where nothing else moves the joint: the v on the right already has the step's
-    gravity and Coriolis acceleration, of which kd takes only a part away. So motors make for a
-    velocity during a control step, with no more force than a spring and a damper would have;
-    ``BulletBatch`` says which velocity, ``MotorForces`` how much force. The robot carries its own
-    weight: the world has no gravity, and the block is pulled by its weight as a force. One call
-    makes all substeps; the motors act anew in each, but PyBullet reckons their impulse limits with
-    the whole call's time, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor with
-    its leader's target.
+    Motors. PyBullet's position control, v' = v - kd v + kp e / dt in every physics step, follows
+    the control law only where nothing else moves the joint: the v on the right already includes the
+    step's gravity and Coriolis acceleration, of which kd removes only a part. So motors control the
+    velocity during a control step, with no more force than a spring and a damper would exert;
+    ``BulletBatch`` computes the velocity, ``MotorForces`` the force. The robot carries its own
+    weight: the world has no gravity, and the block's weight is an external force. One call makes
+    all substeps; the motors act in each, but PyBullet computes their impulse limits with the time
+    of the whole call, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor with its
+    leader's target.
 
-    Solver. Iterations are many because motors of one arm pull against each other. Dantzig's direct
-    method has no such trouble and is faster, but knows no friction cone; so it is taken where no
-    block slides.
+    Solver. It needs many iterations because motors of one arm pull against each other. Dantzig's
+    direct method does not, and is faster, but has no friction cone; so it is used without a block.
 
-    Contacts that press links against each other have no solution at times, and what the solver then
-    says throws a joint a radian farther in a step; so speeds end at ``OVERSPEED``.
+    Speeds. Contacts that press links against each other sometimes have no solution, and the
+    solver's result then throws a joint a radian in a step; so speeds are limited by ``OVERSPEED``.
 
-    Limits. A joint that something has pushed past its limit has to come back. By default PyBullet
-    leaves this to its split impulse from 0.04 (m or rad) on, which articulated bodies do not have,
-    so that a joint can be pushed on and on; ``useSplitImpulse`` is off.
+    Limits. A joint that was pushed past its limit has to return. By default PyBullet leaves this
+    to its split impulse beyond 0.04 m or rad, which articulated bodies do not have, so that a joint
+    can be pushed on and on; ``useSplitImpulse`` is off.
 
-    Friction. By default PyBullet limits it along two axes apart, so that a block that slides askew
-    stops 30 % too early and turns aside; ``enableConeFriction`` makes it Coulomb's.
+    Friction. By default PyBullet limits friction along two axes separately, so that a block that
+    slides diagonally stops 30 % too early and turns aside; ``enableConeFriction`` gives Coulomb
+    friction.
 
-    Resets. What outlives a change of state are contact points and the pairs, in the order of their
-    making, that the broad phase has found; ``saveState`` and ``restoreState`` keep them. Giving
-    every part its collision group again makes its broad-phase entry anew, without pairs, and
+    Resets. Contact points and the broad phase's pairs, in the order of their creation, survive a
+    change of state, and ``saveState`` and ``restoreState`` keep them. Setting every part's
+    collision group again creates its broad-phase entry anew, without pairs, and
     ``deterministicOverlappingPairs`` then orders pairs by entry. After both, a used client gives
-    the bits of a fresh one; nothing else was needed.
+    the same bits as a fresh one.
     """
 
-    def __init__(self, scene: Scene, urdf: Path, body: Robot, contacts: Contacts) -> None:
+    def __init__(self, scene: Scene, urdf: Path, merged: Robot, contacts: Contacts) -> None:
         """Load.
 
         Args:
-            scene: What to load.
-            urdf: The file of ``body``, as ``export_robots`` writes it.
-            body: The scene's robot as ``merge_rigid_links``.
-            contacts: What may touch what.
+            scene: The scene.
+            urdf: URDF of ``merged``, as ``export_robots`` writes it.
+            merged: The scene's robot after ``merge_rigid_links``.
+            contacts: Pairs of things that collide.
 
         Raises:
             SimulationError: If PyBullet has no client left, or cannot load the robot.
@@ -113,10 +115,10 @@ class BulletScene:
                 **self._client,
             )
         self._groups: list[tuple[int, int, int, int]] = []
-        self._load_robot(urdf, body)
+        self._load_robot(urdf, merged)
         self._load_surroundings()
 
-    def _load_robot(self, urdf: Path, body: Robot) -> None:
+    def _load_robot(self, urdf: Path, merged: Robot) -> None:
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER
         if self._contacts.self_collision:
             flags |= pybullet.URDF_USE_SELF_COLLISION
@@ -131,23 +133,23 @@ class BulletScene:
                 )
         except pybullet.error as error:
             raise SimulationError(
-                f"robot {body.name!r}: PyBullet cannot load it: {error}"
+                f"robot {merged.name!r}: PyBullet cannot load it: {error}"
             ) from error
         count = pybullet.getNumJoints(self.robot, **self._client)
         infos = [pybullet.getJointInfo(self.robot, i, **self._client) for i in range(count)]
         joints = {info[1].decode(): info[0] for info in infos}
-        links = {body.root.name: -1} | {info[12].decode(): info[0] for info in infos}
-        self.driven = [joints[body.joints[k].name] for k in body.movable_joints]
-        self.efforts = [_effort(body, k) for k in body.movable_joints]
+        links = {merged.root.name: -1} | {info[12].decode(): info[0] for info in infos}
+        self.driven = [joints[merged.joints[k].name] for k in merged.movable_joints]
+        self.efforts = [_effort(merged, k) for k in merged.movable_joints]
         fastest = max(
-            (body.joints[k].velocity or math.inf for k in body.movable_joints), default=math.inf
+            (merged.joints[k].velocity or math.inf for k in merged.movable_joints), default=math.inf
         )
         if math.isfinite(fastest):
             pybullet.changeDynamics(
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
             )
-        held = {link.name for link in rigid_groups(body)[0].links}
-        level = ground_contact_links(body, self._scene.T_world_root)
+        held = {link.name for link in rigid_groups(merged)[0].links}
+        level = ground_contact_links(merged, self._scene.T_world_root)
         self._level = [link for name, link in links.items() if name in level]
         for name, link in links.items():
             pybullet.changeDynamics(
@@ -161,7 +163,7 @@ class BulletScene:
             )
             self._assign(self.robot, link, _ROOT if name in held else _LINKS)
         if self._contacts.self_collision:
-            for a, b in body.ignore_pairs:
+            for a, b in merged.ignore_pairs:
                 pybullet.setCollisionFilterPair(
                     self.robot, self.robot, links[a], links[b], 0, **self._client
                 )
@@ -220,11 +222,11 @@ class BulletScene:
         self._groups.append((body, link, group, mask))
 
     def reset(self, positions: Sequence[float], block_pose: Sequence[float]) -> None:
-        """Put everything at rest, as if it had never moved.
+        """Put everything at rest, without a past.
 
         Args:
-            positions: Of all movable joints.
-            block_pose: (x, y, z, qw, qx, qy, qz) of the block; ignored if there is none.
+            positions: Positions of all movable joints [rad or m].
+            block_pose: Pose of the block, (x, y, z, qw, qx, qy, qz); ignored without a block.
         """
         for joint, position in zip(self.driven, positions, strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
@@ -239,7 +241,7 @@ class BulletScene:
             pybullet.setCollisionFilterGroupMask(*entry, **self._client)
 
     def step(self, velocities: list[float], forces: list[float]) -> None:
-        """One control step with velocities and largest forces of all movable joints."""
+        """Advance by a control step, given velocities and force limits of all movable joints."""
         if velocities:
             pybullet.setJointMotorControlArray(
                 self.robot,
@@ -261,7 +263,7 @@ class BulletScene:
         pybullet.stepSimulation(**self._client)
 
     def joint_states(self) -> Sequence[tuple[float, float]]:
-        """Position and velocity, and more, of the movable joints."""
+        """Return tuples that begin with position and velocity of the movable joints."""
         if not self.driven:
             return ()
         states: Sequence[tuple[float, float]] = pybullet.getJointStates(
@@ -270,14 +272,14 @@ class BulletScene:
         return states
 
     def block_state(self) -> tuple[float, ...]:
-        """Position, quaternion (x, y, z, w), linear and angular velocity of the block."""
+        """Return position, quaternion (x, y, z, w), linear and angular velocity of the block."""
         position, quaternion = pybullet.getBasePositionAndOrientation(self.block, **self._client)
         linear, angular = pybullet.getBaseVelocity(self.block, **self._client)
         self._block_position = position
         return (*position, *quaternion, *linear, *angular)
 
     def close(self) -> None:
-        """Free the client; a second time does nothing."""
+        """Free the client; a second call does nothing."""
         if self.id >= 0:
             pybullet.disconnect(**self._client)
             self.id = -1
@@ -288,9 +290,9 @@ def _pose(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, f
     return pose.position, (x, y, z, w)
 
 
-def _effort(body: Robot, k: int) -> float:
-    """Largest effort of a movable joint; a mimic joint without its own has its leader's."""
-    joint = body.joints[k]
+def _effort(robot: Robot, k: int) -> float:
+    """Return the effort limit of a movable joint; a mimic joint without one has its leader's."""
+    joint = robot.joints[k]
     while not joint.effort and joint.mimic is not None:
-        joint = body.joints[body.joint_index[joint.mimic.joint]]
+        joint = robot.joints[robot.joint_index[joint.mimic.joint]]
     return joint.effort or UNLIMITED

@@ -1,4 +1,4 @@
-"""What joints do by themselves, in every simulator: how far behind, how fast, and how hard."""
+"""The law of joint motors in all simulators: lag, speed limits and force limits."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 from morphgen.typing import Array
 
 LAG = 2 / BANDWIDTH + TIMESTEP * SUBSTEPS
-"""Seconds by which a joint is behind a target that moves steadily, at most, in steps."""
+"""Largest delay of a joint behind a target that moves steadily in control steps [s]."""
 FASTEST_TURN, FASTEST_SLIDE = 10.0, 1.0
-"""Speed limit of a joint that has none, rad/s and m/s: the benchmark's largest steps at 50 Hz."""
+"""Speed of joints without a limit [rad/s, m/s]: the benchmark's largest steps at 50 Hz."""
 SLACK = 0.2
-"""Share of the spring's and the damper's force, added up, that a motor may pull beside their sum:
-inertia is another where the robot is not at home, and turning about several axes takes some."""
+"""Additional motor force, as a fraction of the spring's plus the damper's force: the inertia
+differs away from home, and rotation about several axes takes some force."""
 GAIN = 1 / (1 - 2 * BANDWIDTH * TIMESTEP)
-"""What the gains of the law are multiplied by in MuJoCo, and so the force of what is held in all.
+"""Factor of the law's gains in MuJoCo, and so of the force of a held joint in all simulators.
 
 MuJoCo integrates damping implicitly, v' = (v + dt s e) / (1 + dt d) at unit inertia. With
 s = ``GAIN`` omega^2 and d = ``GAIN`` 2 omega this is v' = v + dt (omega^2 e - 2 omega v), as in
@@ -28,33 +28,33 @@ other simulators.
 
 
 def speed_limit(joint: Joint) -> float:
-    """Fastest that a joint may be, rad/s or m/s."""
+    """Return the largest speed of a joint [rad/s or m/s]."""
     return joint.velocity or (FASTEST_SLIDE if joint.kind == "prismatic" else FASTEST_TURN)
 
 
 class MotorForces:
-    """How hard the motors of many robots may pull: an arm gives way to what it presses against.
+    """Force limits of the motors of many robots, so that arms yield under contact.
 
-    A motor that makes for a velocity does so with all its effort, as if it were rigid. The law of
-    ``morphgen.model.dynamics`` is a spring and a damper; so a motor may pull as hard as these do
-    with the joint-space inertia M at home, the sum over joints k of |M_jk a_k|, where
-    a_k = omega^2 e_k - 2 omega v_k is what the law wants, with ``SLACK`` and ``GAIN``. What
-    moves freely needs no more.
+    A velocity motor pulls with all its effort, as if it were rigid. The law of
+    ``morphgen.model.dynamics`` is a spring and a damper; so a motor j may pull as hard as these do
+    with the joint-space inertia M at home: the sum over joints k of |M_jk a_k| with the law's
+    acceleration a_k = omega^2 e_k - 2 omega v_k, plus ``SLACK``, times ``GAIN``. Free motion needs
+    no more.
     """
 
     def __init__(self, robots: Sequence[Robot], efforts: Sequence[float]) -> None:
-        """Prepare.
+        """Compute the inertia of each robot.
 
         Args:
-            robots: Their movable joints, one after the other, are the rows of what follows, m.
-            efforts: Largest force of every row, N m or N.
+            robots: Robots, whose movable joints are the rows of all arrays, m in number.
+            efforts: Largest force of each row [N m or N].
         """
         self._efforts = np.array(efforts, dtype=np.float64)
         most = max((robot.dof for robot in robots), default=0)
         self._pull = np.zeros((most, len(self._efforts)))
-        """Force of a row for each independent joint's acceleration; padded with zeros."""
+        """Force of each row per acceleration of each independent joint; padded with zeros."""
         self._row = np.zeros((most, len(self._efforts)), np.intp)
-        """Which row that joint is."""
+        """Row of that independent joint."""
         farthest: list[float] = []
         known: dict[int, Array] = {}
         for robot in robots:
@@ -69,12 +69,12 @@ class MotorForces:
         self._farthest = np.array(farthest)
 
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
-        """Largest forces of a control step, shape (m,).
+        """Return the largest forces in a control step, shape (m,) [N m or N].
 
         Args:
-            errors: How far rows are from their targets when it begins, and when it ends if nothing
-                is in the way, each of shape (m,), rad or m.
-            velocities: How fast they are then, likewise.
+            errors: Distances from the targets at the beginning of the step, and at its end without
+                contacts, shape (m,) each [rad or m].
+            velocities: Velocities at the same times, shape (m,) each.
         """
         springs = [BANDWIDTH**2 * np.clip(e, -self._farthest, self._farthest) for e in errors]
         dampers = [2 * BANDWIDTH * v for v in velocities]
@@ -88,8 +88,8 @@ class MotorForces:
 
 
 def _inertia(robot: Robot) -> Array:
-    """Force on movable joints for each independent joint's acceleration, (dof, movable)."""
-    motors = np.diag([each.armature for each in actuation(robot)])
+    """Return forces on movable joints per acceleration of independent joints, (dof, movable)."""
+    armatures = np.diag([motor.armature for motor in actuation(robot)])
     matrix, _ = robot.mimic_map
-    inertia = np.abs(mass_matrix(robot, robot.home)) + motors
+    inertia = np.abs(mass_matrix(robot, robot.home)) + armatures
     return np.asarray(inertia @ np.abs(matrix).T)

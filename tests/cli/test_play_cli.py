@@ -75,7 +75,7 @@ def test_zero_does_nothing(run):
         (("reach", "arm3-stick", "--policy", "scripted"), "valid: ik, zero, random"),
         (("push", "prims", "--policy", "ik"), "valid: scripted, zero, random"),
         (("push", "prism"), "did you mean 'prims'?"),
-        (("push", "prims", "--out", "film.avi"), "a film ends in .mp4 or .gif"),
+        (("push", "prims", "--out", "film.avi"), "the name of a video ends in .mp4 or .gif"),
         (("push", "prims", "--out", "no/film.mp4"), "there is no folder no"),
         (
             ("push", "prims", "--episodes", "0"),

@@ -246,8 +246,8 @@ def test_a_film_is_there_whole_or_not_at_all(tmp_path):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("film.avi", "a film ends in .mp4 or .gif"),
-        ("film", "a film ends in .mp4 or .gif"),
+        ("film.avi", "the name of a video ends in .mp4 or .gif"),
+        ("film", "the name of a video ends in .mp4 or .gif"),
         ("no/film.mp4", "there is no folder"),
     ],
 )
@@ -283,7 +283,7 @@ def test_a_film_that_the_disk_has_no_room_for_is_an_error(tmp_path, full_disk, n
     [
         ("exit 0", "ffmpeg ended early"),
         ("head -c 100000 >/dev/null; kill -9 $$", "ffmpeg ended early"),
-        ("cat >/dev/null; exit 1", "No such file|ffmpeg left a film that cannot be read"),
+        ("cat >/dev/null; exit 1", "No such file|ffmpeg left a video that cannot be read"),
         (None, "No such file or directory"),
     ],
 )
