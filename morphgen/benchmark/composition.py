@@ -1,4 +1,4 @@
-"""New splits by composition: test robots join parts that are trained, but not together."""
+"""Generate composition splits: test robots combine trained parts in untrained combinations."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import parse_words
 
-ATTEMPTS = 50
-"""Orders in which robots are tried before too few are taken to fit."""
+NUM_ATTEMPTS = 50
+"""Number of random orders in which candidates are held out before the search fails."""
 _CHOICE = re.compile(r"\{([^{}]*)\}")
 
 
 def expand(pattern: str) -> list[tuple[str, ...]]:
-    """Words of ``morphgen compose`` with choices in braces, written out: the product of all.
+    """Expand the choices in braces in arguments of ``morphgen compose``: the product of all.
 
     Args:
-        pattern: Such as ``arm={ur5,panda} ee={plane,stick}``.
+        pattern: A pattern such as ``arm={ur5,panda} ee={plane,stick}``.
 
     Raises:
-        BenchmarkError: If braces do not match, or hold nothing or the same twice.
+        BenchmarkError: If braces do not match, or contain an empty or repeated choice.
     """
     joined = _CHOICE.sub(lambda match: re.sub(r"\s", "", match[0]), pattern)
     if "{" in _CHOICE.sub("", joined) or "}" in _CHOICE.sub("", joined):
@@ -42,73 +42,73 @@ def expand(pattern: str) -> list[tuple[str, ...]]:
 
 
 def composition(
-    order: SplitRequest,
+    request: SplitRequest,
     patterns: Sequence[str],
     library: Library,
     *,
     jobs: int = 1,
     progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
-    """Splits whose test robots have parts that are all trained, in a combination that is not.
+    """Return splits whose test robots have only trained parts, in an untrained combination.
 
-    With several tasks a robot is chosen at a task, and counts so. What is composed then is body
-    and task: the outermost part of a test robot is in no train robot of its task, but in others.
+    With several tasks, a candidate is a robot with one task, and the split composes robots with
+    tasks: the outermost part of a test robot is in no train robot of its task, but in others.
 
     Args:
-        order: Sizes, tasks, seed. Without a size, all that may be trained on is.
-        patterns: What to choose from, see ``expand``.
-        library: Where parts are.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        request: Sizes, tasks and seed. Without a size, all remaining candidates are train robots.
+        patterns: Patterns of the candidates, see ``expand``.
+        library: The library of parts.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
 
     Returns:
-        A split for every size.
+        A split for each size.
 
     Raises:
-        BenchmarkError: If what is asked for does not exist; the message says what stands against.
-        MorphgenError: If words name what does not exist or does not fit.
+        BenchmarkError: If the candidates allow no such split; the message gives the reason.
+        MorphgenError: If a pattern names an unknown part, or parts do not fit.
     """
-    cells = list(_cells(patterns, order.tasks, library))
-    sequence = np.random.SeedSequence(order.seed)
-    test, train = hold_out(cells, order.test, max(order.train, default=1), sequence)
+    cells = list(_cells(patterns, request.tasks, library))
+    sequence = np.random.SeedSequence(request.seed)
+    test, train = hold_out(cells, request.test, max(request.train, default=1), sequence)
     shortest = num_covering(train, test)
-    if order.train and order.train[0] < shortest:
+    if request.train and request.train[0] < shortest:
         names = ", ".join(cell.name for cell in train[:shortest])
         raise BenchmarkError(
-            f"--train {order.train[0]}: {shortest} robots at least are needed so that every part "
+            f"--train {request.train[0]}: {shortest} robots at least are needed so that every part "
             f"of the test robots is trained, such as {names}"
         )
-    chosen = [*train[: order.train[-1] if order.train else None], *test]
+    chosen = [*train[: request.train[-1] if request.train else None], *test]
     unique = {cell.text: ComposedRecipe(cell.words, cell.name) for cell in chosen}
-    maker = RobotFactory(library.folders, max_links=order.max_links)
-    made = make_robots(list(unique.values()), maker, jobs=jobs, progress=progress)
+    factory = RobotFactory(library.folders, max_links=request.max_links)
+    made = make_robots(list(unique.values()), factory, jobs=jobs, progress=progress)
     bodies = dict(zip(unique, made, strict=True))
     robots = []
     for cell in chosen:
         body = bodies[cell.text]
-        name = f"{cell.name}-{cell.task}" if len(order.tasks) > 1 else cell.name
-        task = (cell.task, order.obstacles)
+        name = f"{cell.name}-{cell.task}" if len(request.tasks) > 1 else cell.name
+        task = (cell.task, request.obstacles)
         robots.append(Member(name, body.category, str(body.derivation), *task, body.hash))
     kinds = len({cell.combination for cell in cells})
     return assemble(
-        order,
+        request,
         "composition",
-        f"{{n}} robots out of {kinds} combinations; test: {order.test} of combinations unseen",
+        f"{{n}} robots out of {kinds} combinations; test: {request.test} of combinations unseen",
         robots[: -len(test)],
         robots[-len(test) :],
-        {"from": list(patterns), "tasks": list(order.tasks)},
+        {"from": list(patterns), "tasks": list(request.tasks)},
     )
 
 
 def _choices(word: str, pattern: str) -> list[str]:
-    """A word once for every choice in its braces."""
+    """Return a word once for each choice in its braces."""
     fixed = _CHOICE.split(word)[::2]
     choices = [match.split(",") for match in _CHOICE.findall(word)]
-    for given in choices:
-        twice = [choice for choice, times in Counter(given).items() if times > 1]
-        if "" in given or twice:
+    for options in choices:
+        twice = [choice for choice, times in Counter(options).items() if times > 1]
+        if "" in options or twice:
             what = f"has {twice[0]!r} twice" if twice and twice[0] else "has an empty choice"
-            raise BenchmarkError(f"--from {pattern!r}: {{{','.join(given)}}} {what}")
+            raise BenchmarkError(f"--from {pattern!r}: {{{','.join(options)}}} {what}")
     return [
         "".join(
             piece for pair in itertools.zip_longest(fixed, chosen, fillvalue="") for piece in pair
@@ -120,7 +120,7 @@ def _choices(word: str, pattern: str) -> list[str]:
 def _cells(
     patterns: Sequence[str], tasks: Sequence[str], library: Library
 ) -> Iterator[HoldoutCandidate]:
-    """Every robot that the patterns name, once, at every task."""
+    """Yield every robot of the patterns once for each task."""
     seen: dict[str, str] = {}
     for words in itertools.chain.from_iterable(map(expand, patterns)):
         derivation, name = parse_words(words, library)
@@ -137,50 +137,52 @@ def _cells(
 
 @dataclass(frozen=True)
 class HoldoutCandidate:
-    """A robot that may be chosen, at a task."""
+    """A robot with a task, which may become a train or a test member."""
 
     name: str
     words: tuple[str, ...]
-    """Of ``morphgen compose``."""
+    """Arguments of ``morphgen compose``."""
     text: str
-    """Its derivation."""
+    """Derivation of the robot."""
     combination: str
+    """Parts and ports, see ``regimes.combination``."""
     parts: frozenset[str]
     outermost: str
-    """The last of its parts, most often the end-effector."""
+    """Last part of the robot, usually the end-effector."""
     task: str
 
     @property
-    def shows(self) -> set[str]:
-        """What is trained with it: parts and the task."""
+    def covers(self) -> set[str]:
+        """The parts and the task that training with this robot covers."""
         return {*self.parts, f"task {self.task}"}
 
 
 def hold_out(
     cells: Sequence[HoldoutCandidate], n: int, left: int, seed: np.random.SeedSequence
 ) -> tuple[list[HoldoutCandidate], list[HoldoutCandidate]]:
-    """Choose cells to test on, of as many combinations as can be.
+    """Choose test candidates, of as many different combinations as possible.
 
-    No cell of their combinations may be trained on, whatever the task; with several tasks, neither
-    may their outermost part at their task. Each part and task of theirs is shown by what is left.
+    Candidates with the combination of a test candidate are excluded from training, for all tasks.
+    With several tasks, candidates with the outermost part and the task of a test candidate are
+    excluded, too. The remaining candidates cover every part and task of the test candidates.
 
     Args:
-        cells: What to choose from.
-        n: How many to hold out.
-        left: How many must be left, at least.
-        seed: Of the order in which they are tried.
+        cells: The candidates.
+        n: Number of test candidates.
+        left: Smallest number of candidates that remain for training.
+        seed: Seed of the random orders in which candidates are tried.
 
     Returns:
-        Cells to test on, and cells to train on in an order such that the first few show each part
-        and task of those.
+        Test candidates, and train candidates in an order such that the first few cover each part
+        and task of the test candidates.
 
     Raises:
-        BenchmarkError: If there are not so many; the message says what stands against.
+        BenchmarkError: If too few candidates can be held out; the message gives the reason.
     """
     rng = np.random.default_rng(seed)
     most = 0
-    for _ in range(ATTEMPTS):
-        pool = _Pool(cells)
+    for _ in range(NUM_ATTEMPTS):
+        pool = _TrainPool(cells)
         order = [int(i) for i in rng.permutation(len(cells))]
         for fresh in (True, False):
             for i in order:
@@ -195,63 +197,63 @@ def hold_out(
 
 
 def num_covering(cells: Sequence[HoldoutCandidate], test: Sequence[HoldoutCandidate]) -> int:
-    """How many of the first cells are needed to show each part and task of test cells."""
-    needed = {what for cell in test for what in cell.shows}
+    """Return how many of the first candidates cover each part and task of the test ones."""
+    needed = {item for cell in test for item in cell.covers}
     n = 0
     while needed:
-        needed -= cells[n].shows
+        needed -= cells[n].covers
         n += 1
     return n
 
 
-class _Pool:
-    """What is left to train on while cells are held out; cells by their index."""
+class _TrainPool:
+    """The candidates that remain for training while others are held out, by their index."""
 
     def __init__(self, cells: Sequence[HoldoutCandidate]) -> None:
         self._cells = cells
         self._mixed = len({cell.task for cell in cells}) > 1
-        self._alike: dict[str, list[int]] = defaultdict(list)
+        self._same_combination: dict[str, list[int]] = defaultdict(list)
         self._pairs: dict[tuple[str, str], list[int]] = defaultdict(list)
         for i, cell in enumerate(cells):
-            self._alike[cell.combination].append(i)
+            self._same_combination[cell.combination].append(i)
             for part in cell.parts:
                 self._pairs[part, cell.task].append(i)
         self.left = set(range(len(cells)))
-        self._shown = Counter(what for cell in cells for what in cell.shows)
+        self._covered = Counter(item for cell in cells for item in cell.covers)
         self.held: list[int] = []
         self.needed: set[str] = set()
-        """What must be shown for the cells that are held out."""
+        """Parts and tasks of the candidates that are held out."""
 
     def is_fresh(self, i: int) -> bool:
-        """Whether no cell of its combination is held out."""
+        """Test that no candidate of the same combination is held out."""
         return all(self._cells[i].combination != self._cells[j].combination for j in self.held)
 
     def hold(self, i: int, left: int) -> None:
-        """Hold a cell out, if all that it and the others need is left, and enough cells are."""
+        """Hold a candidate out, if the rest still covers all that is needed and is large enough."""
         cell = self._cells[i]
-        barred = set(self._alike[cell.combination])
+        excluded = set(self._same_combination[cell.combination])
         if self._mixed:
-            barred.update(self._pairs[cell.outermost, cell.task])
-        barred &= self.left
-        lost = Counter(what for j in barred for what in self._cells[j].shows)
-        needed = self.needed | cell.shows
-        is_shown = all(self._shown[what] > lost[what] for what in needed)
-        if i in self.held or not is_shown or len(self.left) - len(barred) < left:
+            excluded.update(self._pairs[cell.outermost, cell.task])
+        excluded &= self.left
+        lost = Counter(item for j in excluded for item in self._cells[j].covers)
+        needed = self.needed | cell.covers
+        is_covered = all(self._covered[item] > lost[item] for item in needed)
+        if i in self.held or not is_covered or len(self.left) - len(excluded) < left:
             return
         self.held.append(i)
         self.needed = needed
-        self.left -= barred
-        self._shown -= lost
+        self.left -= excluded
+        self._covered -= lost
 
 
 def _covering_first(cells: Sequence[HoldoutCandidate], needed: set[str]) -> list[HoldoutCandidate]:
-    """Cells in order, but first those that show all that is needed, as few as come easily."""
+    """Move candidates that cover all that is needed to the front (greedy set cover)."""
     first: list[HoldoutCandidate] = []
     rest = list(cells)
     missing = set(needed)
     while missing:
-        best = max(rest, key=lambda cell: len(missing & cell.shows))
-        missing -= best.shows
+        best = max(rest, key=lambda cell: len(missing & cell.covers))
+        missing -= best.covers
         rest.remove(best)
         first.append(best)
     return first + rest

@@ -1,4 +1,4 @@
-"""New splits by extrapolation: test robots are of a category that is not trained."""
+"""Generate extrapolation splits: test robots come from grammars without train robots."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _BOUND = re.compile(r"\s*([<>])\s*(\d+\.?\d*|\.\d+)\s*")
 
 @dataclass(frozen=True)
 class Bound:
-    """What the cosine of a test robot to the train robot nearest to it must be.
+    """Bound on the cosine similarity of a test robot to the nearest train robot.
 
-    The largest cosine, not the mean: a mean hides a twin among strangers.
+    It is the largest cosine, because a mean would hide one near duplicate among other robots.
     """
 
     is_upper: bool
@@ -41,7 +41,7 @@ class Bound:
         return f"{'<' if self.is_upper else '>'}{self.value:g}"
 
     def holds(self, largest: float) -> bool:
-        """Whether a cosine is on the right side."""
+        """Test if the cosine to the nearest train robot meets the bound."""
         return largest < self.value if self.is_upper else largest > self.value
 
 
@@ -49,7 +49,7 @@ def parse_bound(text: str) -> Bound:
     """Read a bound such as ``<0.6``.
 
     Raises:
-        BenchmarkError: If it is none.
+        BenchmarkError: If the text is malformed.
     """
     match = _BOUND.fullmatch(text)
     if match is None or float(match[2]) > 1:
@@ -60,7 +60,7 @@ def parse_bound(text: str) -> Bound:
 
 
 def extrapolation(
-    order: SplitRequest,
+    request: SplitRequest,
     train_grammars: Sequence[Grammar],
     test_grammars: Sequence[Grammar],
     library: Library,
@@ -69,55 +69,55 @@ def extrapolation(
     jobs: int = 1,
     progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
-    """Splits whose test robots are of a grammar, and a structure, that no train robot is of.
+    """Return splits whose test robots share no grammar and no structure with a train robot.
 
-    Robots are taken from the grammars in turn, so they are spread evenly over them.
+    Robots are sampled from the grammars in turn, so each grammar gives equally many.
 
     Args:
-        order: Sizes, tasks, seed.
-        train_grammars: Of the train robots.
-        test_grammars: Of the test robots.
-        library: Where parts are.
-        similarity: What test robots must meet, for every size.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        request: Sizes, tasks and seed.
+        train_grammars: Grammars of the train robots.
+        test_grammars: Grammars of the test robots.
+        library: The library of parts.
+        similarity: Bound that test robots must meet in the split of every size.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
 
     Returns:
-        A split for every size.
+        A split for each size.
 
     Raises:
-        BenchmarkError: If a grammar is named twice, or too few test robots are found in
-            ``MAX_DRAWS`` draws of which ``MAX_COMPOSED`` are composed.
-        SamplingError: If a robot cannot be drawn.
+        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of which
+            ``MAX_COMPOSED`` are composed, give too few test robots.
+        SamplingError: If a grammar gives no valid robot.
     """
-    require_size(order)
+    require_size(request)
     _require_apart(train_grammars, test_grammars)
     trained, tested = (
-        [RobotStream.of(grammar, grammar.name, order) for grammar in grammars]
+        [RobotStream.of(grammar, grammar.name, request) for grammar in grammars]
         for grammars in (train_grammars, test_grammars)
     )
-    maker = RobotFactory(
-        library.folders, comparable=similarity is not None, max_links=order.max_links
+    factory = RobotFactory(
+        library.folders, with_features=similarity is not None, max_links=request.max_links
     )
-    turns = (divmod(i, len(trained)) for i in range(order.train[-1]))
+    turns = (divmod(i, len(trained)) for i in range(request.train[-1]))
     recipes = [trained[which].recipe(number) for number, which in turns]
-    train = make_robots(recipes, maker, jobs=jobs, progress=progress)
-    names = {structure(body.derivation, library): body.name for body in reversed(train)}
+    train = make_robots(recipes, factory, jobs=jobs, progress=progress)
+    names = {structure(robot.derivation, library): robot.name for robot in reversed(train)}
 
-    def why_not(derivation: Derivation) -> str:
+    def reject_trained(derivation: Derivation) -> str:
         twin = names.get(structure(derivation, library))
         return f"the structure of train robot {twin}" if twin else ""
 
-    alike = _Likeness(train, order.train[0], similarity)
-    search = TestRobotSearch(order, train, maker, progress)
+    bounded = _SimilarityBound(train, request.train[0], similarity)
+    search = TestRobotSearch(request, train, factory, progress)
     targets = ", ".join(grammar.name for grammar in test_grammars)
-    if not search.find(tested, why_not, alike):
-        raise BenchmarkError(f"{targets}: {search.failure()}; {alike.advice()}")
+    if not search.find(tested, reject_trained, bounded):
+        raise BenchmarkError(f"{targets}: {search.failure()}; {bounded.advice()}")
     sources = ", ".join(grammar.name for grammar in train_grammars)
     return assemble_drawn(
-        order,
+        request,
         "extrapolation",
-        f"{{n}} robots of {sources}; test: {order.test} of {targets}",
+        f"{{n}} robots of {sources}; test: {request.test} of {targets}",
         train,
         search.found,
         {
@@ -129,8 +129,8 @@ def extrapolation(
     )
 
 
-class _Likeness:
-    """Whether a body is as alike to the train robots as wanted."""
+class _SimilarityBound:
+    """Reject robots whose cosine to the nearest train robot violates the bound."""
 
     def __init__(self, train: Sequence[Candidate], smallest: int, bound: Bound | None) -> None:
         # The largest cosine grows with the set.
@@ -138,19 +138,21 @@ class _Likeness:
         self._bound = bound
         self._nearest: list[tuple[float, str, str]] = []
 
-    def __call__(self, body: Candidate) -> str:
-        """What a body has that it shall not; nothing if it is as wanted."""
-        if self._bound is None or body.features is None:
+    def __call__(self, robot: Candidate) -> str:
+        """Return the reason why a robot is rejected; empty if it is accepted."""
+        if self._bound is None or robot.features is None:
             return ""
-        cosines = [cosine(body.features, each.features) for each in self._train if each.features]
-        most = int(np.argmax(cosines))
-        if self._bound.holds(cosines[most]):
+        cosines = [
+            cosine(robot.features, other.features) for other in self._train if other.features
+        ]
+        nearest = int(np.argmax(cosines))
+        if self._bound.holds(cosines[nearest]):
             return ""
-        self._nearest.append((cosines[most], body.name, self._train[most].name))
+        self._nearest.append((cosines[nearest], robot.name, self._train[nearest].name))
         return f"a cosine to the nearest train robot that is not {self._bound}"
 
     def advice(self) -> str:
-        """What to change where too few are found."""
+        """Return what to change if a search finds too few robots."""
         if self._bound is None or not self._nearest:
             return "choose other categories, or fewer test robots"
         best = min(self._nearest) if self._bound.is_upper else max(self._nearest)

@@ -1,4 +1,4 @@
-"""What the generators of new splits share: the order, the search for test robots, the result."""
+"""Shared by the generators of splits: the request, the search for test robots, the assembly."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 
 MAX_DRAWS = 2000
-"""Draws that are no test robot before what is asked for is taken to be too hard. They are cheap:
-most are rejected by their derivations."""
+"""Number of rejected draws after which a search fails. A draw is cheap: most are rejected by their
+derivations."""
 MAX_COMPOSED = 200
-"""The same of those that had to be composed to be looked at."""
+"""Number of rejected robots after which a search fails, of those that had to be composed."""
 
 
 @dataclass(frozen=True)
 class SplitRequest:
-    """What is asked for in every regime."""
+    """Request for one or several splits, of any regime."""
 
     name: str
-    """Of the split; with several sizes ``-train30`` and so on is added."""
+    """Name of the split; with several sizes ``-train30`` and so on is appended."""
     train: tuple[int, ...]
-    """Robots to train on. Several sizes make several splits with the same test robots; the train
-    robots of a smaller one are the first of a larger one. Where robots are chosen and not drawn,
-    none means all."""
+    """Numbers of train robots, one per split. The splits share their test robots, and the train
+    robots of a smaller split are the first of a larger one. If robots are chosen from a list, an
+    empty tuple means all."""
     test: int
-    """Robots to test on."""
+    """Number of test robots."""
     tasks: tuple[str, ...] = ("reach",)
     obstacles: bool = False
     seed: int = 0
     max_links: int = MAX_LINKS
-    """The most links that a robot may have; indices of tokens are divided by one less."""
+    """Largest number of links of a robot; link indices in tokens are divided by one less."""
 
     def __post_init__(self) -> None:
         sizes = ",".join(map(str, self.train))
@@ -64,37 +64,40 @@ class SplitRequest:
             raise BenchmarkError(f"--train {sizes}: expected sizes that grow, such as 10,30,100")
 
 
-def require_size(order: SplitRequest) -> None:
-    """Require that an order says how many robots to train on.
+def require_size(request: SplitRequest) -> None:
+    """Check that a request has a number of train robots.
 
     Raises:
-        BenchmarkError: If it does not.
+        BenchmarkError: If it has none.
     """
-    if not order.train:
+    if not request.train:
         raise BenchmarkError("--train: say how many robots to train on, such as 10 or 10,30,100")
 
 
 @dataclass(frozen=True)
 class RobotStream:
-    """Robots of a grammar, by number."""
+    """The endless sequence of robots sampled from a grammar with one seed."""
 
     grammar: Grammar
     prefix: str
-    """Of their names."""
+    """Prefix of the robots' names."""
     seed: int
-    """Of ``morphgen sample``, which draws the same robots."""
+    """Seed; ``morphgen sample --seed`` gives the same robots."""
 
     @classmethod
-    def of(cls, grammar: Grammar, prefix: str, order: SplitRequest) -> RobotStream:
-        """The stream of a prefix in a split."""
-        return cls(grammar, prefix, stream_seed(order.seed, prefix))
+    def of(cls, grammar: Grammar, prefix: str, request: SplitRequest) -> RobotStream:
+        """Return the stream of a name prefix in a split."""
+        return cls(grammar, prefix, stream_seed(request.seed, prefix))
 
     def recipe(self, number: int) -> SampledRecipe:
-        """How to make a robot."""
+        """Return the recipe of a robot."""
         return SampledRecipe(self.grammar, number, self.seed, numbered_name(self.prefix, number))
 
     def derivation(self, number: int, library: Library) -> Derivation | None:
-        """The first derivation drawn for a robot, most often its own; None if it does not end."""
+        """Return the first derivation drawn for a robot; None if it has too many parts.
+
+        The robot has this derivation unless its conditions reject it.
+        """
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         try:
             return derive(self.grammar, library, RecordedChooser(RandomChooser(rng)))
@@ -102,115 +105,119 @@ class RobotStream:
             return None
 
 
-WhyNot = Callable[[Derivation], str]
-"""Why a derivation is none of a test robot; empty if it is."""
-WhyNotBody = Callable[[Candidate], str]
-"""The same of a body, once composed."""
+RejectDerivation = Callable[[Derivation], str]
+"""Returns the reason why a derivation cannot be a test robot's; empty if it can."""
+RejectRobot = Callable[[Candidate], str]
+"""Returns the reason why a composed robot cannot be a test robot; empty if it can."""
 
 
 class TestRobotSearch:
-    """Looks for test robots, number by number."""
+    """Search for test robots in streams, number by number."""
 
     def __init__(
         self,
-        order: SplitRequest,
+        request: SplitRequest,
         train: Sequence[Candidate],
-        maker: RobotFactory,
+        factory: RobotFactory,
         progress: Progress,
     ) -> None:
-        self._order, self._maker, self._progress = order, maker, progress
-        self._before = len(train)
-        self._taken = {body.hash: body.name for body in train}
+        self._request, self._factory, self._progress = request, factory, progress
+        self._num_train = len(train)
+        self._name_by_hash = {robot.hash: robot.name for robot in train}
         self._rejected: Counter[str] = Counter()
-        self._composed = 0
+        self._num_composed = 0
         self.found: list[Candidate] = []
 
     def find(
         self,
         streams: Sequence[RobotStream],
-        why_not: WhyNot,
-        why_not_body: WhyNotBody = lambda body: "",
+        reject_derivation: RejectDerivation,
+        reject_robot: RejectRobot = lambda robot: "",
     ) -> bool:
-        """Take test robots from streams in turn; return whether there are as many as ordered."""
+        """Take test robots from the streams in turn; return True when the request is met."""
         for number in itertools.count():
             for stream in streams:
-                if len(self.found) == self._order.test:
+                if len(self.found) == self._request.test:
                     return True
-                if self._rejected.total() == MAX_DRAWS or self._composed == MAX_COMPOSED:
+                if self._rejected.total() == MAX_DRAWS or self._num_composed == MAX_COMPOSED:
                     return False
-                reason = self._try(stream, number, why_not, why_not_body)
+                reason = self._try(stream, number, reject_derivation, reject_robot)
                 if reason:
                     self._rejected[reason] += 1
         return False
 
     def _try(
-        self, stream: RobotStream, number: int, why_not: WhyNot, why_not_body: WhyNotBody
+        self,
+        stream: RobotStream,
+        number: int,
+        reject_derivation: RejectDerivation,
+        reject_robot: RejectRobot,
     ) -> str:
-        """Take a robot, or say what it has that it shall not."""
-        derivation = stream.derivation(number, self._maker.library)
-        reason = why_not(derivation) if derivation else "no end"
+        """Take a robot and return an empty text, or return the reason why it is rejected."""
+        derivation = stream.derivation(number, self._factory.library)
+        reason = reject_derivation(derivation) if derivation else "no end"
         if reason:
             return reason
-        body = self._maker(stream.recipe(number))
-        # Where the first draw is not sound, the robot comes from a later one.
-        reason = why_not(body.derivation) or why_not_body(body)
-        if not reason and body.hash in self._taken:
-            reason = f"the body of {self._taken[body.hash]}"
+        robot = self._factory(stream.recipe(number))
+        # The robot comes from a later draw if the conditions of the grammar reject the first one.
+        reason = reject_derivation(robot.derivation) or reject_robot(robot)
+        if not reason and robot.hash in self._name_by_hash:
+            reason = f"the body of {self._name_by_hash[robot.hash]}"
         if reason:
-            self._composed += 1
+            self._num_composed += 1
             return reason
-        self._taken[body.hash] = body.name
-        self.found.append(body)
-        self._progress(self._before + len(self.found))
+        self._name_by_hash[robot.hash] = robot.name
+        self.found.append(robot)
+        self._progress(self._num_train + len(self.found))
         return ""
 
     def failure(self) -> str:
-        """How many were tried, and what was wrong with most."""
-        reason, times = self._rejected.most_common(1)[0]
+        """Return how many robots were drawn and found, and the most common reason of rejection."""
+        reason, count = self._rejected.most_common(1)[0]
         drawn = self._rejected.total() + len(self.found)
         return (
-            f"{len(self.found)} of {self._order.test} test robots found in {drawn} draws; "
-            f"{times} had {reason}"
+            f"{len(self.found)} of {self._request.test} test robots found in {drawn} draws; "
+            f"{count} had {reason}"
         )
 
 
 def assemble(
-    order: SplitRequest,
+    request: SplitRequest,
     regime: Regime,
     summary: str,
     train: Sequence[Member],
     test: Sequence[Member],
-    made: Mapping[str, object],
+    provenance: Mapping[str, object],
     per_robot: int = 1,
 ) -> tuple[Split, ...]:
-    """The splits of an order, one for every size.
+    """Return the requested splits, one for each size.
 
     Args:
-        order: The order.
-        regime: Of the split.
-        summary: With ``{n}`` for the number of train robots.
-        train: Members of the largest split.
-        test: Members to test on.
-        made: How they were chosen, besides what the order says.
-        per_robot: Members that a robot has.
+        request: The request.
+        regime: Regime of the splits.
+        summary: Summary with ``{n}`` for the number of train robots.
+        train: Train members of the largest split.
+        test: Test members.
+        provenance: Arguments of the generator besides the request.
+        per_robot: Number of members of each robot.
     """
-    sizes = order.train or (len(train) // per_robot,)
-    several = len(sizes) > 1
-    links = {} if order.max_links == MAX_LINKS else {MAX_LINKS_KEY: order.max_links}
+    sizes = request.train or (len(train) // per_robot,)
+    nested = {"nested": list(sizes)} if len(sizes) > 1 else {}
+    links = {} if request.max_links == MAX_LINKS else {MAX_LINKS_KEY: request.max_links}
     return tuple(
         Split(
-            f"{order.name}-train{n}" if several else order.name,
+            f"{request.name}-train{n}" if nested else request.name,
             regime,
             summary.format(n=n),
             tuple(train[: n * per_robot]),
             tuple(test),
             {
-                "seed": order.seed,
+                "seed": request.seed,
                 "train": n,
-                **({"nested": list(sizes)} if several else {}),
-                "test": order.test,
+                **nested,
+                "test": request.test,
                 **links,
-                **made,
+                **provenance,
             },
         )
         for n in sizes
@@ -218,13 +225,15 @@ def assemble(
 
 
 def assemble_drawn(
-    order: SplitRequest,
+    request: SplitRequest,
     regime: Regime,
     summary: str,
     train: Sequence[Candidate],
     test: Sequence[Candidate],
-    made: Mapping[str, object],
+    provenance: Mapping[str, object],
 ) -> tuple[Split, ...]:
-    """The splits of an order whose robots all do all tasks; see ``assemble``."""
-    trained, tested = (members(side, order.tasks, order.obstacles) for side in (train, test))
-    return assemble(order, regime, summary, trained, tested, made, per_robot=len(order.tasks))
+    """Return the requested splits with a member for each robot and task; see ``assemble``."""
+    trained, tested = (members(side, request.tasks, request.obstacles) for side in (train, test))
+    return assemble(
+        request, regime, summary, trained, tested, provenance, per_robot=len(request.tasks)
+    )

@@ -1,4 +1,4 @@
-"""New splits by interpolation: test robots are train robots of other sizes."""
+"""Generate interpolation splits: test robots have the structure of train robots at other sizes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from morphgen.grammar.library import Library
 
 
 def interpolation(
-    order: SplitRequest,
+    request: SplitRequest,
     grammar: Grammar,
     library: Library,
     *,
@@ -31,45 +31,45 @@ def interpolation(
     jobs: int = 1,
     progress: Progress = lambda done: None,
 ) -> tuple[Split, ...]:
-    """Splits whose test robots have the structure of a train robot.
+    """Return splits whose test robots have the structure of a train robot.
 
-    Train robots are numbers 0, 1, ... of the grammar and a seed of their own; test robots are those
-    of another seed that qualify.
+    Train robots are numbers 0, 1, ... of the grammar with one seed; test robots are sampled with
+    another seed.
 
     Args:
-        order: Sizes, tasks, seed.
-        grammar: Where all robots come from.
-        library: Where parts are.
-        hull: Whether the parameters of test robots lie ``inside`` the convex hull of those of the
-            train robots of their structure, ``outside``, or ``any`` where. Of several sizes,
-            inside the smallest one's and outside the largest one's.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        request: Sizes, tasks and seed.
+        grammar: Grammar of all robots.
+        library: The library of parts.
+        hull: ``inside``, ``outside`` or ``any``: position of the parameters of test robots relative
+            to the convex hull of the train robots of their structure. With several sizes it is
+            the hull of the smallest split for ``inside``, of the largest one for ``outside``.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
 
     Returns:
-        A split for every size.
+        A split for each size.
 
     Raises:
-        BenchmarkError: If too few test robots are found in ``MAX_DRAWS`` draws.
-        SamplingError: If a robot cannot be drawn.
+        BenchmarkError: If ``MAX_DRAWS`` draws give too few test robots.
+        SamplingError: If the grammar gives no valid robot.
     """
-    require_size(order)
+    require_size(request)
     if hull not in HULLS:
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
-    trained = RobotStream.of(grammar, grammar.name, order)
-    tested = RobotStream.of(grammar, f"{grammar.name}-test", order)
-    maker = RobotFactory(library.folders, max_links=order.max_links)
-    recipes = [trained.recipe(i) for i in range(order.train[-1])]
-    train = make_robots(recipes, maker, jobs=jobs, progress=progress)
-    wanted = _Wanted(train, order.train[0], hull, library)
-    search = TestRobotSearch(order, train, maker, progress)
-    if not search.find([tested], wanted):
-        raise BenchmarkError(f"{grammar.name}: {search.failure()}; {wanted.advice()}")
+    trained = RobotStream.of(grammar, grammar.name, request)
+    tested = RobotStream.of(grammar, f"{grammar.name}-test", request)
+    factory = RobotFactory(library.folders, max_links=request.max_links)
+    recipes = [trained.recipe(i) for i in range(request.train[-1])]
+    train = make_robots(recipes, factory, jobs=jobs, progress=progress)
+    criterion = _StructureAndHull(train, request.train[0], hull, library)
+    search = TestRobotSearch(request, train, factory, progress)
+    if not search.find([tested], criterion):
+        raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
     return assemble_drawn(
-        order,
+        request,
         "interpolation",
-        f"{{n}} robots of {grammar.name}; test: {order.test} {where[hull]}",
+        f"{{n}} robots of {grammar.name}; test: {request.test} {where[hull]}",
         train,
         search.found,
         {
@@ -80,28 +80,28 @@ def interpolation(
     )
 
 
-class _Wanted:
-    """Whether a derivation has the structure of a train robot, and lies where it shall."""
+class _StructureAndHull:
+    """Reject derivations of another structure, or on the wrong side of the convex hull."""
 
     def __init__(
         self, train: Sequence[Candidate], smallest: int, hull: str, library: Library
     ) -> None:
         self._hull, self._library = hull, library
-        self._structures = {structure(body.derivation, library) for body in train[:smallest]}
+        self._structures = {structure(robot.derivation, library) for robot in train[:smallest]}
         self._points: dict[str, list[list[float]]] = {}
-        # What is inside the smallest hull is inside all; what is outside the largest likewise.
-        for body in train[:smallest] if hull == "inside" else train:
-            points = self._points.setdefault(structure(body.derivation, library), [])
-            points.append(self._point(body.derivation))
+        # A point inside the smallest hull is inside all; one outside the largest is outside all.
+        for robot in train[:smallest] if hull == "inside" else train:
+            points = self._points.setdefault(structure(robot.derivation, library), [])
+            points.append(self._point(robot.derivation))
 
     def __call__(self, derivation: Derivation) -> str:
-        """What a derivation has that it shall not; nothing if it is as wanted."""
-        own = structure(derivation, self._library)
-        if own not in self._structures:
+        """Return the reason why a derivation is rejected; empty if it is accepted."""
+        kind = structure(derivation, self._library)
+        if kind not in self._structures:
             return "a structure that no train robot has"
         if self._hull == "any":
             return ""
-        is_inside = hull_distance(self._point(derivation), self._points[own]) <= ON_HULL
+        is_inside = hull_distance(self._point(derivation), self._points[kind]) <= ON_HULL
         if is_inside == (self._hull == "inside"):
             return ""
         return f"parameters {'inside' if is_inside else 'outside'} the hull of the train robots"
@@ -110,7 +110,7 @@ class _Wanted:
         return list(parameters(derivation, self._library).values())
 
     def advice(self) -> str:
-        """What to change where too few are found."""
+        """Return what to change if a search finds too few robots."""
         if self._hull == "any":
             return "ask for fewer test robots, or more train robots"
         spans = [np.ptp(np.array(points), axis=0) for points in self._points.values()]

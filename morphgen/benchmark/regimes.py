@@ -1,6 +1,6 @@
-"""What the regimes mean: rules about the parts and parameters of train and test robots.
+"""The rules of the regimes, tested on the parts and parameters of train and test robots.
 
-Nothing is composed here; derivations say enough.
+Derivations suffice: no robot is composed.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from morphgen.grammar.parameters import MOUNT_YAW
 from morphgen.model.findings import Finding
 
 NOTHING = "none"
-"""The part that stands for no end-effector."""
+"""Name of the part for robots without an end-effector."""
 HULLS = ("inside", "outside", "any")
-"""Where parameters of a test robot may lie, of the convex hull of those of the train robots."""
+"""Position of a test robot's parameters relative to the convex hull of the train robots."""
 ON_HULL = 1e-6
-"""How far out a point may be that counts as inside, in ranges of the parameters."""
+"""Distance up to which a point counts as inside the hull, in ranges of the parameters."""
 _SAME = 1e-9
-"""Relative difference of a parameter that does not vary."""
+"""Relative difference below which a parameter does not vary."""
 
 
 def structure(derivation: Derivation, library: Library) -> str:
-    """What a robot is made of, sizes aside: parts, their ports, and counts such as of fingers.
+    """Return the parts of a robot, their ports, and their counts, such as the number of fingers.
 
-    Labels and all parameters but whole numbers are left out. Robots of one structure have the
-    same links and joints, in other sizes.
+    Labels and parameters that are not whole numbers are omitted. Robots of one structure have the
+    same links and joints at different sizes.
 
     Raises:
         PartError: If the library lacks a part.
@@ -49,49 +49,49 @@ def structure(derivation: Derivation, library: Library) -> str:
 
 
 def combination(derivation: Derivation) -> str:
-    """Which parts a robot is made of, and on which ports: its structure without counts."""
+    """Return the parts of a robot and their ports: its structure without counts."""
     below = [f"{port}: {combination(child)}" for port, child in derivation.children]
     return derivation.part + _bracketed("[{}]", below)
 
 
 def parts(derivation: Derivation) -> frozenset[str]:
-    """The parts of a robot, but for ``none``."""
+    """Return the parts of a robot, except ``none``."""
     return frozenset(node.part for node in derivation.walk()) - {NOTHING}
 
 
 def parameters(derivation: Derivation, library: Library) -> dict[str, float]:
-    """All parameters that are no whole numbers, by place and name such as ``1.length``; SI units.
+    """Return all parameters that are not whole numbers, under keys such as ``1.length`` [SI units].
 
-    Places are numbered as in ``Derivation.walk``, so robots of one structure have the same keys.
+    Parts are numbered as in ``Derivation.walk``, so robots of one structure have the same keys.
 
     Raises:
         PartError: If the library lacks a part.
     """
-    found: dict[str, float] = {}
-    for place, node in enumerate(derivation.walk()):
-        turn = {MOUNT_YAW: 0.0} if place else {}
-        values = turn | _values(node, library)
-        found |= {
-            f"{place}.{name}": values[name]
+    result: dict[str, float] = {}
+    for index, node in enumerate(derivation.walk()):
+        yaw = {MOUNT_YAW: 0.0} if index else {}
+        values = yaw | _values(node, library)
+        result |= {
+            f"{index}.{name}": values[name]
             for name in sorted(values)
             if not _is_count(name, node, library)
         }
-    return found
+    return result
 
 
 def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
-    """How far a point lies out of the convex hull of others.
+    """Return the distance of a point from the convex hull of other points.
 
-    The least sum of the absolute differences to a point of the hull, each divided by the range of
-    the others; a linear programme. A coordinate that the others do not vary is left out, but a
-    point that differs in it is infinitely far out.
+    The distance is the smallest L1 distance to a point of the hull, each coordinate divided by its
+    range over the other points. It is the solution of a linear program. A coordinate in which the
+    other points are equal is omitted, but a point that differs in it is infinitely far away.
 
     Args:
-        point: Shape (d,).
-        points: The others, shape (n, d), one at least.
+        point: The point, shape (d,).
+        points: The other points, shape (n, d), at least one.
 
     Returns:
-        0 inside, up to rounding; see ``ON_HULL``.
+        The distance; 0 inside, up to rounding, see ``ON_HULL``.
     """
     x, others = np.asarray(point, dtype=np.float64), np.asarray(points, dtype=np.float64)
     low, span = others.min(axis=0), np.ptp(others, axis=0)
@@ -103,40 +103,42 @@ def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
     scaled = (others[:, varied] - low[varied]) / span[varied]
     target = (x[varied] - low[varied]) / span[varied]
     n, d = scaled.shape
-    # Weights of the others, and what is missing and too much in every coordinate.
+    # Variables: the convex weights of the points, then the negative and positive deviation in each
+    # coordinate, whose sum is minimised.
     equal = np.block([[scaled.T, np.eye(d), -np.eye(d)], [np.ones((1, n)), np.zeros((1, 2 * d))]])
     cost = np.concatenate([np.zeros(n), np.ones(2 * d)])
-    found = linprog(cost, A_eq=equal, b_eq=np.append(target, 1.0), method="highs")
-    if not found.success:
-        raise BenchmarkError(f"the convex hull of {n} robots: {found.message}")
-    return max(float(found.fun), 0.0)
+    solution = linprog(cost, A_eq=equal, b_eq=np.append(target, 1.0), method="highs")
+    if not solution.success:
+        raise BenchmarkError(f"the convex hull of {n} robots: {solution.message}")
+    return max(float(solution.fun), 0.0)
 
 
 def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
-    """What of a split is against its regime, as far as derivations tell.
+    """Return the violations of a split's regime that the derivations of its robots show.
 
-    Interpolation: every test robot has the structure of a train robot, and where the split was
-    made with a hull its parameters lie inside, or outside, that of the train robots of its
-    structure. Composition: all parts of a test robot are in train robots, its combination in none;
-    in a split of several tasks, some part of it is in no train robot of its task. Extrapolation:
-    neither its grammar nor its structure is that of a train robot. All: its task is trained.
+    - Interpolation: each test robot has the structure of a train robot. If the split was made with
+      a hull, its parameters are inside, or outside, the hull of the train robots of its structure.
+    - Composition: all parts of a test robot are in train robots, but no train robot has its
+      combination. In a split of several tasks, one of its parts is in no train robot of its task.
+    - Extrapolation: no train robot has its grammar or its structure.
+    - All regimes: a train robot has its task.
 
     Raises:
-        GrammarError: If a derivation is none.
+        GrammarError: If a derivation is malformed.
         PartError: If the library lacks a part.
     """
-    train = [_Read(member, library) for member in split.train]
+    train = [_Parsed(member, library) for member in split.train]
     rule = _RULES[split.regime]
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for member in split.test:
-        test = _Read(member, library)
-        found += [*_task_findings(test, train), *rule(split, test, train)]
-    return tuple(found)
+        test = _Parsed(member, library)
+        findings += [*_task_findings(test, train), *rule(split, test, train)]
+    return tuple(findings)
 
 
 @dataclass(frozen=True)
-class _Read:
-    """A member with what its derivation says."""
+class _Parsed:
+    """A member with its parsed derivation."""
 
     member: Member
     library: Library
@@ -166,11 +168,11 @@ class _Read:
         return Finding(code, "error", f"test robot {self.member.name}", why, fix)
 
 
-Rule = Callable[[Split, _Read, Sequence[_Read]], Iterator[Finding]]
+Rule = Callable[[Split, _Parsed, Sequence[_Parsed]], Iterator[Finding]]
 
 
-def _interpolation(split: Split, test: _Read, train: Sequence[_Read]) -> Iterator[Finding]:
-    alike = [read for read in train if read.structure == test.structure]
+def _interpolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
+    alike = [robot for robot in train if robot.structure == test.structure]
     if not alike:
         yield test.finding(
             "structure-unseen",
@@ -181,7 +183,7 @@ def _interpolation(split: Split, test: _Read, train: Sequence[_Read]) -> Iterato
     wanted = str(split.provenance.get("hull", "any"))
     if wanted not in HULLS[:2]:
         return
-    distance = hull_distance(test.parameters, [read.parameters for read in alike])
+    distance = hull_distance(test.parameters, [robot.parameters for robot in alike])
     if (distance <= ON_HULL) != (wanted == "inside"):
         is_where = "inside" if distance <= ON_HULL else f"outside, by {distance:.3g} ranges,"
         yield test.finding(
@@ -192,8 +194,8 @@ def _interpolation(split: Split, test: _Read, train: Sequence[_Read]) -> Iterato
         )
 
 
-def _composition(split: Split, test: _Read, train: Sequence[_Read]) -> Iterator[Finding]:
-    trained = frozenset[str]().union(*(read.parts for read in train))
+def _composition(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
+    trained = frozenset[str]().union(*(robot.parts for robot in train))
     unseen = sorted(test.parts - trained)
     if unseen:
         yield test.finding(
@@ -201,14 +203,14 @@ def _composition(split: Split, test: _Read, train: Sequence[_Read]) -> Iterator[
             f"no train robot has {_listed(unseen)}",
             "train on a robot that has it, or test another",
         )
-    same = [read.member.name for read in train if read.combination == test.combination]
+    same = [robot.member.name for robot in train if robot.combination == test.combination]
     if same:
         yield test.finding(
             "combination-seen",
             f"train robot {same[0]} is the same combination, {test.combination}",
             "leave the combination out of train",
         )
-    if len({read.member.task for read in train}) > 1 and not unseen:
+    if len({robot.member.task for robot in train}) > 1 and not unseen:
         task = test.member.task
         at_task = frozenset[str]().union(*(r.parts for r in train if r.member.task == task))
         if test.parts <= at_task:
@@ -219,15 +221,15 @@ def _composition(split: Split, test: _Read, train: Sequence[_Read]) -> Iterator[
             )
 
 
-def _extrapolation(split: Split, test: _Read, train: Sequence[_Read]) -> Iterator[Finding]:
+def _extrapolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
     category = test.member.category
-    if category != COMPOSED and category in {read.member.category for read in train}:
+    if category != COMPOSED and category in {robot.member.category for robot in train}:
         yield test.finding(
             "category-seen",
             f"category {category!r} is in train",
             "test a category that is not trained",
         )
-    same = [read.member.name for read in train if read.structure == test.structure]
+    same = [robot.member.name for robot in train if robot.structure == test.structure]
     if same:
         yield test.finding(
             "structure-seen",
@@ -236,8 +238,8 @@ def _extrapolation(split: Split, test: _Read, train: Sequence[_Read]) -> Iterato
         )
 
 
-def _task_findings(test: _Read, train: Sequence[_Read]) -> Iterator[Finding]:
-    trained = {read.member.task for read in train}
+def _task_findings(test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
+    trained = {robot.member.task for robot in train}
     if test.member.task not in trained:
         yield test.finding(
             "task-unseen",
@@ -254,7 +256,7 @@ _RULES: Mapping[Regime, Rule] = {
 
 
 def _values(node: Derivation, library: Library) -> dict[str, float]:
-    """The parameters of a part, defaults where the derivation does not say."""
+    """Return the parameters of a part, with defaults for those that the derivation omits."""
     known = library.manifest(node.part).parameters
     return {name: known[name].default for name in known} | dict(node.parameters)
 

@@ -1,4 +1,4 @@
-"""Robots of a split, each made after a recipe that any process can follow."""
+"""Make the candidate robots of a split from recipes, in one process or in several."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 
 Progress = Callable[[int], None]
+"""Receives the number of robots that are finished."""
 
 
 @dataclass(frozen=True)
 class SampledRecipe:
-    """A robot drawn from a grammar: what ``morphgen sample`` draws as that number of that seed."""
+    """A robot sampled from a grammar: robot ``number`` of ``morphgen sample --seed``."""
 
     grammar: Grammar
     number: int
@@ -40,11 +41,11 @@ class SampledRecipe:
 
 @dataclass(frozen=True)
 class ComposedRecipe:
-    """A robot given by words of ``morphgen compose``."""
+    """A robot given by the arguments of ``morphgen compose``."""
 
     words: tuple[str, ...]
     name: str = ""
-    """By default from its parts."""
+    """Name of the robot; by default made of the names of its parts."""
 
 
 Recipe = SampledRecipe | ComposedRecipe
@@ -52,47 +53,47 @@ Recipe = SampledRecipe | ComposedRecipe
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A robot that was made."""
+    """A robot that may become a member of a split."""
 
     name: str
     category: str
     derivation: Derivation
     hash: str
-    """See ``robot_hash``."""
+    """Hash of the robot, see ``robot_hash``."""
     features: Features | None = None
-    """For comparing, if asked for."""
+    """Features for similarity measures; None if the factory does not compute them."""
 
 
 @dataclass(frozen=True)
 class RobotFactory:
-    """Makes robots."""
+    """Make candidates from recipes; can be pickled and sent to a worker process."""
 
     folders: tuple[Path, ...]
-    """Of the library."""
-    comparable: bool = False
-    """Whether their features are wanted."""
+    """Folders of the library of parts."""
+    with_features: bool = False
+    """Compute the features of each robot."""
     max_links: int = MAX_LINKS
-    """The most links that a robot may have."""
+    """Largest number of links of a robot."""
 
     @cached_property
     def library(self) -> Library:
-        """Where parts are."""
+        """The library of parts."""
         return Library(self.folders)
 
     def __call__(self, recipe: Recipe) -> Candidate:
         """Make a robot.
 
         Raises:
-            BenchmarkError: If a composed one has an error of ``morphgen check``, or a robot more
-                links than ``max_links``.
-            SamplingError: If none can be drawn.
-            MorphgenError: If the recipe names what does not exist or does not fit.
+            BenchmarkError: If ``morphgen check`` reports an error of a composed robot, or a robot
+                has more than ``max_links`` links.
+            SamplingError: If the grammar gives no valid robot.
+            MorphgenError: If the recipe names an unknown part, or its parts do not fit.
         """
         if isinstance(recipe, SampledRecipe):
             sample = sample_robot(
                 recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
             )
-            return self._body(sample.robot, sample.derivation, recipe.grammar.name)
+            return self._candidate(sample.robot, sample.derivation, recipe.grammar.name)
         derivation, name = parse_words(recipe.words, self.library)
         robot = compose(derivation, self.library, recipe.name or name)
         for finding in check(robot):
@@ -100,77 +101,76 @@ class RobotFactory:
                 raise BenchmarkError(
                     f"{' '.join(recipe.words)}: {finding.code} at {finding.where}: {finding.why}"
                 )
-        return self._body(robot, derivation, category_of(recipe.words, self.library))
+        return self._candidate(robot, derivation, category_of(recipe.words, self.library))
 
-    def _body(self, robot: Robot, derivation: Derivation, category: str) -> Candidate:
-        # The text keeps 12 digits of a number; what it says is what counts.
+    def _candidate(self, robot: Robot, derivation: Derivation, category: str) -> Candidate:
+        # The text of a derivation has 12 digits per number. A split stores the text, so the robot
+        # must be the one that the text gives.
         written = parse_derivation(str(derivation))
         if written != derivation:
             robot = compose(written, self.library, robot.name)
         require_max_links(len(robot.links), f"robot {robot.name!r}", self.max_links)
-        found = None
-        if self.comparable:
+        robot_features = None
+        if self.with_features:
             shapes = token_shapes(robot, self.folders)
-            found = features(robot, shapes, max_links=self.max_links)
-        return Candidate(robot.name, category, written, robot_hash(robot), found)
+            robot_features = features(robot, shapes, max_links=self.max_links)
+        return Candidate(robot.name, category, written, robot_hash(robot), robot_features)
 
 
 def make_robots(
     recipes: Sequence[Recipe],
-    maker: RobotFactory,
+    factory: RobotFactory,
     *,
     jobs: int = 1,
     progress: Progress = lambda done: None,
 ) -> list[Candidate]:
-    """Make robots, in order.
+    """Make robots and return them in the order of their recipes.
 
     Args:
-        recipes: What to make.
-        maker: Makes them.
-        jobs: Processes.
-        progress: Told how many are done, again and again.
+        recipes: The recipes.
+        factory: Factory that makes each robot.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished.
     """
-    bodies = []
-    for body in parallel_map(maker, recipes, jobs):
-        bodies.append(body)
-        progress(len(bodies))
-    return bodies
+    return list(parallel_map(factory, recipes, jobs, lambda done, _: progress(done)))
 
 
 def category_of(words: Sequence[str], library: Library) -> str:
-    """The grammar that words name first, else ``composed``."""
+    """Return the grammar that the arguments of ``compose`` begin with, else ``composed``."""
     is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
     return COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
 
 
 def numbered_name(prefix: str, number: int) -> str:
-    """The name of a drawn robot, such as ``arm3-000004``."""
+    """Return the name of a sampled robot, such as ``arm3-000004``."""
     return f"{prefix}-{number:06d}"
 
 
 def stream_seed(seed: int, prefix: str) -> int:
-    """The seed of all robots of one prefix: by name, so that no robot hangs on what else is drawn.
+    """Return the seed of the robots with one name prefix.
+
+    It depends on the prefix, so robots do not change with the other robots that a split samples.
 
     Args:
-        seed: Of the split.
-        prefix: Of the robots' names.
+        seed: Seed of the split.
+        prefix: Prefix of the robots' names.
     """
     return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
 
 
 def members(
-    bodies: Iterable[Candidate], tasks: Sequence[str], obstacles: bool
+    candidates: Iterable[Candidate], tasks: Sequence[str], obstacles: bool
 ) -> tuple[Member, ...]:
-    """Every robot at every task; with several tasks the name tells which."""
+    """Return a member for each robot and task; with several tasks the name ends in the task."""
     return tuple(
         Member(
-            body.name if len(tasks) == 1 else f"{body.name}-{task}",
-            body.category,
-            str(body.derivation),
+            robot.name if len(tasks) == 1 else f"{robot.name}-{task}",
+            robot.category,
+            str(robot.derivation),
             task,
             obstacles,
-            body.hash,
+            robot.hash,
         )
-        for body in bodies
+        for robot in candidates
         for task in tasks
     )

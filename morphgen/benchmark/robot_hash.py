@@ -27,36 +27,36 @@ from morphgen.model.rotation import to_matrix
 HASH_LENGTH = 32
 """Hexadecimal digits of the hash of a robot and of the id of a split: 128 bits."""
 _GRID = 1e-7
-"""Lengths (m), angles (rad), masses (kg) and all else in a hash are told apart to this."""
+"""Resolution of the numbers in a hash: lengths [m], angles [rad], masses [kg] and others."""
 _GYRATION_GRID = 1e-9
-"""The same of inertia over mass, square metres: a finger's is 1e-5."""
+"""Resolution of inertia over mass [m^2]; a finger has 1e-5."""
 _OFF_GRID = 1 / math.pi
-"""Keeps decimal numbers away from the middle between two points of the grid, where the last bit
-decides."""
+"""Offset of the grid [steps], so that decimal numbers are not halfway between grid points, where
+the last bit would decide."""
 
 
 def robot_hash(robot: Robot, *, visuals: bool = True) -> str:
-    """A hash of the body: 32 hexadecimal digits of a SHA-256.
+    """Return a hash of the physical robot: 32 hexadecimal digits of a SHA-256.
 
-    It tells links, joints and home: what is where, how heavy, how far and how strongly it moves,
-    and where the tool is. A mesh counts by the content of its file, with its scale and part. It
-    does not tell names, colours, pairs to ignore or provenance, so the same body under other
-    labels has the same hash. Numbers count to 1e-7 (m, rad, kg ...), so the last bits, which
-    differ between machines, do not.
+    The hash covers links, joints, the home configuration and the tool frame: poses, inertias,
+    shapes, limits, efforts and velocities. A mesh is represented by the content of its file, its
+    scale and its part. Names, colours, ignored pairs and provenance are not covered, so the same
+    robot under other names has the same hash. Numbers have a resolution of 1e-7 (m, rad, kg ...),
+    because their last bits differ between machines.
 
     Args:
-        robot: The body.
-        visuals: Whether what is only seen counts. Without, and with primitives as its collision
-            shapes, a robot has the same hash however its meshes are stored.
+        robot: The robot.
+        visuals: Include visual shapes. Without them, and with primitives as collision shapes, the
+            hash does not depend on how meshes are stored.
 
     Raises:
         MeshError: If a mesh file cannot be read.
     """
     tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
-    where = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]
+    tool_frame = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]
     joints = [_joint(joint, robot) for joint in robot.joints]
     links = [_link(link if visuals else replace(link, visuals=())) for link in robot.links]
-    return digest([links, joints, _grid(robot.home), where])
+    return digest([links, joints, _grid(robot.home), tool_frame])
 
 
 def digest(data: object) -> str:
@@ -66,7 +66,7 @@ def digest(data: object) -> str:
 
 
 def _grid(values: Iterable[float], step: float = _GRID) -> list[int]:
-    """The nearest point of a grid, each as a whole number of steps."""
+    """Return the nearest grid point of each value as a number of steps."""
     return [math.floor(value / step + _OFF_GRID) for value in values]
 
 
@@ -94,15 +94,15 @@ def _geometry(geometry: Geometry) -> list[object]:
 
 
 def _pose(pose: Pose) -> list[int]:
-    """Position and rotation matrix; the sign of a quaternion may hang on the last bit."""
+    """Return position and rotation matrix; the sign of a quaternion may depend on the last bit."""
     rows = to_matrix(pose.quaternion)
     return _grid([*pose.position, *rows[0], *rows[1], *rows[2]])
 
 
 def _joint(joint: Joint, robot: Robot) -> list[object]:
-    place = [robot.link_index[joint.parent], _pose(joint.T_parent_joint)]
+    attachment = [robot.link_index[joint.parent], _pose(joint.T_parent_joint)]
     if not joint.is_movable:
-        return ["fixed", *place]
+        return ["fixed", *attachment]
     unlimited = joint.kind == "continuous" or joint.limits is None
     kind = "continuous" if unlimited and joint.kind == "revolute" else joint.kind
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
@@ -113,12 +113,12 @@ def _joint(joint: Joint, robot: Robot) -> list[object]:
         robot.joint_index[joint.mimic.joint],
         _grid([joint.mimic.multiplier, joint.mimic.offset]),
     ]
-    return [kind, *place, _grid(motion), limits, mimic]
+    return [kind, *attachment, _grid(motion), limits, mimic]
 
 
 @lru_cache(maxsize=4096)
 def _content(path: Path, stamp: tuple[int, int]) -> str:
-    """SHA-256 of a file as it is at its stamp, hexadecimal."""
+    """Return the SHA-256 of a file; the stamp makes the cache notice a changed file."""
     del stamp
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()

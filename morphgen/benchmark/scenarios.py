@@ -1,6 +1,6 @@
-"""The paper's scenarios: which robots each is made of. Their files lie in ``splits/``.
+"""The scenarios of the paper as tables of robots. The split files in ``splits/`` are made of them.
 
-After a change here, or of a part that they use, ``write_scenarios`` makes the files anew.
+After a change here, or of a part that a scenario uses, run ``write_scenarios``.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from morphgen.benchmark.robot_factory import (
     ComposedRecipe,
     RobotFactory,
     SampledRecipe,
+    members,
     numbered_name,
     stream_seed,
 )
@@ -26,51 +27,51 @@ from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.pinning import pin
 
 SEED = 0
-"""Of all scenarios."""
+"""Seed of all scenarios."""
 PAPER = "AnyBody (arXiv 2505.14986), table 1: {}"
 
 
 @dataclass(frozen=True)
-class Draws:
-    """Robots drawn from a grammar."""
+class SampledRow:
+    """Robots sampled from a grammar."""
 
     n: int
     grammar: str
     pins: str = ""
-    """What is fixed in it, as ``morphgen compose`` takes it."""
+    """Choices that are fixed in the grammar, in the notation of ``morphgen compose``."""
     prefix: str = ""
-    """Of their names, if not the grammar's name."""
+    """Prefix of the robots' names; by default the grammar's name."""
     task: str | None = None
-    """If not that of the scenario."""
+    """Task of the robots; by default that of the variant."""
     first: int = 0
-    """Number of the first."""
+    """Number of the first robot."""
 
 
 @dataclass(frozen=True)
-class Given:
-    """A robot given by words of ``morphgen compose``."""
+class ComposedRow:
+    """A robot given by the arguments of ``morphgen compose``."""
 
     name: str
     words: str
     task: str | None = None
 
 
-Row = Draws | Given
+Row = SampledRow | ComposedRow
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A task that the robots of a scenario are put to."""
+    """A task of a scenario; each variant is a split of its own."""
 
     suffix: str
-    """Of the split's name."""
+    """Suffix of the split's name."""
     task: str
     obstacles: bool = False
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Robots to train and to test on, for one or several tasks."""
+    """Train and test robots for one or several tasks."""
 
     name: str
     regime: Regime
@@ -80,7 +81,7 @@ class Scenario:
     test: tuple[Row, ...]
     variants: tuple[Variant, ...]
     hull: str = ""
-    """Where the parameters of test robots lie, see ``morphgen.benchmark.regimes.HULLS``."""
+    """Position of the parameters of test robots, see ``morphgen.benchmark.regimes.HULLS``."""
     accepted: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -91,17 +92,17 @@ WITH_OBSTACLES = (
 )
 MIXED = Variant("", "push")
 
-UR5_STICK = Given("ur5-stick", "arm=ur5 ee=stick")
-UR5_PLANE = Given("ur5-plane", "arm=ur5 ee=plane")
-UR5_EZ = Given("ur5-ez", "arm=ur5 ee=sake_ez")
-UR5_SAWYER = Given("ur5-sawyer", "arm=ur5 ee=rethink")
-PANDA = Given("panda", "arm=panda ee=panda_hand")
-KINOVA = Given("kinova", "arm=kinova_gen3 ee=robotiq_2f85")
-JACO = Given("jaco", "arm=jaco2 ee=jaco_fingers")
-XARM = Given("xarm", "arm=xarm7 ee=robotiq_2f85")
-LWR = Given("lwr", "arm=lwr ee=panda_hand")
-YUMI = Given("yumi", "arm=yumi left.ee=yumi_gripper right.ee=yumi_gripper")
-WIDOWX = Given("widowx", "arm=widowx ee=widowx_gripper")
+UR5_STICK = ComposedRow("ur5-stick", "arm=ur5 ee=stick")
+UR5_PLANE = ComposedRow("ur5-plane", "arm=ur5 ee=plane")
+UR5_EZ = ComposedRow("ur5-ez", "arm=ur5 ee=sake_ez")
+UR5_SAWYER = ComposedRow("ur5-sawyer", "arm=ur5 ee=rethink")
+PANDA = ComposedRow("panda", "arm=panda ee=panda_hand")
+KINOVA = ComposedRow("kinova", "arm=kinova_gen3 ee=robotiq_2f85")
+JACO = ComposedRow("jaco", "arm=jaco2 ee=jaco_fingers")
+XARM = ComposedRow("xarm", "arm=xarm7 ee=robotiq_2f85")
+LWR = ComposedRow("lwr", "arm=lwr ee=panda_hand")
+YUMI = ComposedRow("yumi", "arm=yumi left.ee=yumi_gripper right.ee=yumi_gripper")
+WIDOWX = ComposedRow("widowx", "arm=widowx ee=widowx_gripper")
 
 SCENARIOS: tuple[Scenario, ...] = (
     Scenario(
@@ -109,8 +110,8 @@ SCENARIOS: tuple[Scenario, ...] = (
         "interpolation",
         "A small arm with a claw, of ten sizes; test: a size between them",
         PAPER.format("Interpolation, Arm-3"),
-        train=(Draws(10, "arm3"),),
-        test=(Draws(1, "arm3", prefix="arm3-test"),),
+        train=(SampledRow(10, "arm3"),),
+        test=(SampledRow(1, "arm3", prefix="arm3-test"),),
         variants=(REACH, PUSH, *WITH_OBSTACLES),
         hull="inside",
     ),
@@ -119,8 +120,8 @@ SCENARIOS: tuple[Scenario, ...] = (
         "interpolation",
         "The Panda with links of other sizes, ten times; test: the Panda as it is",
         PAPER.format("Interpolation, Panda"),
-        train=(Draws(10, "panda_variations"),),
-        test=(Given("panda", "panda_variations"),),
+        train=(SampledRow(10, "panda_variations"),),
+        test=(ComposedRow("panda", "panda_variations"),),
         variants=(REACH, PUSH),
     ),
     Scenario(
@@ -130,8 +131,8 @@ SCENARIOS: tuple[Scenario, ...] = (
         "stick",
         PAPER.format("Composition, EE Arm"),
         train=(
-            Draws(3, "prims", "prim=plane", "plane"),
-            Draws(4, "prims", "prim=cylinder", "cylinder"),
+            SampledRow(3, "prims", "prim=plane", "plane"),
+            SampledRow(4, "prims", "prim=cylinder", "cylinder"),
             UR5_PLANE,
             UR5_EZ,
             UR5_SAWYER,
@@ -149,7 +150,7 @@ SCENARIOS: tuple[Scenario, ...] = (
         "Planes on a gantry push, a UR5 with a stick reaches; test: a UR5 with a plane pushes",
         PAPER.format("Composition, EE-Task"),
         train=(
-            Draws(3, "prims", "prim=plane", "plane", task="push"),
+            SampledRow(3, "prims", "prim=plane", "plane", task="push"),
             replace(UR5_STICK, task="reach"),
         ),
         test=(replace(UR5_PLANE, task="push"),),
@@ -161,14 +162,14 @@ SCENARIOS: tuple[Scenario, ...] = (
         "Sticks, planar chains of bars, and simple bodies on a gantry; test: chains of beads",
         PAPER.format("Extrapolation, Primitives"),
         train=(
-            Draws(2, "stick"),
-            Draws(2, "nlink", "links=5"),
-            Draws(1, "prims", "prim=plane", "plane"),
-            Draws(1, "prims", "prim=cylinder", "cylinder"),
-            Draws(2, "prims", "prim=cube", "cube"),
-            Draws(2, "prims", "prim=sphere", "sphere"),
+            SampledRow(2, "stick"),
+            SampledRow(2, "nlink", "links=5"),
+            SampledRow(1, "prims", "prim=plane", "plane"),
+            SampledRow(1, "prims", "prim=cylinder", "cylinder"),
+            SampledRow(2, "prims", "prim=cube", "cube"),
+            SampledRow(2, "prims", "prim=sphere", "sphere"),
         ),
-        test=(Draws(1, "chain", "beads=2"), Draws(1, "chain", "beads=3", first=1)),
+        test=(SampledRow(1, "chain", "beads=2"), SampledRow(1, "chain", "beads=3", first=1)),
         variants=(REACH, PUSH),
     ),
     Scenario(
@@ -176,7 +177,7 @@ SCENARIOS: tuple[Scenario, ...] = (
         "extrapolation",
         "Eight real arms with their end-effectors, and two arms of tubes; test: the WidowX",
         PAPER.format("Extrapolation, Robot Arms"),
-        train=(UR5_STICK, UR5_EZ, PANDA, KINOVA, JACO, XARM, LWR, YUMI, Draws(2, "arm5")),
+        train=(UR5_STICK, UR5_EZ, PANDA, KINOVA, JACO, XARM, LWR, YUMI, SampledRow(2, "arm5")),
         test=(WIDOWX,),
         variants=(REACH, PUSH),
     ),
@@ -186,7 +187,16 @@ SCENARIOS: tuple[Scenario, ...] = (
         "Six real arms with their end-effectors, two arms of tubes and two small ones; test: the "
         "WidowX",
         "AnyBody's released scenarios: the second set of arms",
-        train=(UR5_STICK, KINOVA, JACO, XARM, LWR, YUMI, Draws(2, "arm5"), Draws(2, "arm3")),
+        train=(
+            UR5_STICK,
+            KINOVA,
+            JACO,
+            XARM,
+            LWR,
+            YUMI,
+            SampledRow(2, "arm5"),
+            SampledRow(2, "arm3"),
+        ),
         test=(WIDOWX,),
         variants=(REACH, PUSH),
     ),
@@ -195,29 +205,29 @@ SCENARIOS: tuple[Scenario, ...] = (
 
 
 def scenario_splits(name: str, library: Library) -> tuple[Split, ...]:
-    """The splits of a scenario, made from nothing but its rows: one for every variant.
+    """Make the splits of a scenario from its table, one for each variant.
 
     Args:
-        name: Such as ``extrapolation/arms``.
-        library: Where parts are.
+        name: Name of the scenario, such as ``extrapolation/arms``.
+        library: The library of parts.
 
     Raises:
-        BenchmarkError: If there is no such scenario.
+        BenchmarkError: If the scenario is unknown.
     """
-    found = {scenario.name: scenario for scenario in SCENARIOS}
-    if name not in found:
-        raise BenchmarkError(f"unknown scenario {name!r}{nearest(name, found)}")
-    scenario = found[name]
-    maker = RobotFactory(library.folders)
+    scenarios = {scenario.name: scenario for scenario in SCENARIOS}
+    if name not in scenarios:
+        raise BenchmarkError(f"unknown scenario {name!r}{nearest(name, scenarios)}")
+    scenario = scenarios[name]
+    factory = RobotFactory(library.folders)
     train, test = (
-        [(body, row.task) for row in rows for body in _bodies(row, maker)]
+        [(robot, row.task) for row in rows for robot in _candidates(row, factory)]
         for rows in (scenario.train, scenario.test)
     )
-    made = {
+    provenance = {
         "seed": SEED,
         **({"hull": scenario.hull} if scenario.hull else {}),
-        "train": [_said(row) for row in scenario.train],
-        "test": [_said(row) for row in scenario.test],
+        "train": [_row_data(row) for row in scenario.train],
+        "test": [_row_data(row) for row in scenario.test],
     }
     splits = [
         Split(
@@ -226,7 +236,7 @@ def scenario_splits(name: str, library: Library) -> tuple[Split, ...]:
             scenario.summary,
             tuple(_members(train, variant)),
             tuple(_members(test, variant)),
-            made,
+            provenance,
             scenario.accepted,
             scenario.reference,
         )
@@ -237,14 +247,11 @@ def scenario_splits(name: str, library: Library) -> tuple[Split, ...]:
 
 
 def write_scenarios(folder: Path, names: Iterable[str] = ()) -> list[Path]:
-    """Write the files of scenarios.
+    """Write the split files of scenarios and return their paths.
 
     Args:
-        folder: Where they go, as ``<folder>/extrapolation/arms/reach.yaml``.
-        names: Which scenarios; all if none are named.
-
-    Returns:
-        The files.
+        folder: Folder of the files, such as ``<folder>/extrapolation/arms/reach.yaml``.
+        names: Names of the scenarios; by default all.
     """
     library = default_library()
     paths = []
@@ -255,36 +262,29 @@ def write_scenarios(folder: Path, names: Iterable[str] = ()) -> list[Path]:
     return paths
 
 
-def _bodies(row: Row, maker: RobotFactory) -> Iterator[Candidate]:
-    if isinstance(row, Given):
-        yield maker(ComposedRecipe(tuple(row.words.split()), row.name))
+def _candidates(row: Row, factory: RobotFactory) -> Iterator[Candidate]:
+    if isinstance(row, ComposedRow):
+        yield factory(ComposedRecipe(tuple(row.words.split()), row.name))
         return
-    folders = maker.library.folders
+    folders = factory.library.folders
     grammar = load_grammar(find_grammar(row.grammar, folders), folders)
-    grammar = pin(grammar, row.pins.split(), maker.library)
+    grammar = pin(grammar, row.pins.split(), factory.library)
     prefix = row.prefix or row.grammar
     for number in range(row.first, row.first + row.n):
-        yield maker(
+        yield factory(
             SampledRecipe(grammar, number, stream_seed(SEED, prefix), numbered_name(prefix, number))
         )
 
 
-def _members(bodies: Iterable[tuple[Candidate, str | None]], variant: Variant) -> Iterator[Member]:
-    for body, task in bodies:
-        yield Member(
-            body.name,
-            body.category,
-            str(body.derivation),
-            task or variant.task,
-            variant.obstacles,
-            body.hash,
-        )
+def _members(robots: Iterable[tuple[Candidate, str | None]], variant: Variant) -> Iterator[Member]:
+    for robot, task in robots:
+        yield from members([robot], [task or variant.task], variant.obstacles)
 
 
-def _said(row: Row) -> dict[str, object]:
-    """A row as the file tells it."""
+def _row_data(row: Row) -> dict[str, object]:
+    """Return a row as plain data for the split file."""
     task = {"task": row.task} if row.task else {}
-    if isinstance(row, Given):
+    if isinstance(row, ComposedRow):
         return {"robot": row.name, "words": row.words, **task}
     return {
         "robots": row.n,

@@ -1,7 +1,7 @@
-"""A split: which robots are trained on, which tested on, at which task.
+"""A split: the robots and tasks to train on, and those to test on.
 
-Robots are given by their derivations, never by a file, so any machine rebuilds them; the hash of
-each body tells that it is the same. ``morphgen.benchmark.split_file`` has the file.
+A split contains the derivation of each robot instead of a file, so any machine can rebuild it. The
+hash of each robot proves that the result is the same. ``split_file`` reads and writes splits.
 """
 
 from __future__ import annotations
@@ -27,24 +27,25 @@ SIDES: tuple[Side, ...] = ("train", "test")
 
 FORMAT = 1
 COMPOSED = "composed"
-"""Category of a robot that was drawn from no grammar."""
+"""Category of a robot that was not sampled from a grammar."""
 MAX_LINKS_KEY = "max_links"
-"""Key in ``made`` of the most links of a robot, if they are not the paper's."""
+"""Key in ``provenance`` of the largest number of links, if it is not the paper's."""
 
 
 @dataclass(frozen=True)
 class Member:
-    """A robot of a split, and what it does there."""
+    """A robot of a split and its task."""
 
     name: str
-    """Unique within the split, and the name of the robot."""
+    """Name of the robot, unique on each side of the split."""
     category: str
-    """The grammar that it was drawn from, or ``composed``."""
+    """Grammar that the robot was sampled from, or ``composed``."""
     derivation: str
-    """Parts and parameters, see ``morphgen.grammar.derivation``."""
+    """Parts and parameters of the robot, see ``morphgen.grammar.derivation``."""
     task: str
-    """Name of a task; whoever makes environments of the split knows which there are."""
+    """Name of the task; the tasks package knows which tasks exist."""
     obstacles: bool
+    """The scene has obstacles."""
     robot_hash: str
     """Hash of the composed robot, see ``morphgen.benchmark.robot_hash``; ``body`` in files."""
 
@@ -56,29 +57,29 @@ class Member:
 
 @dataclass(frozen=True)
 class Split:
-    """Robots to train and to test on."""
+    """Train and test robots, with the history of the split."""
 
     name: str
-    """Such as ``extrapolation/arms/reach``."""
+    """Name, such as ``extrapolation/arms/reach``."""
     regime: Regime
     summary: str
     train: tuple[Member, ...]
     test: tuple[Member, ...]
     provenance: Mapping[str, object] = field(default_factory=dict)
-    """How the robots were chosen: arguments and seed of the generator."""
+    """Arguments and seed of the generator that chose the robots; ``made`` in files."""
     accepted: Mapping[str, str] = field(default_factory=dict)
-    """Findings of the audit that the author knows of: reason by code."""
+    """Findings of the audit that the author accepts: reasons by code."""
     reference: str = ""
-    """Where the split comes from, such as a paper's table."""
+    """Source of the split, such as a table of a paper."""
     statistics: Mapping[str, object] = field(default_factory=dict)
-    """Figures about its robots, for readers; nothing depends on them."""
+    """Statistics of the robots, for readers; nothing depends on them."""
 
     @property
     def max_links(self) -> int:
-        """The most links that a robot may have, by which indices of tokens are scaled.
+        """Largest number of links of a robot, which scales link indices in tokens.
 
         Raises:
-            BenchmarkError: If the split was made with another than a whole number from 2 on.
+            BenchmarkError: If the split's provenance has a value that is not an integer above 1.
         """
         given = self.provenance.get(MAX_LINKS_KEY, MAX_LINKS)
         if type(given) is not int or given < 2:
@@ -89,7 +90,7 @@ class Split:
         return given
 
     def side(self, side: Side) -> tuple[Member, ...]:
-        """The members of a side."""
+        """Return the members of a side."""
         return self.train if side == "train" else self.test
 
     def as_dict(self) -> dict[str, object]:
@@ -99,13 +100,13 @@ class Split:
 
 
 def split_id(split: Split) -> str:
-    """A hash of what matters: the regime, and each side's members in order; 32 hex digits."""
+    """Return a hash of the regime and of the members of each side in order: 32 hex digits."""
     sides = [[list(member.as_dict().values()) for member in split.side(side)] for side in SIDES]
     return digest([split.regime, *sides])
 
 
 def compose_side(split: Split, side: Side, library: Library) -> Iterator[Robot]:
-    """The robots of a side in order, each composed when asked for; see ``member_robot``."""
+    """Compose the robots of a side one after another; see ``compose_member``."""
     for member in split.side(side):
         yield compose_member(member, library)
 
@@ -114,19 +115,19 @@ def compose_member(member: Member, library: Library) -> Robot:
     """Compose the robot of a member.
 
     Raises:
-        BenchmarkError: If its body is not the one that the split was made with.
-        GrammarError: If its derivation is none.
-        CompositionError: If its parts do not fit any more.
-        PartError: If the library lacks a part, or a parameter of it.
-        FormatError: If a part's source cannot be read.
+        BenchmarkError: If the robot is not the one that the split was made with.
+        GrammarError: If the derivation is malformed.
+        CompositionError: If the parts do not fit any more.
+        PartError: If the library lacks a part or one of its parameters.
+        FormatError: If the source of a part cannot be read.
     """
     derivation = parse_derivation(member.derivation, f"derivation of {member.name!r}")
     robot = compose(derivation, library, member.name)
-    body = robot_hash(robot)
-    if body != member.robot_hash:
+    composed_hash = robot_hash(robot)
+    if composed_hash != member.robot_hash:
         raise BenchmarkError(
             f"robot {member.name!r}: the split was made with body {member.robot_hash}, but its "
-            f"derivation gives {body}: a part, or morphgen, has changed since"
+            f"derivation gives {composed_hash}: a part, or morphgen, has changed since"
         )
     return robot
 

@@ -1,4 +1,4 @@
-"""Write every robot of a split into a folder that anyone can use; ``built`` says what is in it."""
+"""Build a split folder: write a split and all its robots; see ``split_folder`` for the layout."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ from morphgen.processes import Progress, no_progress, parallel_map
 
 @dataclass(frozen=True)
 class BuildReport:
-    """What a build did."""
+    """Result of a build."""
 
     folder: Path
     num_written: int
-    """Bodies that were written."""
+    """Number of robots that were written."""
     num_kept: int
-    """Bodies that were there."""
+    """Number of robots that an earlier build had written."""
 
 
 def build_split(
@@ -65,22 +65,22 @@ def build_split(
     settings: BuildSettings = BUNDLED,
     progress: Progress = no_progress,
 ) -> BuildReport:
-    """Write a split with all its robots below ``folder``, in folders of the split's name.
+    """Write a split and all its robots to ``folder / split.name``.
 
-    What an interrupted run has left is kept where it is as it should be. The same split gives the
-    same bytes.
+    Robots that an interrupted build has written are kept if they are correct. The same split gives
+    the same bytes.
 
     Args:
         split: The split.
-        folder: Such as ``data``.
-        library: Where the parts are.
-        jobs: Processes.
-        settings: How robots are written.
-        progress: Told how many bodies are done, again and again.
+        folder: Parent folder, such as ``data``.
+        library: The library of parts.
+        jobs: Number of processes.
+        settings: Settings of the build.
+        progress: Receives the number of robots that are finished, and of all.
 
     Raises:
-        BenchmarkError: If a robot is not the one that the split names, or the folder holds
-            something else or cannot be written.
+        BenchmarkError: If a robot is not the one that the split names, or the folder has other
+            content or cannot be written.
         MorphgenError: If a robot cannot be composed.
     """
     home = split_folder_path(split, folder)
@@ -90,7 +90,7 @@ def build_split(
         with locked_folder(home):
             (home / SUMS_FILE).unlink(missing_ok=True)
             _sweep(home / ROBOTS_DIR)
-            maker = _Maker(library.folders, home, settings, split.max_links)
+            maker = _RobotWriter(library.folders, home, settings, split.max_links)
             results = parallel_map(maker, firsts, jobs, progress)
             made = {member.robot_hash: one for member, one in zip(firsts, results, strict=True)}
             _finish(home, split, settings, made)
@@ -99,10 +99,10 @@ def build_split(
 
 
 def split_folder_path(split: Split, folder: Path) -> Path:
-    """Where a split is built below a folder.
+    """Return the folder of a split in a parent folder.
 
     Raises:
-        FormatError: If the split's name makes no folders.
+        FormatError: If the split's name contains an invalid folder name.
     """
     for name in split.name.split("/"):
         folder = bundle_folder(folder, name)
@@ -110,17 +110,17 @@ def split_folder_path(split: Split, folder: Path) -> Path:
 
 
 @dataclass(frozen=True, eq=False)
-class _Made:
+class _WrittenRobot:
     """A robot that was written or kept."""
 
     is_new: bool
-    body: RobotData
+    data: RobotData
     hashes: dict[str, str]
 
 
 @dataclass(frozen=True, eq=False)
-class _Maker:
-    """How a worker writes a robot."""
+class _RobotWriter:
+    """Write the folder of a member; sent to worker processes."""
 
     folders: tuple[Path, ...]
     home: Path
@@ -131,7 +131,7 @@ class _Maker:
     def library(self) -> Library:
         return Library(self.folders)
 
-    def __call__(self, member: Member) -> _Made:
+    def __call__(self, member: Member) -> _WrittenRobot:
         robot = compose_member(member, self.library)
         require_max_links(len(robot.links), f"robot {member.name!r}", self.max_links)
         folder = bundle_folder(self.home / ROBOTS_DIR, member.name)
@@ -141,11 +141,13 @@ class _Maker:
         )
         if not is_kept:
             write_robot(robot, folder, light=light, picture=picture)
-        return _Made(not is_kept, robot_data(robot, self.folders, self.max_links), hashes(folder))
+        return _WrittenRobot(
+            not is_kept, robot_data(robot, self.folders, self.max_links), hashes(folder)
+        )
 
 
 def _prepare(home: Path, split: Split, settings: BuildSettings) -> None:
-    """Make the folder, or see that it holds the same split, built in the same way."""
+    """Create the folder, or check that it has the same split with the same settings."""
     wanted = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
     if not (home / BUILD_FILE).is_file():
         leftover = {partial_path(home / BUILD_FILE)}
@@ -168,30 +170,32 @@ def _prepare(home: Path, split: Split, settings: BuildSettings) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what an interruption left half-written."""
+    """Remove the partial folders of an interrupted build."""
     for leftover in folder.glob(".*"):
         shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _finish(home: Path, split: Split, settings: BuildSettings, made: Mapping[str, _Made]) -> None:
-    """Write what is there once, the sums last."""
-    known = {body: one.body for body, one in made.items()}
+def _finish(
+    home: Path, split: Split, settings: BuildSettings, made: Mapping[str, _WrittenRobot]
+) -> None:
+    """Write the files of the whole split, the hashes last."""
+    known = {robot_hash: robot.data for robot_hash, robot in made.items()}
     write_atomic(home / ROBOTS_FILE, records_text(split, known))
     write_atomic(home / TOKENS_FILE, tokens_npz(split, known))
     write_atomic(home / README_FILE, readme_text(split, settings))
     single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
     sums = {name: hashlib.sha256((home / name).read_bytes()).hexdigest() for name in single}
     paths = robot_paths(split)
-    for body, one in made.items():
-        sums |= {f"{paths[body]}/{name}": value for name, value in one.hashes.items()}
+    for robot_hash, robot in made.items():
+        sums |= {f"{paths[robot_hash]}/{name}": value for name, value in robot.hashes.items()}
     write_atomic(home / SUMS_FILE, sums_text(sums))
 
 
 @contextmanager
 def _writing(home: Path) -> Iterator[None]:
-    """Say in one line that a folder cannot be written."""
+    """Convert an ``OSError`` to an error of one line."""
     try:
         yield
     except OSError as error:
-        place = error.filename or home
-        raise BenchmarkError(f"cannot write {place}: {error.strerror}") from error
+        path = error.filename or home
+        raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error

@@ -1,13 +1,13 @@
-"""A split on disk, every robot of it written: its layout, and how it is read.
+"""Read a split folder: a split with the files of all its robots, see ``split_build``.
 
 split.yaml         the split
-robots.jsonl       a line a robot, the train robots first
-tokens.npz         tokens (n, max_links, 48), mask (n, max_links), names (n,); robots as above
-robots/<name>/     a bundle: robot.urdf, robot.xml, meshes/, card.json; a body that is named
-                   twice is there once
-README.md          what is what
-build.json         how it was built
-SHA256SUMS         of all these files, written last; ``sha256sum -c`` reads it
+robots.jsonl       one line per robot, train robots first
+tokens.npz         tokens (n, max_links, 48), mask (n, max_links), names (n,), in the same order
+robots/<name>/     a bundle: robot.urdf, robot.xml, meshes/, card.json; members with the same robot
+                   share one
+README.md          description of the files
+build.json         settings of the build
+SHA256SUMS         hashes of all these files, written last, for ``sha256sum -c``
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BUILD_FILE = "build.json"
 SUMS_FILE = "SHA256SUMS"
 
 FORMAT = 1
-"""Of the layout."""
+"""Version of the folder's layout."""
 
 _SUM = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -45,7 +45,7 @@ Record = dict[str, Any]
 
 
 class Robots(Sequence[Record]):
-    """Robots as plain dictionaries.
+    """Robots as dictionaries.
 
     Keys are those of ``robots.jsonl``, and ``tokens``, shape (max_links, 48), and ``mask``, shape
     (max_links,).
@@ -65,34 +65,34 @@ class Robots(Sequence[Record]):
     @overload
     def __getitem__(self, index: slice) -> Robots: ...
     def __getitem__(self, index: int | slice) -> Record | Robots:
-        """A robot by its number, or several."""
-        found = self._records[index]
-        return Robots(found) if isinstance(found, tuple) else found
+        """Return one robot, or the robots of a slice."""
+        records = self._records[index]
+        return Robots(records) if isinstance(records, tuple) else records
 
 
 @dataclass(frozen=True, eq=False)
 class SplitFolder:
-    """A split that was built."""
+    """The content of a split folder."""
 
     folder: Path
     robots: Robots
-    """All of them. The bundle of one is ``folder / robot["path"]``."""
+    """All robots, train robots first. The bundle of a robot is ``folder / robot["path"]``."""
     tokens: NDArray[np.float64]
-    """At home, in the order of ``robots``, shape (n, max_links, 48)."""
+    """Tokens at home, in the order of ``robots``, shape (n, max_links, 48)."""
     mask: NDArray[np.bool_]
-    """Where there is a link, shape (n, max_links)."""
+    """True for the rows of tokens that are links, shape (n, max_links)."""
 
     @property
     def train(self) -> Robots:
-        """The robots to train on."""
-        return self._of("train")
+        """The train robots."""
+        return self._side("train")
 
     @property
     def test(self) -> Robots:
-        """The robots to test on."""
-        return self._of("test")
+        """The test robots."""
+        return self._side("test")
 
-    def _of(self, side: Side) -> Robots:
+    def _side(self, side: Side) -> Robots:
         return Robots([robot for robot in self.robots if robot["side"] == side])
 
     def __iter__(self) -> Iterator[Record]:
@@ -103,13 +103,13 @@ class SplitFolder:
 
 
 def load_split_folder(folder: str | Path) -> SplitFolder:
-    """Read a folder that ``morphgen split build`` wrote; bundles are not looked at.
+    """Read a folder that ``morphgen split build`` wrote, without its bundles.
 
     Args:
-        folder: Such as ``data/extrapolation/arms/reach``.
+        folder: The folder, such as ``data/extrapolation/arms/reach``.
 
     Raises:
-        BenchmarkError: If it is none, or not finished, or its parts do not go together.
+        BenchmarkError: If it is not a split folder, is not finished, or its files disagree.
     """
     folder = Path(folder)
     require_split_folder(folder)
@@ -123,10 +123,10 @@ def load_split_folder(folder: str | Path) -> SplitFolder:
 
 
 def require_split_folder(folder: Path) -> None:
-    """Require a finished build.
+    """Check that a folder is a finished split folder.
 
     Raises:
-        BenchmarkError: If the folder is none.
+        BenchmarkError: If it is not.
     """
     if not folder.is_dir():
         raise BenchmarkError(f"{folder}: no such folder")
@@ -139,10 +139,10 @@ def require_split_folder(folder: Path) -> None:
 
 
 def read_records(path: Path) -> list[Record]:
-    """The lines of ``robots.jsonl``.
+    """Read the lines of ``robots.jsonl``.
 
     Raises:
-        BenchmarkError: If it is missing, or a line is none; the message says which.
+        BenchmarkError: If the file is missing or a line is malformed; the message has its number.
     """
     records = []
     for number, line in enumerate(_text(path).splitlines(), 1):
@@ -157,10 +157,10 @@ def read_records(path: Path) -> list[Record]:
 
 
 def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.bool_]]:
-    """Names, tokens and mask of ``tokens.npz``.
+    """Read names, tokens and mask of ``tokens.npz``.
 
     Raises:
-        BenchmarkError: If it is missing, cannot be read or does not go together.
+        BenchmarkError: If it is missing or cannot be read, or the shapes of its arrays disagree.
     """
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -180,25 +180,25 @@ def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.
 
 
 def read_sums(path: Path) -> dict[str, str]:
-    """SHA-256 by path, as ``sha256sum`` writes it.
+    """Read SHA-256 hashes by path, as ``sha256sum`` writes them.
 
     Raises:
-        BenchmarkError: If it is missing, or a line is none; the message says which.
+        BenchmarkError: If the file is missing or a line is malformed; the message has its number.
     """
     sums = {}
     for number, line in enumerate(_text(path).splitlines(), 1):
-        found = _SUM.fullmatch(line)
-        if not found:
+        match = _SUM.fullmatch(line)
+        if not match:
             raise BenchmarkError(f"{path}:{number}: expected a hash, two spaces and a path")
-        sums[found[2]] = found[1]
+        sums[match[2]] = match[1]
     return sums
 
 
 def read_settings(path: Path) -> tuple[str, bool]:
-    """The id of the split that was built, and whether its robots are light, of ``build.json``.
+    """Read the id of the split, and if its robots were built light, from ``build.json``.
 
     Raises:
-        BenchmarkError: If it is missing or no such file.
+        BenchmarkError: If the file is missing or malformed.
     """
     try:
         data = parse_json(_text(path), str(path))

@@ -1,4 +1,7 @@
-"""What the files of a built split hold that are there once; made to be written or compared."""
+"""The content of the files of a split folder, except those of single robots.
+
+``split_build`` writes them; ``verify`` compares them.
+"""
 
 from __future__ import annotations
 
@@ -71,12 +74,12 @@ _LIGHT = (
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """How robots are written."""
+    """Settings of a build."""
 
     light: bool = False
-    """URDF and derivation only; meshes are named where their data packages have them."""
+    """Write only URDF and derivation; the URDF refers to the meshes of the data packages."""
     picture: bool = False
-    """Bundles with ``preview.png``."""
+    """Add ``preview.png`` to the bundles."""
 
 
 BUNDLED = BuildSettings()
@@ -84,20 +87,21 @@ BUNDLED = BuildSettings()
 
 @dataclass(frozen=True, eq=False)
 class RobotData:
-    """What is known of a body besides its folder."""
+    """The measurements and tokens of a robot."""
 
     facts: Mapping[str, object]
+    """Numbers of links and joints, reach and mass, see ``survey.RobotStats``."""
     tokens: Array
-    """Shape (n_links, 48)."""
+    """Tokens, shape (n_links, 48)."""
 
 
 def robot_data(robot: Robot, folders: Sequence[Path], max_links: int) -> RobotData:
     """Measure a robot.
 
     Args:
-        robot: The body.
+        robot: The robot.
         folders: Folders of parts, for their stored fits.
-        max_links: Of the split.
+        max_links: Largest number of links in the split.
 
     Raises:
         BenchmarkError: If the robot has more links.
@@ -107,16 +111,16 @@ def robot_data(robot: Robot, folders: Sequence[Path], max_links: int) -> RobotDa
 
 
 def unique_robots(split: Split) -> list[Member]:
-    """The first member of every body, train first; the body's folder has its name.
+    """Return the first member of each robot, train first; its name is that of the folder.
 
     Raises:
-        BenchmarkError: If two bodies have the same name.
+        BenchmarkError: If two different robots have the same name.
     """
     firsts: dict[str, Member] = {}
-    named: dict[str, str] = {}
+    hash_by_name: dict[str, str] = {}
     for _, member in sided_members(split):
         firsts.setdefault(member.robot_hash, member)
-        if named.setdefault(member.name, member.robot_hash) != member.robot_hash:
+        if hash_by_name.setdefault(member.name, member.robot_hash) != member.robot_hash:
             raise BenchmarkError(
                 f"split {split.name!r}: a train and a test robot of different bodies are both "
                 f"named {member.name!r}; rename one"
@@ -125,16 +129,16 @@ def unique_robots(split: Split) -> list[Member]:
 
 
 def robot_paths(split: Split) -> dict[str, str]:
-    """The folder of every body below the split's, by the body's hash."""
+    """Return the path of each robot's folder in the split folder, by the robot's hash."""
     return {member.robot_hash: f"{ROBOTS_DIR}/{member.name}" for member in unique_robots(split)}
 
 
 def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
-    """The lines of ``robots.jsonl``.
+    """Return the lines of ``robots.jsonl``.
 
     Args:
         split: The split.
-        known: Every body by its hash.
+        known: Data of each robot by its hash.
     """
     paths = robot_paths(split)
     return [
@@ -154,20 +158,20 @@ def records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
 
 
 def records_text(split: Split, known: Mapping[str, RobotData]) -> str:
-    """``robots.jsonl``."""
+    """Return the text of ``robots.jsonl``."""
     lines = (json.dumps(record, ensure_ascii=False) for record in records(split, known))
     return "".join(f"{line}\n" for line in lines)
 
 
 def token_tables(split: Split, known: Mapping[str, RobotData]) -> tuple[Array, NDArray[np.bool_]]:
-    """Tokens (n, max_links, 48) and mask (n, max_links) of all members."""
+    """Return tokens (n, max_links, 48) and mask (n, max_links) of all members."""
     tables = [known[member.robot_hash].tokens for _, member in sided_members(split)]
     both = [pad_tokens(table, split.max_links) for table in tables]
     return np.array([table for table, _ in both]), np.array([mask for _, mask in both])
 
 
 def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
-    """``tokens.npz``."""
+    """Return the bytes of ``tokens.npz``."""
     tables, mask = token_tables(split, known)
     content = io.BytesIO()
     np.savez(
@@ -182,7 +186,7 @@ def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
 
 
 def settings_text(split: Split, settings: BuildSettings) -> str:
-    """``build.json``: a build is only continued with the same."""
+    """Return the text of ``build.json``; a build is continued only with the same settings."""
     data = {
         "format": FORMAT,
         "split": split_id(split),
@@ -193,7 +197,7 @@ def settings_text(split: Split, settings: BuildSettings) -> str:
 
 
 def readme_text(split: Split, settings: BuildSettings) -> str:
-    """``README.md``."""
+    """Return the text of ``README.md``."""
     return _README.format(
         name=split.name,
         summary=split.summary or "(no summary)",
@@ -212,7 +216,7 @@ def readme_text(split: Split, settings: BuildSettings) -> str:
 
 
 def sums_text(sums: Mapping[str, str]) -> str:
-    """``SHA256SUMS``: hexadecimal hashes by path."""
+    """Return the text of ``SHA256SUMS`` for hexadecimal hashes by path."""
     return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
 
 

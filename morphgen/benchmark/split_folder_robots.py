@@ -1,4 +1,4 @@
-"""The folder of one robot in a built split: written, and compared with the robot."""
+"""Write the folder of one robot in a split folder, and compare it with the robot."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from morphgen.grammar.robot_set import DERIVATION, light_urdf
 from morphgen.model.robot import Robot
 
 _MESH = re.compile(r'(<mesh filename=")[^"]*"')
-_FREE = {"findings", "versions"}
-"""What of a card is not compared."""
-_RELATIVE, _ABSOLUTE = 1e-6, 1e-9
-"""How far numbers of two cards may differ: another machine may round otherwise."""
+_IGNORED_KEYS = {"findings", "versions"}
+"""Keys of a card that are not compared."""
+_REL_TOL, _ABS_TOL = 1e-6, 1e-9
+"""Tolerances of the numbers of two cards, which may be rounded on different machines."""
 
 
 def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> None:
-    """Write a robot's bundle in place of what is there; ``light``: only its URDF and derivation.
+    """Write a robot's bundle over an existing folder; ``light``: only URDF and derivation.
 
     Raises:
         FormatError: If the folder cannot be written.
@@ -52,10 +52,10 @@ def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> No
 
 
 def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
-    """What of a robot's folder is not as the robot says, a line each; none if all is.
+    """Return the differences between a robot's folder and the robot, one line each.
 
-    The URDF, but for the names of meshes, and the card, but for its findings and versions, are
-    compared with the robot; all other files with the hashes on the card.
+    The URDF (without the names of meshes) and the card (without findings and versions) are compared
+    with the robot, all other files with the hashes on the card.
     """
     if not folder.is_dir():
         return ["its folder is missing"]
@@ -63,7 +63,7 @@ def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
 
 
 def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
-    """Whether this version of morphgen would write a folder without differences again."""
+    """Test if this version of morphgen would write a folder without differences in the same way."""
     if light:
         return True
     card = read_json(folder / CARD)
@@ -72,7 +72,7 @@ def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below a folder, hexadecimal, by its path, sorted."""
+    """Return the SHA-256 of every file in a folder, hexadecimal, by its path, sorted."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
@@ -104,31 +104,33 @@ def _differences(folder: Path, robot: Robot) -> Iterator[str]:
     yield from (f"{finding.where}: {finding.why}" for finding in findings)
     card = read_json(folder / CARD)
     urdf = folder / URDF
-    if urdf.is_file() and _MESH.sub(r'\1"', urdf.read_text("utf-8", "replace")) != _nameless(robot):
+    if urdf.is_file() and _MESH.sub(
+        r'\1"', urdf.read_text("utf-8", "replace")
+    ) != _urdf_without_names(robot):
         yield f"file {URDF} is not the robot's"
     expected = json.loads(card_text(robot_card(robot, (), card["hashes"], {})))
-    for key in sorted(expected.keys() - _FREE):
+    for key in sorted(expected.keys() - _IGNORED_KEYS):
         if not same(card.get(key), expected[key]):
             yield f"file {CARD}: its {key!r} is not the robot's"
     yield from _extra(folder, (*card["hashes"], CARD, PICTURE))
 
 
-def _nameless(robot: Robot) -> str:
-    """A bundle's URDF, meshes without names."""
+def _urdf_without_names(robot: Robot) -> str:
+    """Return the URDF of a robot's bundle, with empty names of meshes."""
     return urdf_text(split_colours(robot), lambda mesh: "")
 
 
 def _extra(folder: Path, known: Iterable[str]) -> Iterator[str]:
-    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    yield from (f"file {name} does not belong to it" for name in sorted(found - set(known)))
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    yield from (f"file {name} does not belong to it" for name in sorted(names - set(known)))
 
 
 def same(a: object, b: object) -> bool:
-    """Whether two values read from JSON are the same, but for rounding."""
+    """Test if two values read from JSON are equal up to rounding."""
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
     if isinstance(a, list) and isinstance(b, list):
         return len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, float) and isinstance(b, float):
-        return math.isclose(a, b, rel_tol=_RELATIVE, abs_tol=_ABSOLUTE)
+        return math.isclose(a, b, rel_tol=_REL_TOL, abs_tol=_ABS_TOL)
     return a == b
