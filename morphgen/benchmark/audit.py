@@ -1,4 +1,4 @@
-"""What a split gives away, or promises and does not keep; and how far test is from train."""
+"""Audit a split: leaks between train and test, violated rules, and nearest train robots."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from morphgen.processes import Progress, no_progress
 
 @dataclass(frozen=True)
 class NearThresholds:
-    """Two bodies are near each other if their trees and their tokens are."""
+    """Thresholds of near duplicates: both conditions must hold."""
 
     tree: float
-    """Tree distances below it are near."""
+    """Tree distance below which two robots are near."""
     cosine: float
-    """Cosines above it are near."""
+    """Cosine of the tokens above which two robots are near."""
 
 
 NEAR_THRESHOLDS = NearThresholds(0.001, 0.99999)
-"""Sizes that differ by about one per cent, which is within what a builder calls the same.
+"""Thresholds for sizes that differ by about one per cent, which is a manufacturing tolerance.
 
-Sizes of robots of the shipped grammars, each changed by 1 %, give tree distances of 0.0002 to
-0.0011 and cosines above 0.999997; by 3 %, 0.0007 to 0.0033 and down to 0.99997. Neither is enough
-alone: the tree does not tell where along a link the next one sits, and the cosine is mostly flags
-and unit quaternions, so it hardly tells sizes.
+Changing the sizes of robots of the shipped grammars by 1 % gives tree distances of 0.0002 to 0.0011
+and cosines above 0.999997; by 3 %, distances of 0.0007 to 0.0033 and cosines down to 0.99997. Both
+measures are needed: the tree distance ignores where along a link the next one is attached, and the
+cosine depends little on sizes, because most token entries are flags and unit quaternions.
 """
 
 _FIXES = {
@@ -53,37 +53,38 @@ _FIXES = {
 
 @dataclass(frozen=True)
 class Neighbour:
-    """The train robot that a test robot is most like."""
+    """The train robot that is most similar to a test robot by one measure."""
 
     test: str
     measure: str
-    """A name in ``MEASURES``."""
+    """Name of the measure, a key of ``MEASURES``."""
     train: str
     value: float
 
 
 @dataclass(frozen=True)
 class Audit:
-    """What was found of a split."""
+    """Result of an audit."""
 
     split: str
     findings: tuple[Finding, ...]
     accepted: tuple[tuple[Finding, str], ...]
-    """Findings that the split's author knows of, each with the reason."""
+    """Findings that the split's author accepts, each with the reason."""
     neighbours: tuple[Neighbour, ...]
-    """By test robot, then measure; robots that cannot be composed have none."""
+    """Nearest train robots by test robot, then measure, without robots that cannot be composed."""
 
     def passed(self, *, strict: bool = False) -> bool:
-        """Whether no error is left that was not accepted; ``strict``: nor a warning."""
+        """Return True if there are no unaccepted errors; ``strict``: and no warnings."""
         failing = ("error", "warning") if strict else ("error",)
         return not any(finding.severity in failing for finding in self.findings)
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data for JSON."""
-        accepted = [{**each.as_dict(), "reason": reason} for each, reason in self.accepted]
+        """Return plain data for JSON."""
+        accepted = [{**finding.as_dict(), "reason": reason} for finding, reason in self.accepted]
         nearest: dict[str, dict[str, object]] = defaultdict(dict)
-        for one in self.neighbours:
-            nearest[one.test][one.measure] = {"train": one.train, "value": one.value}
+        for neighbour in self.neighbours:
+            entry = {"train": neighbour.train, "value": neighbour.value}
+            nearest[neighbour.test][neighbour.measure] = entry
         return {
             "split": self.split,
             "findings": [finding.as_dict() for finding in self.findings],
@@ -100,53 +101,61 @@ def audit(
     jobs: int = 1,
     progress: Progress = no_progress,
 ) -> Audit:
-    """Look for leaks between train and test, and for rules of the regime that are broken.
+    """Find leaks between train and test robots, and violations of the regime.
 
-    Errors: ``part-missing`` and ``body-broken`` (a robot cannot be composed), ``links-many`` (it
-    has more links than the split's ``max_links``), ``body-changed`` (it is not the one that the
-    split names), ``body-shared`` (a test robot is trained at its task),
-    ``body-near`` (nearly so, see ``Near``), ``name-shared`` (by different bodies),
-    ``similarity-bound`` (made with one that does not hold), and those of ``regime_findings``.
-    Warnings: ``body-repeated`` (on one side, at one task),
-    ``accepted-unused`` (the split accepts what is not found).
+    Errors:
+
+    - ``part-missing``, ``body-broken``: a robot cannot be composed;
+    - ``links-many``: a robot has more links than the split's ``max_links``;
+    - ``body-changed``: a robot is not the one that the split names;
+    - ``body-shared``: a test robot is a train robot of the same task;
+    - ``body-near``: a test robot is a near duplicate of one, see ``NearThresholds``;
+    - ``name-shared``: a train and a test robot with the same name are different;
+    - ``similarity-bound``: a test robot violates the bound that the split was made with;
+    - those of ``regime_findings``.
+
+    Warnings: ``body-repeated`` (a side has a robot twice at one task) and ``accepted-unused`` (the
+    split accepts a finding that does not occur).
 
     Args:
         split: The split.
-        library: Where its parts are.
-        near: When bodies are near each other.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        library: The library of parts.
+        near: Thresholds of near duplicates.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished, and of all.
 
     Raises:
-        BenchmarkError: If ``jobs`` is below 1, or what the split says of its making is malformed.
+        BenchmarkError: If ``jobs`` is below 1, or the provenance of the split is malformed.
     """
     return audit_survey(survey_split(split, library, jobs=jobs, progress=progress), library, near)
 
 
 def audit_survey(
-    found: SplitSurvey, library: Library, near: NearThresholds = NEAR_THRESHOLDS
+    survey: SplitSurvey, library: Library, near: NearThresholds = NEAR_THRESHOLDS
 ) -> Audit:
-    """The audit of a split that was surveyed; see ``audit``."""
-    split = found.split
+    """Audit a split from its survey; see ``audit``."""
+    split = survey.split
     findings = [
-        *_robot_findings(found),
-        *_leaks(found, near),
+        *_robot_findings(survey),
+        *_leaks(survey, near),
         *_repeated(split),
-        *_regime_findings(found, library),
-        *_bound_findings(found),
+        *_regime_findings(survey, library),
+        *_bound_findings(survey),
     ]
-    left = tuple(each for each in findings if each.code not in split.accepted)
-    known = tuple(
-        (each, split.accepted[each.code]) for each in findings if each.code in split.accepted
+    remaining = tuple(finding for finding in findings if finding.code not in split.accepted)
+    accepted = tuple(
+        (finding, split.accepted[finding.code])
+        for finding in findings
+        if finding.code in split.accepted
     )
     codes = {finding.code for finding in findings}
     unused = tuple(_unused(code) for code in split.accepted if code not in codes)
-    return Audit(split.name, (*left, *unused), known, tuple(_neighbours(found)))
+    return Audit(split.name, (*remaining, *unused), accepted, tuple(_neighbours(survey)))
 
 
-def _robot_findings(found: SplitSurvey) -> Iterator[Finding]:
-    """Robots that are not to be had, or not as they were."""
-    for side, member, robot in _robots(found):
+def _robot_findings(survey: SplitSurvey) -> Iterator[Finding]:
+    """Yield robots that cannot be composed, or that have changed."""
+    for side, member, robot in _robots(survey):
         if isinstance(robot, Fault):
             yield _finding(robot.code, side, member, robot.why)
         elif robot.robot_hash != member.robot_hash:
@@ -156,11 +165,11 @@ def _robot_findings(found: SplitSurvey) -> Iterator[Finding]:
             yield _finding("body-changed", side, member, why)
 
 
-def _leaks(found: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
-    """Test robots that are in train, or nearly."""
-    split = found.split
+def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
+    """Yield test robots that are train robots, or near duplicates of them."""
+    split = survey.split
     names = {member.name: member for member in split.train}
-    tree, cosine = found.by_measure("tree"), found.by_measure("cosine")
+    tree, cosine = survey.by_measure("tree"), survey.by_measure("cosine")
     for j, member in enumerate(split.test):
         rivals = [i for i, other in enumerate(split.train) if other.task == member.task]
         shared = [i for i in rivals if split.train[i].robot_hash == member.robot_hash]
@@ -170,11 +179,13 @@ def _leaks(found: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
             )
             yield _finding("body-shared", "test", member, why)
         close = (tree[:, j] < near.tree) & (cosine[:, j] > near.cosine)
-        beside = sorted((i for i in rivals if close[i] and i not in shared), key=tree[:, j].item)
-        if beside:
-            first = beside[0]
+        duplicates = sorted(
+            (i for i in rivals if close[i] and i not in shared), key=tree[:, j].item
+        )
+        if duplicates:
+            first = duplicates[0]
             why = (
-                f"train robot {_others(split, beside)} is nearly the same: tree distance "
+                f"train robot {_others(split, duplicates)} is nearly the same: tree distance "
                 f"{tree[first, j]:.2g} (below {near.tree:g}), cosine {cosine[first, j]:.6f} "
                 f"(above {near.cosine:g})"
             )
@@ -186,7 +197,7 @@ def _leaks(found: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
 
 
 def _repeated(split: Split) -> Iterator[Finding]:
-    """Robots that a side has twice."""
+    """Yield robots that a side has twice."""
     for side in SIDES:
         first: dict[tuple[object, ...], str] = {}
         for member in split.side(side):
@@ -197,28 +208,28 @@ def _repeated(split: Split) -> Iterator[Finding]:
                 yield replace(_finding("body-repeated", side, member, why), severity="warning")
 
 
-def _regime_findings(found: SplitSurvey, library: Library) -> tuple[Finding, ...]:
-    """What is against the regime, of the robots that can be composed."""
-    sound: dict[Side, list[Member]] = {"train": [], "test": []}
-    for side, member, robot in _robots(found):
+def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ...]:
+    """Return violations of the regime by the robots that can be composed."""
+    composable: dict[Side, list[Member]] = {"train": [], "test": []}
+    for side, member, robot in _robots(survey):
         if isinstance(robot, SurveyedRobot):
-            sound[side].append(member)
-    if not sound["train"]:
+            composable[side].append(member)
+    if not composable["train"]:
         return ()
-    split = replace(found.split, train=tuple(sound["train"]), test=tuple(sound["test"]))
+    split = replace(survey.split, train=tuple(composable["train"]), test=tuple(composable["test"]))
     return regime_findings(split, library)
 
 
-def _bound_findings(found: SplitSurvey) -> Iterator[Finding]:
-    """Test robots that are not as alike to train as the split was made to be."""
-    text = found.split.provenance.get("similarity")
+def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
+    """Yield test robots that violate the similarity bound that the split was made with."""
+    text = survey.split.provenance.get("similarity")
     if text is None:
         return
     try:
         bound = parse_bound(str(text))
     except BenchmarkError as error:
-        raise BenchmarkError(f"split {found.split.name!r}: made: {error}") from error
-    for member, cosines in zip(found.split.test, found.by_measure("cosine").T, strict=True):
+        raise BenchmarkError(f"split {survey.split.name!r}: made: {error}") from error
+    for member, cosines in zip(survey.split.test, survey.by_measure("cosine").T, strict=True):
         largest = max(cosines[~np.isnan(cosines)].tolist(), default=None)
         if largest is not None and not bound.holds(largest):
             why = (
@@ -228,24 +239,24 @@ def _bound_findings(found: SplitSurvey) -> Iterator[Finding]:
             yield _finding("similarity-bound", "test", member, why)
 
 
-def _neighbours(found: SplitSurvey) -> Iterator[Neighbour]:
-    train, test = found.split.train, found.split.test
+def _neighbours(survey: SplitSurvey) -> Iterator[Neighbour]:
+    train, test = survey.split.train, survey.split.test
     for j, member in enumerate(test):
         for name, measure in MEASURES.items():
-            values = found.by_measure(name)[:, j]
+            values = survey.by_measure(name)[:, j]
             if np.isnan(values).all():
                 continue
             best = np.nanargmax(values) if measure.larger_is_more_alike else np.nanargmin(values)
             yield Neighbour(member.name, name, train[best].name, float(values[best]))
 
 
-def _robots(found: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
+def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
     robots: Mapping[Side, Sequence[SurveyedRobot | Fault]] = {
-        "train": found.train,
-        "test": found.test,
+        "train": survey.train,
+        "test": survey.test,
     }
     for side in SIDES:
-        for member, robot in zip(found.split.side(side), robots[side], strict=True):
+        for member, robot in zip(survey.split.side(side), robots[side], strict=True):
             yield side, member, robot
 
 

@@ -1,4 +1,4 @@
-"""The file of a split: YAML, a robot a line, the same bytes for the same split."""
+"""Read and write split files: YAML with one line per robot, the same bytes for the same split."""
 
 from __future__ import annotations
 
@@ -57,31 +57,32 @@ _SPLIT_NAME = re.compile(r"[A-Za-z0-9][\w.-]*(?:/[A-Za-z0-9][\w.-]*)*")
 
 @dataclass(frozen=True)
 class SplitFile:
-    """What a file says, true or not."""
+    """The content of a split file; its id may be wrong."""
 
     path: Path
     split: Split
     version: str
-    """Of the morphgen that wrote it."""
+    """Version of morphgen that wrote the file."""
     id: str
-    """Of the split when it was written."""
+    """Id of the split when it was written."""
     id_line: int
+    """Line of the id in the file."""
 
     @property
     def is_whole(self) -> bool:
-        """Whether the robots are still those that the file was written with."""
+        """True if the id matches the robots: the file was not changed since it was written."""
         return self.id == split_id(self.split)
 
 
 def parse_split(text: str, path: Path) -> SplitFile:
-    """Read the text of a file.
+    """Parse the text of a split file.
 
     Args:
-        text: YAML, see ``morphgen.benchmark.split_file.split_text``.
-        path: Where it stands, for messages.
+        text: YAML, see ``split_text``.
+        path: Path of the file, for messages.
 
     Raises:
-        BenchmarkError: If it is malformed.
+        BenchmarkError: If it is malformed; the message has the line.
     """
     try:
         require_plain_yaml(text, str(path))
@@ -93,13 +94,13 @@ def parse_split(text: str, path: Path) -> SplitFile:
     except FormatError as error:
         raise BenchmarkError(str(error)) from error
     except yaml.MarkedYAMLError as error:
-        raise BenchmarkError(f"{path}{_place(error)}") from error
+        raise BenchmarkError(f"{path}{_yaml_problem(error)}") from error
     except yaml.YAMLError as error:
         raise BenchmarkError(f"{path}: invalid YAML: {error}") from error
 
 
-def _place(error: yaml.MarkedYAMLError) -> str:
-    """Line and problem, and where what was being read begins."""
+def _yaml_problem(error: yaml.MarkedYAMLError) -> str:
+    """Return line and problem of a YAML error, and the line where its context begins."""
     mark = error.problem_mark or error.context_mark
     line = f":{mark.line + 1}" if mark else ""
     began = error.context_mark.line + 1 if error.context and error.context_mark else 0
@@ -108,7 +109,7 @@ def _place(error: yaml.MarkedYAMLError) -> str:
 
 
 class _Reader:
-    """Nodes of YAML to a split."""
+    """Convert YAML nodes, which know their lines, to a split."""
 
     def __init__(self, path: Path, loader: Any) -> None:  # noqa: ANN401
         self._path, self._loader = path, loader
@@ -137,7 +138,7 @@ class _Reader:
         return BenchmarkError(f"{self._path}:{node.start_mark.line + 1}: {what}")
 
     def _require_format(self, node: Node) -> None:
-        """Tell first whether this morphgen can read the rest."""
+        """Check the version of the format before anything else."""
         if not isinstance(node, MappingNode):
             raise self._fail(node, "no split: expected 'format: 1', 'name: ...' and so on")
         for key, value in node.value:
@@ -217,7 +218,7 @@ class _Reader:
         return value
 
     def _free(self, node: Node | None, key: str) -> dict[str, object]:
-        """A mapping of anything."""
+        """Return a mapping of any content."""
         if node is None:
             return {}
         if not isinstance(node, MappingNode):
@@ -240,7 +241,7 @@ class _Reader:
 
 
 def split_names() -> list[str]:
-    """Names of the splits that come with morphgen, sorted."""
+    """Return the names of the splits that are shipped with morphgen, sorted."""
     root = _shipped()
     return sorted(
         path.relative_to(root).with_suffix("").as_posix() for path in root.rglob(f"*{SUFFIX}")
@@ -248,14 +249,14 @@ def split_names() -> list[str]:
 
 
 def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
-    """The file of a split.
+    """Return the path of a split file.
 
     Args:
-        name_or_path: A file, or the name of a split in a folder or of morphgen's own.
-        folders: Where a name is looked for first, as ``<folder>/<name>.yaml``.
+        name_or_path: A file, or the name of a split in a folder or shipped with morphgen.
+        folders: Folders that are searched first for ``<folder>/<name>.yaml``.
 
     Raises:
-        BenchmarkError: If there is none.
+        BenchmarkError: If the split does not exist.
     """
     name = str(name_or_path)
     path = Path(name)
@@ -265,20 +266,19 @@ def find_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Path:
         return path
     if _SPLIT_NAME.fullmatch(name):
         for folder in (*folders, _shipped()):
-            found = folder / f"{name}{SUFFIX}"
-            if found.is_file():
-                return found
+            candidate = folder / f"{name}{SUFFIX}"
+            if candidate.is_file():
+                return candidate
     raise BenchmarkError(
         f"{name}: no such file, and no split of this name{nearest(name, split_names())}"
     )
 
 
 def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:
-    """Read a split, by its name or file; see ``find_split``.
+    """Read a split by its name or file; see ``find_split``.
 
     Raises:
-        BenchmarkError: If there is none, the file is malformed, or its robots are not those that
-            it was written with.
+        BenchmarkError: If it does not exist, is malformed, or was changed since it was written.
     """
     read = read_split_file(find_split(name_or_path, folders))
     if not read.is_whole:
@@ -291,7 +291,7 @@ def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:
 
 
 def read_split_file(path: Path) -> SplitFile:
-    """Read a file, whether or not its id is that of its robots.
+    """Read a split file without checking its id.
 
     Raises:
         BenchmarkError: If it cannot be read or is malformed.
@@ -306,7 +306,7 @@ def read_split_file(path: Path) -> SplitFile:
 
 
 def write_split(split: Split, path: Path) -> None:
-    """Write a split's file, by way of a temporary one; its folder is made.
+    """Write a split file through a temporary file; the folder is created if needed.
 
     Raises:
         BenchmarkError: If it cannot be written.
@@ -319,10 +319,10 @@ def write_split(split: Split, path: Path) -> None:
 
 
 def split_text(split: Split) -> str:
-    """A split as the text of its file.
+    """Return the text of a split file.
 
     Raises:
-        BenchmarkError: If its name or that of a robot is none.
+        BenchmarkError: If the name of the split or of a robot is invalid.
     """
     require_split_name(split.name)
     head: dict[str, object] = {
@@ -344,7 +344,7 @@ def split_text(split: Split) -> str:
 
 
 def require_split_name(name: str) -> None:
-    """Require that a name can be a file's.
+    """Check that the name of a split can be a file's name.
 
     Raises:
         BenchmarkError: If it cannot.
@@ -371,7 +371,7 @@ def _block(key: str, value: Mapping[str, object]) -> str:
 
 
 def _plain_data(value: object) -> object:
-    """Mappings and sequences of any kind as those that YAML knows."""
+    """Convert mappings and sequences of any type to dictionaries and lists."""
     if isinstance(value, Mapping):
         return {str(key): _plain_data(each) for key, each in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -389,7 +389,7 @@ def _member_line(member: Member) -> str:
 
 
 def _pair(key: str, value: object) -> str:
-    """Text bare where every reader of YAML takes it for text, else as JSON writes it."""
+    """Return ``key: value``; text is quoted if a YAML reader could take it for another type."""
     plain = isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS
     return (
         f"{key}: {value if plain and key not in _QUOTED else json.dumps(value, ensure_ascii=False)}"

@@ -1,4 +1,4 @@
-"""Whether a split, as a file or with all its robots built, is the one that it claims to be."""
+"""Verify that a split file or split folder matches the robots that its derivations give today."""
 
 from __future__ import annotations
 
@@ -38,25 +38,25 @@ from morphgen.grammar.library import Library
 from morphgen.processes import Progress, no_progress, parallel_map
 
 FITTED_TOLERANCE = 1e-3
-"""How far the numbers of a link's primitive may be off: it may have been sought anew, here."""
+"""Tolerance of the token numbers of a link's primitive, which may be fitted on this machine."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Something that is not as it should be."""
+    """One difference between a split and its robots."""
 
     where: str
-    """The robot's name, or a file."""
+    """Name of the robot, or of a file."""
     why: str
 
 
 @dataclass(frozen=True)
-class Verified:
-    """What was found of a split."""
+class Verification:
+    """Result of a verification."""
 
     split: Split
     id: str
-    """As its robots give it."""
+    """Id of the split, computed from its robots."""
     differences: tuple[Difference, ...]
 
 
@@ -66,20 +66,20 @@ def verify(
     *,
     jobs: int = 1,
     progress: Progress = no_progress,
-) -> Verified:
-    """Compare a split with what its derivations give today.
+) -> Verification:
+    """Compare a split with the robots that its derivations give today.
 
-    Of a file the id and the hash of every body are tested; of a folder that ``build`` wrote, also
-    every file, against ``SHA256SUMS`` and against the robot that its derivation gives.
+    The id of the split and the hash of each robot are tested. In a split folder every file is
+    compared with ``SHA256SUMS`` and with the robot that its derivation gives, too.
 
     Args:
-        name_or_path: A split's name or file, or a built folder.
-        library: Where the parts are.
-        jobs: Processes.
-        progress: Told how many robots are done, again and again.
+        name_or_path: Name or file of a split, or a split folder.
+        library: The library of parts.
+        jobs: Number of processes.
+        progress: Receives the number of robots that are finished, and of all.
 
     Raises:
-        BenchmarkError: If there is no such split, or it cannot be read at all.
+        BenchmarkError: If the split does not exist or cannot be read.
     """
     folder = Path(name_or_path)
     is_built = folder.is_dir()
@@ -87,35 +87,35 @@ def verify(
         require_split_folder(folder)
     path = folder / SPLIT_FILE if is_built else find_split(name_or_path)
     read = read_split_file(path)
-    own = split_id(read.split)
-    found = []
-    if read.id != own:
-        found.append(Difference(str(path), f"its id is {read.id}, but that of its robots is {own}"))
+    computed_id = split_id(read.split)
+    differences = []
+    if read.id != computed_id:
+        why = f"its id is {read.id}, but that of its robots is {computed_id}"
+        differences.append(Difference(str(path), why))
     if is_built:
-        found += _built_differences(folder, read.split, library, jobs, progress)
+        differences += _folder_differences(folder, read.split, library, jobs, progress)
     else:
-        seen = _seen(
-            read.split, _Examination(library.folders, read.split.max_links), jobs, progress
-        )
-        found += _robot_differences(read.split, seen)
-    return Verified(read.split, own, tuple(found))
+        inspector = _Inspector(library.folders, read.split.max_links)
+        inspected = _inspect(read.split, inspector, jobs, progress)
+        differences += _robot_differences(read.split, inspected)
+    return Verification(read.split, computed_id, tuple(differences))
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What a worker finds of a robot."""
+class _Inspection:
+    """Result of inspecting a robot: its differences and, in a split folder, its data."""
 
-    whys: tuple[str, ...]
-    body: RobotData | None = None
+    differences: tuple[str, ...]
+    data: RobotData | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class _Examination:
-    """How a worker composes a robot, and looks at its folder in a built split if there is one."""
+class _Inspector:
+    """Compose a member, and compare it with its folder; sent to worker processes."""
 
     folders: tuple[Path, ...]
     max_links: int
-    built: Path | None = None
+    split_folder: Path | None = None
     light: bool = False
     paths: Mapping[str, str] = field(default_factory=dict)
 
@@ -123,36 +123,39 @@ class _Examination:
     def library(self) -> Library:
         return Library(self.folders)
 
-    def __call__(self, member: Member) -> _Seen:
+    def __call__(self, member: Member) -> _Inspection:
         try:
             robot = compose_member(member, self.library)
-            if self.built is None:
-                return _Seen(())
-            folder = self.built / self.paths[member.robot_hash]
-            named_so = folder.name == member.name
-            whys = differences(folder, robot, light=self.light) if named_so else []
-            return _Seen(tuple(whys), robot_data(robot, self.folders, self.max_links))
+            if self.split_folder is None:
+                return _Inspection(())
+            folder = self.split_folder / self.paths[member.robot_hash]
+            # Members with the same robot share the folder of the first one, which is compared.
+            is_first = folder.name == member.name
+            lines = differences(folder, robot, light=self.light) if is_first else []
+            return _Inspection(tuple(lines), robot_data(robot, self.folders, self.max_links))
         except MorphgenError as error:
-            return _Seen((str(error),))
+            return _Inspection((str(error),))
 
 
-def _seen(
-    split: Split, look: _Examination, jobs: int, progress: Progress
-) -> dict[tuple[str, str], _Seen]:
-    """What is found of the robots, by derivation and hash."""
+def _inspect(
+    split: Split, inspector: _Inspector, jobs: int, progress: Progress
+) -> dict[tuple[str, str], _Inspection]:
+    """Inspect each different robot once; return the results by derivation and hash."""
     members = [member for _, member in reversed(sided_members(split))]
     firsts = {(member.derivation, member.robot_hash): member for member in members}
-    found = parallel_map(look, list(firsts.values()), jobs, progress)
-    return dict(zip(firsts, found, strict=True))
+    inspections = parallel_map(inspector, list(firsts.values()), jobs, progress)
+    return dict(zip(firsts, inspections, strict=True))
 
 
-def _robot_differences(split: Split, seen: Mapping[tuple[str, str], _Seen]) -> Iterator[Difference]:
+def _robot_differences(
+    split: Split, inspected: Mapping[tuple[str, str], _Inspection]
+) -> Iterator[Difference]:
     for _, member in sided_members(split):
-        for why in seen[member.derivation, member.robot_hash].whys:
+        for why in inspected[member.derivation, member.robot_hash].differences:
             yield Difference(member.name, why)
 
 
-def _built_differences(
+def _folder_differences(
     folder: Path, split: Split, library: Library, jobs: int, progress: Progress
 ) -> Iterator[Difference]:
     id_, light = read_settings(folder / BUILD_FILE)
@@ -165,39 +168,46 @@ def _built_differences(
         return
     files = list(_file_differences(folder))
     yield from files
-    look = _Examination(library.folders, split.max_links, folder, light, paths)
-    seen = _seen(split, look, jobs, progress)
-    told = {difference.where for difference in files}
-    yield from (each for each in _robot_differences(split, seen) if each.where not in told)
-    known = {body: one.body for (_, body), one in seen.items() if one.body is not None}
+    inspector = _Inspector(library.folders, split.max_links, folder, light, paths)
+    inspected = _inspect(split, inspector, jobs, progress)
+    # A changed file explains the differences of its robot.
+    explained = {difference.where for difference in files}
+    for difference in _robot_differences(split, inspected):
+        if difference.where not in explained:
+            yield difference
+    known = {
+        robot_hash: inspection.data
+        for (_, robot_hash), inspection in inspected.items()
+        if inspection.data is not None
+    }
     if known.keys() >= paths.keys():
         yield from _record_differences(folder / ROBOTS_FILE, split, known)
         yield from _token_differences(folder / TOKENS_FILE, split, known)
 
 
 def _file_differences(folder: Path) -> Iterator[Difference]:
-    """Files that are not as ``SHA256SUMS`` says; those of a robot are told by its name."""
+    """Yield files that differ from ``SHA256SUMS``; a file of a robot is listed under its name."""
     expected = read_sums(folder / SUMS_FILE)
-    found = hashes(folder)
-    for name in sorted((expected.keys() | found.keys()) - {SUMS_FILE}):
-        if name not in found:
+    actual = hashes(folder)
+    for name in sorted((expected.keys() | actual.keys()) - {SUMS_FILE}):
+        if name not in actual:
             why = f"is missing, but {SUMS_FILE} names it"
         elif name not in expected:
             why = f"is not named by {SUMS_FILE}"
-        elif found[name] != expected[name]:
+        elif actual[name] != expected[name]:
             why = f"is not what {SUMS_FILE} was written for"
         else:
             continue
-        place, _, below = name.partition("/")
-        robot, _, file = below.partition("/")
-        where, told = (robot, file) if place == ROBOTS_DIR and file else (name, name)
-        yield Difference(where, f"file {told} {why}")
+        parent, _, rest = name.partition("/")
+        robot, _, file = rest.partition("/")
+        where, path = (robot, file) if parent == ROBOTS_DIR and file else (name, name)
+        yield Difference(where, f"file {path} {why}")
 
 
 def _record_differences(
     path: Path, split: Split, known: Mapping[str, RobotData]
 ) -> Iterator[Difference]:
-    """Lines of ``robots.jsonl`` that are not as the robots are."""
+    """Yield entries of ``robots.jsonl`` that differ from the robots."""
     try:
         found = read_records(path)
     except BenchmarkError as error:
@@ -218,7 +228,7 @@ def _record_differences(
 def _token_differences(
     path: Path, split: Split, known: Mapping[str, RobotData]
 ) -> Iterator[Difference]:
-    """Rows of ``tokens.npz`` that are not as the robots are."""
+    """Yield robots whose rows of ``tokens.npz`` differ from their tokens."""
     try:
         names, tokens, mask = read_tokens(path)
     except BenchmarkError as error:
@@ -229,14 +239,16 @@ def _token_differences(
     if names != expected or tokens.shape != wanted.shape:
         yield Difference(path.name, f"it is not of the {len(expected)} robots of {SPLIT_FILE}")
         return
-    apart = np.abs(tokens - wanted)
+    errors = np.abs(tokens - wanted)
     for shape in (GEOMETRY, SHAPE_POSE):
-        apart[..., shape.columns] *= TOLERANCE / FITTED_TOLERANCE
+        errors[..., shape.columns] *= TOLERANCE / FITTED_TOLERANCE
     for i, name in enumerate(expected):
         if (mask[i] != wanted_mask[i]).any():
             yield Difference(name, f"{path.name}: its mask is not that of its links")
-        lost = ~(apart[i] <= TOLERANCE)
-        if lost.any():
-            link, column = np.argwhere(lost)[0].tolist()
-            what = next(each for each in LAYOUT if column < each.columns.stop)
-            yield Difference(name, f"{path.name}: {what.name} of link {link} is not the robot's")
+        wrong = ~(errors[i] <= TOLERANCE)  # NaN is wrong, too
+        if wrong.any():
+            link, column = np.argwhere(wrong)[0].tolist()
+            token_field = next(entry for entry in LAYOUT if column < entry.columns.stop)
+            yield Difference(
+                name, f"{path.name}: {token_field.name} of link {link} is not the robot's"
+            )
