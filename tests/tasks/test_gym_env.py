@@ -20,6 +20,7 @@ from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import default_simulator
 from morphgen.tasks.sim.base import Contacts
 
 STEPS = 8
@@ -319,3 +320,27 @@ def test_wrong_options_are_refused(task, options, error, says, cache):
     given = {"robot": "arm3-stick", "config": config, "cache": cache} | options
     with pytest.raises(error, match=says):
         TaskEnv(task, **given)
+
+
+def test_mujoco_is_the_default_where_pybullet_is_missing(cache):
+    code = (
+        "import sys; from pathlib import Path; sys.modules['pybullet'] = None\n"
+        "import gymnasium, morphgen.tasks\n"
+        "from morphgen.tasks.reach.config import ReachConfig\n"
+        "options = {'cache': Path(sys.argv[1]), 'config': ReachConfig(num_goals=5)}\n"
+        "for _ in range(2):\n"
+        "    env = gymnasium.make('morphgen/Reach-v0', robot='arm3-stick', **options)\n"
+        "    print(type(env.unwrapped.batch.simulation).__name__)\n"
+        "    env.reset(seed=0); env.close()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(cache)], check=True, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["MujocoSimulation"] * 2
+    warning = "PyBullet is not installed; using simulator MuJoCo"
+    assert [line for line in done.stderr.splitlines() if "PyBullet" in line] == [warning]
+
+
+def test_pybullet_is_the_default_where_it_is_installed():
+    pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+    assert default_simulator() == "pybullet"

@@ -20,7 +20,8 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sb3 import sb3_vector
-from morphgen.tasks.vector import TaskVector
+from morphgen.tasks.task import BOUND, ObservationField
+from morphgen.tasks.vector import TaskVector, observation_space
 
 ROBOTS, TASKS = ["arm3-stick", "prims"], ["reach", "push"]
 REACH, PUSH = (
@@ -231,3 +232,19 @@ def test_gymnasium_makes_vectors_of_several_robots(cache):
         envs.step(envs.action_space.sample())
     with pytest.raises(TaskError, match="these environments are closed"):
         envs.reset()
+
+
+def test_goal_sampling_reports_its_progress(cache):
+    calls = []
+    options = {"sim": "mujoco", "configs": (REACH,), "cache": cache}
+    batch = make_batch("reach", ROBOTS, 2, progress=lambda *call: calls.append(call), **options)
+    batch.close()
+    assert calls == [(0, 2), (1, 2), (2, 2)]
+
+
+def test_spaces_have_the_bounds_that_tasks_declare():
+    values = {"speed": np.zeros((3, 2), np.float32), "goal": np.zeros((3, 7), np.float32)}
+    fields = (ObservationField("speed", 2, "speed_mask", low=0.0, high=5.0),)
+    space = observation_space(values, fields)
+    assert (space["speed"].low.min(), space["speed"].high.max()) == (0.0, 5.0)
+    assert (space["goal"].low.min(), space["goal"].high.max()) == (-BOUND, BOUND)
