@@ -116,7 +116,7 @@ def test_a_xacro_takes_arguments(tmp_path):
             {"root_link": "slider", "tool": "base"},
             "tool 'base' is not below the root link 'slider'",
         ),
-        ({"args": {"length": "1"}}, "xacro arguments length for a file that is no xacro"),
+        ({"args": {"length": "1"}}, "xacro arguments length for a file that is not a xacro"),
     ],
 )
 def test_what_the_file_does_not_have_is_refused(urdf, options, message):
