@@ -101,7 +101,7 @@ def test_what_the_page_pins_can_be_pinned():
 
 
 def test_the_index_has_the_facts_that_the_page_names(tmp_path):
-    (row,) = re.findall(r"\| `index\.jsonl` \| a line a robot: (.*?) \|", PAGE)
+    (row,) = re.findall(r"\| `index\.jsonl` \| one line per robot: (.*?) \|", PAGE)
     named = set(row.replace("rejected draws", "rejected").split(", "))
     plan = SetConfig(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())
     make_set(plan, 1, make_serially)
