@@ -15,6 +15,7 @@ from morphgen.cli.progress import TrainingProgress
 from morphgen.cli.train import SIDES, SPLIT_HELP, require_split_for_options, robots_to_train
 from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
+from morphgen.tasks.registry import default_simulator
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
@@ -83,7 +84,6 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
-    from morphgen.tasks.registry import default_simulator
 
     name = args.checkpoint
     if not args.words:

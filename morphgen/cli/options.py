@@ -67,8 +67,8 @@ TASK_NAMES = f"{', '.join(TASKS.builtin)}, or a task of an installed package"
 TASK = option("task", choices=TASKS, metavar="TASK", help=TASK_NAMES)
 
 
-def sim_option(default: str = "pybullet, or mujoco where it is not installed") -> Option:
-    """Return the option ``--sim``, None by default: the command decides what ``default`` says."""
+def sim_option(default: str = "pybullet if installed, else mujoco") -> Option:
+    """Return the option ``--sim``; its value is None if it is not given."""
     names = f"{', '.join(SIMULATORS.builtin)}, or a simulator of an installed package"
     return option(
         "--sim",

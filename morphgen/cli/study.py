@@ -14,6 +14,7 @@ from morphgen.cli.progress import training_progress
 from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
+from morphgen.tasks.registry import default_simulator
 
 if TYPE_CHECKING:
     from morphgen.rl.study import Cell
@@ -80,7 +81,6 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
     from morphgen.rl.training import require_device, require_runnable, subruns_of
     from morphgen.tasks.env_specs import default_configs
-    from morphgen.tasks.registry import default_simulator
 
     if args.gpus is not None and args.ray is None:
         raise TaskError(f"--gpus {args.gpus:g} goes with --ray; without it, say --device cuda")

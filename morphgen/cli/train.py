@@ -13,7 +13,7 @@ from morphgen.cli.command import Option, command, flag, number, option, path_opt
 from morphgen.cli.progress import status, training_progress
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.rl.agents import AGENTS
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import TASKS, default_simulator
 
 if TYPE_CHECKING:
     from morphgen.rl.agent_spec import AgentSpec
@@ -265,7 +265,6 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     from morphgen.rl.agent_spec import configs_of, parse_constants
     from morphgen.rl.robot_source import tasks_of
     from morphgen.rl.runs import RunConfig
-    from morphgen.tasks.registry import default_simulator
 
     changes = {**parse_constants(args.set), "bf16": args.bf16, "compile": args.compile}
     policy, ppo = configs_of(spec, tasks_of(source), changes, args.steps)
