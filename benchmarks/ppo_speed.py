@@ -297,7 +297,7 @@ class _RandomBatch:
 
     def __init__(self, envs: int, device: str) -> None:
         self.num_envs, self.device = envs, torch.device(device)
-        self.body = torch.arange(envs, device=device) % ROBOTS
+        self.env_robot_index = torch.arange(envs, device=device) % ROBOTS
         generator = torch.Generator(device).manual_seed(0)
 
         def drawn(*shape: int) -> torch.Tensor:

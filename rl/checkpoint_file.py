@@ -1,7 +1,7 @@
-"""Checkpoint files: written with a hash of their content, and read without trust in it.
+"""Checkpoint files: written with a hash of their content, and read as untrusted data.
 
-``torch.load`` with ``weights_only`` runs no code of a file. What is here bounds what it may
-allocate before it is called, and what its result may be.
+``torch.load`` with ``weights_only`` runs no code of a file. This module bounds what it may
+allocate before it is called, and checks its result.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from morphgen.errors import TaskError
 _log = logging.getLogger(__name__)
 
 HASH = "sha256"
-"""Where a checkpoint holds the hash of all else in it; those of older versions have none."""
+"""Key of the hash of all other content; checkpoints of older versions have none."""
 MAX_BYTES = 512 * 2**20
-"""Size of a checkpoint's file, and of its tensors together [bytes]."""
+"""Largest size of a checkpoint's file, and of its tensors together [bytes]."""
 MAX_INDEX_BYTES = 32 * 2**20
-"""Size of what a checkpoint holds beside the numbers of its tensors [bytes]."""
+"""Largest size of a checkpoint without the numbers of its tensors [bytes]."""
 MAX_INSTRUCTIONS = 2_000_000
-"""Instructions of that part of the file; a run of 1,000 environments has about 60,000."""
+"""Most pickle instructions of that part; a run of 1,000 environments has about 60,000."""
 MAX_VALUES = 1_000_000
-"""Numbers, texts, tensors and containers of a checkpoint."""
+"""Most numbers, texts, tensors and containers in a checkpoint."""
 MAX_LEVELS = 20
-"""Levels of containers in containers."""
+"""Most levels of nested containers."""
 MAX_INTEGER_BITS = 256
-"""The states of random generators have 128."""
+"""Most bits of an integer; the states of random generators have 128."""
 _GLOBALS = frozenset(
     {"collections OrderedDict", "torch._utils _rebuild_tensor_v2"}
     | {f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16")}
     | {f"torch {kind}Storage" for kind in ("Long", "Int", "Short", "Char", "Byte", "Bool")}
 )
-"""All that a checkpoint of morphgen names of Python; torch itself would allow some that allocate
-what a file asks for, such as ``bytearray``."""
+"""All Python objects that a checkpoint of morphgen names. torch itself would also allow some that
+allocate as much as a file asks for, such as ``bytearray``."""
 
 
 def packed(content: Mapping[str, Any], where: str) -> bytes:
-    """The bytes of a checkpoint's file, with its hash.
+    """Return the bytes of a checkpoint's file, with its hash.
 
     Raises:
         TaskError: If a number of the content is not finite, or it is beyond a limit.
@@ -61,11 +61,11 @@ def packed(content: Mapping[str, Any], where: str) -> bytes:
 
 
 def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
-    """The content of a checkpoint's file without its hash, and whether it has one.
+    """Return the content of a checkpoint's file without its hash, and whether it has one.
 
     Raises:
-        TaskError: If it is no such file, is damaged or beyond a limit, or a number in it is not
-            finite.
+        TaskError: If the file is not a checkpoint, is damaged or beyond a limit, or a number in it
+            is not finite.
     """
     try:
         _require_container(file)
@@ -102,7 +102,7 @@ def unpacked(file: Path) -> tuple[dict[str, Any], bool]:
 
 @cache
 def warn_of_no_hash(file: Path) -> None:
-    """Warn once a file."""
+    """Warn once per file."""
     _log.warning(
         "morphgen: %s has no hash, as those of older versions: damage to it would not be noticed",
         file,
@@ -141,10 +141,10 @@ def _require_container(file: Path) -> None:
 
 
 def _require_plain(content: object, where: str) -> None:
-    """Require that a content is of plain containers, finite numbers and dense tensors alone.
+    """Require that the content has plain containers, finite numbers and dense tensors only.
 
     Raises:
-        TaskError: If it is not; or is beyond a limit.
+        TaskError: If it has others, or is beyond a limit.
     """
     total = 0
     for count, (path, value) in enumerate(_walked(content, where)):
@@ -163,7 +163,7 @@ def _require_plain(content: object, where: str) -> None:
 
 
 def _walked(content: object, where: str) -> Iterator[tuple[str, object]]:
-    """Every value of nested containers, with its path."""
+    """Yield every value of nested containers, with its path."""
     left: list[tuple[str, object, int]] = [("", content, 0)]
     while left:
         path, value, level = left.pop()
@@ -184,7 +184,7 @@ def _walked(content: object, where: str) -> Iterator[tuple[str, object]]:
 
 
 def _require_tensor(tensor: torch.Tensor, where: str, path: str) -> int:
-    """The bytes of a tensor, which is one of plain numbers, all finite."""
+    """Require a dense tensor of finite numbers in main memory; return its size [bytes]."""
     plain = type(tensor) is torch.Tensor and tensor.device.type == "cpu"
     if not plain or tensor.layout != torch.strided or tensor.is_quantized:
         raise TaskError(f"{where}: {path} is not a dense tensor in main memory")
@@ -198,37 +198,37 @@ def _require_tensor(tensor: torch.Tensor, where: str, path: str) -> int:
 
 
 def _digest(content: object) -> str:
-    """SHA-256 of a content, hexadecimal; it does not depend on the order of keys."""
-    found = hashlib.sha256()
-    _add(found, content)
-    return found.hexdigest()
+    """Return the hexadecimal SHA-256 of a content; the order of keys does not matter."""
+    digest = hashlib.sha256()
+    _add(digest, content)
+    return digest.hexdigest()
 
 
-def _add(found: hashlib._Hash, value: object) -> None:
+def _add(digest: hashlib._Hash, value: object) -> None:
     if isinstance(value, torch.Tensor):
-        found.update(f"t{value.dtype}{tuple(value.shape)}".encode())
+        digest.update(f"t{value.dtype}{tuple(value.shape)}".encode())
         flat = value.detach().cpu().contiguous().reshape(-1)
-        found.update(flat.view(torch.uint8).numpy().tobytes())
+        digest.update(flat.view(torch.uint8).numpy().tobytes())
     elif isinstance(value, dict):
-        found.update(f"d{len(value)};".encode())
+        digest.update(f"d{len(value)};".encode())
         for key in sorted(value, key=lambda key: (isinstance(key, str), key)):
-            _add(found, key)
-            _add(found, value[key])
+            _add(digest, key)
+            _add(digest, value[key])
     elif isinstance(value, list | tuple):
-        found.update(f"l{len(value)};".encode())
-        for each in value:
-            _add(found, each)
+        digest.update(f"l{len(value)};".encode())
+        for item in value:
+            _add(digest, item)
     elif isinstance(value, str):
         text = value.encode("utf-8", "surrogatepass")
-        found.update(f"s{len(text)};".encode() + text)
+        digest.update(f"s{len(text)};".encode() + text)
     elif isinstance(value, float):
-        found.update(b"f" + struct.pack(">d", value))
+        digest.update(b"f" + struct.pack(">d", value))
     else:
-        found.update(f"{type(value).__name__}{value};".encode())
+        digest.update(f"{type(value).__name__}{value};".encode())
 
 
 def _copied(value: object) -> object:
-    """A content with tensors of its own, which no longer need the file."""
+    """Return a copy of a content whose tensors no longer need the file."""
     if isinstance(value, torch.Tensor):
         return value.detach().clone()
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Functions of tensors as they are called: in bfloat16, by ``torch.compile``, as CUDA graphs."""
+"""Run functions of tensors in bfloat16, by ``torch.compile``, and as CUDA graphs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 
 from morphgen.errors import TaskError
 
-KINDS = 64
-"""Of functions and shapes, that a process may compile."""
+MAX_COMPILED = 64
+"""Functions and input shapes that a process may compile."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -19,17 +19,17 @@ T = TypeVar("T")
 def prepared(
     function: Callable[P, T], device: torch.device, *, bf16: bool, compiled: bool
 ) -> Callable[P, T]:
-    """A function ready to be called.
+    """Return a function that runs another one in bfloat16, or compiled.
 
-    On a GPU what is compiled is a CUDA graph: a gradient step of a small network is hundreds of
-    kernels, and starting them one by one takes longer than what they do. What a graph returns is
-    overwritten when the next is called; who keeps it copies it.
+    On a GPU the compiled function is a CUDA graph: a gradient step of a small network is hundreds
+    of kernels, and to launch them one by one takes longer than they run. The next call of any graph
+    overwrites what a graph returned; copy results that you keep.
 
     Args:
-        function: A network, or what calls networks; its tensors are on the device.
-        device: Where it is called.
-        bf16: Whether products are in bfloat16, by autocast.
-        compiled: Whether ``torch.compile`` makes it.
+        function: A network, or a function that calls networks.
+        device: Device of the function's tensors.
+        bf16: Compute matrix products in bfloat16, by autocast.
+        compiled: Compile the function by ``torch.compile``.
     """
     graphs = compiled and device.type == "cuda"
     inner = _compiled(function, graphs) if compiled else function
@@ -44,15 +44,15 @@ def prepared(
 
 
 def _compiled(function: Callable[P, T], graphs: bool) -> Callable[P, T]:
-    """By ``torch.compile``, however many kinds of functions a process has compiled before.
+    """Return the function compiled by ``torch.compile``.
 
-    torch gives up after eight kinds and shapes, which four learners of a study are. Calls raise
-    TaskError where torch cannot compile, such as without a compiler of C++ on a CPU.
+    By default torch stops compiling after eight functions and shapes; four learners of a study have
+    as many. Calls raise TaskError if torch cannot compile, for example without a C++ compiler.
     """
     from torch._dynamo import config  # takes a second to load
     from torch._dynamo.exc import TorchDynamoException
 
-    config.recompile_limit = max(config.recompile_limit, KINDS)
+    config.recompile_limit = max(config.recompile_limit, MAX_COMPILED)
     mode = "reduce-overhead" if graphs else None
     compiled = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
 

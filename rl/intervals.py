@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import bootstrap, trim_mean
 
 LEVEL = 0.95
-"""Of the intervals."""
+"""Confidence level of the intervals."""
 RESAMPLES = 2000
 TRIM = 0.25
-"""Share that the interquartile mean leaves away at each end."""
+"""Fraction that the interquartile mean leaves out at each end."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An average, and where it is in 95 of 100 resamples; nan if there is nothing to resample."""
+    """An average with its bootstrap interval; the ends are nan if there is only one sample."""
 
     value: float
     low: float
@@ -31,45 +31,41 @@ class Interval:
 
 
 def mean_interval(samples: ArrayLike) -> Interval:
-    """Mean of independent samples, shape (k,).
+    """Return the mean of independent samples, shape (k,).
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there are no samples.
     """
     values = _table(samples, 1)
-    found = float(values.mean())
+    mean = float(values.mean())
     if len(values) < 2:
-        return Interval(found, math.nan, math.nan)
-    return _interval(found, (values,), np.mean, paired=False)
+        return Interval(mean, math.nan, math.nan)
+    return _interval(mean, (values,), np.mean, paired=False)
 
 
 def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
-    """Interquartile mean of all scores, with an interval by the stratified bootstrap over seeds.
+    """Return the interquartile mean of all scores, with a stratified bootstrap over seeds.
 
-    Robots are the strata: every resample has as many scores of each robot as there are.
+    Robots are the strata: every resample has as many scores of each robot as the original.
 
     Args:
-        scores: Of runs with as many seeds on robots, shape (seeds, robots).
-        together: Whether a seed's scores come of one policy, so that seeds are drawn whole; else
-            those of each robot are drawn by themselves.
+        scores: Scores of every seed on every robot, shape (seeds, robots).
+        together: Resample whole seeds, as the scores of a seed come from one policy; otherwise
+            resample the scores of each robot independently.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there are no scores.
     """
     table = _table(scores, 2)
-    found = _iqm(table.ravel())
+    iqm = float(trim_mean(table.ravel(), TRIM))
     if len(table) < 2:
-        return Interval(found, math.nan, math.nan)
+        return Interval(iqm, math.nan, math.nan)
 
     def statistic(*strata: NDArray[Any], axis: int = -1) -> NDArray[Any]:
         values: NDArray[Any] = trim_mean(np.concatenate(strata, axis=axis), TRIM, axis=axis)
         return values
 
-    return _interval(found, tuple(table.T), statistic, paired=together)
-
-
-def _iqm(values: NDArray[np.float64]) -> float:
-    return float(trim_mean(values, TRIM))
+    return _interval(iqm, tuple(table.T), statistic, paired=together)
 
 
 def _interval(
@@ -81,7 +77,7 @@ def _interval(
 ) -> Interval:
     if all(np.ptp(sample) == 0 for sample in samples):
         return Interval(value, value, value)
-    found = bootstrap(
+    interval = bootstrap(
         samples,
         statistic,
         paired=paired,
@@ -91,7 +87,7 @@ def _interval(
         method="percentile",
         random_state=np.random.default_rng(0),
     ).confidence_interval
-    return Interval(value, float(found.low), float(found.high))
+    return Interval(value, float(interval.low), float(interval.high))
 
 
 def _table(values: ArrayLike, axes: int) -> NDArray[np.float64]:
