@@ -12,11 +12,9 @@ from itertools import combinations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from lxml import etree
 from numpy.typing import ArrayLike
 
 from morphgen.errors import RobotError
-from morphgen.formats.mjcf import MJCF_COMPILER
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
 from morphgen.model.tree import RigidGroup, rigid_groups
@@ -248,7 +246,9 @@ def _pairs(names: Iterable[str]) -> Iterator[Pair]:
 def _compile(robot: Robot, ignore: Iterable[Pair]) -> mujoco.MjModel:
     """Compile a model of collision shapes and joints only; bodies are named by link index."""
     import mujoco
+    from lxml import etree
 
+    from morphgen.formats.mjcf import MJCF_COMPILER
     from morphgen.formats.mjcf_elements import (
         Meshes,
         geom_attributes,
