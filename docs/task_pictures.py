@@ -1,8 +1,8 @@
-"""Draw reach and push of three bodies: docs/images/tasks/{reach,push}.png, a row a body.
+"""Draw reach and push of three robots: docs/images/tasks/{reach,push}.png, a row for each robot.
 
     python docs/task_pictures.py [--seed 1]
 
-Five moments of an episode of inverse kinematics, or of the scripted push, in PyBullet.
+A row shows five frames of an episode of the task's first baseline, in the default simulator.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
 
 ROBOTS = ("ur5-plane", "prims", "chain beads=3")
-MOMENTS = 5
+FRAMES = 5
 SIZE = (320, 240)
 
 
 def main() -> int:
-    """Play and draw."""
+    """Draw the pictures of all tasks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
@@ -44,11 +44,11 @@ def main() -> int:
 
 def _row(task: str, robot: str, seed: int) -> np.ndarray:
     with closing(TaskEnv(task, robot, render_mode="rgb_array", size=SIZE)) as env:
-        acting = make_controller(baselines_for(task)[0], env, seed)
-        frames = list(play(env, acting, 1, seed, lambda episode: print(robot, episode)))
-    # An episode that success does not end is over long before its time is.
+        controller = make_controller(baselines_for(task)[0], env, seed)
+        frames = list(play(env, controller, 1, seed, lambda episode: print(robot, episode)))
+    # A push ends with success; a reach is stationary after a quarter of its time.
     last = len(frames) if TASKS[task].target == "line" else len(frames) // 4
-    chosen = np.linspace(0, last - 1, MOMENTS).round().astype(int)
+    chosen = np.linspace(0, last - 1, FRAMES).round().astype(int)
     return np.concatenate([frames[i] for i in chosen], axis=1)
 
 

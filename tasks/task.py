@@ -317,12 +317,14 @@ class Task(ABC, Generic[C, G]):
         """
 
     @abstractmethod
-    def make_envs(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> TaskEnvs:
+    def make_envs(
+        self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int
+    ) -> TaskEnvs:
         """Make the environments of a batch that are at this task.
 
         Args:
-            specs: Kinds of environments, all at this task.
-            spec: Index of each environment's kind, shape (k,), int64, on the batch's device.
+            specs: Specifications of environments, all at this task.
+            env_spec_index: Index in ``specs`` of each environment, shape (k,), int64.
             num_joints: Independent joints of a row, padding included, J.
         """
 

@@ -19,17 +19,23 @@ from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
 class PushEnvs(TaskEnvs):
     """Environments that push the blocks of their robots' push sets."""
 
-    def __init__(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> None:
+    def __init__(
+        self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int
+    ) -> None:
         """Set up with the line at its final position; arguments as of ``Task.make_envs``."""
         self._config: PushConfig = specs[0].config  # type: ignore[assignment]  # its own type
         sets: list[PushStartSet] = [each.goals for each in specs]  # type: ignore[misc]
-        device = spec.device
-        self._spec = spec
+        device = env_spec_index.device
+        self._env_spec_index = env_spec_index
         self._count = [len(pushes.q) for pushes in sets]
         self._q = padded_rows([pushes.q for pushes in sets], num_joints, device)
         self._blocks = padded_rows([pushes.blocks for pushes in sets], 7, device)
-        self._final_line = torch.tensor([pushes.line for pushes in sets], device=device)[spec]
-        self._size = torch.tensor([pushes.block.size for pushes in sets], device=device)[spec]
+        self._final_line = torch.tensor([pushes.line for pushes in sets], device=device)[
+            env_spec_index
+        ]
+        self._size = torch.tensor([pushes.block.size for pushes in sets], device=device)[
+            env_spec_index
+        ]
         self._middle = [(np.ptp(s.blocks[:, 0]) / 2 + s.blocks[:, 0].min(), s.ground) for s in sets]
         self.line = self._final_line.clone()
         """Current y that the block must cross, shape (k,) [m]."""
@@ -38,7 +44,7 @@ class PushEnvs(TaskEnvs):
         self, rows: torch.Tensor, random: Sequence[np.random.Generator]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw starts of the robots' sets: configurations and poses of blocks."""
-        spec = self._spec[rows]
+        spec = self._env_spec_index[rows]
         drawn = [
             int(stream.integers(self._count[i]))
             for stream, i in zip(random, spec.tolist(), strict=True)
@@ -66,7 +72,7 @@ class PushEnvs(TaskEnvs):
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the line."""
-        x, ground = self._middle[int(self._spec[row])]
+        x, ground = self._middle[int(self._env_spec_index[row])]
         pose = (x, float(self.line[row]), ground, 1.0, 0.0, 0.0, 0.0)
         return {"line": np.array(pose, dtype=np.float32)}
 

@@ -71,11 +71,13 @@ class Push(Task[PushConfig, PushStartSet]):
         """Return the scene with the block."""
         return Scene(robot, block=goals.block, obstacles=goals.obstacles, ground=ground)
 
-    def make_envs(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> PushEnvs:
+    def make_envs(
+        self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int
+    ) -> PushEnvs:
         """Make the environments of a batch that push."""
         from morphgen.tasks.push.envs import PushEnvs
 
-        return PushEnvs(specs, spec, num_joints)
+        return PushEnvs(specs, env_spec_index, num_joints)
 
     def episode_score(self, total: float, last: float, steps: int) -> float:
         """Return 1 for success at the end, else 0."""

@@ -17,32 +17,34 @@ from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
 class ReachEnvs(TaskEnvs):
     """Environments that reach for goals of their robots' goal sets."""
 
-    def __init__(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> None:
+    def __init__(
+        self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int
+    ) -> None:
         """Set up; arguments as of ``Task.make_envs``.
 
         Raises:
             TaskError: If a robot has fewer than two goals.
         """
         self._config: ReachConfig = specs[0].config  # type: ignore[assignment]  # its own type
-        self._spec = spec
+        self._env_spec_index = env_spec_index
         sets = [each.goals for each in specs]
         for goals in sets:
             if len(goals.q) < 2:
                 raise TaskError(f"robot {goals.robot!r}: {len(goals.q)} goals; expected 2 or more")
-        device = spec.device
+        device = env_spec_index.device
         self._count = [len(goals.q) for goals in sets]
         self._q = padded_rows([goals.q for goals in sets], num_joints, device)
         self._poses = padded_rows([goals.goal_poses for goals in sets], 7, device)
-        self.goal = torch.zeros(len(spec), 7, device=device)
+        self.goal = torch.zeros(len(env_spec_index), 7, device=device)
         """Goal pose of the tool, shape (k, 7)."""
-        self.goal_configuration = torch.zeros(len(spec), num_joints, device=device)
+        self.goal_configuration = torch.zeros(len(env_spec_index), num_joints, device=device)
         """Joint positions that bring the tool to its goal, shape (k, J)."""
 
     def begin(
         self, rows: torch.Tensor, random: Sequence[np.random.Generator]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw a start and another goal of each robot's set."""
-        spec = self._spec[rows]
+        spec = self._env_spec_index[rows]
         pairs = [
             stream.choice(self._count[i], size=2, replace=False)
             for stream, i in zip(random, spec.tolist(), strict=True)

@@ -58,11 +58,13 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         """Test every configuration; see ``certify_goals``."""
         return certify_goals(goals, robot, scene)
 
-    def make_envs(self, specs: Sequence[EnvSpec], spec: torch.Tensor, num_joints: int) -> ReachEnvs:
+    def make_envs(
+        self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int
+    ) -> ReachEnvs:
         """Make the environments of a batch that reach."""
         from morphgen.tasks.reach.envs import ReachEnvs
 
-        return ReachEnvs(specs, spec, num_joints)
+        return ReachEnvs(specs, env_spec_index, num_joints)
 
     def markers(self, config: ReachConfig, goals: ReachGoalSet) -> tuple[Marker, ...]:
         """Return a ball with the radius of success, and axes of the goal pose."""

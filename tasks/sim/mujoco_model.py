@@ -1,4 +1,4 @@
-"""Scenes as MuJoCo models, and where in a model's state a task's numbers are."""
+"""Scenes as MuJoCo models, with the indices of joints and block in their state."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from morphgen.typing import Array
 Indices = NDArray[np.int64]
 
 PASSIVE = 0.2
-"""Share of the damping that the joints have, and not the actuators; see ``PositionControl``."""
+"""Fraction of the damping that belongs to joints instead of actuators; see ``PositionControl``."""
 IMPEDANCE_RATIO = 100.0
-"""How much harder friction is than the normal direction of a contact (MuJoCo's ``impratio``)."""
+"""Ratio of friction to normal impedance of contacts (MuJoCo's ``impratio``)."""
 BLOCK_IMPEDANCE = (0.1, 0.95, 0.001, 0.5, 2.0)
-"""Of the block's contacts (MuJoCo's ``solimp``): soft at first touch, hard a millimetre further on.
+"""Impedance of the block's contacts (MuJoCo's ``solimp``): soft at touch, hard 1 mm deeper.
 
-What slips in MuJoCo is pushed apart, by friction times its speed times the damping of the contact;
-a block that is pushed at 0.3 m/s hopped, and was on the ground for two fifths of the time. In a
-soft contact its weight has the upper hand.
+MuJoCo pushes sliding bodies apart, in proportion to friction, speed and damping of the contact: a
+block pushed at 0.3 m/s hopped, and was on the ground for two fifths of the time. In a soft contact
+its weight prevails.
 """
 BLOCK_MARGIN = 6e-4
-"""How much earlier than they touch the block and what it touches feel each other, metres: as far as
-its weight presses it into the ground, so that it stands upon it."""
+"""Distance at which contacts of the block become active [m]: as far as its weight presses it into
+the ground, so that it stands on the surface."""
 
 _BY_LINKS, _BY_SCENE, _BY_BLOCK, _BY_GROUND = 1, 2, 4, 8
-"""Collision bits: links with links; links with obstacles and block; the block with ground and
-obstacles; links with the ground."""
+"""Collision bits: links with links; links with obstacles and block; block with ground and
+obstacles; links with ground."""
 _OBSTACLE_PRIORITY, _BLOCK_PRIORITY = 1, 2
 
 
@@ -46,25 +46,26 @@ class World:
     """A compiled scene."""
 
     robot: Robot
+    """The robot after ``merge_rigid_links``."""
     model: mujoco.MjModel
     movable_q_at: Indices
-    """Where ``qpos`` has the movable joints, in the order of ``robot.movable_joints``."""
+    """Indices in ``qpos`` of the movable joints, in the order of ``robot.movable_joints``."""
     movable_qd_at: Indices
-    """Where ``qvel`` has them."""
+    """Indices in ``qvel`` of the movable joints."""
     q_at: Indices
-    """Where ``qpos`` has the independent joints."""
+    """Indices in ``qpos`` of the independent joints."""
     qd_at: Indices
-    """Where ``qvel`` has them."""
+    """Indices in ``qvel`` of the independent joints."""
     block: int | None
-    """Body of the block."""
+    """Body id of the block, if there is one."""
 
     @property
     def block_moves(self) -> bool:
-        """Whether the block has mass: it is then free, and otherwise a mocap body."""
+        """Whether the block has mass and is a free body; otherwise it is a mocap body."""
         return self.block is not None and self.model.body_mocapid[self.block] < 0
 
     def block_pose_in(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """The block's position (3,) and quaternion (4,), views into the data of this model."""
+        """Return views of the block's position (3,) and quaternion (4,) in data of this model."""
         if self.block_moves:
             at = int(self.model.jnt_qposadr[self.model.body_jntadr[self.block]])
             return data.qpos[at : at + 3], data.qpos[at + 3 : at + 7]
@@ -73,32 +74,32 @@ class World:
 
     @property
     def block_qd_at(self) -> int:
-        """Where ``qvel`` begins to have the velocity of a block that moves."""
+        """First index in ``qvel`` of the velocity of a block that moves."""
         return int(self.model.body_dofadr[self.block])
 
 
 def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
-    """Compile scenes; those that differ in nothing but where the block begins share a model.
+    """Compile scenes; those that differ only in the initial pose of the block share a model.
 
-    Contacts are elliptic cones, solved with Newton's method; damping is integrated implicitly, as
-    in every MJCF of morphgen. MuJoCo's default contact, critically damped in 20 ms, is four steps
-    long, which is stable: blocks come to rest. A pyramidal cone would hold more along its edges
-    than between them, and friction no harder than the normal direction lets a pushed block creep;
-    the softer contact of blocks (``BLOCK_IMPEDANCE``) needs it a hundred times harder.
-    What is solved to MuJoCo's default tolerance takes two or three iterations. To look for parts
-    that could be solved apart costs more than that saves: a scene has two at most that matter.
+    Contacts have elliptic cones, solved with Newton's method; damping is integrated implicitly, as
+    in every MJCF of morphgen. MuJoCo's default contact, critically damped in 20 ms, lasts four
+    steps, which is stable: blocks come to rest. A pyramidal cone would hold more along its edges
+    than between them, and friction as soft as the normal direction lets a pushed block creep; the
+    softer contact of blocks (``BLOCK_IMPEDANCE``) needs a hundred times the impedance. The default
+    tolerance takes two or three iterations. Solving constraint islands separately costs more than
+    it saves, since a scene has at most two that matter; so islands are off.
 
-    MuJoCo takes the larger friction of two geoms of one priority, and otherwise that of the higher
-    priority: the block's friction counts whatever it touches, an obstacle's for links, and links
-    have 1 on the ground and on each other.
+    MuJoCo uses the larger friction of two geoms of the same priority, else that of the higher
+    priority: the block's friction acts in all of its contacts, an obstacle's in contacts with
+    links, and links have a friction of 1 on the ground and on each other.
 
-    Which links touch each other is up to ``untested_pairs`` alone: MuJoCo's own exception for
-    neighbours is off. It never tests what stands still against what stands still: the root link
-    and those fixed to it do not touch the ground, obstacles or a block without mass.
+    ``untested_pairs`` alone determines which links collide: MuJoCo's exception for neighbours is
+    off. MuJoCo never tests static geoms against each other: the root link and links fixed to it do
+    not collide with the ground, obstacles or a block without mass.
 
     Args:
-        scenes: One for every environment; equal robots are read once if they are one object.
-        contacts: What may touch what.
+        scenes: Scene of each environment; a robot that several share is compiled once.
+        contacts: Pairs of things that collide.
 
     Raises:
         SimulationError: If MuJoCo refuses a scene.
@@ -107,7 +108,7 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     """
     specs: dict[int, tuple[Robot, mujoco.MjSpec]] = {}
     models: dict[object, World] = {}
-    found = []
+    compiled = []
     for env, scene in enumerate(scenes):
         block = replace(scene.block, pose=IDENTITY) if scene.block is not None else None
         key = (id(scene.robot), scene.T_world_root, block, scene.obstacles, scene.ground)
@@ -122,14 +123,14 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
                 raise SimulationError(
                     f"environment {env}, robot {robot.name!r}: MuJoCo refuses the scene: {reason}"
                 ) from error
-        found.append(models[key])
-    return found
+        compiled.append(models[key])
+    return compiled
 
 
 def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]:
-    """The robot as ``merge_rigid_links``, with a root that can be moved, and its spec.
+    """Return the robot after ``merge_rigid_links`` and its spec, whose root can be moved.
 
-    Joints have no friction of their own: the law of the position control says how they move.
+    Joints have no friction and damping of their own: the law of position control moves them.
     """
     robot = _with_own_root(merge_rigid_links(robot))
     bare = replace(
@@ -159,7 +160,7 @@ def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]
 
 
 def _with_own_root(robot: Robot) -> Robot:
-    """The robot; a root named ``world`` is renamed, which MuJoCo would take for the world."""
+    """Return the robot with a root named ``world`` renamed: MuJoCo reserves that name."""
     if robot.root.name != "world":
         return robot
     root = "world_"
