@@ -139,6 +139,11 @@ def test_reading_manifests_loads_no_simulator():
     assert loaded.isdisjoint(SIMULATORS_AND_MESHES)
 
 
+def test_importing_the_checks_loads_no_simulator():
+    loaded = modules_after("import morphgen.checks")
+    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "fcl", "igl", "lxml", "scipy"})
+
+
 def test_processes_of_pybullet_load_little_else():
     loaded = modules_after("import morphgen.tasks.sim.bullet_workers")
     assert "pybullet" in loaded

@@ -131,7 +131,7 @@ def test_a_part_that_is_not_there_is_told_with_the_nearest():
     [
         ("base=planar[up: ee=cube]", "no port 'up'"),
         ("base=planar[top: ee=cube(size=9)]", "out of range"),
-        ("base=planar[", "no derivation"),
+        ("base=planar[", "invalid derivation"),
         ("base=fixed[top: ee=cube]", "no joint moves its tool"),
     ],
 )
