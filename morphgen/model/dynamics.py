@@ -52,6 +52,8 @@ class Actuation:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Return the joint-space inertia at one configuration, the sum of J^T I J over all links.
 
+    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 7.1.1.
+
     Args:
         robot: The robot, its root fixed in the world.
         q: Independent joint positions, shape (dof,) [rad or m].

@@ -224,6 +224,7 @@ def _central_second(primitive: Primitive) -> tuple[float, float, float]:
         case Cylinder(radius, length):
             return (v * radius**2 / 4, v * radius**2 / 4, v * length**2 / 12)
         case Capsule(r, length):
+            # A cylinder and two half balls, whose centroids are 3/8 r beyond the cylinder's ends.
             tube, caps = math.pi * r**2 * length, 4 / 3 * math.pi * r**3
             side = tube * r**2 / 4 + caps * r**2 / 5
             along = tube * length**2 / 12 + caps * (r**2 / 5 + length**2 / 4 + 3 / 8 * length * r)
@@ -236,7 +237,7 @@ def _mesh_integrals(mesh: trimesh.Trimesh) -> VolumeIntegrals:
         return VolumeIntegrals.zero()
     com = np.asarray(mesh.center_mass)
     inertia = np.asarray(mesh.moment_inertia) / mesh.density
-    central = np.trace(inertia) / 2 * np.eye(3) - inertia
+    central = np.trace(inertia) / 2 * np.eye(3) - inertia  # inverse of I = tr(C) 1 - C
     return VolumeIntegrals(v, v * com, central + v * np.outer(com, com))
 
 

@@ -266,6 +266,7 @@ def _rotation_from_z(axis: Vec3) -> Quat:
     x, y, z = axis
     if z < -0.5:  # near -z the formula below is singular: first turn by pi about x
         return rotation.multiply((0.0, 1.0, 0.0, 0.0), _rotation_from_z((x, -y, -z)))
+    # The quaternion (1 + z . axis, z x axis) rotates z to the axis by the shortest way.
     return rotation.normalize((1 + z, -y, x, 0.0))
 
 
