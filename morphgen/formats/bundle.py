@@ -27,7 +27,7 @@ from morphgen.formats.urdf_text import urdf_text
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, StoredFits
 from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts
-from morphgen.model.robot import Link, Robot
+from morphgen.model.robot import Robot
 
 URDF = "robot.urdf"
 MJCF = "robot.xml"
@@ -194,12 +194,11 @@ def split_colours(robot: Robot) -> Robot:
 
     A part of a single triangle is dropped, because MuJoCo refuses meshes of three vertices.
     """
-    return replace(robot, links=tuple(_split_link(link) for link in robot.links))
-
-
-def _split_link(link: Link) -> Link:
-    visuals = tuple(piece for shape in link.visuals for piece in _split_shape(shape))
-    return replace(link, visuals=visuals)
+    links = [
+        replace(link, visuals=tuple(part for shape in link.visuals for part in _split_shape(shape)))
+        for link in robot.links
+    ]
+    return replace(robot, links=tuple(links))
 
 
 def _split_shape(shape: Shape) -> tuple[Shape, ...]:

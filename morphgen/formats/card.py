@@ -20,15 +20,7 @@ from morphgen.model.robot import Robot
 
 CARD_FORMAT = 1
 
-_PROVENANCE = (
-    "derivation",
-    "source",
-    "choices",
-    "repairs",
-    "parts",
-    "accepted",
-    "primitives",
-)
+_PROVENANCE = ("derivation", "source", "choices", "repairs", "parts", "accepted", "primitives")
 """Keys of a card that become the robot's ``provenance``."""
 
 

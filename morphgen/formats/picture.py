@@ -52,11 +52,7 @@ class GlContext(Protocol):
 
 
 def render(
-    robot: Robot,
-    urdf: Path,
-    mjcf: Path,
-    q: ArrayLike | None = None,
-    size: tuple[int, int] = SIZE,
+    robot: Robot, urdf: Path, mjcf: Path, q: ArrayLike | None = None, size: tuple[int, int] = SIZE
 ) -> Image.Image:
     """Draw a robot from its files, with PyBullet's software renderer or else with MuJoCo's.
 

@@ -42,7 +42,6 @@ KeyPath = tuple[str | int, ...]
 FiniteNumber = Annotated[float, Meta(ge=-1e12, le=1e12)]
 """A number that is neither NaN nor infinite, nor beyond what a robot can hold in SI units."""
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e12)]
-NonEmptyText = Annotated[str, Meta(min_length=1)]
 
 _SHOWN_VALUE = 80
 """Longest value that an error shows [characters]."""

@@ -94,9 +94,7 @@ class PackageFinder:
 
 
 def default_finder(
-    roots: Iterable[Path] = (),
-    packages: Mapping[str, Path] | None = None,
-    root: Path | None = None,
+    roots: Iterable[Path] = (), packages: Mapping[str, Path] | None = None, root: Path | None = None
 ) -> PackageFinder:
     """Return a finder for the given roots, then ROS's environment, then the pip data packages.
 

@@ -10,16 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from morphgen.model.geometry import (
-    Box,
-    Capsule,
-    Cylinder,
-    Geometry,
-    Mesh,
-    Pose,
-    Shape,
-    Sphere,
-)
+from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
@@ -123,9 +114,7 @@ def rounded_shapes(shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
 
 def _link(link: Link) -> Link:
     return replace(
-        link,
-        inertial=_inertial(link.inertial),
-        collisions=rounded_shapes(link.collisions),
+        link, inertial=_inertial(link.inertial), collisions=rounded_shapes(link.collisions)
     )
 
 

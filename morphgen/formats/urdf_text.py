@@ -15,14 +15,7 @@ from morphgen.formats.rounding import (
     urdf_pieces,
 )
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Sphere
-from morphgen.model.robot import (
-    DEFAULT_EFFORT,
-    DEFAULT_VELOCITY,
-    Inertial,
-    Joint,
-    Link,
-    Robot,
-)
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
 
 OWN = "morphgen"
 """Tag of the URDF element for data that only morphgen reads."""

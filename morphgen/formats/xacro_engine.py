@@ -74,10 +74,8 @@ def _fresh_module() -> Engine:
     module.safe_eval = _safe_eval
     module.glob = SimpleNamespace(glob=lambda pattern: module.list_files(pattern))
     module.eval_all = _counting(module)
-    for name in ("handle_macro_call", "process_include"):
+    for name in ("handle_macro_call", "process_include", "check_attrs", "reqd_attrs"):
         setattr(module, name, _returning(module, getattr(module, name)))
-    for name in ("check_attrs", "reqd_attrs"):
-        setattr(module, name, _noting(module, getattr(module, name)))
     return module
 
 
@@ -127,14 +125,6 @@ def _returning(engine: Engine, function: Callable[..., object]) -> Callable[...,
         return result
 
     return called
-
-
-def _noting(engine: Engine, function: Callable[..., object]) -> Callable[..., object]:
-    def noted(node: Untyped, *rest: Untyped) -> object:
-        engine.node = node
-        return function(node, *rest)
-
-    return noted
 
 
 def _symbols(engine: Engine) -> dict[str, object]:

@@ -176,19 +176,14 @@ def _prod(numbers: Iterable[Value], *, start: Value = 1) -> object:
     return product
 
 
-def _factorial(n: int) -> int:
-    _require(n, MAX_FACTORIAL, "an argument of factorial()")
-    return math.factorial(n)
+def _limited(function: Callable[..., int], limit: int) -> Function:
+    """Return a function of ``math`` whose first argument is bounded."""
 
+    def call(n: int, *rest: int) -> int:
+        _require(n, limit, f"an argument of {function.__name__}()")
+        return function(n, *rest)
 
-def _comb(n: int, k: int) -> int:
-    _require(n, MAX_CHOOSE, "an argument of comb()")
-    return math.comb(n, k)
-
-
-def _perm(n: int, k: int | None = None) -> int:
-    _require(n, MAX_CHOOSE, "an argument of perm()")
-    return math.perm(n, k)
+    return Function(function.__name__, call)
 
 
 def _sorted(items: Iterable[Value], *, reverse: bool = False) -> list[Value]:
@@ -243,9 +238,9 @@ MATH: Mapping[str, object] = {
     "inf": math.inf,
     "nan": math.nan,
     **{name: Function(name, getattr(math, name)) for name in _REAL if hasattr(math, name)},
-    "factorial": Function("factorial", _factorial),
-    "comb": Function("comb", _comb),
-    "perm": Function("perm", _perm),
+    "factorial": _limited(math.factorial, MAX_FACTORIAL),
+    "comb": _limited(math.comb, MAX_CHOOSE),
+    "perm": _limited(math.perm, MAX_CHOOSE),
     "prod": Function("prod", _prod),
 }
 """Names of ``math`` that expressions may use."""
