@@ -32,7 +32,7 @@ ALIASES: Mapping[str, Mapping[str, str]] = {
 
 
 def renamed(section: str, table: object) -> Any:  # noqa: ANN401
-    """Return a stored table with today's names of its keys; what is no table stays as it is.
+    """Return a stored table with today's names of its keys; other values stay as they are.
 
     A key that is there under both names keeps its old name as well, so that readers refuse it.
     """

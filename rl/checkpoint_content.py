@@ -80,11 +80,11 @@ def _require_network(stored: object, wanted: Mapping[str, torch.Tensor], where: 
             raise TaskError(f"{where} has {shown(name)}, which its sizes do not ask for")
         if not isinstance(tensor, torch.Tensor):
             raise TaskError(f"{where}: {name} is {shown(tensor)}; expected a tensor")
-        found = (tuple(tensor.shape), tensor.dtype)
+        actual = (tuple(tensor.shape), tensor.dtype)
         expected = (tuple(wanted[name].shape), wanted[name].dtype)
-        if found != expected:
+        if actual != expected:
             raise TaskError(
-                f"{where}: {name} has shape {found[0]} of {found[1]}; expected {expected[0]} of "
+                f"{where}: {name} has shape {actual[0]} of {actual[1]}; expected {expected[0]} of "
                 f"{expected[1]}"
             )
 

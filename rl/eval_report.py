@@ -27,16 +27,16 @@ Scores = Mapping[str, Sequence[Score]]
 """Scores by mode, or by the name of a baseline."""
 
 
-def score_table(found: Scores, style: str = "simple") -> str:
+def score_table(scores_by_mode: Scores, style: str = "simple") -> str:
     """Return a table with a line per robot and mode; ``style`` is one of tabulate's."""
-    rows = [_row(mode, each) for mode, scores in found.items() for each in scores]
+    rows = [_row(mode, each) for mode, scores in scores_by_mode.items() for each in scores]
     return tabulate(rows, HEADERS, tablefmt=style, disable_numparse=True)
 
 
-def summary(found: Scores) -> str:
+def summary(scores_by_mode: Scores) -> str:
     """Return a line per mode: mean scores of each side and task, and diverged episodes."""
     lines = []
-    for mode, scores in found.items():
+    for mode, scores in scores_by_mode.items():
         groups = dict.fromkeys((each.side, each.task) for each in scores)
         means = []
         for side, task in groups:
@@ -65,7 +65,7 @@ def require_table(path: Path) -> None:
         raise TaskError(f"{path}: there is no folder {path.parent}")
 
 
-def write_scores(path: Path, found: Scores) -> None:
+def write_scores(path: Path, scores_by_mode: Scores) -> None:
     """Write CSV, JSON or Markdown, by the suffix of the path.
 
     Raises:
@@ -73,11 +73,11 @@ def write_scores(path: Path, found: Scores) -> None:
         FormatError: If it cannot be written.
     """
     require_table(path)
-    data = {mode: scores_to_json(scores) for mode, scores in found.items()}
+    data = {mode: scores_to_json(scores) for mode, scores in scores_by_mode.items()}
     if path.suffix == ".json":
         write_file(path, json.dumps(data, indent=2) + "\n")
     elif path.suffix == ".md":
-        write_file(path, score_table(found, "github") + "\n")
+        write_file(path, score_table(scores_by_mode, "github") + "\n")
     else:
         text = io.StringIO()
         names = ["mode", *(field.name for field in fields(Score))]

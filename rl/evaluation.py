@@ -139,20 +139,20 @@ def evaluate_checkpoints(
     count alike.
 
     Raises:
-        TaskError: If a file is no checkpoint, or its policy has other observations or actions than
-            the first.
+        TaskError: If a file is not a checkpoint, or its observations or actions differ from
+            those of the first.
         MorphgenError: If a robot or simulator cannot be built.
     """
     trained = [read_checkpoint(path) for path in paths]
     sources = [run.source for run, _ in trained]
     if all(own.member for own in sources) and _of_same(sources[0], source):
-        found = (
+        per_robot = (
             _evaluate_together(
                 [one], replace(source, member=own.member), config, mode, device, progress
             )
             for one, own in zip(trained, sources, strict=True)
         )
-        return [score for scores in found for score in scores]
+        return [score for scores in per_robot for score in scores]
     _require_same_interface(paths, [run for run, _ in trained])
     return _evaluate_together(trained, source, config, mode, device, progress)
 

@@ -87,7 +87,7 @@ def load_policy(
     """Load the policy of a checkpoint, or of a run's folder. Nothing in the file is executed.
 
     Raises:
-        TaskError: If there is no checkpoint, or it is damaged or of another version.
+        TaskError: If the checkpoint is missing, damaged or of another version.
     """
     return Policy(read_checkpoint(Path(path))[1], mode, seed, device)
 

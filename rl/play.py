@@ -36,14 +36,14 @@ def require_policy(name: str, task: str) -> None:
             f"valid: {', '.join(valid)}"
         )
     if name not in BASELINES:
-        raise TaskError(f"{name!r} is no checkpoint, and no policy{nearest(name, valid)}")
+        raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
 
 
 def interface_of(name: str) -> Interface:
     """Return the interface of a checkpoint's policy; baselines take any environment.
 
     Raises:
-        TaskError: If the file is no checkpoint.
+        TaskError: If the file is not a checkpoint.
     """
     if not _is_file(name):
         return Interface()
@@ -61,7 +61,7 @@ def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
         seed: Seed of random numbers.
 
     Raises:
-        TaskError: As ``require_policy``; or if the file is no checkpoint, or one for other
+        TaskError: As ``require_policy``; or if the file is not a checkpoint, or one for other
             observations or actions.
         BenchmarkError: If the robot has hardly any collision-free configuration.
     """

@@ -38,21 +38,21 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     An unfinished last line of a killed run is ignored.
 
     Raises:
-        FormatError: If a line is no report.
+        FormatError: If a line is not the report of an update.
     """
     path = folder / METRICS
     if not path.is_file():
         return []
     lines = read_text(path).split("\n")[:-1]
-    found = []
+    reports = []
     for number, line in enumerate(lines, 1):
         try:
             report = parse_json(line, f"{path}:{number}")
             report["update"], report["transitions"], report["score"]
         except (FormatError, KeyError, TypeError) as error:
             raise FormatError(f"{path}, line {number}: not the report of an update") from error
-        found.append(report)
-    return found
+        reports.append(report)
+    return reports
 
 
 class Metrics:

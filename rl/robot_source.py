@@ -1,4 +1,4 @@
-"""What agents are trained and tested on: the robots of a split, or one robot."""
+"""Sources of robots for training and evaluation: the robots of a split, or one robot."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def other_side(source: RobotSource, side: Side) -> RobotSource:
     if source.split:
         return replace(source, side=side, member=None)
     if side == "test":
-        raise TaskError(f"{source.name!r} is one robot, no split: there is nothing to test on")
+        raise TaskError(f"{source.name!r} is one robot and not a split: it has no test robots")
     return source
 
 

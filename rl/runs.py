@@ -135,14 +135,16 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
     path = folder / CONFIG
     if _has_learned(folder):
         if not resume:
-            raise TaskError(f"{folder} has a run: say --resume to go on, or another --out")
+            raise TaskError(f"{folder} has a run: pass --resume to continue it, or another --out")
         _require_same(folder, read_config(folder), config)
     elif path.is_file():
         read_config(folder)
     elif folder.is_dir():
         own = (LOCK, partial_path(path).name)
         if any(each.name not in own for each in folder.iterdir()):
-            raise TaskError(f"{folder} is there and is no run's folder: name another with --out")
+            raise TaskError(
+                f"{folder} exists and is not the folder of a run: name another with --out"
+            )
     elif folder.exists():
         raise TaskError(f"{folder} is a file: name a folder with --out")
 
@@ -163,7 +165,7 @@ def read_config(folder: Path) -> RunConfig:
         data = read_json(path)
         _require_format(path, data)
     except OSError as error:
-        raise TaskError(f"{folder} is no run's folder: it has no {CONFIG}") from error
+        raise TaskError(f"{folder} is not the folder of a run: it has no {CONFIG}") from error
     except (FormatError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TaskError(f"{path} is not the config of a run: {error}") from error
     try:

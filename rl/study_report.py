@@ -93,7 +93,7 @@ class Row:
 
 def rows(results: Results) -> list[Row]:
     """Return a row for every split, task, agent and mode, in the order of the cells."""
-    found = []
+    table: list[Row] = []
     lines = dict.fromkeys((cell.split, cell.agent) for cell in results)
     for split, agent in lines:
         own = {c: s for c, s in results.items() if (c.split, c.agent) == (split, agent)}
@@ -105,7 +105,7 @@ def rows(results: Results) -> list[Row]:
         tasks: list[str] = list(dict.fromkeys(score.task for score in every))
         if not there:
             task = next(iter(tasks_of(first.source)), "")
-            found.append(Row(split, task, agent, "", (), missing, {}, first.sides))
+            table.append(Row(split, task, agent, "", (), missing, {}, first.sides))
         for task in tasks:
             for mode in modes:
                 groups = _groups(there, task, mode)
@@ -116,10 +116,10 @@ def rows(results: Results) -> list[Row]:
                     for each in scores[mode]
                     if each.task == task
                 )
-                found.append(
+                table.append(
                     Row(split, task, agent, mode, seeds, missing, groups, first.sides, lost)
                 )
-    return found
+    return table
 
 
 def write_tables(folder: Path, results: Results) -> list[Path]:
@@ -128,20 +128,20 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
     Raises:
         FormatError: If one cannot be written.
     """
-    made = rows(results)
-    write_file(folder / TABLE, table_text(made))
-    data = {"rows": [_finite(asdict(row)) for row in made], "cells": _cells(results)}
+    table = rows(results)
+    write_file(folder / TABLE, table_text(table))
+    data = {"rows": [_finite(asdict(row)) for row in table], "cells": _cells(results)}
     write_file(folder / DATA, json.dumps(data, indent=2) + "\n")
     write_file(folder / ROBOTS, _csv(results))
     write_file(folder / CURVES, curves(results))
     return [folder / name for name in (TABLE, DATA, ROBOTS, CURVES)]
 
 
-def table_text(made: Sequence[Row]) -> str:
+def table_text(table: Sequence[Row]) -> str:
     """Return Markdown with a table for each split and task."""
     parts = []
-    for split in dict.fromkeys(row.split for row in made):
-        own = [row for row in made if row.split == split]
+    for split in dict.fromkeys(row.split for row in table):
+        own = [row for row in table if row.split == split]
         tasks = dict.fromkeys(row.task for row in own if row.mode) or {own[0].task: None}
         for task in tasks:
             lines = [_line(row) for row in own if not row.mode or row.task == task]
@@ -168,15 +168,15 @@ def curves(results: Results) -> bytes:
         panel.grid(alpha=0.3)
         for agent in dict.fromkeys(c.agent for c in results if c.split == split and c.config):
             own = [c for c in results if (c.split, c.agent) == (split, agent)]
-            found = [curve for curve in map(_curve, own) if curve is not None]
-            if not found:
+            runs = [curve for curve in map(_curve, own) if curve is not None]
+            if not runs:
                 panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
                 continue
-            steps = max((curve.timesteps for curve in found), key=len)
-            values = np.full((len(found), len(steps)), np.nan)
-            for row, curve in zip(values, found, strict=True):
+            steps = max((curve.timesteps for curve in runs), key=len)
+            values = np.full((len(runs), len(steps)), np.nan)
+            for row, curve in zip(values, runs, strict=True):
                 row[: len(curve.scores)] = curve.scores
-            done = sum(curve.complete for curve in found)
+            done = sum(curve.complete for curve in runs)
             note = "" if done == len(own) else f" ({done} of {len(own)} seeds to the end)"
             (line,) = panel.plot(steps, np.nanmean(values, axis=0), label=agent + note)
             panel.fill_between(
@@ -209,7 +209,7 @@ def _curve(cell: Cell) -> Curve | None:
 def _groups(
     there: Mapping[Cell, Mapping[str, Sequence[Score]]], task: str, mode: str
 ) -> dict[Side, Group]:
-    found: dict[Side, Group] = {}
+    groups: dict[Side, Group] = {}
     for side in SIDES:
         table = [
             [each for each in scores[mode] if (each.side, each.task) == (side, task)]
@@ -224,8 +224,8 @@ def _groups(
         # Policies of single robots are independent samples on the robots that they learned.
         apart = apart and side == first.source.side
         iqm = iqm_interval(scores, together=not apart)
-        found[side] = Group(float(scores.mean()), iqm, success)
-    return found
+        groups[side] = Group(float(scores.mean()), iqm, success)
+    return groups
 
 
 def _line(row: Row) -> list[str]:
@@ -251,10 +251,10 @@ def _seeds(row: Row) -> str:
     return f"{count} of {len(row.seeds) + len(row.missing)} ({MISSING}: {gone})"
 
 
-def _interval(found: Interval) -> str:
-    if math.isnan(found.low):
-        return f"{found.value:.2f}"
-    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+def _interval(interval: Interval) -> str:
+    if math.isnan(interval.low):
+        return f"{interval.value:.2f}"
+    return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def _cells(results: Results) -> list[dict[str, Any]]:

@@ -47,7 +47,7 @@ ShowMetrics = Callable[[UpdateMetrics, int], None]
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """How a run is executed; its weights do not depend on it."""
+    """Execution of a run; the weights do not depend on it."""
 
     workers: int = 1
     """Number of processes of PyBullet, or threads of MuJoCo."""
@@ -193,13 +193,13 @@ def checkpoint_files(path: Path) -> Iterator[Path]:
     """Yield the checkpoints of a path: a file, or the folder of a run, with one or many parts.
 
     Raises:
-        TaskError: If there is none, or some parts of the run have none yet.
+        TaskError: If there is no checkpoint, or some robots of the run have none yet.
     """
     if path.is_file() or (path / CHECKPOINT).is_file():
         yield path if path.is_file() else path / CHECKPOINT
         return
-    found = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
-    if not found:
+    files = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
+    if not files:
         raise TaskError(f"{path}: no checkpoint, and no folder of a run with one")
     parts = subruns_of(path, read_config(path))
     missing = [part.folder.name for part in parts if not (part.folder / CHECKPOINT).is_file()]
@@ -208,7 +208,7 @@ def checkpoint_files(path: Path) -> Iterator[Path]:
             f"{path}: {len(missing)} of its {len(parts)} robots have no policy yet, such as "
             f"{missing[0]}; train goes on with --resume"
         )
-    yield from found
+    yield from files
 
 
 def is_done(part: Subrun) -> bool:

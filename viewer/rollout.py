@@ -188,7 +188,7 @@ def _checkpoint_path(policy: str, baselines: Iterable[str], files: FileAccess) -
         if "/" in policy or policy.endswith(".pt"):
             raise
         raise TaskError(
-            f"{shorten(policy)!r} is no checkpoint, and no policy{nearest(policy, baselines)}"
+            f"{shorten(policy)!r} is neither a checkpoint nor a policy{nearest(policy, baselines)}"
         ) from error
 
 

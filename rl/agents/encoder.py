@@ -1,4 +1,4 @@
-"""What networks of all agents share: the encoder of observations, and their interface.
+"""Encoder of observations and interface that the networks of all agents share.
 
 Padding is replaced by zeros before anything else: it has no influence on actions, values or
 gradients.

@@ -74,7 +74,7 @@ the random configurations of that tree."""
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How to push."""
+    """A planned push: the path behind the block, and the pose of the tool during the push."""
 
     path: tuple[Array, ...]
     """Waypoints, each (dof,); at the last one the tool is behind the block."""

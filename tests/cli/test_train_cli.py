@@ -137,7 +137,7 @@ def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_ya
     assert (other.curriculum, other.bf16, other.compile) == (True, True, False)
     code, _, err = run("finetune", "a", "--steps", "32", "--envs", "4")
     assert code == 2
-    assert "say --resume" in err
+    assert "pass --resume" in err
 
 
 def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_yaml):
@@ -327,7 +327,7 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
             "argument --goal-seed: -1: expected a whole number, 0 or more",
         ),
         (("eval", "nothing"), "no checkpoint, and no folder of a run"),
-        ((*RUN, "--on", "test"), "is one robot, no split: there is nothing to test on"),
+        ((*RUN, "--on", "test"), "is one robot and not a split: it has no test robots"),
         ((*RUN, "--whole"), "--whole is for --agent se, not for me-mlp"),
         ((*RUN, "--max-links", "1"), "argument --max-links: 1: expected a whole number, 2 or more"),
         (
@@ -365,13 +365,13 @@ def test_what_cannot_be_is_refused_in_one_line(refused, words, says):
 def test_folders_and_checkpoints_that_are_others_are_refused(run, refused, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    assert "no run's folder" in refused(*RUN, "--steps", "32", "--out", "mine")
+    assert "not the folder of a run" in refused(*RUN, "--steps", "32", "--out", "mine")
     assert "not a checkpoint" in refused("eval", "mine/letter.txt")
     assert "not a checkpoint" in refused(
         "play", "reach", "planar-cube", "--policy", "mine/letter.txt"
     )
     run(*RUN, "--steps", "32", "--out", "run", "--no-tensorboard")
-    assert "say --resume" in refused(*RUN, "--steps", "32", "--out", "run")
+    assert "pass --resume" in refused(*RUN, "--steps", "32", "--out", "run")
     assert "total_timesteps 32, not 64" in refused(
         *RUN, "--steps", "64", "--out", "run", "--resume"
     )

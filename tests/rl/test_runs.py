@@ -74,7 +74,7 @@ def test_a_run_is_only_continued_on_purpose_and_as_it_was(tmp_path):
     open_run(folder, config, resume=True)
     write_checkpoint(folder, config, {"update": 1})
     before = tree(tmp_path)
-    with pytest.raises(TaskError, match="has a run: say --resume"):
+    with pytest.raises(TaskError, match="has a run: pass --resume"):
         open_run(folder, config, resume=False)
     open_run(folder, config, resume=True)
     other = replace(config, seed=3, ppo=replace(config.ppo, gamma=0.5))
@@ -93,7 +93,7 @@ def test_a_run_that_has_no_checkpoint_yet_may_become_another(tmp_path, resume):
     open_run(tmp_path, other, resume=resume)
     assert read_config(tmp_path) == other
     write_checkpoint(tmp_path / ROBOTS / "a", first, {"update": 1})
-    with pytest.raises(TaskError, match="has a run: say --resume"):
+    with pytest.raises(TaskError, match="has a run: pass --resume"):
         open_run(tmp_path, first, resume=False)
 
 
@@ -118,7 +118,7 @@ def test_the_config_of_something_else_is_left_alone(tmp_path):
 def test_what_is_no_run_is_left_alone(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    for name, says in (("mine", "no run's folder"), ("mine/letter.txt", "is a file")):
+    for name, says in (("mine", "not the folder of a run"), ("mine/letter.txt", "is a file")):
         for resume in (True, False):
             with pytest.raises(TaskError, match=says):
                 open_run(tmp_path / name, small_config(), resume=resume)

@@ -138,7 +138,7 @@ def test_a_finished_run_is_not_trained_again(tmp_path):
     before = tree(tmp_path)
     never = stop_after(1)
     assert train(tmp_path / "run", config, resume=True, execution=QUIET, show=never)
-    with pytest.raises(TaskError, match="say --resume"):
+    with pytest.raises(TaskError, match="pass --resume"):
         train(tmp_path / "run", config, execution=QUIET)
     assert tree(tmp_path) == before
 

@@ -85,7 +85,7 @@ def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, quer
         ("?split=%00", "no such file or folder"),
         ("?compare=%00&compare=%00", "no such file or folder"),
         ("?play=%00.npz", "no such file or folder"),
-        ("?play=reach&policy=%00", "no checkpoint, and no policy"),
+        ("?play=reach&policy=%00", "neither a checkpoint nor a policy"),
         ("?play=reach&policy=ikk", "did you mean 'ik'"),
         ("?play=reach&seed=" + "9" * 5000, "seed '9+.*: expected a whole number"),
         ("?robot=derivation:" + DEEP, "more than 100 parts"),
