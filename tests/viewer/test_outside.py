@@ -122,7 +122,7 @@ def test_a_grammars_text_includes_nothing(viewer, secret):
     with PlainClient(viewer().port, "?compose=arm3") as client:
         text = client.control("Text", "text")
         client.change(text, f'include "{secret}/a.grammar"\nrobot -> ur5\n')
-        client.shows("a grammar given as text includes no other")
+        client.shows("a grammar given as text cannot include others")
         assert WORD not in client.text
 
 
