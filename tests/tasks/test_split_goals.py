@@ -230,7 +230,9 @@ def test_a_batch_takes_the_sets_that_are_shipped_and_refuses_others(home, cache,
         ({"goal_seed": 1}, "seed"),
         ({"configs": (ReachConfig(num_goals=3),)}, "constants"),
     ):
-        with pytest.raises(MorphgenError, match=f"robot 'gantry-plane': the set .* {words}"):
+        with pytest.raises(
+            MorphgenError, match=f"robot 'gantry-plane': the shipped goal set .* {words}"
+        ):
             make_split_batch(which, "train", 2, **{**options, **wrong})
 
 
@@ -340,7 +342,7 @@ def test_a_broken_file_is_named(cache, tmp_path):
         with pytest.raises(BenchmarkError, match=r"some\.npz: not a goal set for reach"):
             goals_from_npz(broken, "reach", path)
     for wrong in (replace(whole, poses=whole.poses[1:]), replace(whole, q=whole.q[0])):
-        with pytest.raises(BenchmarkError, match=r"some\.npz: configurations and poses are of"):
+        with pytest.raises(BenchmarkError, match=r"some\.npz: configurations and poses have"):
             goals_from_npz(set_npz(wrong), "reach", path)
 
 
@@ -352,7 +354,7 @@ def test_numbers_that_are_not_finite_are_refused(cache, tmp_path, name, value):
     values[1, 2] = value
     content = set_npz(replace(whole, **{name: values}))
     with pytest.raises(
-        BenchmarkError, match=rf"s\.npz: no goal set .*: {name} has a number that is"
+        BenchmarkError, match=rf"s\.npz: not a goal set .*: {name} has a number that is"
     ):
         goals_from_npz(content, "reach", tmp_path / "s.npz")
 
