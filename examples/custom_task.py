@@ -1,13 +1,14 @@
-"""A task of your own: follow a goal that moves on a circle with the tool.
+"""A task outside of morphgen: follow a goal that moves on a circle with the tool.
 
-Outside of morphgen; registered, it works with every command, run as this script:
+The script registers the task and runs the command line, so that every command knows the task:
 
     python examples/custom_task.py train ur5-stick task=follow --agent se --sim mujoco --steps 2e5
     python examples/custom_task.py eval runs/ur5-stick-follow/se/seed0
     python examples/custom_task.py play follow ur5-stick --policy runs/ur5-stick-follow/se/seed0
     python examples/custom_task.py view
 
-A package names its tasks in the entry point group ``morphgen.tasks`` instead.
+Worker processes do not run the script. A package declares its tasks as entry points of the group
+``morphgen.tasks`` instead, which all processes know.
 """
 
 import sys
@@ -38,11 +39,11 @@ class FollowConfig:
     num_goals: int = 20
     """Number of starts in a robot's goal set."""
     radius: float = 0.05
-    """Radius of the horizontal circle that the goal moves on, metres."""
+    """Radius of the horizontal circle on which the goal moves [m]."""
     period: float = 4.0
-    """Duration of a turn of the goal, seconds."""
+    """Duration of a turn of the goal [s]."""
     near: float = 0.05
-    """Distance of tool and goal that counts as success, metres."""
+    """Distance between tool and goal that counts as success [m]."""
     obstacles: int = 0
     obstacle_size: tuple[float, float] = (0.06, 0.15)
 
@@ -115,7 +116,7 @@ class Follow(Task):
     goal_format, cache_folder, fields = 1, "follow-1", (GOAL, TIME)
 
     def sample(self, robot, config, *, obstacles, ground, seeds, identity):
-        """Draw free configurations."""
+        """Sample free configurations."""
         space = FreeSpace(Scene(robot, ground=ground))
         q, tried = space.sample(config.num_goals, np.random.default_rng(seeds))
         poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(q), 1))
@@ -125,14 +126,14 @@ class Follow(Task):
     def certify(self, goals, robot, scene):
         """Test that the starts are free of collisions."""
         free = FreeSpace(scene).free(goals.q)
-        return [f"goal {i}: it is in collision" for i in np.flatnonzero(~free)]
+        return [f"goal {i}: its configuration is in collision" for i in np.flatnonzero(~free)]
 
     def make_envs(self, specs, spec, num_joints):
         """Make the environments of a batch."""
         return FollowEnvs(specs, spec, num_joints)
 
     def markers(self, config, goals):
-        """Return a ball in which the tool is near."""
+        """Return a ball with the radius of success."""
         return (Marker("goal", "frame", (2 * config.near,) * 3),)
 
 

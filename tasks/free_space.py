@@ -83,7 +83,9 @@ class FreeSpace:
             ValueError: If ``q`` or ``blocks`` has another shape or is not finite, or the scene has
                 no block.
         """
-        return np.array([not found for found in self._each(q, blocks)], dtype=np.bool_)
+        return np.array(
+            [not contacts for contacts in self._penetrations(q, blocks)], dtype=np.bool_
+        )
 
     def block_is_clear(self, blocks: ArrayLike) -> NDArray[np.bool_]:
         """Return at which poses the block penetrates neither an obstacle nor the robot's base.
@@ -101,8 +103,8 @@ class FreeSpace:
         still = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
         home = np.tile(robot.home, (len(np.asarray(blocks)), 1))
         clear = [
-            not any(self._block in pair and still & {*pair} for pair in found)
-            for found in self._each(home, blocks)
+            not any(self._block in pair and still & {*pair} for pair in contacts)
+            for contacts in self._penetrations(home, blocks)
         ]
         return np.array(clear, dtype=np.bool_)
 
@@ -118,7 +120,7 @@ class FreeSpace:
         Raises:
             ValueError: If ``q`` has another shape or is not finite.
         """
-        rows = [{name for pair in found for name in pair} for found in self._each(q)]
+        rows = [{name for pair in contacts for name in pair} for contacts in self._penetrations(q)]
         hits = [[name in row for name in self._obstacles] for row in rows]
         return np.array(hits, dtype=np.bool_).reshape(len(rows), len(self._obstacles))
 
@@ -151,14 +153,14 @@ class FreeSpace:
             if tried >= n * TRIES:
                 raise self._too_few(len(kept), passed, n, tried, collisions)
             q = random_configurations(self.scene.robot, _CHUNK, rng)[: n * TRIES - tried]
-            for row, found in zip(q, self._each(q), strict=True):
+            for row, contacts in zip(q, self._penetrations(q), strict=True):
                 tried += 1
-                collisions.update(found.keys())
-                if not found and accept(row):
+                collisions.update(contacts.keys())
+                if not contacts and accept(row):
                     kept.append(row)
                     if len(kept) == n:
                         break
-                elif not found:
+                elif not contacts:
                     passed += 1
         return np.array(kept).reshape(n, self.scene.robot.dof), tried
 
@@ -174,7 +176,9 @@ class FreeSpace:
             "ground, by a base or its place in the world, or narrow the limits of its joints"
         )
 
-    def _each(self, q: ArrayLike, blocks: ArrayLike | None = None) -> Iterator[dict[Pair, float]]:
+    def _penetrations(
+        self, q: ArrayLike, blocks: ArrayLike | None = None
+    ) -> Iterator[dict[Pair, float]]:
         q = np.asarray(q, dtype=np.float64)
         robot = self.scene.robot
         if q.ndim != 2 or q.shape[1] != robot.dof:
