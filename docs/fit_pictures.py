@@ -1,11 +1,11 @@
-"""Draw every real arm beside the same arm made of its fitted primitives.
+"""Draw every real arm next to the same arm with its fitted primitives.
 
     python docs/fit_pictures.py [--only panda,ur5] [--out docs/images/fit]
 
-Left the visuals, right up to four primitives in place of each link's collision meshes, one colour
-for each link; both at home, by the same camera. The mean intersection over union is that of links
-with collision meshes; links that the source itself gives primitives keep them. Fits come from
-beside the parts' manifests, and are made now where none is stored.
+Left: the visuals. Right: up to four primitives per link in place of its collision meshes, one
+colour per link. Both robots are at home, under the same camera. The mean intersection over union is
+over links with collision meshes; links whose source has primitives keep them. Stored fits are used;
+links without a stored fit are fitted now.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from morphgen.model.robot import Robot
 
 SIZE = (900, 450)
 TITLE = 40
-"""Height of the title, pixels."""
+"""Height of the title [px]."""
 PALETTE = 128
-"""Colours of a file."""
+"""Number of colours of a picture."""
 COLOURS: tuple[Rgba, ...] = (
     (0.12, 0.47, 0.71, 1.0),
     (1.00, 0.50, 0.05, 1.0),
@@ -49,7 +49,7 @@ COLOURS: tuple[Rgba, ...] = (
 
 
 def main() -> int:
-    """Draw and say where."""
+    """Draw the pictures and print their paths."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", help="names of arms, separated by commas")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images" / "fit")
@@ -81,9 +81,9 @@ def _picture(name: str, library: Library) -> Image.Image:
     for i, half in enumerate(_halves(robot, fitted, size)):
         sheet.paste(half, (i * size[0], TITLE))
     count = sum(len(link.visuals) for link in fitted.links)
-    worth = f"mean IoU {sum(ious) / len(ious):.2f}" if ious else "as in its source"
+    quality = f"mean IoU {sum(ious) / len(ious):.2f}" if ious else "as in its source"
     draw = ImageDraw.Draw(sheet)
-    for i, text in enumerate((name, f"{count} primitives, {worth}")):
+    for i, text in enumerate((name, f"{count} primitives, {quality}")):
         draw.text(
             ((i + 0.5) * size[0], TITLE / 2),
             text,
@@ -95,23 +95,23 @@ def _picture(name: str, library: Library) -> Image.Image:
 
 
 def _fitted(robot: Robot, library: Library) -> tuple[dict[str, tuple[Shape, ...]], list[float]]:
-    """Primitives by link, and the intersection over union of links that have meshes."""
+    """Return primitives by link, and the IoU of each link that has meshes."""
     stored = read_stored_fits(library.folders)
-    found, missing = stored_primitives(robot, stored)
+    primitives, missing = stored_primitives(robot, stored)
     ious = [
         stored[shapes_key(link.collisions)].collision_iou
         for link in robot.links
-        if link.name in found and not are_primitives(link.collisions)
+        if link.name in primitives and not are_primitives(link.collisions)
     ]
     report = fit_links(robot, COLLISION_OPTIONS, only=missing)
     for finding in report.findings:
         tqdm.write(f"{robot.name}: {finding.where}: {finding.why}")
-    found |= {row.link: row.fit.primitives for row in report.links}
-    return found, ious + [row.fit.quality.iou for row in report.links]
+    primitives |= {row.link: row.fit.primitives for row in report.links}
+    return primitives, ious + [row.fit.quality.iou for row in report.links]
 
 
 def _coloured(robot: Robot) -> Robot:
-    """The robot drawn as it collides, with one colour for each link, another than its parent's."""
+    """Return the robot with its collision shapes as visuals, one colour per link."""
     links, depths = [], {-1: -1}
     for i, link in enumerate(robot.links):
         depths[i] = depths[robot.parents[i]] + bool(link.collisions)
@@ -122,7 +122,7 @@ def _coloured(robot: Robot) -> Robot:
 
 
 def _halves(left: Robot, right: Robot, size: tuple[int, int]) -> list[Image.Image]:
-    """Both robots, by a camera that holds either."""
+    """Render both robots with one camera that shows all of either."""
     framed = left.with_links(
         replace(a, visuals=(*a.visuals, *b.visuals))
         for a, b in zip(left.links, right.links, strict=True)
@@ -136,7 +136,7 @@ def _halves(left: Robot, right: Robot, size: tuple[int, int]) -> list[Image.Imag
 
 
 def _meshed(robot: Robot, scratch: Path) -> Robot:
-    """The robot with fine meshes for its visual primitives, which PyBullet draws coarsely."""
+    """Replace visual primitives by fine meshes, because PyBullet draws primitives coarsely."""
     links = []
     for i, link in enumerate(robot.links):
         visuals = []

@@ -1,8 +1,8 @@
-"""Draw how alike all robots of the paper's scenarios are: docs/images/splits/{heatmap,map}.png.
+"""Draw the similarity of all robots of the paper's scenarios: docs/images/splits/{heatmap,map}.png.
 
     python docs/split_pictures.py [--measure tree]
 
-Every body once, whichever scenarios share it.
+A robot that several scenarios share is drawn once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from morphgen.grammar.library import default_library
 
 
 def main() -> int:
-    """Compare and draw."""
+    """Compute the similarities and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--measure", default="tree", choices=sorted(MEASURES))
     parser.add_argument(
@@ -36,25 +36,25 @@ def main() -> int:
     )
     args = parser.parse_args()
     library = default_library()
-    bodies: dict[str, Member] = {}
+    members: dict[str, Member] = {}
     for name in split_names():
         split = read_split(name)
         for member in (*split.train, *split.test):
-            bodies.setdefault(member.robot_hash, member)
-    found = []
-    for member in tqdm(bodies.values(), unit="robot", file=sys.stderr):
+            members.setdefault(member.robot_hash, member)
+    robots_features = []
+    for member in tqdm(members.values(), unit="robot", file=sys.stderr):
         robot = compose_member(member, library)
-        found.append(features(robot, token_shapes(robot, library.folders)))
-    names = [each.name for each in found]
+        robots_features.append(features(robot, token_shapes(robot, library.folders)))
+    names = [robot.name for robot in robots_features]
     measure = MEASURES[args.measure]
-    values = similarity_matrix(found, args.measure)
+    values = similarity_matrix(robots_features, args.measure)
     title = f"{args.measure}: {measure.meaning}"
     args.out.mkdir(parents=True, exist_ok=True)
     heat = heatmap_png(names, [Panel(title, values, measure.larger_is_more_alike)])
     (args.out / "heatmap.png").write_bytes(heat)
-    placed = classical_mds(to_distances(values, args.measure))
-    (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, placed)]))
-    print(f"{len(names)} bodies: {args.out}/heatmap.png, {args.out}/map.png")
+    points = classical_mds(to_distances(values, args.measure))
+    (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, points)]))
+    print(f"{len(names)} robots: {args.out}/heatmap.png, {args.out}/map.png")
     return 0
 
 
