@@ -1,7 +1,8 @@
-"""One primitive for several, the same whatever the last bits are."""
+"""The primitive fitted to several is good, and does not depend on the last bits of numbers."""
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import solid_of
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 
-SEEDS = range(6)
+SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 4, 5))]
+"""Links of two and of three primitives; more of the same are slow."""
 
 
 def drawn(seed, noise=0.0):
@@ -28,6 +30,11 @@ def drawn(seed, noise=0.0):
     return shapes
 
 
+@cache
+def fitted(seed):
+    return fit_composite(drawn(seed))
+
+
 def overlap(shapes, *found):
     return quality(solid_of(shapes), found, volume_points=2**15).iou
 
@@ -36,12 +43,12 @@ def overlap(shapes, *found):
 def test_no_primitive_of_the_link_overlaps_more(seed):
     shapes = drawn(seed)
     own = max(overlap(shapes, shape) for shape in shapes)
-    assert overlap(shapes, fit_composite(shapes)) > own - 0.01
+    assert overlap(shapes, fitted(seed)) > own - 0.01
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_last_bits_change_nothing(seed):
-    assert fit_composite(drawn(seed)) == fit_composite(drawn(seed, noise=3e-16))
+    assert fitted(seed) == fit_composite(drawn(seed, noise=3e-16))
 
 
 def test_of_two_rails_one_stands_for_the_link():

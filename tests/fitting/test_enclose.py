@@ -245,7 +245,7 @@ def test_what_has_no_volume_is_refused(points: Array, reason: str) -> None:
 
 
 def test_a_wrong_call_is_a_programming_error() -> None:
-    with pytest.raises(ValueError, match=r"\(8, 2\), not \(n, 3\)"):
+    with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
         enclose(CUBE[:, :2])
     with pytest.raises(ValueError, match="valid: some of box, cylinder, sphere"):
         enclose(CUBE, [])
