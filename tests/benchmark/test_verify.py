@@ -92,7 +92,7 @@ def test_words_about_a_split_may_be_changed(tmp_path):
     [
         ("base=planar[top: ee=cubw]", "unknown part 'cubw'; did you mean 'cube'?"),
         ("base=planar[top: ee=cube(size=9)]", "out of range"),
-        ("base=planar[", "no derivation"),
+        ("base=planar[", "invalid derivation"),
     ],
 )
 def test_a_robot_that_cannot_be_composed_is_told(tmp_path, derivation, why):

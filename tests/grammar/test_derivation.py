@@ -30,7 +30,7 @@ def test_printing_what_was_parsed_from_print_is_the_identity(tree):
 
 @pytest.mark.parametrize("text", ["", "arm", "arm=ur5(", "arm=ur5[top ee=x]", "a=b(c=d)", "a=b]"])
 def test_what_is_no_derivation_is_refused_with_its_place(text):
-    with pytest.raises(GrammarError, match=r"^card:1:\d+: no derivation"):
+    with pytest.raises(GrammarError, match=r"^card:1:\d+: invalid derivation"):
         parse_derivation(text, "card")
 
 

@@ -219,7 +219,7 @@ def test_a_large_file_and_a_binary_one_are_refused(tmp_path):
         ("a=b[c:" * 20_000 + "a=b" + "]" * 20_000, "^d: a derivation has more than 100 parts"),
         ("a=b[" + ",".join(["c:a=b"] * 20_000) + "]", "^d: a derivation has more than 100 parts"),
         ("a=b[c:" * 300_000, "^d: a derivation of 1,800,000 characters; expected at most 262,144"),
-        ("a=b[" * 20_000, "^d:1:6: no derivation"),
+        ("a=b[" * 20_000, "^d:1:6: invalid derivation"),
     ],
 )
 def test_a_derivation_beyond_the_limits_is_refused(text, message):
