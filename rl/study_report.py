@@ -146,8 +146,8 @@ def table_text(table: Sequence[Row]) -> str:
         for task in tasks:
             lines = [_line(row) for row in own if not row.mode or row.task == task]
             title = split if len(tasks) == 1 else f"{split}: {task}"
-            table = tabulate(lines, HEADERS, tablefmt="github", disable_numparse=True)
-            parts.append(f"## {title}\n\n{table}\n")
+            text = tabulate(lines, HEADERS, tablefmt="github", disable_numparse=True)
+            parts.append(f"## {title}\n\n{text}\n")
             parts += [
                 f"{row.agent} {row.mode}: {UNSTABLE}: {row.unstable}\n"
                 for row in own
