@@ -112,7 +112,7 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
         """Whether the part is procedural."""
         return self.package_source is None
 
-    @property
+    @cached_property
     def source(self) -> PackageSource | Path:
         """A file of a data package, or the template's own xacro."""
         return self.package_source or self.path.parent / self.file
