@@ -1,7 +1,8 @@
-"""Draw the pictures of robots: python docs/pictures.py [robots|panda_variations]."""
+"""Draw the pictures of robots for the docs: python docs/pictures.py [robots|panda_variations]."""
 
 from __future__ import annotations
 
+import math
 import sys
 import tempfile
 from collections.abc import Callable
@@ -28,12 +29,12 @@ TILE = (480, 360)
 
 
 def robots() -> list[Robot]:
-    """The README's robots."""
+    """Return the robots of the README."""
     return [morphgen.compose(request) for request in REQUESTS]
 
 
 def panda_variations() -> list[Robot]:
-    """Six of the train robots of interpolation/panda."""
+    """Return six of the train robots of interpolation/panda."""
     library = default_library()
     members = read_split("interpolation/panda/reach").train[:6]
     return [compose_member(member, library) for member in members]
@@ -43,19 +44,19 @@ SHEETS: tuple[Callable[[], list[Robot]], ...] = (robots, panda_variations)
 
 
 def main() -> None:
-    """Paste the previews of every sheet's robots into one picture."""
-    asked = sys.argv[1:]
+    """Draw the named pictures, or all."""
+    names = sys.argv[1:]
     for sheet in SHEETS:
-        if not asked or sheet.__name__ in asked:
+        if not names or sheet.__name__ in names:
             draw(sheet(), Path(__file__).parent / "images" / f"{sheet.__name__}.png")
 
 
-def draw(shown: list[Robot], target: Path) -> None:
-    """Write robots beside each other into a picture."""
-    rows = -(-len(shown) // COLUMNS)
+def draw(robots: list[Robot], target: Path) -> None:
+    """Paste the previews of robots into one picture, in rows of ``COLUMNS``."""
+    rows = math.ceil(len(robots) / COLUMNS)
     picture = Image.new("RGB", (COLUMNS * TILE[0], rows * TILE[1]), "white")
     with tempfile.TemporaryDirectory() as scratch:
-        for i, robot in enumerate(shown):
+        for i, robot in enumerate(robots):
             folder = morphgen.write(robot, scratch)
             tile = Image.open(folder / "preview.png").resize(TILE, Image.Resampling.LANCZOS)
             picture.paste(tile, (i % COLUMNS * TILE[0], i // COLUMNS * TILE[1]))
