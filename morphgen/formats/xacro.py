@@ -12,6 +12,7 @@ from xml.dom import minidom
 from xml.parsers.expat import ExpatError
 
 from morphgen.errors import FormatError, nearest
+from morphgen.formats import xacro_process
 from morphgen.formats.resolve import PackageFinder, is_installed, require_allowed_text
 from morphgen.formats.xacro_engine import thread_engine
 from morphgen.formats.xacro_files import (
@@ -22,7 +23,6 @@ from morphgen.formats.xacro_files import (
     read_file,
 )
 from morphgen.formats.xacro_functions import RefusedError
-from morphgen.formats.xacro_process import MEMORY_LIMIT, run_in_child
 from morphgen.formats.xml import parse_xml
 
 MAX_INCLUDE_DEPTH = 40
@@ -81,7 +81,7 @@ def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
         except FormatError:
             if not expansion.met_foreign:
                 raise
-    document: str = run_in_child(expand_here, path, finder, args=args)
+    document: str = xacro_process.run_in_child(expand_here, path, finder, args=args)
     return document.encode()
 
 
@@ -290,7 +290,7 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, RecursionError):
         return "macros or properties refer to each other endlessly or too deeply"
     if isinstance(error, MemoryError):
-        return f"its expansion needs more than {MEMORY_LIMIT >> 20} MiB of memory"
+        return f"its expansion needs more than {xacro_process.MEMORY_LIMIT >> 20} MiB of memory"
     reason = " ".join(f"{error or type(error).__name__} {suffix}".split())
     return reason if len(reason) <= MAX_REASON else f"{reason[:MAX_REASON]}..."
 

@@ -140,6 +140,8 @@ class _Recorder(logging.Handler):
 
 def limit_process(cpu: int, memory: int) -> None:
     """Limit CPU time [s] and address space [bytes] of this process, and forbid writing files."""
+    global MEMORY_LIMIT
+    MEMORY_LIMIT = memory  # errors of the expansion name it
     sys.setrecursionlimit(_RECURSION_LIMIT)
     try:
         import resource

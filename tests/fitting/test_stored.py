@@ -94,7 +94,7 @@ def test_plain_data_names_the_kind_and_where_it_is():
 
 @pytest.mark.parametrize("geometry", [Capsule(0.1, 0.2), Mesh(Path("m.stl"))])
 def test_only_boxes_cylinders_and_spheres_are_stored(geometry):
-    with pytest.raises(ValueError, match=f"{type(geometry).__name__} is no box"):
+    with pytest.raises(ValueError, match=f"{type(geometry).__name__} is not a box"):
         shape_to_data(Shape(geometry))
 
 

@@ -158,7 +158,7 @@ def test_what_is_no_reference_to_a_file_is_refused(uri: str, urdf: Path) -> None
 
 
 def test_a_folder_is_not_a_file(urdf: Path) -> None:
-    assert "no file" in failure("../urdf", urdf)
+    assert "does not exist" in failure("../urdf", urdf)
 
 
 def test_ros_environment_is_searched_after_given_roots(

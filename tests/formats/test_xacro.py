@@ -278,7 +278,7 @@ def test_an_expression_is_a_number(expression: str, value: float) -> None:
         ("${True}", "not a finite number"),
         ("long", "not a finite number"),
         ("", "not a finite number"),
-        ("$(arg length)", "no meaning"),
+        ("$(arg length)", "is not valid here"),
         ("${().__class__}", "__class__"),
     ],
 )
