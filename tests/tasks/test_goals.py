@@ -293,7 +293,7 @@ def test_a_changed_byte_is_noticed(body, cache):
 def test_a_file_under_another_name_is_noticed(body, cache):
     first, second = made(body, cache), made(body, cache, seed=1)
     (cache / f"{first.key}.npz").replace(cache / f"{second.key}.npz")
-    with pytest.raises(TaskError, match=f"a set of key {first.key}, not"):
+    with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
         made(body, cache, seed=1)
 
 
@@ -329,8 +329,8 @@ def test_a_certificate_names_every_fault(body, cache):
     assert "goal 5: the tool" in faults(poses=poses)[0]
     assert faults(poses=found.poses * [1, 1, 1, -1, -1, -1, -1]) == []
     assert faults(obstacles=()) == ["the obstacles of the scene are not those of the goal set"]
-    assert "no goals of robot 'arm'" in faults(q=found.q[:, :2])[0]
-    assert "no goals of robot 'arm'" in faults(poses=found.poses[1:])[0]
+    assert "not goals of robot 'arm'" in faults(q=found.q[:, :2])[0]
+    assert "not goals of robot 'arm'" in faults(poses=found.poses[1:])[0]
 
 
 def test_a_certificate_notices_a_collision(body, cache):

@@ -185,7 +185,7 @@ def test_a_robot_that_cannot_push_is_refused_with_the_reason(cache):
         TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
     ):
         made("cartpole", cache)
-    with pytest.raises(TaskError, match="'prims' can hardly push: only 0 of 160 places") as caught:
+    with pytest.raises(TaskError, match="'prims' can hardly push: only 0 of 160 poses") as caught:
         made("prims", cache, config=replace(CONFIG, start=-0.9))
     assert "acceptance rate 0), 5 are needed; the tool does not get behind it (100%)" in str(
         caught.value
@@ -225,7 +225,7 @@ def test_a_broken_or_misnamed_file_is_named(cache):
     first, second = made("prims", cache), made("prims", cache, seed=1)
     paths = [cache / f"{each.key}.npz" for each in (first, second)]
     paths[1].write_bytes(paths[0].read_bytes())
-    with pytest.raises(TaskError, match=f"a set of key {first.key}, not"):
+    with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
         made("prims", cache, seed=1)
     paths[0].write_bytes(paths[0].read_bytes()[:-100])
     with pytest.raises(TaskError, match=f"{paths[0].name}: not a PushStartSet: .*; delete it"):

@@ -171,8 +171,8 @@ def test_an_episode_that_diverges_is_never_a_success(made):
             return torch.zeros(task.action_mask.shape)
 
     reached, pushed, *_ = run_episodes(batch, Breaks(), 1)
-    assert reached.diverged
-    assert pushed.diverged
+    assert reached.unstable
+    assert pushed.unstable
     assert not reached.success
     assert not pushed.success
     assert pushed.score == 0

@@ -197,7 +197,7 @@ def test_stable_baselines3_asks_for_attributes(batch_from_specs):
     assert envs.get_attr("label") == ["x"] * 4
     seen, _ = envs.env_method("reset", seed=1)[0]
     assert seen in envs.vector.observation_space
-    with pytest.raises(TaskError, match="in common"):
+    with pytest.raises(TaskError, match="share their attributes"):
         envs.set_attr("label", "y", indices=0)
 
 
