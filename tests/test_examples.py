@@ -51,7 +51,7 @@ def test_a_task_outside_of_the_package_trains_plays_and_is_shown(follow, tmp_pat
         pass
     rollout.close()
     (track,) = rollout.episode.tracks
-    assert track.steps == 200
+    assert track.num_steps == 200
     goals = np.array(track.marker_poses["goal"])
     assert goals.shape == (201, 7)
     assert np.linalg.norm(goals[100, :2] - goals[0, :2]) == pytest.approx(0.1, abs=1e-3)
