@@ -179,7 +179,7 @@ def _moves(browser: Any, folder: Path, moves: int) -> list[Row]:  # noqa: ANN401
 
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
-    from morphgen.viewer import page_robot
+    from morphgen.viewer import page_robot_show
     from morphgen.viewer.app import serve
     from morphgen.viewer.page_robot_show import RobotPage, update_scene
 
@@ -190,7 +190,7 @@ def _serve(told: Path) -> None:
         update_scene(moved)
         times.append(1e3 * (time.perf_counter() - begun))
 
-    with patch.object(page_robot, "update_scene", timed):
+    with patch.object(page_robot_show, "update_scene", timed):
         viewer = serve()
         print(f"http://127.0.0.1:{viewer.port}", flush=True)
         with suppress(KeyboardInterrupt):

@@ -38,6 +38,8 @@ from morphgen.viewer.workers import Workers
 
 NOTHING = "There is nothing to see here"
 """Title of the page for an address that cannot be shown."""
+FAULT_WIDTH = 760.0
+"""Width of that page's panel [pixels]."""
 NUM_WORKERS = 2
 """Processes that draw thumbnails and compare robots."""
 
@@ -187,13 +189,10 @@ def open_page(session: Session) -> None:
 
 
 def _show_fault(session: Session, title: str, html: str) -> None:
-    gui, session.status = session.client.gui, None
+    gui = session.client.gui
     gui.reset()
     session.client.scene.reset()
-    gui.set_panel_label("morphgen")
-    gui.main_panel.dock_left()
-    gui.main_panel.set_width(760)
-    gui.add_html(markup.STYLE + markup.breadcrumbs((session.address.page, None)))
+    session.open_panel(FAULT_WIDTH, markup.breadcrumbs((session.address.page, None)), left=True)
     gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{html}"))
 
 

@@ -13,21 +13,9 @@ from typing import Any
 import viser
 
 from morphgen.formats.bundle import PICTURE
-from morphgen.viewer import markup
+from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.address import Address, parse_count
 from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
-from morphgen.viewer.robot_rows import (
-    NUMBERS,
-    PAGE_SIZES,
-    SORTS,
-    Filter,
-    Row,
-    fact_choices,
-    fact_range,
-    facts_line,
-    select_page,
-    sort_rows,
-)
 from morphgen.viewer.session import Session
 from morphgen.viewer.workers import WorkerDied
 
@@ -47,7 +35,7 @@ _PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
 _RANGE_LABELS = {"dof": "DoF", "reach": "Reach (m)", "mass": "Mass (kg)"}
 _SORT_KEYS = {
     label: key
-    for name in SORTS
+    for name in robot_rows.SORTS
     for label, key in ((name, name), (f"{name}, largest first", f"-{name}"))
 }
 """Keys of ``sort_rows`` by their label in the dropdown."""
@@ -59,7 +47,7 @@ class Gallery:
 
     session: Session
     title: str
-    rows: list[Row]
+    rows: list[robot_rows.Row]
     """All robots, shown or not."""
     columns: tuple[str, ...] = ()
     """Roles that are shown in a column each; without any, all robots are in one grid."""
@@ -72,7 +60,7 @@ class Gallery:
     grid: viser.GuiHtmlHandle | None = None
     summary: str = ""
     """Number of robots that pass the filter, and of the page."""
-    page_rows: list[Row] = field(default_factory=list)
+    page_rows: list[robot_rows.Row] = field(default_factory=list)
     """Robots on the current page."""
     page_number: int = 1
 
@@ -90,11 +78,7 @@ def open_panels(
     """
     client = gallery.session.client
     gui = client.gui
-    gui.set_panel_label("morphgen")
-    gui.main_panel.dock_right()
-    gui.main_panel.set_width(width)
-    gui.add_html(markup.STYLE + breadcrumbs + (markup.framed(header) if header else ""))
-    gallery.session.status = gui.add_html("")
+    gallery.session.open_panel(width, breadcrumbs + (markup.framed(header) if header else ""))
     panel = gui.add_panel()
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
@@ -114,16 +98,20 @@ def add_controls(gallery: Gallery) -> None:
     controls["search"] = gui.add_text("Search", state.get("search", ""))
     labels = {key: label for label, key in _SORT_KEYS.items()}
     add_dropdown("sort", "Sort by", list(_SORT_KEYS), labels.get(state.get("sort", ""), ""))
-    is_filtered = not state.keys().isdisjoint({"category", "role", "findings", "size", *NUMBERS})
+    is_filtered = not state.keys().isdisjoint(
+        {"category", "role", "findings", "size", *robot_rows.NUMBERS}
+    )
     with gui.add_folder("Filter", expand_by_default=is_filtered):
         for key, label in (("category", "Category"), ("role", "Role")):
-            if len(options := fact_choices(gallery.rows, key)) > 1:
+            if len(options := robot_rows.fact_choices(gallery.rows, key)) > 1:
                 add_dropdown(key, label, [_ALL, *options], state.get(key, _ALL))
         findings = [_ALL, "with", "without"]
         add_dropdown("findings", "Findings", findings, state.get("findings", _ALL))
-        for fact in NUMBERS:
+        for fact in robot_rows.NUMBERS:
             _add_range(gallery, fact)
-        add_dropdown("size", "On a page", list(map(str, PAGE_SIZES)), state.get("size", ""))
+        add_dropdown(
+            "size", "On a page", list(map(str, robot_rows.PAGE_SIZES)), state.get("size", "")
+        )
     gallery.page_number = parse_count(state.get("n", ""), 1)
     buttons = gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
 
@@ -136,9 +124,9 @@ def add_controls(gallery: Gallery) -> None:
     _show_page(gallery, gallery.page_number)
 
 
-def passing_rows(gallery: Gallery) -> list[Row]:
+def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
     """Return the robots that pass the filter, on all pages, in the order of the set."""
-    return sort_rows(filter(_current_filter(gallery).passes, gallery.rows), "order")
+    return robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), "order")
 
 
 def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
@@ -148,7 +136,7 @@ def show_saved(session: Session, path: Path, text: viser.GuiHtmlHandle) -> None:
     session.notify("Saved", name)
 
 
-def card(row: Row, thumbnail: str, fault: str) -> str:
+def card(row: robot_rows.Row, thumbnail: str, fault: str) -> str:
     """Return a robot's card in the grid, a link to its page."""
     image = f'<img alt="" src="{thumbnail}">'
     if not thumbnail:
@@ -158,7 +146,7 @@ def card(row: Row, thumbnail: str, fault: str) -> str:
         tags += markup.tag(row.task)
     if row.findings:
         tags += markup.tag(", ".join(row.findings[:2]), "error" if fault else "warning")
-    facts = facts_line(row) or escape(row.category)
+    facts = robot_rows.facts_line(row) or escape(row.category)
     query = escape(Address("robot", (row.uri,)).query)
     return (
         f'<a class="card" href="{query}" title="{escape(fault or row.uri)}">'
@@ -171,13 +159,13 @@ def _show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
     session, controls = gallery.session, gallery.controls
     sort = _SORT_KEYS[controls["sort"].value]
-    rows = sort_rows(filter(_current_filter(gallery).passes, gallery.rows), sort)
+    rows = robot_rows.sort_rows(filter(_current_filter(gallery).passes, gallery.rows), sort)
     size = int(controls["size"].value)
-    gallery.page_rows, gallery.page_number, count = select_page(rows, number, size)
+    gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
     state = {key: str(control.value) for key, control in controls.items()}
-    state |= {fact: _range_text(gallery, fact) for fact in NUMBERS if fact in controls}
+    state |= {fact: _range_text(gallery, fact) for fact in robot_rows.NUMBERS if fact in controls}
     state |= {"sort": sort, "n": str(gallery.page_number)}
-    defaults = {"sort": "order", "n": "1", "size": str(PAGE_SIZES[0])}
+    defaults = {"sort": "order", "n": "1", "size": str(robot_rows.PAGE_SIZES[0])}
     for key, value in state.items():
         if value == defaults.get(key, _ALL) and key != "search":
             state[key] = ""
@@ -189,18 +177,18 @@ def _show_page(gallery: Gallery, number: int) -> None:
     session.run_in_background(lambda: _draw_missing(gallery), "thumbnails")
 
 
-def _current_filter(gallery: Gallery) -> Filter:
+def _current_filter(gallery: Gallery) -> robot_rows.Filter:
     values = {
         key: "" if control.value == _ALL and key != "search" else control.value
         for key, control in gallery.controls.items()
-        if key not in NUMBERS
+        if key not in robot_rows.NUMBERS
     }
     ranges = {}
-    for fact in NUMBERS:
+    for fact in robot_rows.NUMBERS:
         if fact in gallery.controls and _range_text(gallery, fact):
             low, high = gallery.controls[fact].value
             ranges[fact] = (low - 1e-9, high + 1e-9)  # browsers round
-    return Filter(
+    return robot_rows.Filter(
         values["search"],
         values.get("category", ""),
         values.get("role", ""),
@@ -279,7 +267,7 @@ def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
 
 def _add_range(gallery: Gallery, fact: str) -> None:
     """Add a slider with two ends for a fact that varies."""
-    limits = fact_range(gallery.rows, fact)
+    limits = robot_rows.fact_range(gallery.rows, fact)
     if limits is None:
         return
     step = 1.0 if fact == "dof" else 0.001
@@ -304,7 +292,7 @@ def _parse_range(text: str, low: float, high: float) -> tuple[float, float]:
 def _range_text(gallery: Gallery, fact: str) -> str:
     """Return a range slider's value for the address; empty if it lets every known value pass."""
     low, high = gallery.controls[fact].value
-    limits = fact_range(gallery.rows, fact)
+    limits = robot_rows.fact_range(gallery.rows, fact)
     if limits is None or (low <= limits[0] and high >= limits[1]):
         return ""
     return f"{low:g}..{high:g}"

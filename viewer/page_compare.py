@@ -13,34 +13,10 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import split_colours
 from morphgen.model.robot import Robot
-from morphgen.viewer import markup
+from morphgen.viewer import comparison, markup, scene_robot
 from morphgen.viewer.address import Address
-from morphgen.viewer.comparison import (
-    all_roles,
-    compare_robots,
-    fit_quality,
-    fit_table,
-    iou_colour,
-    joint_roles,
-    normalized_positions,
-    similarity_table,
-    with_roles,
-)
 from morphgen.viewer.figures import tokens_png
-from morphgen.viewer.page_robot import open_panel
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
-from morphgen.viewer.scene_robot import (
-    RobotView,
-    add_floor,
-    add_robot,
-    look_at,
-    paint,
-    remove_layer,
-    robot_bounds,
-    set_configuration,
-    set_visible,
-    show_shapes,
-)
 from morphgen.viewer.session import Session, set_value
 
 MAX_ROBOTS = 4
@@ -58,7 +34,7 @@ class ComparePage:
     session: Session
     uris: tuple[str, ...]
     robots: list[Robot]
-    views: list[RobotView]
+    views: list[scene_robot.RobotView]
     sliders: dict[str, viser.GuiSliderHandle[float]] = field(default_factory=dict)
     """Sliders by role of the joints."""
     moved: dict[str, float] = field(default_factory=dict)
@@ -77,7 +53,7 @@ def show(session: Session) -> None:
     if not 1 <= len(uris) <= MAX_ROBOTS:
         raise UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_ROBOTS}")
     header = markup.breadcrumbs(("compare", None))
-    open_panel(session, PANEL_WIDTH, header, f"reading {len(uris)} robots")
+    session.open_panel(PANEL_WIDTH, header, f"reading {len(uris)} robots")
     robots = [split_colours(read_robot_uri(uri, session.files)) for uri in uris]
     page = ComparePage(session, uris, robots, _add_robots(session, robots))
     gui = session.client.gui
@@ -104,21 +80,21 @@ def parse_uris(text: str) -> tuple[str, ...]:
     return tuple(line.strip() for line in text.splitlines() if line.strip())
 
 
-def _add_robots(session: Session, robots: Sequence[Robot]) -> list[RobotView]:
+def _add_robots(session: Session, robots: Sequence[Robot]) -> list[scene_robot.RobotView]:
     """Draw robots in a row along y, the first at the left as the camera sees it."""
     scene = session.client.scene
     views, corners, edge = [], [], 0.0
     for i, robot in enumerate(robots):
-        low, high = robot_bounds(robot)
+        low, high = scene_robot.robot_bounds(robot)
         y = edge - float(low[1])
         edge = y + float(high[1]) + GAP
-        views.append(add_robot(scene, robot, f"/robot{i}", (0.0, y, 0.0)))
+        views.append(scene_robot.add_robot(scene, robot, f"/robot{i}", (0.0, y, 0.0)))
         above = (0.0, y, float(high[2]) + 0.12)
         scene.add_label(f"/label{i}", robot.name, position=above, anchor="bottom-center")
         corners += [corner + np.array([0.0, y, 0.0]) for corner in (low, high)]
     lowest, highest = np.min(corners, axis=0), np.max(corners, axis=0)
-    add_floor(scene, float(np.linalg.norm(highest - lowest)))
-    look_at(session.client, lowest, highest, (0.74, 0.09, 0.28))
+    scene_robot.add_floor(scene, float(np.linalg.norm(highest - lowest)))
+    scene_robot.look_at(session.client, lowest, highest, (0.74, 0.09, 0.28))
     return views
 
 
@@ -151,8 +127,10 @@ def _add_move_tab(page: ComparePage) -> None:
     gui, session = page.session.client.gui, page.session
     buttons = gui.add_button_group("Go to", ("home", "middle"))
     session.on_change(buttons, lambda: _go_to(page, buttons.value))
-    for role in all_roles(page.robots):
-        names = ", ".join(robot.name for robot in page.robots if role in joint_roles(robot))
+    for role in comparison.all_roles(page.robots):
+        names = ", ".join(
+            robot.name for robot in page.robots if role in comparison.joint_roles(robot)
+        )
         value = _home_value(page, role)
         slider = gui.add_slider(role, -1.0, 1.0, 0.01, value, hint=f"of {names}")
         page.sliders[role] = slider
@@ -161,9 +139,9 @@ def _add_move_tab(page: ComparePage) -> None:
 
 def _home_value(page: ComparePage, role: str) -> float:
     """Return a role's normalized home position of the first robot that has the role."""
-    robot = next(robot for robot in page.robots if role in joint_roles(robot))
-    home = normalized_positions(robot, np.array(robot.home))
-    return float(np.clip(home[joint_roles(robot).index(role)], -1, 1))
+    robot = next(robot for robot in page.robots if role in comparison.joint_roles(robot))
+    home = comparison.normalized_positions(robot, np.array(robot.home))
+    return float(np.clip(home[comparison.joint_roles(robot).index(role)], -1, 1))
 
 
 def _read_sliders(page: ComparePage) -> None:
@@ -183,22 +161,24 @@ def _go_to(page: ComparePage, target: str) -> None:
 def _move(page: ComparePage) -> None:
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
-            set_configuration(view, with_roles(robot, np.array(robot.home), page.moved))
+            view.set_configuration(comparison.with_roles(robot, np.array(robot.home), page.moved))
 
 
 def _show_fits(page: ComparePage, *, on: bool) -> None:
     """Show the stored primitives of the robots and their IoU, or the meshes again."""
     parts = []
     for robot, view in zip(page.robots, page.views, strict=True):
-        set_visible(view, "visual", not on)
-        remove_layer(view, "primitives")
+        view.set_visible("visual", not on)
+        view.remove_layer("primitives")
         if not on:
             continue
-        quality = fit_quality(robot, page.session.files.library_folders)
+        quality = comparison.fit_quality(robot, page.session.files.library_folders)
         shapes = [quality[link.name][1] if link.name in quality else () for link in robot.links]
-        show_shapes(view, "primitives", shapes)
-        paint(view, "primitives", {name: iou_colour(iou) for name, (iou, _) in quality.items()})
-        parts.append(f"<h3>{escape(robot.name)}</h3>" + fit_table(robot, quality))
+        view.show_shapes("primitives", shapes)
+        view.paint(
+            "primitives", {name: comparison.iou_colour(iou) for name, (iou, _) in quality.items()}
+        )
+        parts.append(f"<h3>{escape(robot.name)}</h3>" + comparison.fit_table(robot, quality))
     page.texts["fits"].content = markup.framed(*parts)
 
 
@@ -209,7 +189,7 @@ def _compare(page: ComparePage) -> None:
     session.set_status("comparing")
     try:
         folders = session.files.library_folders
-        comparison = session.run_in_worker(compare_robots, page.robots, folders)
+        result = session.run_in_worker(comparison.compare_robots, page.robots, folders)
     except MorphgenError as error:
         page.texts["similarity"].content = markup.framed(
             markup.tag("cannot be compared", "warning"), escape(session.files.redact(error))
@@ -217,9 +197,9 @@ def _compare(page: ComparePage) -> None:
         session.set_status("")
         return
     links = [[link.name for link in robot.links] for robot in page.robots]
-    picture = base64.b64encode(tokens_png(names, links, comparison.tables)).decode()
+    picture = base64.b64encode(tokens_png(names, links, result.tables)).decode()
     page.texts["similarity"].content = markup.framed(
-        "<h3>Similarity</h3>", similarity_table(names, comparison)
+        "<h3>Similarity</h3>", comparison.similarity_table(names, result)
     )
     page.texts["tokens"].content = markup.framed(
         markup.dim(

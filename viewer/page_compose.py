@@ -15,22 +15,10 @@ from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
 from morphgen.model.robot import Robot
-from morphgen.viewer import markup
+from morphgen.viewer import markup, part_choice
 from morphgen.viewer.address import Address
 from morphgen.viewer.page_compose_grammar import add_grammar_tab, show_grammar
-from morphgen.viewer.page_robot import PANEL_WIDTH, open_panel, summary
-from morphgen.viewer.part_choice import (
-    NO_PART,
-    Control,
-    PartChoice,
-    controls_of,
-    kind_of,
-    parse_choice,
-    part_options,
-    slots_of,
-    with_part,
-    with_value,
-)
+from morphgen.viewer.page_robot import PANEL_WIDTH, summary
 from morphgen.viewer.robot_files import new_bundle_files, zip_files
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import WORDS, resolve_grammar, resolve_words
@@ -60,7 +48,7 @@ class PartsTab:
     """The tab on which parts are chosen."""
 
     page: ComposePage
-    choice: PartChoice
+    choice: part_choice.PartChoice
     fault: viser.GuiHtmlHandle
     folder: viser.GuiFolderHandle
     slots: dict[str, viser.GuiFolderHandle] = field(default_factory=dict)
@@ -76,10 +64,10 @@ def show(session: Session) -> None:
     words = session.address.subject.split()
     is_grammar = bool(words) and "=" not in words[0]
     parts = DEFAULT_PARTS if is_grammar or not words else words
-    choice = parse_choice(parts, session.files.library)
+    choice = part_choice.parse_choice(parts, session.files.library)
     name = words[0] if is_grammar else DEFAULT_GRAMMAR
     grammar = resolve_grammar(name, session.files)
-    open_panel(session, PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
+    session.open_panel(PANEL_WIDTH + 30, markup.breadcrumbs(("compose", None)))
     gui = session.client.gui
     page = ComposePage(session, gui.add_html(""))
     add_floor(session.client.scene, 2.0)
@@ -185,7 +173,7 @@ def _send_bundle(page: ComposePage, name: str) -> None:
 
 
 def _add_parts_tab(
-    page: ComposePage, tabs: viser.GuiTabGroupHandle, choice: PartChoice
+    page: ComposePage, tabs: viser.GuiTabGroupHandle, choice: part_choice.PartChoice
 ) -> PartsTab:
     session = page.session
     gui = session.client.gui
@@ -223,27 +211,31 @@ def _add_slots(tab: PartsTab) -> None:
         folder.remove()
     tab.slots.clear()
     with tab.folder:
-        for slot in ("base", *slots_of(tab.choice, library)):
+        for slot in ("base", *part_choice.slots_of(tab.choice, library)):
             folder = tab.slots[slot] = gui.add_folder(slot)
             with folder:
                 if slot != "base":
                     _add_part_dropdown(tab, slot)
                 if part := tab.choice.parts.get(slot):
-                    for control in controls_of(slot, library.manifest(part, kind_of(slot))):
+                    for control in part_choice.controls_of(
+                        slot, library.manifest(part, part_choice.kind_of(slot))
+                    ):
                         _add_slider(tab, control)
 
 
 def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
     session = tab.page.session
-    names = part_options(slot, session.files.library)
+    names = part_choice.part_options(slot, session.files.library)
     chosen = tab.choice.parts.get(slot)
     dropdown = session.client.gui.add_dropdown(
-        kind_of(slot), tuple(names), initial_value=chosen if chosen in names else NO_PART
+        part_choice.kind_of(slot),
+        tuple(names),
+        initial_value=chosen if chosen in names else part_choice.NO_PART,
     )
     session.on_change(dropdown, lambda: _choose_part(tab, slot, dropdown.value))
 
 
-def _add_slider(tab: PartsTab, control: Control) -> None:
+def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
     slider = tab.page.session.client.gui.add_slider(
         control.label,
         control.low,
@@ -254,13 +246,13 @@ def _add_slider(tab: PartsTab, control: Control) -> None:
     )
 
     def set_parameter() -> None:
-        tab.choice = with_value(tab.choice, control, slider.value)
+        tab.choice = part_choice.with_value(tab.choice, control, slider.value)
         _show_choice(tab)
 
     tab.page.session.on_change(slider, set_parameter, control.key)
 
 
 def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
-    tab.choice = with_part(tab.choice, slot, part, tab.page.session.files.library)
+    tab.choice = part_choice.with_part(tab.choice, slot, part, tab.page.session.files.library)
     _add_slots(tab)
     _show_choice(tab)

@@ -22,7 +22,6 @@ from morphgen.viewer.page_play_controls import (
     parse_rollout,
     rollout_address,
 )
-from morphgen.viewer.page_robot import open_panel
 from morphgen.viewer.player import SPEEDS, Player
 from morphgen.viewer.robot_uri import EPISODE_SUFFIX, uri_name
 from morphgen.viewer.rollout import EpisodeSource, RecordedEpisode, Rollout, RolloutConfig
@@ -109,7 +108,7 @@ def show(session: Session) -> None:
     """
     gui, subject = session.client.gui, session.address.subject
     header = markup.breadcrumbs((uri_name(subject) or "play", None))
-    open_panel(session, PANEL_WIDTH, header, "reading")
+    session.open_panel(PANEL_WIDTH, header, "reading")
     if subject.endswith(EPISODE_SUFFIX):
         episode = read_episode(session.files.path(subject), session.files)
         page, player = _add_player(session)

@@ -140,8 +140,12 @@ def add_rollout_controls(controls: RolloutControls) -> None:
         action = gui.add_button_group("this robot", ACTIONS)
     session.on_change(restart, lambda: _change(controls, seed=controls.config.seed + 1))
     session.on_change(handles["task"], lambda: _change_task(controls))
+
+    def apply(name: str) -> None:
+        _change(controls, **{name: handles[name].value})
+
     for name in ("policy", "obstacles", "seed", "simulator"):
-        session.on_change(handles[name], functools.partial(_apply, controls, name), name)
+        session.on_change(handles[name], functools.partial(apply, name), name)
     session.on_change(handles["from"], lambda: _list_robots(controls))
     session.on_change(handles["robot"], lambda: _use_robot(controls, "replace"))
     session.on_change(action, lambda: _use_robot(controls, action.value))
@@ -221,10 +225,6 @@ def _use_robot(controls: RolloutControls, action: str) -> None:
         _change(controls, robots=(*robots, uri))
     else:
         _change(controls, robots=(uri, *(robots[1:] if action == "replace" else ())))
-
-
-def _apply(controls: RolloutControls, name: str) -> None:
-    _change(controls, **{name: controls.handles[name].value})
 
 
 def _change_task(controls: RolloutControls) -> None:

@@ -20,7 +20,7 @@ from morphgen.model.kinematics import joint_limits, random_configurations, reach
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
-from morphgen.viewer import markup, robot_tables
+from morphgen.viewer import markup, robot_tables, scene_robot
 from morphgen.viewer.address import Address
 from morphgen.viewer.page_robot_show import (
     RobotPage,
@@ -44,13 +44,6 @@ from morphgen.viewer.robot_uri import (
     uri_name,
 )
 from morphgen.viewer.scene_overlays import Overlays
-from morphgen.viewer.scene_robot import (
-    add_floor,
-    add_robot,
-    look_at,
-    paint_red,
-    robot_bounds,
-)
 from morphgen.viewer.session import Session, set_value
 
 PANEL_WIDTH = 390.0
@@ -71,12 +64,12 @@ def show(session: Session) -> None:
     """
     uri = session.address.subject
     gui = session.client.gui
-    open_panel(session, PANEL_WIDTH, _location(session, uri), f"reading {uri_name(uri)}")
+    session.open_panel(PANEL_WIDTH, _location(session, uri), f"reading {uri_name(uri)}")
     robot = split_colours(read_robot_uri(uri, session.files))
-    low, high = robot_bounds(robot)
-    add_floor(session.client.scene, float(np.linalg.norm(high - low)))
-    look_at(session.client, low, high)
-    view = add_robot(session.client.scene, robot, "/robot")
+    low, high = scene_robot.robot_bounds(robot)
+    scene_robot.add_floor(session.client.scene, float(np.linalg.norm(high - low)))
+    scene_robot.look_at(session.client, low, high)
+    view = scene_robot.add_robot(session.client.scene, robot, "/robot")
     page = RobotPage(session, uri, robot, view, Overlays(view), np.array(robot.home))
     gui.add_html(summary(robot, _task_links(robot, uri)))
     tabs = gui.add_tab_group()
@@ -93,16 +86,6 @@ def show(session: Session) -> None:
     session.set_status("")
     _apply_address(page)
     session.run_in_background(lambda: _check_robot(page))
-
-
-def open_panel(session: Session, width: float, header: str, status: str = "") -> None:
-    """Open a page's panel at the right, with breadcrumbs or other HTML and the status line."""
-    gui = session.client.gui
-    gui.set_panel_label("morphgen")
-    gui.main_panel.dock_right()
-    gui.main_panel.set_width(width)
-    gui.add_html(markup.STYLE + header)
-    session.status = gui.add_html(markup.status(status))
 
 
 def summary(robot: Robot, links: str) -> str:
@@ -214,10 +197,10 @@ def _add_links_tab(page: RobotPage) -> None:
         name = dropdown.value
         if name == _NO_LINK:
             details.content = ""
-            paint_red(page.view, ())
+            page.view.paint_red(())
         else:
             details.content = markup.framed(robot_tables.link_details(page.robot, name))
-            paint_red(page.view, (name,))
+            page.view.paint_red((name,))
 
     page.session.on_change(dropdown, select_link)
 

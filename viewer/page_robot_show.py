@@ -21,7 +21,6 @@ from morphgen.viewer import markup, robot_tables, scene_overlays, scene_robot
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import with_library_meshes
 from morphgen.viewer.scene_overlays import Overlays, remove_overlay
-from morphgen.viewer.scene_robot import LAYERS, Layer, RobotView, robot_extent
 from morphgen.viewer.session import Session, set_value
 
 FRAMES, GIZMO = "frames", "drag the tool"
@@ -30,12 +29,12 @@ _SHOW_OVERLAY: Mapping[str, Callable[[Overlays], None]] = {
     "centres of mass": scene_overlays.show_mass_centres,
     "ignored pairs": scene_overlays.show_ignored_pairs,
 }
-TOGGLES = (*LAYERS, FRAMES, *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
+TOGGLES = (*scene_robot.LAYERS, FRAMES, *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
 """What can be shown of a robot, as named in the address."""
 TOOL_TOGGLES = ("workspace", "trail", GIZMO)
 """Those that need a tool."""
 ADDRESS_DELAY = 0.5
-"""Time between a move and the update of the URL, which browsers limit to about 3 a second [s]."""
+"""Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
 
 
 @dataclass(eq=False)
@@ -45,7 +44,7 @@ class RobotPage:
     session: Session
     uri: str
     robot: Robot
-    view: RobotView
+    view: scene_robot.RobotView
     overlays: Overlays
     q: Array
     """Independent joint positions, shape (dof,) [rad or m]."""
@@ -81,10 +80,10 @@ def read_sliders(page: RobotPage) -> None:
 def update_scene(page: RobotPage) -> None:
     """Draw the robot and its overlays at the current configuration."""
     with page.session.client.atomic():
-        scene_robot.set_configuration(page.view, page.q)
+        page.view.set_configuration(page.q)
         if page.checker is not None:
             (collisions,) = page.checker.penetrations([page.q])
-            scene_robot.paint_red(page.view, {name for pair in collisions for name in pair})
+            page.view.paint_red({name for pair in collisions for name in pair})
             text = robot_tables.collision_text(collisions)
             page.texts["collisions"].content = markup.framed(text)
         if is_on(page, "ignored pairs"):
@@ -135,7 +134,7 @@ def add_toggles(page: RobotPage) -> None:
         box = page.toggles[name] = gui.add_checkbox(name, name == "visual")
         session.on_change(box, functools.partial(apply_toggle, page, name))
     opacity = gui.add_slider("opacity", 0.05, 1.0, 0.05, 1.0)
-    session.on_change(opacity, lambda: scene_robot.set_opacity(page.view, opacity.value), "opacity")
+    session.on_change(opacity, lambda: page.view.set_opacity(opacity.value), "opacity")
 
 
 def is_on(page: RobotPage, name: str) -> bool:
@@ -146,11 +145,11 @@ def is_on(page: RobotPage, name: str) -> bool:
 def apply_toggle(page: RobotPage, name: str) -> None:
     """Show or hide what a toggle stands for."""
     on = page.toggles[name].value
-    layer = next((layer for layer in LAYERS if layer == name), None)
+    layer = next((layer for layer in scene_robot.LAYERS if layer == name), None)
     if layer is not None:
         _toggle_layer(page, layer, on)
     elif name == FRAMES:
-        scene_robot.show_axes(page.view, on)
+        page.view.show_axes(on)
     elif name == GIZMO:
         _toggle_gizmo(page, on)
     elif not on:
@@ -162,14 +161,14 @@ def apply_toggle(page: RobotPage, name: str) -> None:
     show_in_address(page)
 
 
-def _toggle_layer(page: RobotPage, layer: Layer, on: bool) -> None:
+def _toggle_layer(page: RobotPage, layer: scene_robot.Layer, on: bool) -> None:
     if layer in page.view.layers or not on:
-        scene_robot.set_visible(page.view, layer, on)
+        page.view.set_visible(layer, on)
     elif layer == "collision":
         shapes = [link.collisions for link in page.robot.links]
-        scene_robot.show_shapes(page.view, layer, shapes)
+        page.view.show_shapes(layer, shapes)
     elif layer == "inertia":
-        scene_robot.show_inertia(page.view)
+        page.view.show_inertia()
     else:
         page.session.run_in_background(lambda: _show_primitives(page))
 
@@ -187,7 +186,7 @@ def _show_primitives(page: RobotPage) -> None:
     session.set_status("")
     if is_on(page, "primitives"):
         shapes = [primitives.get(link.name, ()) for link in robot.links]
-        session.enqueue(lambda: scene_robot.show_shapes(page.view, "primitives", shapes))
+        session.enqueue(lambda: page.view.show_shapes("primitives", shapes))
 
 
 def _show_workspace(page: RobotPage) -> None:
@@ -208,7 +207,7 @@ def _toggle_gizmo(page: RobotPage, on: bool) -> None:
     pose = Pose.from_matrix(frame_pose(page.robot, page.q))
     page.gizmo = page.session.client.scene.add_transform_controls(
         "/gizmo",
-        scale=0.2 * robot_extent(page.robot),
+        scale=0.2 * scene_robot.robot_extent(page.robot),
         depth_test=False,
         position=pose.position,
         wxyz=pose.quaternion,

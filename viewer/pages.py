@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, cast
-
-if TYPE_CHECKING:
-    from morphgen.viewer.session import Session
+from typing import Any
 
 PAGES: Mapping[str, str] = {
     "library": "morphgen.viewer.page_library:show",
@@ -21,11 +18,12 @@ PAGES: Mapping[str, str] = {
 """The function that builds each page, by the page's key in the address (``?robot=...``)."""
 
 
-def load_page(name: str) -> Callable[[Session], None]:
-    """Import and return the function that builds a page.
+def load_page(name: str) -> Callable[[Any], None]:
+    """Import and return the function that builds a page for a ``Session``.
 
     Pages are imported when they are first opened: ``play`` loads PyTorch and the simulators, which
-    takes seconds and 200 MB.
+    takes seconds and much memory.
     """
     module, _, function = PAGES[name].partition(":")
-    return cast("Callable[[Session], None]", getattr(import_module(module), function))
+    show: Callable[[Any], None] = getattr(import_module(module), function)
+    return show

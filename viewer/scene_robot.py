@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal, get_args
@@ -70,6 +70,89 @@ class RobotView:
     T_root_link: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Current pose of every link in the root frame, shape (n_links, 4, 4)."""
 
+    def set_configuration(self, q: ArrayLike) -> None:
+        """Move the robot to independent joint positions, shape (dof,) [rad or m]."""
+        self.T_root_link = forward_kinematics(self.robot, q)
+        for handle, T in zip(self.links, self.T_root_link, strict=True):
+            pose = Pose.from_matrix(T)
+            handle.position, handle.wxyz = pose.position, pose.quaternion
+
+    def show_shapes(self, layer: Layer, shapes: Sequence[Sequence[Shape]]) -> None:
+        """Draw shapes, given by link, in a layer; they replace the layer's previous shapes."""
+        self.remove_layer(layer)
+        self.layers[layer] = [
+            [
+                _add_mesh(
+                    self,
+                    f"{self.name}/{i}/{layer}{j}",
+                    triangles(shape.geometry),
+                    shape.T_link_shape,
+                    layer,
+                    _shape_colour(layer, shape),
+                )
+                for j, shape in enumerate(link_shapes)
+            ]
+            for i, link_shapes in enumerate(shapes)
+        ]
+
+    def show_inertia(self) -> None:
+        """Draw for every link the solid ellipsoid that has its mass and inertia."""
+        self.remove_layer("inertia")
+        shapes = self.layers["inertia"] = []
+        for i, link in enumerate(self.robot.links):
+            ellipsoid = inertia_ellipsoid(link.inertial) if link.inertial else None
+            shapes.append([])
+            if link.inertial is None or ellipsoid is None:
+                continue
+            semi_axes, axes = ellipsoid
+            T_link_ellipsoid = np.eye(4)
+            T_link_ellipsoid[:3, :3], T_link_ellipsoid[:3, 3] = axes, link.inertial.com
+            ball = trimesh.creation.icosphere(subdivisions=3)
+            surface = _triangles(ball.vertices * semi_axes, ball.faces)
+            name, pose = f"{self.name}/{i}/inertia", Pose.from_matrix(T_link_ellipsoid)
+            shapes[i].append(_add_mesh(self, name, surface, pose, "inertia", _COLOURS["inertia"]))
+
+    def remove_layer(self, layer: Layer) -> None:
+        """Remove a layer's shapes."""
+        for shape in self._shapes(layer):
+            shape.handle.remove()
+        self.layers.pop(layer, None)
+
+    def set_visible(self, layer: Layer, visible: bool) -> None:
+        """Show or hide a layer that was drawn."""
+        for shape in self._shapes(layer):
+            shape.handle.visible = visible
+
+    def set_opacity(self, opacity: float) -> None:
+        """Set the opacity of the visual shapes, from 0 (invisible) to 1."""
+        for shape in self._shapes("visual"):
+            shape.handle.opacity = None if opacity >= 1 else opacity
+
+    def paint_red(self, names: Collection[str]) -> None:
+        """Paint the named links red, and the other links in their own colours."""
+        if (names := frozenset(names)) == self.red:
+            return
+        for layer in ("visual", "collision"):
+            for link, shapes in zip(self.robot.links, self.layers.get(layer, []), strict=False):
+                if (link.name in names) != (link.name in self.red):
+                    for shape in shapes:
+                        shape.handle.color = RED if link.name in names else shape.colour
+        self.red = names
+
+    def paint(self, layer: Layer, colours: Mapping[str, Rgb]) -> None:
+        """Set the colours of a layer's shapes, by link."""
+        for link, shapes in zip(self.robot.links, self.layers.get(layer, []), strict=False):
+            for shape in shapes if link.name in colours else ():
+                shape.handle.color = shape.colour = colours[link.name]
+
+    def show_axes(self, visible: bool) -> None:
+        """Show or hide the frame of every link."""
+        for handle in self.links:
+            handle.show_axes = visible
+
+    def _shapes(self, layer: Layer) -> list[DrawnShape]:
+        return [shape for shapes in self.layers.get(layer, []) for shape in shapes]
+
 
 def add_robot(
     scene: viser.SceneApi,
@@ -101,8 +184,8 @@ def add_robot(
         for i in range(len(robot.links))
     ]
     view = RobotView(scene, robot, name, base, links)
-    set_configuration(view, robot.home)
-    show_shapes(view, "visual", [link.visuals or link.collisions for link in robot.links])
+    view.set_configuration(robot.home)
+    view.show_shapes("visual", [link.visuals or link.collisions for link in robot.links])
     return view
 
 
@@ -110,95 +193,6 @@ def add_floor(scene: viser.SceneApi, size: float) -> None:
     """Draw a square grid on the ground, twice as wide as a size: cells 10 cm, sections 1 m."""
     side = max(2.0, 2.0 * round(2 * size) / 2)
     scene.add_grid("/floor", width=side, height=side, cell_size=0.1, section_size=1.0)
-
-
-def set_configuration(view: RobotView, q: ArrayLike) -> None:
-    """Move a robot to a configuration: independent joint positions, shape (dof,) [rad or m]."""
-    view.T_root_link = forward_kinematics(view.robot, q)
-    for handle, T in zip(view.links, view.T_root_link, strict=True):
-        pose = Pose.from_matrix(T)
-        handle.position, handle.wxyz = pose.position, pose.quaternion
-
-
-def show_shapes(view: RobotView, layer: Layer, shapes: Sequence[Sequence[Shape]]) -> None:
-    """Draw shapes, given by link, in a layer; they replace the layer's previous shapes."""
-    remove_layer(view, layer)
-    view.layers[layer] = [
-        [
-            _add_mesh(
-                view,
-                f"{view.name}/{i}/{layer}{j}",
-                triangles(shape.geometry),
-                shape.T_link_shape,
-                layer,
-                _shape_colour(layer, shape),
-            )
-            for j, shape in enumerate(link_shapes)
-        ]
-        for i, link_shapes in enumerate(shapes)
-    ]
-
-
-def show_inertia(view: RobotView) -> None:
-    """Draw for every link the solid ellipsoid that has its mass and inertia."""
-    remove_layer(view, "inertia")
-    shapes = view.layers["inertia"] = []
-    for i, link in enumerate(view.robot.links):
-        ellipsoid = inertia_ellipsoid(link.inertial) if link.inertial else None
-        shapes.append([])
-        if link.inertial is None or ellipsoid is None:
-            continue
-        semi_axes, axes = ellipsoid
-        T_link_ellipsoid = np.eye(4)
-        T_link_ellipsoid[:3, :3], T_link_ellipsoid[:3, 3] = axes, link.inertial.com
-        ball = trimesh.creation.icosphere(subdivisions=3)
-        surface = _triangles(ball.vertices * semi_axes, ball.faces)
-        name, pose = f"{view.name}/{i}/inertia", Pose.from_matrix(T_link_ellipsoid)
-        shapes[i].append(_add_mesh(view, name, surface, pose, "inertia", _COLOURS["inertia"]))
-
-
-def remove_layer(view: RobotView, layer: Layer) -> None:
-    """Remove a layer's shapes."""
-    for shape in _shapes(view, layer):
-        shape.handle.remove()
-    view.layers.pop(layer, None)
-
-
-def set_visible(view: RobotView, layer: Layer, visible: bool) -> None:
-    """Show or hide a layer that was drawn."""
-    for shape in _shapes(view, layer):
-        shape.handle.visible = visible
-
-
-def set_opacity(view: RobotView, opacity: float) -> None:
-    """Set the opacity of the visual shapes, from 0 (invisible) to 1."""
-    for shape in _shapes(view, "visual"):
-        shape.handle.opacity = None if opacity >= 1 else opacity
-
-
-def paint_red(view: RobotView, names: Collection[str]) -> None:
-    """Paint the named links red, and the other links in their own colours."""
-    if (names := frozenset(names)) == view.red:
-        return
-    for layer in ("visual", "collision"):
-        for link, shapes in zip(view.robot.links, view.layers.get(layer, []), strict=False):
-            if (link.name in names) != (link.name in view.red):
-                for shape in shapes:
-                    shape.handle.color = RED if link.name in names else shape.colour
-    view.red = names
-
-
-def paint(view: RobotView, layer: Layer, colours: Mapping[str, Rgb]) -> None:
-    """Set the colours of a layer's shapes, by link."""
-    for link, shapes in zip(view.robot.links, view.layers.get(layer, []), strict=False):
-        for shape in shapes if link.name in colours else ():
-            shape.handle.color = shape.colour = colours[link.name]
-
-
-def show_axes(view: RobotView, visible: bool) -> None:
-    """Show or hide the frame of every link."""
-    for handle in view.links:
-        handle.show_axes = visible
 
 
 def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -303,10 +297,6 @@ def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangl
 
 def _triangles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Triangles:
     return np.asarray(vertices, dtype=np.float32), np.asarray(faces, dtype=np.uint32)
-
-
-def _shapes(view: RobotView, layer: Layer) -> Iterable[DrawnShape]:
-    return [shape for shapes in view.layers.get(layer, []) for shape in shapes]
 
 
 def _add_mesh(

@@ -14,7 +14,7 @@ from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 from morphgen.viewer.episode import Episode, Track
-from morphgen.viewer.scene_robot import Rgb, RobotView, add_robot, robot_bounds, set_configuration
+from morphgen.viewer.scene_robot import Rgb, RobotView, add_robot, robot_bounds
 
 Position = tuple[float, float, float]
 
@@ -85,7 +85,7 @@ def show_step(scene: RolloutScene, step: int) -> None:
     for drawn in scene.tracks:
         track = drawn.track
         i = min(step, track.num_steps)
-        set_configuration(drawn.view, track.q[i])
+        drawn.view.set_configuration(track.q[i])
         moving = [(handle, track.marker_poses[name]) for name, handle in drawn.markers.items()]
         if drawn.block is not None:
             moving.append((drawn.block, track.block))

@@ -133,6 +133,17 @@ class Session:
         self.events.shutdown(wait=False, cancel_futures=True)
         self.background.shutdown(wait=False, cancel_futures=True)
 
+    def open_panel(
+        self, width: float, header: str, status: str = "", *, left: bool = False
+    ) -> None:
+        """Open the page's panel with a header as HTML and the status line; width in pixels."""
+        gui = self.client.gui
+        gui.set_panel_label("morphgen")
+        (gui.main_panel.dock_left if left else gui.main_panel.dock_right)()
+        gui.main_panel.set_width(width)
+        gui.add_html(markup.STYLE + header)
+        self.status = gui.add_html(markup.status(status))
+
     def set_status(self, text: str, fraction: float | None = None) -> None:
         """Show the current activity and its progress in [0, 1]; an empty text clears the line."""
         if self.status is not None and not self.closed.is_set():

@@ -55,17 +55,8 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
 _MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")
 """Suffixes of files that meshes refer to."""
 _PATH_ATTRIBUTES = (
-    "assetdir",
-    "file",
-    "fileback",
-    "filedown",
-    "filefront",
-    "fileleft",
-    "filename",
-    "fileright",
-    "fileup",
-    "meshdir",
-    "texturedir",
+    *("assetdir", "file", "filename", "meshdir", "texturedir"),
+    *(f"file{side}" for side in ("back", "down", "front", "left", "right", "up")),
 )
 """Attributes of URDF and MJCF that name files or folders."""
 

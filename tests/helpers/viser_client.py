@@ -1,4 +1,4 @@
-"""A client of a viewer that is no browser: it speaks viser's protocol over a real websocket."""
+"""A client of a viewer without a browser: it speaks viser's protocol over a real websocket."""
 
 import contextlib
 import socket
@@ -27,7 +27,7 @@ CAMERA = {
 
 
 class PlainClient:
-    """Connects, tells an address when it is asked for it, and keeps all that it is sent."""
+    """Connects, reports an address when the server asks for it, and stores all messages."""
 
     def __init__(self, port, query="", *, origin=None, host=None, address="127.0.0.1"):
         name = f"[{address}]" if ":" in address else address
@@ -42,19 +42,19 @@ class PlainClient:
         )
 
     def __enter__(self):
-        self.say(CAMERA)
+        self.send(CAMERA)
         return self
 
     def __exit__(self, *fault):
         self.websocket.close()
 
-    def say(self, message):
+    def send(self, message):
         """Send a message, or bytes as they are."""
         data = message if isinstance(message, bytes) else msgspec.msgpack.encode(message)
         self.websocket.send(data)
 
     def until(self, condition, seconds=60):
-        """Take messages until a condition holds of all of them; return what it gives."""
+        """Receive messages until a condition returns a true value; return that value."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if found := condition():
@@ -63,10 +63,10 @@ class PlainClient:
                 self._take(self.websocket.recv(timeout=0.2))
             except TimeoutError:
                 continue
-        raise AssertionError(f"not within {seconds} s; the page said ...{self.text[-2000:]!r}")
+        raise AssertionError(f"not within {seconds} s; the page shows ...{self.text[-2000:]!r}")
 
     def until_closed(self):
-        """Take messages until the server closes the connection; return code and reason."""
+        """Receive messages until the server closes the connection; return code and reason."""
         try:
             while True:
                 self._take(self.websocket.recv(timeout=60))
@@ -75,7 +75,7 @@ class PlainClient:
 
     @property
     def text(self):
-        """All texts of the page: HTML, notifications, labels."""
+        """All texts that the page has shown: HTML, notifications, labels."""
         return "\n".join(_texts(self.messages))
 
     def shows(self, text):
@@ -83,27 +83,29 @@ class PlainClient:
         self.until(lambda: text in self.text)
 
     def control(self, kind, label):
-        """The control of a kind with a label, when it is there: its identity."""
+        """Wait for the control of a kind with a label; return its identity."""
 
         def found():
             of_kind = [each for each in self.messages if each["type"] == f"Gui{kind}Message"]
             return next((m["uuid"] for m in of_kind if m["props"]["label"] == label), None)
 
         identity = self.until(found)
-        # viser sends a control before it listens to it: what comes later, or silence, tells that
-        # it does. A browser is never that quick.
+        # viser sends a control before it accepts values for it. A later message, or silence, shows
+        # that it accepts them; a browser is never that quick.
         with contextlib.suppress(TimeoutError):
             self._take(self.websocket.recv(timeout=0.5))
         return identity
 
     def change(self, control, value):
         """Change a control's value."""
-        self.say({"type": "GuiUpdateMessage", "uuid": control, "updates": {"value": value}})
+        self.send({"type": "GuiUpdateMessage", "uuid": control, "updates": {"value": value}})
 
     def upload(self, name, content, *, size=None, parts=None):
-        """Send a file by the button of the first page, in parts as a browser does."""
+        """Upload a file on the first page, in parts as a browser does."""
         button = self.control("UploadButton", "Look at a URDF or a zipped bundle")
-        self.control("Text", "Search")  # comes after it, when the server listens to the button
+        self.control(
+            "Text", "Search"
+        )  # comes after the button, when the server accepts its uploads
         transfer, step = uuid.uuid4().hex, 512 * 1024
         pieces = [content[at : at + step] for at in range(0, len(content), step)]
         begin = {
@@ -115,13 +117,13 @@ class PlainClient:
             "part_count": len(pieces) if parts is None else parts,
             "size_bytes": len(content) if size is None else size,
         }
-        self.say(begin)
+        self.send(begin)
         for i, piece in enumerate(pieces):
             part = {"part_index": i, "content": piece, "transfer_uuid": transfer}
-            self.say({"type": "FileTransferPart", "source_component_uuid": button, **part})
+            self.send({"type": "FileTransferPart", "source_component_uuid": button, **part})
 
     def sent_to(self):
-        """Wait until the page is told to load another; return that query."""
+        """Wait until the server makes the page load another one; return its query."""
 
         def found():
             sources = [m["source"] for m in self.messages if m["type"] == "RunJavascriptMessage"]
@@ -137,7 +139,7 @@ class PlainClient:
             self.messages.append(message)
             if message["type"] == "LocalStorageGetItemRequestMessage":
                 answer = {"request_uuid": message["request_uuid"], "error": None}
-                self.say(
+                self.send(
                     {
                         "type": "LocalStorageGetItemResponseMessage",
                         "value": self.query,

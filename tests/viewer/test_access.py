@@ -40,7 +40,7 @@ def asked(gate, host, origin=None, path="/"):
         ("::", "[fe80::1]:8080", "http://[fe80::1]:8080"),
     ],
 )
-def test_its_own_names_and_allowed_sites_may_ask(bound, host, origin):
+def test_own_names_and_allowed_sites_are_answered(bound, host, origin):
     assert asked(access_policy(bound, [HUB]), host, origin) == ""
 
 
@@ -69,7 +69,7 @@ def test_its_own_names_and_allowed_sites_may_ask(bound, host, origin):
         ("0.0.0.0", "192.168.1.5:8080", "http://evil.example"),
     ],
 )
-def test_all_others_may_not(bound, host, origin):
+def test_other_names_and_sites_are_refused(bound, host, origin):
     assert asked(access_policy(bound), host, origin)
 
 
@@ -90,7 +90,7 @@ def test_two_hosts_or_origins_are_refused():
         "playbackPath=a.viser",
     ],
 )
-def test_an_address_cannot_bring_in_another_server(query):
+def test_an_address_cannot_show_another_server(query):
     assert "another server" in asked(AccessPolicy(), "localhost:8080", path=f"/?{query}")
     assert (
         asked(AccessPolicy(), "localhost:8080", path="/?websocket=ws://localhost:8080/proxy") == ""
@@ -100,7 +100,7 @@ def test_an_address_cannot_bring_in_another_server(query):
 @pytest.mark.parametrize(
     "origin", ["null", "*", "evil.example", "http://", "http://a/b", "ftp://a", "http://u@a", ""]
 )
-def test_a_malformed_origin_is_refused(origin):
+def test_a_malformed_origin_is_rejected(origin):
     with pytest.raises(MorphgenError, match=re.escape(f"--allow-origin {origin!r}: expected")):
         access_policy("127.0.0.1", [origin])
 
@@ -114,7 +114,7 @@ def test_a_foreign_page_gets_no_websocket(viewer, origin):
     assert b"may not use this viewer" in refused.value.response.body
 
 
-def test_a_foreign_name_gets_no_websocket(viewer):
+def test_a_foreign_host_name_gets_no_websocket(viewer):
     port = viewer().port
     host = f"evil.example:{port}"
     with pytest.raises(InvalidStatus) as refused:
@@ -123,7 +123,7 @@ def test_a_foreign_name_gets_no_websocket(viewer):
 
 
 @pytest.mark.parametrize("origin", [None, "http://127.0.0.1:{port}", HUB])
-def test_its_own_page_and_an_allowed_site_get_one(viewer, origin):
+def test_own_pages_and_allowed_sites_get_a_websocket(viewer, origin):
     on = viewer(origins=[HUB])
     with PlainClient(on.port, origin=origin and origin.format(port=on.port)) as client:
         client.shows("Categories")
@@ -160,7 +160,7 @@ def test_pages_are_served_to_its_own_names_only(viewer, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_is_no_request_leaves_no_traceback(viewer, capfd):
+def test_invalid_requests_leave_no_traceback(viewer, capfd):
     port = viewer().port
     for data in (b"\x16\x03\x01\x02\x00", b"GET / HTTP/1.1\r\nHost", b"a" * 70_000, b"\r\n\r\n"):
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
@@ -171,7 +171,7 @@ def test_what_is_no_request_leaves_no_traceback(viewer, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_nobody_may_ask_the_server_of_a_recording():
+def test_the_server_of_a_recording_refuses_everyone():
     server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))
     try:
         with pytest.raises(InvalidStatus):

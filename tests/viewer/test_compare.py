@@ -11,16 +11,19 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.kinematics import joint_limits
-from morphgen.viewer.comparison import all_roles, joint_roles, normalized_positions, with_roles
-from morphgen.viewer.figures import heatmap_svg, map_svg, token_differences, tokens_png
-from morphgen.viewer.page_compare import (
+from morphgen.viewer.comparison import (
+    all_roles,
     compare_robots,
     fit_quality,
     fit_table,
     iou_colour,
-    parse_uris,
+    joint_roles,
+    normalized_positions,
     similarity_table,
+    with_roles,
 )
+from morphgen.viewer.figures import heatmap_svg, map_svg, token_differences, tokens_png
+from morphgen.viewer.page_compare import parse_uris
 
 LIBRARY = default_library()
 
@@ -30,7 +33,7 @@ def robot_of(words):
     return compose(derivation, LIBRARY, name)
 
 
-def test_roles_are_places_on_the_way_to_the_tool():
+def test_roles_count_joints_on_the_path_to_the_tool():
     assert joint_roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
     panda = robot_of("arm=panda ee=panda_hand")
     assert joint_roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
@@ -50,7 +53,7 @@ def test_a_role_moves_every_robot_by_the_same_share():
         assert with_roles(robot, home, values) == pytest.approx(home)
 
 
-def test_differences_are_those_from_the_first():
+def test_token_differences_are_relative_to_the_first_robot():
     a = np.zeros((2, 48))
     b = np.zeros((3, 48))
     b[1, 5] = 0.1
@@ -80,7 +83,7 @@ def test_robots_are_like_themselves():
     assert "&lt;a&gt; and b" in table
 
 
-def test_fits_have_their_quality():
+def test_fits_have_an_iou():
     robot = robot_of("arm=ur5 ee=plane")
     found = fit_quality(robot, LIBRARY.folders)
     assert found["ee_plate"][0] == 1.0
@@ -90,17 +93,17 @@ def test_fits_have_their_quality():
     assert "not fitted yet" in fit_table(robot, {})
 
 
-def test_heat_goes_from_red_over_yellow_to_green():
+def test_colours_go_from_red_over_yellow_to_green():
     assert iou_colour(0.2) == iou_colour(0.5) == (224, 49, 49)
     assert iou_colour(0.75) == (250, 200, 30)
     assert iou_colour(1.0) == (47, 158, 68)
 
 
-def test_places_are_read_a_line_each():
+def test_uris_are_read_from_lines():
     assert parse_uris(" a \n\nwords:arm=ur5 ee=plane\n") == ("a", "words:arm=ur5 ee=plane")
 
 
-def test_drawings_lead_to_robots_and_escape_names():
+def test_figures_link_to_robots_and_escape_names():
     names, sides = ["<a>", "b"], ["train", "test"]
     text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), names, sides, ["x y", "z"])
     assert 'href="?robot=x%20y"' in text

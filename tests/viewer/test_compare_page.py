@@ -31,7 +31,7 @@ def test_robots_are_compared(see, viewer, picture):
     assert page.failures == []
 
 
-def test_primitives_are_coloured_by_how_well_they_stand_for_meshes(see, viewer, picture):
+def test_primitives_are_coloured_by_their_iou(see, viewer, picture):
     on = viewer()
     page = see("?compare=words:arm=ur5 ee=plane", on=on)
     page.get_by_role("tab", name="Primitives").click()

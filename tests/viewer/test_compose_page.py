@@ -27,7 +27,7 @@ def test_parts_are_chosen_and_turned_into_words(see, picture):
     assert page.failures == []
 
 
-def test_what_does_not_fit_says_why_and_the_robot_stays(see):
+def test_parts_that_do_not_fit_say_why_and_the_robot_stays(see):
     page = see("?compose=base=gantry ee=stick")
     page.get_by_text("DoF").first.wait_for()
     choose(page, "ee", "(none)", nth=1)

@@ -60,7 +60,7 @@ def test_thumbnails_are_drawn_by_workers_and_a_broken_robot_says_so(see):
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_is_told_once_and_thumbnails_are_drawn_all_the_same(see, viewer):
+def test_a_dead_worker_is_reported_once_and_thumbnails_are_still_drawn(see, viewer):
     on = viewer()
     page = see("?gallery=robots/prims", on=on)
     page.locator(".card img").first.wait_for()
@@ -73,7 +73,7 @@ def test_a_worker_that_dies_is_told_once_and_thumbnails_are_drawn_all_the_same(s
 
 
 @pytest.mark.slow
-def test_the_library_leads_to_all(see):
+def test_the_library_links_to_everything(see):
     page = see()
     page.locator(".card").first.wait_for()
     for text in ("robots/prims", "extrapolation/arms/reach", "planar_arm", "compose a robot"):

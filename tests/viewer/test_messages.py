@@ -32,7 +32,7 @@ def test_a_malformed_message_closes_its_connection_only(viewer, capfd, message):
     on = viewer()
     with PlainClient(on.port) as client, PlainClient(on.port) as other:
         client.shows("Categories")
-        client.say(message)
+        client.send(message)
         code, reason = client.until_closed()
         assert (code, bool(reason)) == (1008, True)
         other.shows("Categories")
@@ -74,7 +74,7 @@ def test_a_value_that_a_control_cannot_have_is_rejected(viewer, capfd, kind, lab
 def test_nothing_but_a_controls_value_is_changed(viewer, capfd, updates):
     with PlainClient(viewer().port) as client:
         search = client.control("Text", "Search")
-        client.say({"type": "GuiUpdateMessage", "uuid": search, "updates": updates})
+        client.send({"type": "GuiUpdateMessage", "uuid": search, "updates": updates})
         client.shows("the value of a control, and nothing else of it")
         client.change(search, "ur5")
         client.until(lambda: "search=ur5" in client.text)

@@ -62,7 +62,7 @@ def secret(tmp_path):
         "?compose=./../elsewhere/a.grammar",
     ],
 )
-def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, query):
+def test_an_address_reveals_nothing_outside_the_folders(viewer, capfd, secret, query):
     with PlainClient(viewer().port, query.replace("{}", str(secret))) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
         assert re.search("outside of the folders|no such file", client.text)
@@ -96,7 +96,7 @@ def test_an_address_tells_nothing_of_what_is_outside(viewer, capfd, secret, quer
     ],
     ids=lambda each: each[:30],
 )
-def test_an_odd_address_has_a_sentence_for_an_answer(viewer, capfd, query, why):
+def test_an_invalid_address_is_answered_in_a_sentence(viewer, capfd, query, why):
     with PlainClient(viewer().port, query) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
         shown = client.text.replace("&#x27;", "'")
@@ -105,7 +105,7 @@ def test_an_odd_address_has_a_sentence_for_an_answer(viewer, capfd, query, why):
 
 
 @pytest.mark.parametrize("query", ["?compose=arm3&seed=²", f"?compose=arm3&number={'9' * 5000}"])
-def test_a_number_that_is_none_is_zero(viewer, capfd, query):
+def test_an_invalid_number_counts_as_zero(viewer, capfd, query):
     with PlainClient(viewer().port, query) as client:
         client.until(lambda: "The same on the command line" in client.text)
     assert capfd.readouterr().err == ""

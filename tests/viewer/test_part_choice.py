@@ -29,7 +29,7 @@ def test_words_come_back():
 
 
 @pytest.mark.parametrize("bad", ["arm", "arm=ur5 ee.size=1", "arm=ur5 arm.size=1", "arm=ur6"])
-def test_bad_words_are_refused(bad):
+def test_invalid_words_are_rejected(bad):
     with pytest.raises(MorphgenError):
         parse_choice(bad.split(), LIBRARY)
 
@@ -105,7 +105,7 @@ def test_another_base_keeps_the_limbs_that_it_has_ports_for():
     assert planar.parts == {**choice.parts, "base": "planar"}
 
 
-def test_a_default_is_not_said():
+def test_default_values_are_left_out():
     choice = parse_choice(["arm=arm3", "arm.length=0.2"], LIBRARY)
     control = next(c for c in controls_of("arm", LIBRARY.manifest("arm3")) if c.key == "arm.length")
     assert with_value(choice, control, control.default).words == "base=fixed arm=arm3"

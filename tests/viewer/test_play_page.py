@@ -148,7 +148,7 @@ def test_a_checkpoint_starts_with_the_robot_it_was_trained_on(see, viewer, folde
     page.get_by_text(re.compile("the checkpoint is for other observations: obstacles 0")).wait_for()
 
 
-def test_nothing_is_left_when_the_browser_goes_or_turns_to_another_page(see, viewer, capfd):
+def test_a_player_ends_when_its_browser_leaves_the_page(see, viewer, capfd):
     on = viewer()
     page = see(f"?play=reach&robot={CUBE}&policy=random", on=on)
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()

@@ -202,7 +202,7 @@ def test_two_browsers_do_not_disturb_each_other(see, viewer):
 
 
 @pytest.mark.slow
-def test_a_browser_that_goes_while_its_page_is_made_harms_nobody(see, viewer, capfd):
+def test_a_browser_that_leaves_while_its_page_is_built_harms_nobody(see, viewer, capfd):
     on = viewer()
     for _ in range(3):
         page = see("?robot=words:arm=panda ee=panda_hand&show=visual,workspace,primitives", on=on)

@@ -62,7 +62,7 @@ def test_sorting_puts_the_unknown_last(key, order):
     assert names(sort_rows(ROWS, key)) == list(order)
 
 
-def test_unknown_keys_are_refused():
+def test_unknown_sort_keys_are_rejected():
     with pytest.raises(ValueError, match="cannot sort by 'colour'"):
         sort_rows(ROWS, "colour")
 
@@ -85,7 +85,7 @@ def test_no_rows_make_one_empty_page():
     assert select_page([], 3, 24) == ([], 1, 1)
 
 
-def test_extents_and_choices():
+def test_ranges_and_choices_of_facts():
     assert fact_range(ROWS, "reach") == (0.9, 1.2)
     assert fact_range(ROWS[:1], "reach") is None
     assert fact_choices([*ROWS, Row("d", "d")], "category") == ["arms", "hands"]

@@ -74,7 +74,7 @@ def test_collisions_are_listed_deepest_first():
     assert text.index("c in d: 20.0 mm") < text.index("a in b: 1.0 mm")
 
 
-def test_configurations_go_through_addresses():
+def test_configurations_come_back_from_addresses():
     robot = arm()
     q = np.array([0.1234, -1.5, 0.02, 0.04])
     assert parse_joints(format_joints(q), robot) == pytest.approx(q)

@@ -110,7 +110,7 @@ def test_invalid_uris_say_why(files, uri, why):
         read_robot_uri(uri, files)
 
 
-def test_a_key_changes_with_the_file(files):
+def test_the_content_hash_changes_with_the_file(files):
     before = content_hash("robots/one", files)
     assert content_hash("robots/one", files) == before
     urdf = files.path("robots/one/robot.urdf")

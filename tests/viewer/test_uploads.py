@@ -79,7 +79,7 @@ def test_a_zipped_bundle_comes_back_as_it_left(access, tmp_path):
         ("a.urdf", b'<!DOCTYPE r [<!ENTITY x "y">]><robot name="r"/>', "DOCTYPE"),
     ],
 )
-def test_what_is_no_robot_or_climbs_out_is_rejected(access, name, content, why):
+def test_an_invalid_or_unsafe_upload_is_rejected(access, name, content, why):
     with pytest.raises(MorphgenError, match=why):
         store_upload(name, content, access)
     assert list(access.uploads.iterdir()) == []
@@ -182,7 +182,7 @@ def patched(whole, old, new):
     ],
     ids=lambda each: each[:40] if isinstance(each, str) else "",
 )  # fmt: skip
-def test_an_odd_zip_is_rejected_in_a_sentence(access, content, why):
+def test_an_unsafe_zip_is_rejected_in_a_sentence(access, content, why):
     with pytest.raises(UploadError, match=why) as refused:
         store_upload("a.zip", content, access)
     assert str(access.uploads) not in str(refused.value)
@@ -193,7 +193,7 @@ def test_an_odd_zip_is_rejected_in_a_sentence(access, content, why):
 @pytest.mark.parametrize(
     "name", ["a" * 300 + ".urdf", "\0.urdf", "a b.urdf", "a\n.urdf", "", "é.urdf"]
 )
-def test_an_odd_name_is_rejected(access, name):
+def test_an_invalid_file_name_is_rejected(access, name):
     with pytest.raises(UploadError, match="invalid file name"):
         store_upload(name, URDF, access)
 
@@ -244,7 +244,7 @@ def test_no_xacro_is_read_below_the_uploads(access):
         read_robot_uri("upload:1/a.xacro", access)
 
 
-def test_no_more_are_kept_than_a_number(access, monkeypatch):
+def test_the_number_of_uploads_is_limited(access, monkeypatch):
     monkeypatch.setattr(uploads, "MAX_UPLOADS", 2)
     store_upload("a.urdf", URDF, access)
     store_upload("a.urdf", URDF, access)
@@ -308,7 +308,7 @@ def test_uploads_come_through_a_websocket_and_are_read(viewer, tmp_path):
         ("../../a" + "b" * 10_000 + ".urdf", URDF, "invalid file name"),
     ],
 )
-def test_a_hostile_upload_is_a_sentence_on_the_page(viewer, capfd, name, content, why):
+def test_a_hostile_upload_is_rejected_in_a_sentence(viewer, capfd, name, content, why):
     on = viewer()
     with PlainClient(on.port) as client:
         client.upload(name, content)
@@ -318,7 +318,7 @@ def test_a_hostile_upload_is_a_sentence_on_the_page(viewer, capfd, name, content
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_upload_that_is_not_as_it_was_said_to_be_is_dropped(viewer, capfd):
+def test_an_upload_that_differs_from_its_announcement_is_dropped(viewer, capfd):
     on = viewer()
     with PlainClient(on.port) as client:
         client.upload("a.urdf", b" " * 2000, size=1000)
@@ -336,7 +336,7 @@ def test_an_upload_that_is_not_as_it_was_said_to_be_is_dropped(viewer, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_error_tells_no_temporary_path(viewer, capfd):
+def test_an_error_shows_no_temporary_path(viewer, capfd):
     broken = URDF.replace(b'<link name="a"/>', b'<link name="a"/><link name="b"/>')
     on = viewer()
     with PlainClient(on.port) as client:

@@ -28,7 +28,7 @@ def test_a_worker_that_dies_is_reported_once_and_replaced(workers):
     assert second not in (first, os.getpid())
 
 
-def test_nothing_is_left_of_closed_workers():
+def test_closed_workers_end_their_processes():
     workers = Workers(1)
     _, process = workers.result(workers.submit(power, 2, 3))
     workers.close()
