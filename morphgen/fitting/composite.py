@@ -281,7 +281,7 @@ def _shape(candidate: _Candidate) -> Shape:
 
 def _primitive(shape: Shape) -> Box | Cylinder | Sphere:
     if not isinstance(shape.geometry, Box | Cylinder | Sphere):
-        raise TypeError(f"{shape.geometry!r} is no box, cylinder or sphere")
+        raise TypeError(f"{shape.geometry!r} is not a box, cylinder or sphere")
     return shape.geometry
 
 
