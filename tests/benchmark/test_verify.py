@@ -204,7 +204,7 @@ def test_meshes_of_a_real_arm_are_verified(tmp_path):
     )
     summed(folder)
     ((where, why),) = found(folder)
-    assert (where, f"file meshes/{mesh.name}: its content is not" in why) == ("ur5-plane", True)
+    assert (where, f"file meshes/{mesh.name}: its content differs" in why) == ("ur5-plane", True)
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def test_a_missing_loader_is_reported(tmp_path, monkeypatch):
 
 
 def test_a_folder_that_is_not_a_bundle_is_an_error(tmp_path):
-    with pytest.raises(FormatError, match="no bundle"):
+    with pytest.raises(FormatError, match="is not a bundle"):
         conformance(tmp_path)
 
 

@@ -343,7 +343,10 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
             ("eval", "ik", "--split", "planar-cube", "task=reach", "--mode", "stochastic"),
             "--mode is for policies",
         ),
-        (("eval", "ik", "--split", "planar-cube", "task=reach", "--on", "test"), "nothing to test"),
+        (
+            ("eval", "ik", "--split", "planar-cube", "task=reach", "--on", "test"),
+            "is one robot and not a split: it has no test robots",
+        ),
         (("eval", "ik", "--out", "none/scores.csv"), "there is no folder none"),
         (("eval", "nothing", "--goal-seed", "1"), "--goal-seed goes with --split"),
         (("finetune", "nothing", "--obstacles"), "--obstacles goes with --split"),

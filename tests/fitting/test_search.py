@@ -155,8 +155,8 @@ def test_the_points_are_those_of_the_solid_and_around_it():
     shape = Shape(Box((0.1, 0.2, 0.4)), Pose((1.0, 2.0, 3.0)))
     target = target_of(shape)
     size = math.hypot(0.1, 0.2, 0.4)
-    np.testing.assert_allclose(target.middle, (1.0, 2.0, 3.0), atol=1e-9)
-    placed = target.points * size + target.middle
+    np.testing.assert_allclose(target.centre, (1.0, 2.0, 3.0), atol=1e-9)
+    placed = target.points * size + target.centre
     np.testing.assert_array_equal(target.inside, target.solid.contains(placed))
     assert (target.points.max(axis=0) > np.array((0.05, 0.1, 0.2)) / size + 0.1).all()
     assert (target.weights > 0).all()

@@ -9,7 +9,7 @@ from xml.dom import minidom
 import pytest
 
 from morphgen.errors import FormatError
-from morphgen.formats import resolve, xacro
+from morphgen.formats import resolve, xacro_process
 from morphgen.formats.resolve import PackageFinder, default_finder, distribution_file
 from morphgen.formats.xacro import Expansion, evaluate, expand
 from morphgen.formats.xml import parse_xml
@@ -308,8 +308,10 @@ def test_an_installed_file_that_reads_a_strangers_is_expanded_in_a_process_of_it
     )
     monkeypatch.setattr(resolve, "_own_folders", lambda: (installed,))
     asked = []
-    run = xacro.run_in_child
-    monkeypatch.setattr(xacro, "run_in_child", lambda *a, **k: asked.append(a) or run(*a, **k))
+    run = xacro_process.run_in_child
+    monkeypatch.setattr(
+        xacro_process, "run_in_child", lambda *a, **k: asked.append(a) or run(*a, **k)
+    )
     assert b"ours" in expand(part, {}, NOWHERE)
     assert asked == []
     assert b"theirs" in expand(part, {"file": str(tmp_path / "other" / "x.xacro")}, NOWHERE)
