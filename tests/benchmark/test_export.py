@@ -167,7 +167,9 @@ def test_pictures_are_drawn_if_asked_for(tmp_path):
     assert build_split(made, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).num_kept == 2
 
 
-@pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
+@pytest.mark.parametrize(
+    "settings", [pytest.param(BUNDLED, marks=pytest.mark.slow), LIGHT], ids=["bundles", "light"]
+)
 def test_twice_and_in_two_processes_it_is_the_same_bytes(tmp_path, settings):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["arm=ur5 ee=plane"])

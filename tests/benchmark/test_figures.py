@@ -50,7 +50,9 @@ def chunks(png):
     return found
 
 
-@pytest.mark.parametrize("n", [1, MAX_WITH_VALUES, MAX_NAMED, MAX_NAMED + 1])
+@pytest.mark.parametrize(
+    "n", [1, MAX_WITH_VALUES, pytest.param(MAX_NAMED, marks=pytest.mark.slow), MAX_NAMED + 1]
+)
 def test_every_number_of_robots_can_be_drawn(n):
     for png in drawings(n):
         assert pixels(png).std() > 5

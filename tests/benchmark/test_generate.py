@@ -128,6 +128,7 @@ def test_every_robot_does_every_task():
     assert all(m.obstacles for m in splits[0].train)
 
 
+@pytest.mark.slow
 def test_several_processes_make_the_same():
     one, two = (interpolation(order(10), shipped("cubes"), LIBRARY, jobs=n) for n in (1, 2))
     assert one == two

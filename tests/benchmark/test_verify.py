@@ -115,6 +115,7 @@ def test_a_built_split_is_verified_wherever_it_was_moved_to(whole, tmp_path):
     assert seen == [(i, 4) for i in (1, 2, 3, 4)]
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["base=planar ee=plane"])

@@ -230,6 +230,7 @@ def test_ones_own_library_is_used(run, tmp_path, monkeypatch):
     assert tool.T_link_frame.position == pytest.approx((0, 0, 0.35))
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_same_bytes(tmp_path):
     words = ("compose", "arm=lwr", "ee=robotiq_2f85", "ee.mount_yaw=45deg", "--out")
     processes = [start(*words, tmp_path / seed, PYTHONHASHSEED=seed) for seed in ("1", "2")]

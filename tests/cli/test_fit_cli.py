@@ -134,6 +134,7 @@ def test_a_mesh_as_json_is_data_in_metres(run, box):
     assert {**again, "seconds": 0} == {**data, "seconds": 0}
 
 
+@pytest.mark.slow
 def test_more_primitives_are_fitted_where_one_does_not_do(run, angle):
     code, out, err = run("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json")
     assert (code, err) == (0, "")
@@ -194,6 +195,7 @@ def test_a_users_part_is_found_in_the_library_that_is_named(run, tmp_path):
     assert {link["link"] for link in json.loads(out)["links"]} == names
 
 
+@pytest.mark.slow
 def test_a_real_part_is_written_without_collision_meshes(run, tmp_path):
     """The Fetch's gripper: a palm and two fingers that are each other's copies."""
     words = ("fit", "fetch_gripper", "--out", "made/gripper", "--no-picture", "--json")
@@ -248,6 +250,7 @@ def test_a_bundle_is_fitted_link_by_link(run, meshed, tmp_path):
     assert {link["link"] for link in card["primitives"]["links"]} == set(rows) - {"mean"}
 
 
+@pytest.mark.slow
 def test_visuals_are_replaced_where_asked_and_keep_their_colour(run, meshed, tmp_path):
     words = ("fit", meshed, "--visual", "--out", "made", "--no-picture", "--configurations", "1")
     assert run(*words)[0] == 0

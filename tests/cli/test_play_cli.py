@@ -38,6 +38,7 @@ def test_inverse_kinematics_reaches(run, tmp_path):
     assert tree(tmp_path) == {}
 
 
+@pytest.mark.slow
 def test_the_script_pushes_in_less_than_the_time_and_is_filmed(run, tmp_path):
     words = ("play", "push", "prims", "--policy", "scripted", "--sim", "mujoco")
     code, out, err = run(*words, "--out", "push.mp4")

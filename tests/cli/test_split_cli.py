@@ -127,6 +127,7 @@ def test_several_sizes_make_a_file_each(run):
     assert Path("a-train2.yaml").is_file()
 
 
+@pytest.mark.slow
 def test_the_same_order_gives_the_same_bytes_with_any_number_of_jobs(run, tmp_path):
     assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml")[0] == 0
     before = tree(tmp_path)

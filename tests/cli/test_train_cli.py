@@ -160,6 +160,7 @@ def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_y
     assert not Path("b").exists()
 
 
+@pytest.mark.slow
 def test_training_may_have_more_goals_than_evaluations(run):
     """Which have the same, whatever the training had."""
     found = []
@@ -220,6 +221,7 @@ def test_references_are_evaluated_beside(run, split_yaml):
     assert out.count("100%") == 5  # three robots, two means
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_run_that_goes_on(run, tmp_path, cache):
     words = (*RUN, "--steps", 32 * 300, "--no-tensorboard")
     process = start(*words, "--out", "cut", XDG_CACHE_HOME=str(cache))
@@ -257,6 +259,7 @@ def test_tables_of_runs_on_a_gpu_are_written_without_one(run, split_yaml, tmp_pa
     assert "missing" in out
 
 
+@pytest.mark.slow
 def test_a_study_is_a_table(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp,me-mlp-discrete", "--seeds", "0..1", *SMALL)
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")

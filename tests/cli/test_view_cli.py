@@ -33,7 +33,14 @@ def test_a_bundle_is_served_until_interrupted(tmp_path):
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "end",
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+)
 def test_however_it_ends_no_upload_is_left(tmp_path, monkeypatch, end):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     viewing = start("view", "--port", "8933")
@@ -61,6 +68,7 @@ def test_it_serves_the_sites_that_are_allowed(tmp_path):
     assert viewing.communicate(timeout=60)[1] == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="no IPv6 here")
 def test_it_serves_at_ipv6(tmp_path):
     viewing = start("view", "--port", "8935", "--host", "::1")
@@ -73,6 +81,7 @@ def test_it_serves_at_ipv6(tmp_path):
     assert viewing.communicate(timeout=60)[1] == ""
 
 
+@pytest.mark.slow
 def test_another_host_is_warned_of(tmp_path):
     viewing = start("view", "--host", "0.0.0.0", "--port", "8932")
     address(viewing)

@@ -123,7 +123,7 @@ def test_rounding_up_is_all_that_a_small_thing_gains() -> None:
         assert -3e-6 < outside(shape, points) <= 1e-9
 
 
-@pytest.mark.parametrize("robot", ["ur5", "panda"])
+@pytest.mark.parametrize("robot", ["ur5", pytest.param("panda", marks=pytest.mark.slow)])
 def test_no_link_gets_more_than_the_tightest_bound_of_trimesh(robot: str) -> None:
     links = load_part(default_library(()).manifest(robot)).fragment.links
     meshes = [solid_of(link.collisions).mesh for link in links if link.collisions]

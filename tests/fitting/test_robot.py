@@ -69,6 +69,7 @@ def test_a_mirrored_link_shares_its_fit(tmp_path, wedge):
     assert second.fit.seconds == 0
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_processes(tmp_path, wedge):
     ball = trimesh.creation.icosphere(3, 0.1)
     robot = arm([mesh_shape(tmp_path, wedge, "a.stl")], [mesh_shape(tmp_path, ball, "b.stl")])
@@ -116,6 +117,7 @@ def test_enclosing_primitives_hold_every_vertex(tmp_path, wedge):
     assert three.quality.volume_ratio < 0.7 * one.quality.volume_ratio
 
 
+@pytest.mark.slow
 def test_more_primitives_are_better_until_they_are_good_enough(tmp_path):
     bent = trimesh.util.concatenate(
         [

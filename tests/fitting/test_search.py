@@ -115,6 +115,7 @@ def test_two_boxes_are_found_in_an_l():
     assert quality(target.solid, one.shapes).iou == pytest.approx(one.iou, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_cylinder_and_a_box_are_found_together():
     parts = (Shape(Cylinder(0.05, 0.3)), Shape(Box((0.4, 0.2, 0.06)), Pose((0, 0, 0.18))))
     target = target_of(*parts)
@@ -131,6 +132,7 @@ def threads():
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_shapes_with_any_number_of_threads(threads):
     found = []
     for n in (1, 3):
@@ -268,6 +270,7 @@ def test_more_primitives_than_points_allow_are_none():
     assert best_several(few, one, 0) is None
 
 
+@pytest.mark.slow
 def test_one_more_primitive_begins_where_those_found_leave_the_solid_out():
     arms = [Shape(Box((0.5, 0.1, 0.1)), Pose((0.0, y, 0.0))) for y in (-0.4, 0.0, 0.4)]
     spine = Shape(Box((0.1, 0.9, 0.1)), Pose((-0.2, 0.0, 0.0)))

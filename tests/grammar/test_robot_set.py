@@ -190,7 +190,7 @@ def test_an_index_is_whole_or_not_there(tmp_path, whole):
         read_index(own.folder)
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path, jobs):
     words = ("sample", "chain", "-n", 32, "--seed", 3, "--light", "--jobs", jobs)
     process = start(*words, "--out", tmp_path / "killed")

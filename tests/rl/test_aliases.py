@@ -59,7 +59,7 @@ def old_checkpoint(content):
     }
 
 
-@pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
+@pytest.mark.parametrize("agent", ["me-mlp", pytest.param("me-tf", marks=pytest.mark.slow)])
 def test_a_run_of_format_2_is_read_and_resumed_to_the_same_weights(tmp_path, agent):
     config = small_config(agent=agent, total_timesteps=24 * 4 * 8)
     config = replace(config, policy=replace(config.policy, discrete=False, fixed_std=True))

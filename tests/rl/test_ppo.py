@@ -69,6 +69,7 @@ def test_the_actors_share_of_the_rate_has_a_floor():
     assert updates < 30, "it must rise again within a run"
 
 
+@pytest.mark.slow
 def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
     options = {"learning_rate": 5e-3, "total_timesteps": 30 * 64}
     divergence = {0: [], 0.01: []}

@@ -52,11 +52,13 @@ def test_four_of_five_blocks_get_across(words, sim, tmp_path):
     assert across.float().mean() >= 0.8
 
 
+@pytest.mark.slow
 def test_actions_may_be_discrete(tmp_path):
     task = batch([PLANE], 3, tmp_path, sim="mujoco", kind="discrete")
     assert successes(task, ScriptedPush(0)).sum() >= 2
 
 
+@pytest.mark.slow
 def test_the_same_seed_does_the_same(tmp_path):
     def actions(seed):
         task, controller = batch([UR5], 2, tmp_path, sim="mujoco"), ScriptedPush(seed)

@@ -72,7 +72,9 @@ def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
     assert (run, learner["update"]) == (config, 6)
 
 
-@pytest.mark.parametrize("stops", [(1,), (8,), (7, 13)], ids=str)
+@pytest.mark.parametrize(
+    "stops", [pytest.param((1,), marks=pytest.mark.slow), (8,), (7, 13)], ids=str
+)
 def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp_path, stops):
     config = small_config(small_source(), total_timesteps=24 * 4 * 8, slow_critic=True)
     train(tmp_path / "whole", config, execution=QUIET)

@@ -140,6 +140,7 @@ def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
     assert all(same(a.goals, b.goals) for a, b in zip(found, made(reaching(), cache), strict=True))
 
 
+@pytest.mark.slow
 def test_processes_make_the_same_sets(tmp_path):
     sizes = [f"base=gantry ee=cube ee.size={size}mm" for size in range(60, 68)]
     which = split(
