@@ -57,6 +57,7 @@ def test_a_robot_with_two_tasks_counts_twice():
     assert (found["train"]["robots"], found["train"]["bodies"]) == (2, 1)
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_does_not_matter():
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["base=gantry ee=cube"])

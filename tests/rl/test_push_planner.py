@@ -23,6 +23,7 @@ UR5, PANDA, PLANE = "arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"
 PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 
 
+@pytest.mark.slow
 def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
