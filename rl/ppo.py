@@ -2,6 +2,8 @@
 
 An update (``Learner.iterate``) collects a rollout into preallocated buffers, estimates advantages
 and returns (GAE), and then takes gradient steps on minibatches of the rollout.
+
+Shapes: T control steps of n environments with R robots; m transitions in a minibatch.
 """
 
 from __future__ import annotations
@@ -23,7 +25,6 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
 from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
 from morphgen.rl.policies import make_networks, rows_needed
-from morphgen.rl.rollout_buffer import STEP_KEYS, RolloutBuffer
 from morphgen.rl.symlog import half_square, matching_loss, symexp
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import Observation
@@ -34,13 +35,11 @@ LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient")
 KL_FACTOR = 1.2
 """Factor by which the actor's learning rate changes per update to follow ``desired_kl``."""
 MIN_ACTOR_LR_SCALE = 0.01
-"""Smallest factor on the actor's learning rate, as in rsl_rl (1e-5 of 1e-3).
-
-Without it, a factor that fell for long needs as many updates to rise again."""
+"""Smallest factor on the actor's learning rate, so that it rises again soon (rsl_rl: 1e-5/1e-3)."""
 
 
 class Learner:
-    """A policy in training: call ``iterate`` until ``done``."""
+    """Networks, optimiser and rollout of a training run; call ``iterate`` until ``done``."""
 
     def __init__(
         self,
@@ -56,7 +55,7 @@ class Learner:
         Args:
             batch: Environments; their actions are of the policy's kind.
             policy: Agent and networks.
-            config: Constants of the algorithm.
+            config: Hyperparameters.
             seed: Seed of weights, actions, minibatches and random weights of robots.
             device: Device of networks and rollouts; the batch may be on another.
 
@@ -71,12 +70,13 @@ class Learner:
         self.batch, self.policy, self.config = batch, policy, config
         self.device = torch.device(device)
         self.update, self.num_updates = 0, config.num_updates(batch.num_envs)
-        self._minibatch_size = config.minibatch_size(batch.num_envs)
-        self._env_robot_index = batch.env_robot_index.to(self.device)
-        self._num_robots = int(batch.env_robot_index.max()) + 1
+        self.minibatch_size = config.minibatch_size(batch.num_envs)
+        self.env_robot_index = batch.env_robot_index.to(self.device)
+        self.num_robots = int(batch.env_robot_index.max()) + 1
         self._observation: Observation | None = None
-        first = self._current_observation()
-        self.layout, self._rows = layout_of(first), rows_needed(policy, first)
+        observation = self._current_observation()
+        self.layout = layout_of(observation)
+        self._num_link_rows = rows_needed(policy, observation)
 
         network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
         actor, critic = make_networks(policy, self.layout, network_seed)
@@ -92,13 +92,30 @@ class Learner:
             name: torch.Generator(self.device).manual_seed(stream)
             for name, stream in zip(("actions", "minibatches", "weights"), streams, strict=True)
         }
+        # In bfloat16 or compiled if the config says so.
         ready = partial(prepared, device=self.device, bf16=config.bf16, compiled=config.compile)
-        self._actor_numbers = ready(self.actor)
-        self._value = ready(self.target_critic if config.slow_critic else self.critic)
-        self._compiled_loss = ready(self._loss)
-        self.buffer = RolloutBuffer(
-            self._visible(first), config.num_steps, discrete=policy.discrete, device=batch.device
+        self._run_actor = ready(self.actor)
+        self._run_critic = ready(self.target_critic if config.slow_critic else self.critic)
+        self._run_loss = ready(self._loss)
+
+        # The rollout, (T, n, ...). What the networks read and write is on the learner's device.
+        obs, T, n = self._network_input(observation), config.num_steps, batch.num_envs
+        self.observations = {k: v.new_empty(T, *v.shape) for k, v in obs.items()}
+        self.actions = torch.zeros(
+            (T, *obs["actions"].shape),
+            dtype=torch.int64 if policy.discrete else torch.float32,
+            device=self.device,
         )
+        self.log_probs = torch.zeros(T, n, device=self.device)
+        # Results of the control steps stay on the batch's device: no transfer in the loop.
+        self.rewards, self.scores = torch.zeros(2, T, n, device=batch.device)
+        self.successes, self.terminated, self.truncated, self.diverged = torch.zeros(
+            4, T, n, dtype=torch.bool, device=batch.device
+        )
+        # The observation after the rollout (n, ...), and the last ones of the k truncated episodes,
+        # tensors (k, ...) in the order of torch.nonzero(truncated).
+        self.next_observation: Observation = {}
+        self.final_observations: Observation = {}
 
     @property
     def done(self) -> bool:
@@ -132,140 +149,151 @@ class Learner:
             **learn_metrics,
         )
 
+    def restart_episodes(self) -> None:
+        """Begin new episodes in all environments at the next ``iterate``."""
+        self._observation = None
+
     def _current_observation(self) -> Observation:
         """Advance the curriculum, begin episodes if none are under way; return the observation."""
         if self.config.curriculum:
             self.batch.advance(self.update / self.num_updates)
         if self._observation is None:
+            # Spread over the length of an episode: they shall not all end in the same rollout.
             self._observation = self.batch.reset(spread=True)
         elif self.config.curriculum:
             self._observation = self.batch.observe()
         return self._observation
 
-    def _visible(self, observation: Observation) -> Observation:
-        """Return an observation as the networks get it, on their device."""
-        needed = truncate_links(observation, self._rows)
+    def _network_input(self, observation: Observation) -> Observation:
+        """Return an observation with the rows of links that the networks need, on their device."""
+        needed = truncate_links(observation, self._num_link_rows)
         return {name: value.to(self.device) for name, value in needed.items()}
 
     @torch.no_grad()
     def _collect_rollout(self) -> Metrics:
-        """Act for ``num_steps`` control steps and fill the buffer; return the rollout's metrics."""
-        buffer, obs = self.buffer, self._visible(self._current_observation())
+        """Act for ``num_steps`` control steps and fill the buffers; return rollout metrics."""
+        obs = self._network_input(self._current_observation())
         reward_terms, final_observations = [], []
-        for t in range(self.config.num_steps):
-            for name, rows in buffer.observations.items():
-                rows[t].copy_(obs[name])
-            # Compiled as a CUDA graph, the actor reads its inputs from where they are: the buffer.
-            obs = {name: rows[t] for name, rows in buffer.observations.items()}
-            head = self.actor.head(self._actor_numbers(obs), obs["actions"])
+        for step in range(self.config.num_steps):
+            for name, buffer in self.observations.items():
+                buffer[step].copy_(obs[name])
+            # A CUDA graph reads its inputs in place, from the buffer: nothing is copied again.
+            obs = {name: buffer[step] for name, buffer in self.observations.items()}
+            head = self.actor.head(self._run_actor(obs), obs["actions"])
             action = head.sample(self.generators["actions"])
-            buffer.actions[t] = action
-            buffer.log_probs[t] = head.log_prob(action)
+            self.actions[step] = action
+            self.log_probs[step] = head.log_prob(action)
 
-            step = self.batch.step(pad_links(action, self.layout.links).to(self.batch.device))
-            for name in STEP_KEYS:
-                getattr(buffer, name)[t] = getattr(step, name)
-            reward_terms.append({name: term.mean() for name, term in step.terms.items()})
+            result = self.batch.step(pad_links(action, self.layout.links).to(self.batch.device))
+            self.rewards[step], self.scores[step] = result.reward, result.score
+            self.successes[step], self.diverged[step] = result.success, result.diverged
+            self.terminated[step], self.truncated[step] = result.terminated, result.truncated
+            reward_terms.append({name: term.mean() for name, term in result.terms.items()})
             final_observations.append(
-                {name: value[step.truncated] for name, value in step.final_observation.items()}
+                {name: value[result.truncated] for name, value in result.final_observation.items()}
             )
-            self._observation = step.observation
-            obs = self._visible(step.observation)
+            self._observation = result.observation
+            obs = self._network_input(result.observation)
         # The batch may reuse the tensors of its observation in the next step.
-        buffer.last_observation = {name: value.clone() for name, value in obs.items()}
-        buffer.final_observations = self._visible(
+        self.next_observation = {name: value.clone() for name, value in obs.items()}
+        self.final_observations = self._network_input(
             {name: torch.cat([final[name] for final in final_observations]) for name in obs}
         )
-        metrics = buffer.metrics(self.batch.env_robot_index, self._num_robots)
+        metrics = self._rollout_metrics()
         metrics["terms"] = {
             name: float(torch.stack([terms[name] for terms in reward_terms]).mean())
             for name in reward_terms[0]
         }
         return metrics
 
+    def _rollout_metrics(self) -> Metrics:
+        """Return rewards and scores of the rollout, and counts of the episodes that ended in it."""
+        ended = self.terminated | self.truncated
+        robots, num_robots = self.batch.env_robot_index, self.num_robots
+        env_scores = self.scores.mean(dim=0)
+        num_envs = torch.bincount(robots, minlength=num_robots)
+        robot_scores = torch.zeros(num_robots, device=robots.device)
+        robot_scores.index_add_(0, robots, env_scores)
+        return {
+            "reward": float(self.rewards.mean()),
+            "score": float(env_scores.mean()),
+            "scores": tuple((robot_scores / num_envs).tolist()),
+            "success": float(self.successes[ended].float().mean()),
+            "episodes": int(ended.sum()),
+            "unstable": int(self.diverged.sum()),
+        }
+
     @torch.no_grad()
     def _compute_returns(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return values, advantages and returns of the rollout, each (T, n)."""
-        buffer = self.buffer
-        rewards, terminated, truncated = (
-            each.to(self.device) for each in (buffer.reward, buffer.terminated, buffer.truncated)
-        )
-        flat = {name: rows.flatten(0, 1) for name, rows in buffer.observations.items()}
+        rewards = self.rewards.to(self.device)
+        terminated, truncated = self.terminated.to(self.device), self.truncated.to(self.device)
+        flat = {name: buffer.flatten(0, 1) for name, buffer in self.observations.items()}
         values = self._values(flat).reshape(rewards.shape)
         # Values of the observations that the actions led to: where time ended an episode, that of
         # its last observation; where the task did, the next episode's, which ``gae`` ignores.
-        next_values = torch.cat([values[1:], self._values(buffer.last_observation)[None]])
-        next_values[truncated] = self._values(buffer.final_observations)
+        next_values = torch.cat([values[1:], self._values(self.next_observation)[None]])
+        next_values[truncated] = self._values(self.final_observations)
+        gamma, gae_lambda = self.config.gamma, self.config.gae_lambda
         advantages = gae(
-            rewards,
-            values,
-            next_values,
-            terminated,
-            truncated,
-            gamma=self.config.gamma,
-            gae_lambda=self.config.gae_lambda,
+            rewards, values, next_values, terminated, truncated, gamma=gamma, gae_lambda=gae_lambda
         )
         return values, advantages, advantages + values
 
     def _values(self, observation: Observation) -> torch.Tensor:
         """Return expected returns, shape (n,), in chunks of one shape: they compile once."""
-        count, chunks = len(observation["goal"]), [torch.zeros(0, device=self.device)]
-        for start in range(0, count, self._minibatch_size):
-            rows = torch.arange(start, start + self._minibatch_size, device=self.device)
-            rows = rows.clamp(max=count - 1)
+        count, size = len(observation["goal"]), self.minibatch_size
+        chunks = [torch.zeros(0, device=self.device)]
+        for start in range(0, count, size):
+            # The last chunk repeats the last row up to the common shape.
+            rows = torch.arange(start, start + size, device=self.device).clamp(max=count - 1)
             chunk = {name: value[rows] for name, value in observation.items()}
-            chunks.append(self._value(chunk).clone())
+            # The next call of a CUDA graph overwrites its output.
+            chunks.append(self._run_critic(chunk).clone())
         values = torch.cat(chunks)[:count]
         return symexp(values) if self.config.symlog else values
 
     def _learn(self) -> Metrics:
-        """Improve actor and critic on the rollout; return the metrics of learning."""
-        config, buffer = self.config, self.buffer
-        rate = learning_rate(config, self.update, self.num_updates)
+        """Improve actor and critic on the rollout; return the means of ``LEARN_METRICS``."""
+        config = self.config
+        learning_rate = config.learning_rate * (1 - self.update / self.num_updates)
         actor_group, critic_group = self.optimiser.param_groups
-        actor_group["lr"], critic_group["lr"] = rate * self.actor_lr_scale, rate
+        actor_group["lr"], critic_group["lr"] = learning_rate * self.actor_lr_scale, learning_rate
 
         values, advantages, returns = self._compute_returns()
-        normalised = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        observations = {name: rows.flatten(0, 1) for name, rows in buffer.observations.items()}
+        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        observations = {name: buffer.flatten(0, 1) for name, buffer in self.observations.items()}
         transitions = {
-            "action": buffer.actions.flatten(0, 1),
-            "log_prob": buffer.log_probs.flatten(),
-            "advantage": normalised.flatten(),
+            "action": self.actions.flatten(0, 1),
+            "log_prob": self.log_probs.flatten(),
+            "advantage": advantages.flatten(),
             "return": returns.flatten(),
-            "robot": self._env_robot_index.repeat(config.num_steps),
+            "robot": self.env_robot_index.repeat(config.num_steps),
         }
         metrics = []
         for _ in range(config.epochs):
             order = torch.randperm(
-                len(transitions["robot"]),
-                generator=self.generators["minibatches"],
-                device=self.device,
+                returns.numel(), generator=self.generators["minibatches"], device=self.device
             )
-            for rows in order.reshape(-1, self._minibatch_size):
+            for rows in order.reshape(-1, self.minibatch_size):
                 obs = {name: value[rows] for name, value in observations.items()}
                 minibatch = {name: value[rows] for name, value in transitions.items()}
-                metrics.append(self._gradient_step(obs, minibatch))
+                self.optimiser.zero_grad(set_to_none=True)
+                loss, loss_metrics = self._run_loss(obs, minibatch, self._robot_weights())
+                loss.backward()  # type: ignore[no-untyped-call]
+                # Apart: a large gradient of the critic shall not shrink the actor's.
+                norms = [
+                    nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm)
+                    for network in (self.actor, self.critic)
+                ]
+                self.optimiser.step()
+                ema_update(self.target_critic, self.critic, config.slow_decay)
+                metrics.append(torch.stack([*loss_metrics, *norms]))
 
         means = dict(zip(LEARN_METRICS, torch.stack(metrics).mean(dim=0).tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         explained = float(explained_variance(values, returns))
         return {**means, "explained_variance": explained, "learning_rate": actor_group["lr"]}
-
-    def _gradient_step(
-        self, observations: Observation, minibatch: Mapping[str, torch.Tensor]
-    ) -> torch.Tensor:
-        """Take one gradient step on a minibatch; return its ``LEARN_METRICS``, shape (7,)."""
-        self.optimiser.zero_grad(set_to_none=True)
-        loss, metrics = self._compiled_loss(observations, minibatch, self._robot_weights())
-        loss.backward()  # type: ignore[no-untyped-call]
-        norms = [
-            nn.utils.clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
-            for network in (self.actor, self.critic)
-        ]
-        self.optimiser.step()
-        ema_update(self.target_critic, self.critic, self.config.slow_decay)
-        return torch.stack([*metrics, *norms])
 
     def _loss(
         self,
@@ -280,7 +308,7 @@ class Learner:
             minibatch: Actions, log-probabilities, advantages, returns and robots, tensors (m, ...).
             robot_weights: Weight of each robot's transitions, shape (R,).
         """
-        head = self.actor.head(self.actor(observations), observations["actions"])
+        head = self.actor.distribution(observations)
         log_ratio = head.log_prob(minibatch["action"]) - minibatch["log_prob"]
         policy = policy_loss(log_ratio, minibatch["advantage"], self.config.clip_coef)
         entropy = head.entropy()
@@ -301,14 +329,10 @@ class Learner:
         al. 2022, "Reasonable effectiveness of random weighting").
         """
         if not self.config.task_reweighting:
-            return torch.ones(self._num_robots, device=self.device)
-        drawn = torch.empty(self._num_robots, device=self.device)
-        drawn.normal_(generator=self.generators["weights"])
-        return self._num_robots * torch.softmax(drawn, dim=0)
-
-    def restart_episodes(self) -> None:
-        """Begin new episodes in all environments at the next ``iterate``."""
-        self._observation = None
+            return torch.ones(self.num_robots, device=self.device)
+        normal = torch.empty(self.num_robots, device=self.device)
+        normal.normal_(generator=self.generators["weights"])
+        return self.num_robots * torch.softmax(normal, dim=0)
 
 
 def gae(
@@ -324,7 +348,8 @@ def gae(
     """Return advantages by generalised estimation (Schulman et al. 2016, equation 16).
 
     After a termination the return is zero. After a truncation it is the value of the episode's last
-    observation (Pardo et al. 2018), and the sum stops there. All tensors have the shape (T, n).
+    observation (Pardo et al. 2018), and the sum stops there. The critic learns advantages plus
+    values. All tensors have the shape (T, n).
 
     Args:
         rewards: Rewards of T control steps in n environments.
@@ -334,9 +359,6 @@ def gae(
         truncated: Where the time limit ended the episode, bool.
         gamma: Discount factor.
         gae_lambda: Weight of longer estimates.
-
-    Returns:
-        Advantages; plus ``values`` they are the returns that the critic learns.
     """
     delta = rewards + gamma * torch.where(terminated, 0.0, next_values) - values
     carry = gamma * gae_lambda * (~(terminated | truncated)).to(delta.dtype)
@@ -351,13 +373,8 @@ def gae(
 def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip_coef: float) -> torch.Tensor:
     """Return the negative clipped objective (Schulman et al. 2017, equation 7), shape (m,)."""
     ratio = log_ratio.exp()
-    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
-    return -torch.minimum(ratio * advantage, clipped * advantage)
-
-
-def learning_rate(config: PPOConfig, update: int, num_updates: int) -> float:
-    """Return the learning rate of an update, counted from 0; it falls linearly to zero."""
-    return config.learning_rate * (1 - update / num_updates)
+    clipped_ratio = ratio.clamp(1 - clip_coef, 1 + clip_coef)
+    return -torch.minimum(ratio * advantage, clipped_ratio * advantage)
 
 
 def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
@@ -377,6 +394,6 @@ def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
 
 @torch.no_grad()
 def ema_update(target: nn.Module, source: nn.Module, decay: float) -> None:
-    """Move a network's weights towards another's: keep ``decay`` of them, take the rest."""
+    """Set a network's weights to ``decay * target + (1 - decay) * source``."""
     average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     average([*target.parameters()], [*source.parameters()], 0)

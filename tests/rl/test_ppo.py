@@ -18,11 +18,9 @@ from morphgen.rl.ppo import (
     MIN_ACTOR_LR_SCALE,
     Learner,
     ema_update,
-    learning_rate,
     next_actor_lr_scale,
     policy_loss,
 )
-from morphgen.rl.rollout_buffer import RolloutBuffer
 from morphgen.rl.symlog import symlog
 
 
@@ -40,13 +38,12 @@ def test_policy_loss_has_a_slope_only_where_it_is_not_clipped():
 
 
 def test_the_learning_rate_falls_over_the_updates_that_happen():
-    made = learner()
+    trainer = learner()
     rates = []
-    while not made.done:
-        rates.append(made.iterate().learning_rate)
-    assert made.num_updates == 4
+    while not trainer.done:
+        rates.append(trainer.iterate().learning_rate)
+    assert trainer.num_updates == 4
     assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
-    assert learning_rate(SMALL, 4, 4) == 0
 
 
 def test_the_actors_share_of_the_rate_follows_the_divergence():
@@ -74,11 +71,11 @@ def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
     options = {"learning_rate": 5e-3, "total_timesteps": 30 * 64}
     divergence = {0: [], 0.01: []}
     for target, seed in product(divergence, range(4)):
-        made = learner(**options, desired_kl=target, seed=seed)
-        first, *_ = (made.iterate() for _ in range(3))
+        trainer = learner(**options, desired_kl=target, seed=seed)
+        first, *_ = (trainer.iterate() for _ in range(3))
         assert first.kl > 0.1
-        divergence[target] += [made.iterate().kl for _ in range(7)]
-        actor, critic = (group["lr"] for group in made.optimiser.param_groups)
+        divergence[target] += [trainer.iterate().kl for _ in range(7)]
+        actor, critic = (group["lr"] for group in trainer.optimiser.param_groups)
         assert critic == pytest.approx(5e-3 * (1 - 9 / 30))
         assert actor <= 0.5 * critic if target else actor == critic
     assert median(divergence[0]) > 0.03
@@ -96,19 +93,19 @@ def test_explained_variance_by_hand():
 
 def test_the_metrics_of_a_rollout_by_hand():
     true, false = True, False
-    observation = {"actions": torch.zeros(3, 4)}
-    buffer = RolloutBuffer(observation, 2, discrete=True, device=torch.device("cpu"))
-    buffer.reward[:] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    buffer.score[:] = torch.tensor([[0.0, 1.0, 2.0], [4.0, 3.0, 2.0]])
-    buffer.success[:] = torch.tensor([[true, true, false], [false, false, true]])
-    buffer.terminated[:] = torch.tensor([[true, false, false], [false, false, false]])
-    buffer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
-    buffer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
-    found = buffer.metrics(torch.tensor([1, 0, 1]), 3)
-    assert (found["reward"], found["score"]) == (3.5, 2.0)
-    assert found["scores"][:2] == (2.0, 2.0)
-    assert math.isnan(found["scores"][2])
-    assert (found["success"], found["episodes"], found["unstable"]) == (0.5, 4, 1)
+    trainer = learner(OnALine(3), num_steps=2, minibatches=1)
+    trainer.batch.env_robot_index, trainer.num_robots = torch.tensor([1, 0, 1]), 3
+    trainer.rewards[:] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    trainer.scores[:] = torch.tensor([[0.0, 1.0, 2.0], [4.0, 3.0, 2.0]])
+    trainer.successes[:] = torch.tensor([[true, true, false], [false, false, true]])
+    trainer.terminated[:] = torch.tensor([[true, false, false], [false, false, false]])
+    trainer.truncated[:] = torch.tensor([[false, false, true], [false, true, true]])
+    trainer.diverged[:] = torch.tensor([[false, false, true], [false, false, false]])
+    metrics = trainer._rollout_metrics()
+    assert (metrics["reward"], metrics["score"]) == (3.5, 2.0)
+    assert metrics["scores"][:2] == (2.0, 2.0)
+    assert math.isnan(metrics["scores"][2])
+    assert (metrics["success"], metrics["episodes"], metrics["unstable"]) == (0.5, 4, 1)
 
 
 def test_a_moving_average_by_hand():
@@ -122,15 +119,15 @@ def test_a_moving_average_by_hand():
 
 
 def test_the_slow_critic_follows_every_gradient_step():
-    made = learner(epochs=1, minibatches=1)
-    before = weights(made)
-    made.iterate()
-    after = weights(made)
+    trainer = learner(epochs=1, minibatches=1)
+    before = weights(trainer)
+    trainer.iterate()
+    after = weights(trainer)
     moved = [name[7:] for name in after if name.startswith("critic.")]
     assert moved
     for name in moved:
         fast = after[f"critic.{name}"]
-        wanted = torch.lerp(fast, before[f"target_critic.{name}"], made.config.slow_decay)
+        wanted = torch.lerp(fast, before[f"target_critic.{name}"], trainer.config.slow_decay)
         torch.testing.assert_close(after[f"target_critic.{name}"], wanted)
     assert not equal({k: v for k, v in before.items() if k.startswith("target_critic")}, after)
 
@@ -147,15 +144,17 @@ class Answers(torch.nn.Module):
 def test_targets_by_hand(slow, logarithmic):
     # With lambda 0 a return is the reward and the discounted value of what the action led to.
     batch = OnALine(4, horizon=3)
-    made = learner(batch, slow_critic=slow, symlog=logarithmic, gae_lambda=0.0, minibatches=4)
+    trainer = learner(batch, slow_critic=slow, symlog=logarithmic, gae_lambda=0.0, minibatches=4)
     wrong = lambda seen: torch.full_like(seen["line"][:, 0], 99.0)  # noqa: E731
     right = lambda seen: symlog(Answers()(seen)) if logarithmic else Answers()(seen)  # noqa: E731
-    made.target_critic.forward, made.critic.forward = (right, wrong) if slow else (wrong, right)
+    trainer.target_critic.forward, trainer.critic.forward = (
+        (right, wrong) if slow else (wrong, right)
+    )
     steps = []
     step = batch.step
     batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
-    made._collect_rollout()
-    values, advantages, returns = made._compute_returns()
+    trainer._collect_rollout()
+    values, advantages, returns = trainer._compute_returns()
     after = torch.stack([Answers()(each.final_observation) for each in steps])
     rewards = torch.stack([each.reward for each in steps])
     terminated = torch.stack([each.terminated for each in steps])
@@ -163,7 +162,7 @@ def test_targets_by_hand(slow, logarithmic):
     assert terminated.any()
     assert truncated.any()
     torch.testing.assert_close(returns, rewards + 0.99 * after * ~terminated, rtol=1e-4, atol=1e-4)
-    at = Answers()({"tokens": made.buffer.observations["tokens"].flatten(0, 1)}).reshape(8, 4)
+    at = Answers()({"tokens": trainer.observations["tokens"].flatten(0, 1)}).reshape(8, 4)
     torch.testing.assert_close(values, at, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(advantages, returns - values)
 
@@ -171,12 +170,12 @@ def test_targets_by_hand(slow, logarithmic):
 @pytest.mark.parametrize("logarithmic", [True, False], ids=["symlog", "plain"])
 def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
     options = {"epochs": 80, "minibatches": 1, "learning_rate": 3e-3, "max_grad_norm": 10.0}
-    made = learner(symlog=logarithmic, **options)
-    made._collect_rollout()
-    _, _, returns = made._compute_returns()
-    made._learn()
+    trainer = learner(symlog=logarithmic, **options)
+    trainer._collect_rollout()
+    _, _, returns = trainer._compute_returns()
+    trainer._learn()
     with torch.no_grad():
-        values = made.critic({k: v.flatten(0, 1) for k, v in made.buffer.observations.items()})
+        values = trainer.critic({k: v.flatten(0, 1) for k, v in trainer.observations.items()})
     wanted = (symlog(returns) if logarithmic else returns).flatten()
     other = (returns if logarithmic else symlog(returns)).flatten()
     assert (values - wanted).square().mean() < 0.2 * wanted.var()
@@ -184,11 +183,11 @@ def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
 
 
 def test_minibatches_hold_every_transition_once_an_epoch():
-    made = learner(epochs=3)
+    trainer = learner(epochs=3)
     seen = []
-    step = made._gradient_step
-    made._gradient_step = lambda obs, data: seen.append(data) or step(obs, data)
-    made.iterate()
+    loss = trainer._run_loss
+    trainer._run_loss = lambda obs, data, w: seen.append(data) or loss(obs, data, w)
+    trainer.iterate()
     assert len(seen) == 3 * 4
     for epoch in range(3):
         part = [each["log_prob"] for each in seen[4 * epoch : 4 * epoch + 4]]
@@ -204,12 +203,12 @@ def test_minibatches_hold_every_transition_once_an_epoch():
     assert first.sort().values.equal(second.sort().values)
 
 
-def test_a_transition_keeps_its_observation_action_and_body_through_shuffling():
-    made = learner()
+def test_a_transition_keeps_its_observation_action_and_robot_through_shuffling():
+    trainer = learner()
     pairs = []
-    step = made._gradient_step
-    made._gradient_step = lambda seen, data: pairs.append((seen, data)) or step(seen, data)
-    made.iterate()
+    loss = trainer._run_loss
+    trainer._run_loss = lambda obs, data, w: pairs.append((obs, data)) or loss(obs, data, w)
+    trainer.iterate()
     for seen, data in pairs[:1]:
         assert seen["object_mask"].equal(data["robot"] == 1)
         head = learner().actor.distribution(seen)
@@ -228,9 +227,9 @@ def test_before_the_first_step_no_ratio_is_clipped_and_kl_is_zero():
 
 
 def test_gradients_of_actor_and_critic_are_clipped_apart():
-    made = learner(max_grad_norm=1e-3, epochs=1, minibatches=1)
-    report = made.iterate()
-    for network, norm in ((made.actor, "actor_gradient"), (made.critic, "critic_gradient")):
+    trainer = learner(max_grad_norm=1e-3, epochs=1, minibatches=1)
+    report = trainer.iterate()
+    for network, norm in ((trainer.actor, "actor_gradient"), (trainer.critic, "critic_gradient")):
         left = torch.stack([each.grad.norm() for each in network.parameters()]).norm()
         assert getattr(report, norm) > 1e-3
         assert left.item() == pytest.approx(1e-3, rel=1e-2)
@@ -259,26 +258,26 @@ def test_a_report_says_what_happened():
 
 
 def test_entropy_grows_if_it_is_all_that_counts():
-    made = learner(discrete=False, ent_coef=10.0, learning_rate=1e-2)
+    trainer = learner(discrete=False, ent_coef=10.0, learning_rate=1e-2)
     reports = []
-    while not made.done:
-        reports.append(made.iterate())
+    while not trainer.done:
+        reports.append(trainer.iterate())
     assert reports[-1].entropy > reports[0].entropy + 0.05
 
 
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_deviation_is_learned_or_stays(fixed):
     policy = PolicyConfig("me-mlp", discrete=False, fixed_std=fixed)
-    made = Learner(OnALine(8, kind="continuous"), policy, replace(SMALL, ent_coef=1.0))
-    reports = [made.iterate() for _ in range(3)]
-    assert made.actor.raw_log_std.any() != fixed
+    trainer = Learner(OnALine(8, kind="continuous"), policy, replace(SMALL, ent_coef=1.0))
+    reports = [trainer.iterate() for _ in range(3)]
+    assert trainer.actor.raw_log_std.any() != fixed
     assert (reports[0].entropy == pytest.approx(reports[2].entropy, rel=1e-6)) == fixed
 
 
 def test_robots_count_alike_or_with_random_weights_of_mean_one():
     assert learner()._robot_weights().tolist() == [1, 1]
-    made = learner(task_reweighting=True)
-    drawn = torch.stack([made._robot_weights() for _ in range(4000)])
+    trainer = learner(task_reweighting=True)
+    drawn = torch.stack([trainer._robot_weights() for _ in range(4000)])
     assert (drawn > 0).all()
     torch.testing.assert_close(drawn.mean(dim=1), torch.ones(4000))
     torch.testing.assert_close(drawn.mean(dim=0), torch.ones(2), atol=0.05, rtol=0)
@@ -288,23 +287,23 @@ def test_robots_count_alike_or_with_random_weights_of_mean_one():
 
 
 def test_a_robot_without_weight_is_not_learned_from():
-    def steps(weight, change=lambda buffer: None):
-        made = learner(epochs=1, minibatches=1, ent_coef=0.01)
-        made._robot_weights = lambda: torch.tensor(weight)
-        collect = made._collect_rollout
+    def steps(weight, change=lambda learner: None):
+        trainer = learner(epochs=1, minibatches=1, ent_coef=0.01)
+        trainer._robot_weights = lambda: torch.tensor(weight)
+        collect = trainer._collect_rollout
 
         def other():
             metrics = collect()
-            change(made.buffer)
+            change(trainer)
             return metrics
 
-        made._collect_rollout = other
-        made.iterate()
-        return weights(made)
+        trainer._collect_rollout = other
+        trainer.iterate()
+        return weights(trainer)
 
     # What pushers are said to have been likely to do does not matter if they weigh nothing.
-    def twisted(buffer):
-        buffer.log_probs[:, 1::2] -= 0.1
+    def twisted(learner):
+        learner.log_probs[:, 1::2] -= 0.1
 
     assert equal(steps([2.0, 0.0]), steps([2.0, 0.0], twisted))
     assert not equal(steps([1.0, 1.0]), steps([1.0, 1.0], twisted))
@@ -313,9 +312,9 @@ def test_a_robot_without_weight_is_not_learned_from():
 @pytest.mark.parametrize("moves", [True, False])
 def test_the_curriculum_goes_with_the_updates(moves):
     batch = OnALine(8)
-    made = learner(batch, curriculum=moves)
-    while not made.done:
-        made.iterate()
+    trainer = learner(batch, curriculum=moves)
+    while not trainer.done:
+        trainer.iterate()
     assert batch.progress == ([0.0, 0.0, 0.25, 0.5, 0.75] if moves else [])
 
 
@@ -326,11 +325,11 @@ def test_a_batch_of_other_actions_is_refused():
 
 def test_numbers_that_are_lost_stop_the_run():
     batch = OnALine(8)
-    made = learner(batch)
+    trainer = learner(batch)
     step = batch.step
     batch.step = lambda actions: replace(step(actions), reward=torch.full((8,), math.nan))
     with pytest.raises(TaskError, match=r"update 1: .*value_loss.* is not finite any more"):
-        made.iterate()
+        trainer.iterate()
 
 
 def test_bfloat16_gives_nearly_the_same_update():
@@ -352,10 +351,10 @@ def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
         gamma=0.9,
         **changes,
     )
-    made = Learner(batch, PolicyConfig(agent=agent, discrete=discrete), config)
+    trainer = Learner(batch, PolicyConfig(agent=agent, discrete=discrete), config)
     reports = []
-    while not made.done:
-        reports.append(made.iterate())
+    while not trainer.done:
+        reports.append(trainer.iterate())
     return reports
 
 
