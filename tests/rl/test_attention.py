@@ -1,4 +1,4 @@
-"""Attention against PyTorch's own, and a layer that sees what its mask shows."""
+"""Attention equals PyTorch's, and masked tokens have no influence."""
 
 import math
 
@@ -12,7 +12,7 @@ WAYS = {"as here": transformer.attend, "as on a GPU": transformer.attend_to_few}
 
 
 def some(seed=0):
-    """Queries, keys, values, and a mask that leaves one token at least."""
+    """Return queries, keys, values, and a mask with at least one token per row."""
     generator = torch.Generator().manual_seed(seed)
     q, k, v = torch.randn(3, N, HEADS, T, FEATURES, generator=generator)
     mask = torch.rand(N, T, generator=generator) < 0.5
@@ -21,7 +21,7 @@ def some(seed=0):
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_attention_is_a_weighted_mean_of_the_values_in_the_mask(way):
+def test_attention_is_a_weighted_mean_of_the_unmasked_values(way):
     q, k, v, mask = some()
     found = way(q, k, v, mask)
     for row in range(N):
@@ -34,7 +34,7 @@ def test_attention_is_a_weighted_mean_of_the_values_in_the_mask(way):
                 torch.testing.assert_close(found[row, head, token], wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_both_ways_have_the_same_gradients():
+def test_both_implementations_have_the_same_gradients():
     *inputs, mask = some()
     gradients = []
     for way in WAYS.values():
@@ -47,7 +47,7 @@ def test_both_ways_have_the_same_gradients():
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_what_the_mask_hides_changes_nothing_and_gets_no_gradient(way):
+def test_masked_entries_change_nothing_and_get_no_gradient(way):
     q, k, v, mask = some()
     hidden = ~mask[:, None, :, None]
     before = way(q, k, v, mask)
@@ -61,7 +61,7 @@ def test_what_the_mask_hides_changes_nothing_and_gets_no_gradient(way):
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-def test_bfloat16_stays_bfloat16(way):
+def test_bfloat16_input_gives_bfloat16_output(way):
     q, k, v, mask = some()
     exact = way(q, k, v, mask)
     rough = way(*(each.bfloat16() for each in (q, k, v)), mask)

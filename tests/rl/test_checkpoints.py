@@ -1,4 +1,4 @@
-"""Checkpoints of a learner: what goes on from one equals what never stopped, or is refused."""
+"""A learner resumed from a checkpoint equals an uninterrupted one; others are rejected."""
 
 import copy
 
@@ -12,7 +12,7 @@ from morphgen.rl.learner_state import load_networks, resume, state_of
 
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
 @pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
-def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
+def test_a_resumed_run_equals_an_uninterrupted_one(agent, discrete):
     options = {
         "agent": agent,
         "discrete": discrete,
@@ -42,7 +42,7 @@ def test_a_run_that_is_taken_up_again_equals_one_that_went_on(agent, discrete):
 @pytest.mark.parametrize(
     "part", ["optimiser", "generators", "batch", "target_critic", "update", "actor_lr_scale"]
 )
-def test_a_run_that_forgets_a_part_does_not_equal_one_that_went_on(part):
+def test_a_run_resumed_without_a_part_of_the_state_differs(part):
     options = {"task_reweighting": True, "learning_rate": 3e-3, "desired_kl": 1e-3}
     went_on = learner(**options)
     went_on.iterate(), went_on.iterate()
@@ -56,7 +56,7 @@ def test_a_run_that_forgets_a_part_does_not_equal_one_that_went_on(part):
     assert not equal(weights(went_on), weights(again))
 
 
-def test_a_checkpoint_does_not_change_with_the_learner():
+def test_later_updates_do_not_change_a_saved_state():
     made = learner()
     made.iterate()
     checkpoint = state_of(made)
@@ -69,7 +69,7 @@ def test_a_checkpoint_does_not_change_with_the_learner():
     assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
 
 
-def test_a_learner_does_not_change_with_a_checkpoint():
+def test_saving_the_state_does_not_change_the_learner():
     looked_at, alone = learner(), learner()
     for each in (looked_at, alone):
         each.iterate()
@@ -86,7 +86,7 @@ def test_the_same_seed_gives_the_same_run():
     assert not equal(weights(runs[0]), weights(runs[2]))
 
 
-def test_checkpoints_of_other_runs_are_refused_and_nothing_is_changed():
+def test_resume_rejects_checkpoints_of_other_runs_and_changes_nothing():
     made = learner()
     before = weights(made)
     with pytest.raises(TaskError, match=r"another run: gamma 0\.9, here 0\.99$"):
@@ -101,7 +101,7 @@ def test_checkpoints_of_other_runs_are_refused_and_nothing_is_changed():
     assert equal(before, weights(made))
 
 
-def test_checkpoints_from_before_a_constant_have_its_default():
+def test_a_constant_missing_in_an_old_checkpoint_has_its_default():
     made, again = learner(seed=1), learner()
     checkpoint = stored(state_of(made))
     del checkpoint["policy"]["network"]["mlp_width"], checkpoint["config"]["desired_kl"]
@@ -109,7 +109,7 @@ def test_checkpoints_from_before_a_constant_have_its_default():
     assert equal(weights(made), weights(again))
 
 
-def test_fine_tuning_begins_with_the_networks_and_nothing_else():
+def test_load_networks_loads_only_the_networks():
     pre = learner()
     pre.iterate()
     fine = learner(OnALine(16), gamma=0.9)

@@ -1,4 +1,4 @@
-"""What is compiled learns as what is not, on a GPU too."""
+"""Compiled learners learn like uncompiled ones, also on a GPU."""
 
 import functools
 
@@ -17,14 +17,14 @@ CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize(("bf16", "kind"), [(True, torch.bfloat16), (False, torch.float32)])
-def test_products_are_in_the_precision_that_is_asked_for(bf16, kind):
+def test_matrix_products_have_the_requested_precision(bf16, kind):
     call = prepared(lambda x: x @ x, CPU, bf16=bf16, compiled=False)
     found = call(torch.eye(3) / 3)
     assert found.dtype == kind
     torch.testing.assert_close(found.float(), torch.eye(3) / 9, rtol=1e-2, atol=0)
 
 
-def test_what_cannot_be_compiled_is_said_in_one_line(monkeypatch):
+def test_a_failed_compilation_is_a_one_line_error(monkeypatch):
     def without(function, **options):
         def call(*args):
             raise TorchDynamoException("no compiler\nand a long story")
@@ -49,7 +49,7 @@ def test_compilation_gives_nearly_the_same_update(agent):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
-def test_graphs_on_a_gpu_learn_the_same_one_learner_after_the_other(agent):
+def test_cuda_graphs_of_two_learners_in_turn_learn_the_same(agent):
     for seed in (0, 1):
         plain, graphs = (
             learner(agent=agent, seed=seed, device="cuda", compile=compiled)
@@ -64,7 +64,7 @@ def test_graphs_on_a_gpu_learn_the_same_one_learner_after_the_other(agent):
 
 
 @pytest.mark.slow
-def test_a_process_compiles_learners_of_many_kinds(monkeypatch):
+def test_one_process_compiles_many_learners(monkeypatch):
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
     for agent in ("se", "me-mlp", "me-tf"):
         for envs in (2, 4, 6):

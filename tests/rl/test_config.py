@@ -1,4 +1,4 @@
-"""Constants that cannot be are refused, and what follows from the others."""
+"""Configs: derived values, and rejected ones."""
 
 import math
 
@@ -37,7 +37,7 @@ def test_transitions_are_rounded_up_to_whole_updates():
         ),
     ],
 )
-def test_impossible_configurations_are_refused(make, words):
+def test_invalid_configurations_are_rejected(make, words):
     with pytest.raises(TaskError, match=words):
         make()
 

@@ -1,4 +1,4 @@
-"""Scores of policies and reference controllers, robot by robot."""
+"""Scores of policies and baselines by robot."""
 
 import json
 import math
@@ -33,13 +33,13 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Hardly trained, on the robots of a split."""
+    """A run of two updates on the robots of a split."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     train(folder, small_config(small_source(), total_timesteps=64), execution=QUIET)
     return folder
 
 
-def test_the_random_controller_is_no_better_than_itself():
+def test_the_score_of_the_random_policy_is_zero():
     scores = evaluate_baseline("random", small_source(), EVAL)
     assert [each.side for each in scores] == ["train", "train"]
     for each in scores:
@@ -50,7 +50,7 @@ def test_the_random_controller_is_no_better_than_itself():
         assert each.relative_distance > 0.03
 
 
-def test_inverse_kinematics_is_far_better():
+def test_inverse_kinematics_scores_far_above_the_random_policy():
     for side in ("train", "test"):
         for each in evaluate_baseline("ik", other_side(small_source(), side), EVAL):
             assert each.side == side
@@ -61,39 +61,39 @@ def test_inverse_kinematics_is_far_better():
             assert each.low <= each.score <= each.high
 
 
-def test_episodes_are_those_of_the_seed():
+def test_the_seed_determines_the_episodes():
     source = small_source()
     scores = [evaluate_baseline("zero", source, replace(EVAL, seed=seed)) for seed in (0, 0, 1)]
     assert scores[0] == scores[1]
     assert scores[0][0].distance != scores[2][0].distance
 
 
-def test_mean_and_drawn_actions_are_each_the_same_again(run):
+def test_evaluations_are_repeatable_in_both_modes(run):
     modes = ("deterministic", "deterministic", "stochastic", "stochastic")
     found = [evaluate_run(run, "train", EVAL, mode) for mode in modes]
     assert found[0] == found[1] != found[2] == found[3]
     assert found[0][0].random == found[2][0].random
 
 
-def test_workers_change_nothing(run):
+def test_the_number_of_workers_does_not_change_scores(run):
     one, two = (evaluate_run(run, "test", replace(EVAL, workers=n), "stochastic") for n in (1, 2))
     assert one == two
 
 
 def at_most(count, monkeypatch):
-    """Have MuJoCo hold no more environments at once."""
+    """Limit the number of parallel environments of MuJoCo."""
     fewer = replace(SIMULATORS["mujoco"], max_envs=count)
     monkeypatch.setitem(SIMULATORS._loaded, "mujoco", fewer)
 
 
-def test_more_episodes_than_environments_are_rounds():
+def test_more_episodes_than_environments_run_in_rounds():
     config = replace(EVAL, episodes=35)
     (score,) = evaluate_baseline("zero", robot_source("planar-cube", "reach"), config)
     assert score.episodes == 36
     assert score.steps == 36 * 300
 
 
-def test_robots_that_do_not_fit_at_once_have_the_same_episodes(run, monkeypatch):
+def test_evaluation_in_several_batches_has_the_same_episodes(run, monkeypatch):
     config = replace(EVAL, episodes=5)
     source = other_side(small_source(), "train")
     whole = evaluate_run(run, "train", config, "deterministic")
@@ -123,7 +123,7 @@ def test_ten_thousand_steps_are_34_episodes():
         episodes_for(0, 300)
 
 
-def test_push_scores_its_success_rate_and_references_are_for_their_task():
+def test_push_scores_are_success_rates_and_baselines_reject_other_tasks():
     mixed = robot_source("prims", "push")
     config = EvalConfig(episodes=3, sim="mujoco")
     (zero,) = evaluate_baseline("zero", mixed, config)
@@ -138,7 +138,7 @@ def test_push_scores_its_success_rate_and_references_are_for_their_task():
         evaluate_baseline("script", mixed, config)
 
 
-def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
+def test_se_policies_are_scored_on_their_own_robot_and_together_on_others(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=64)
     train(tmp_path, config, execution=QUIET)
     own = evaluate_run(tmp_path, "train", EVAL, "deterministic")
@@ -167,7 +167,7 @@ def test_se_is_scored_on_each_ones_own_robot_and_with_all_on_others(tmp_path):
     ],
     ids=["at once", "in rounds", "in batches"],
 )
-def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
+def test_progress_counts_finished_and_partial_episodes(monkeypatch, limit, value, calls, whole):
     if limit is None:
         at_most(value, monkeypatch)
     else:
@@ -183,14 +183,14 @@ def test_it_tells_how_far_it_is(monkeypatch, limit, value, calls, whole):
     assert parts[-1] == whole
 
 
-def test_of_policies_of_single_robots_it_tells_all_that_play(tmp_path):
+def test_progress_of_se_policies_covers_all_policies(tmp_path):
     train(tmp_path, small_config(small_source(), agent="se", total_timesteps=64), execution=QUIET)
     seen = []
     evaluate_run(tmp_path, "test", EVAL, "deterministic", progress=lambda *now: seen.append(now))
     assert (len(seen), seen[300], seen[-1]) == (600, (pytest.approx(2 + 1 / 150), 4), (4, 4))
 
 
-def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_path):
+def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(run, tmp_path):
     config, learner = read_checkpoint(run)
     learner["layout"]["obstacles"] = 0
     boxes = robot_source("planar-cube", "reach", obstacles=True)
@@ -200,7 +200,7 @@ def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(run, tmp_
     evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
-def test_policies_for_other_observations_or_actions_are_not_evaluated_together(run, tmp_path):
+def test_policies_with_different_interfaces_are_not_evaluated_together(run, tmp_path):
     config, learner = read_checkpoint(run)
     for name, changed in {
         "wider": replace(config, max_links=30),
@@ -220,7 +220,7 @@ def test_policies_for_other_observations_or_actions_are_not_evaluated_together(r
 
 
 @pytest.mark.parametrize("agent", ["me-mlp", "se"])
-def test_obstacles_may_be_on_one_side_or_around_one_robot_alone(agent, tmp_path):
+def test_obstacles_may_surround_only_some_robots(agent, tmp_path):
     def made(words, obstacles):
         return member(words, task="reach", obstacles=obstacles)
 
@@ -245,7 +245,7 @@ def test_one_robot_has_no_other_side(tmp_path):
         evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
-def test_an_evaluation_is_in_the_simulator_and_task_of_the_run(run):
+def test_eval_config_has_the_simulator_and_tasks_of_the_run(run):
     config, _ = read_checkpoint(run)
     assert eval_config_of(config, 3) == EvalConfig(3, "mujoco")
     with pytest.raises(TaskError, match="0 episodes"):
@@ -254,7 +254,7 @@ def test_an_evaluation_is_in_the_simulator_and_task_of_the_run(run):
         EvalConfig(seed=2**63)
 
 
-def test_tables_hold_every_robot_and_mode(run, tmp_path):
+def test_score_tables_have_every_robot_and_mode(run, tmp_path):
     found = {
         mode: evaluate_run(run, "train", EVAL, mode) for mode in ("deterministic", "stochastic")
     }

@@ -1,4 +1,4 @@
-"""Advantages, worked out by hand."""
+"""Generalised advantage estimation against values computed by hand."""
 
 import torch
 
@@ -28,30 +28,30 @@ NEVER = (False, False, False)
 MIDDLE = (False, True, False)
 
 
-def test_an_episode_that_goes_on():
+def test_advantages_of_an_unfinished_episode():
     # delta: 1 + 18 - 10 = 9; 2 + 27 - 20 = 9; 3 + 36 - 30 = 9. Each passes on 0.45 of the next.
     wanted = torch.tensor([9 + 0.45 * (9 + 0.45 * 9), 9 + 0.45 * 9, 9.0])
     torch.testing.assert_close(advantages(NEVER, NEVER), wanted)
 
 
-def test_after_a_termination_nothing_follows():
+def test_the_value_after_a_termination_is_zero():
     # The middle delta loses its 27, and nothing of the last step passes on to it.
     wanted = torch.tensor([9 + 0.45 * (2 - 20), 2.0 - 20, 9.0])
     torch.testing.assert_close(advantages(MIDDLE, NEVER), wanted)
 
 
-def test_after_a_truncation_the_last_observation_counts_and_the_sum_stops():
+def test_a_truncation_bootstraps_from_the_final_observation():
     # 50 is the value of the episode's last observation: 2 + 45 - 20 = 27.
     wanted = torch.tensor([9 + 0.45 * 27, 27.0, 9.0])
     torch.testing.assert_close(advantages(NEVER, MIDDLE, (20.0, 50.0, 40.0)), wanted)
 
 
-def test_a_step_that_ends_both_ways_has_terminated():
+def test_termination_takes_precedence_over_truncation():
     both = advantages(MIDDLE, MIDDLE, (20.0, 50.0, 40.0))
     torch.testing.assert_close(both, advantages(MIDDLE, NEVER))
 
 
-def test_environments_do_not_mix():
+def test_environments_are_independent():
     rewards = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
     values, ahead = rewards.flip(0), rewards.roll(1, 0)
     over = torch.zeros(5, 3, dtype=torch.bool)

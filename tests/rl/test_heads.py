@@ -1,4 +1,4 @@
-"""Only movable links have a say in what is drawn, how likely it is, and how open."""
+"""Action distributions: only movable links count in samples, probabilities and entropies."""
 
 import math
 
@@ -34,7 +34,7 @@ def discrete(mask=MASK):
     return MaskedMultiDiscrete(2 * torch.randn(3, 4, len(BINS), generator=seeded()), mask)
 
 
-def test_gaussian_is_torchs_over_the_movable_links():
+def test_gaussian_matches_torch_over_the_movable_links():
     head = gaussian()
     actions = head.sample(seeded(1))
     for row, mask in enumerate(MASK[:2]):
@@ -43,7 +43,7 @@ def test_gaussian_is_torchs_over_the_movable_links():
         assert head.entropy()[row] == pytest.approx(theirs.entropy())
 
 
-def test_multi_discrete_is_torchs_over_the_movable_links():
+def test_multi_discrete_matches_torch_over_the_movable_links():
     head = discrete()
     actions = head.sample(seeded(1))
     for row, mask in enumerate(MASK[:2]):
@@ -53,12 +53,12 @@ def test_multi_discrete_is_torchs_over_the_movable_links():
 
 
 @pytest.mark.parametrize("head", [gaussian(), discrete()], ids=["gaussian", "discrete"])
-def test_what_cannot_move_says_nothing(head):
+def test_immovable_links_add_nothing_to_log_prob_and_entropy(head):
     assert head.log_prob(head.sample(seeded()))[2] == 0
     assert head.entropy()[2] == 0
 
 
-def test_gaussian_draws_with_its_mean_and_deviation():
+def test_gaussian_samples_have_its_mean_and_std():
     mask = torch.ones(40_000, 2, dtype=torch.bool)
     mean = torch.tensor([0.2, -0.4])
     head = MaskedGaussian(mean.expand(40_000, 2), torch.tensor([-1.0, 0]), mask)
@@ -68,7 +68,7 @@ def test_gaussian_draws_with_its_mean_and_deviation():
     torch.testing.assert_close(drawn.std(dim=0), wanted, atol=0.02, rtol=0)
 
 
-def test_multi_discrete_draws_with_its_probabilities():
+def test_multi_discrete_samples_have_its_probabilities():
     logits = torch.linspace(-2, 1, len(BINS))
     mask = torch.ones(60_000, 1, dtype=torch.bool)
     drawn = MaskedMultiDiscrete(logits.expand(60_000, 1, len(BINS)), mask).sample(seeded())
@@ -76,7 +76,7 @@ def test_multi_discrete_draws_with_its_probabilities():
     torch.testing.assert_close(shares, logits.softmax(dim=0), atol=0.01, rtol=0)
 
 
-def test_the_middle_is_the_mean_and_the_bin_nearest_to_it():
+def test_the_mode_is_the_mean_or_the_bin_nearest_to_it():
     head = gaussian()
     assert head.mode()[MASK].equal(head.mean[MASK])
     shares = {-1 / 16: 0.4, 1 / 2: 0.3, 1 / 4: 0.3}  # mean 0.2, where 1/4 is nearest
@@ -86,13 +86,13 @@ def test_the_middle_is_the_mean_and_the_bin_nearest_to_it():
 
 
 @pytest.mark.parametrize("chosen", range(len(BINS)))
-def test_the_middle_of_one_bin_is_that_bin(chosen):
+def test_the_mode_of_a_certain_bin_is_that_bin(chosen):
     logits = 50.0 * functional.one_hot(torch.tensor(chosen), len(BINS)).float()
     bins = MaskedMultiDiscrete(logits.expand(*MASK.shape, len(BINS)), MASK)
     assert set(bins.mode()[MASK].tolist()) == {chosen}
 
 
-def test_links_that_do_not_move_rest():
+def test_immovable_links_get_the_resting_action():
     assert BINS[REST] == 0
     for actions in (discrete().sample(seeded()), discrete().mode()):
         assert set(actions[~MASK].tolist()) == {REST}
@@ -100,14 +100,14 @@ def test_links_that_do_not_move_rest():
         assert set(actions[~MASK].tolist()) == {0.0}
 
 
-def test_a_generator_is_all_that_chance_depends_on():
+def test_samples_depend_only_on_the_generator():
     for head in (gaussian(), discrete()):
         assert head.sample(seeded(3)).equal(head.sample(seeded(3)))
         assert not head.sample(seeded(3)).equal(head.sample(seeded(4)))
 
 
 @pytest.mark.parametrize("garbage", [1e30, math.inf, math.nan])
-def test_garbage_behind_the_mask_changes_no_gradient(garbage):
+def test_invalid_numbers_behind_the_mask_change_no_gradient(garbage):
     def gradients(fill):
         mean = torch.randn(3, 4, generator=seeded()).masked_fill(~MASK, fill).requires_grad_()
         logits = torch.randn(3, 4, len(BINS), generator=seeded())
@@ -127,7 +127,7 @@ def test_garbage_behind_the_mask_changes_no_gradient(garbage):
         assert clean.isfinite().all()
 
 
-def test_log_std_starts_where_it_should_learns_and_stays_in_bounds():
+def test_log_std_starts_at_its_initial_value_and_stays_in_bounds():
     raw = torch.zeros(1, requires_grad=True)
     found = bounded_log_std(raw)
     assert found.item() == pytest.approx(INITIAL_LOG_STD, abs=1e-6)

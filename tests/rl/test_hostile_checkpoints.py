@@ -1,4 +1,4 @@
-"""A checkpoint that is damaged, incomplete or hostile is refused in one line, and runs no code."""
+"""A damaged, incomplete or hostile checkpoint is rejected in one line, and runs no code."""
 
 import copy
 import logging
@@ -29,14 +29,14 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def content(run):
-    """The content of a checkpoint, as one of an older version has it: without a hash."""
+    """The content of a checkpoint without a hash, as in older versions."""
     found = torch.load(run / CHECKPOINT, weights_only=True)
     del found["sha256"]
     return found
 
 
 def refused(tmp_path, content, change):
-    """Why a checkpoint is refused whose content was changed, and its hash removed."""
+    """Return the error of a checkpoint with changed content and without a hash."""
     changed = copy.deepcopy(content)
     change(changed, changed["learner"])
     torch.save(changed, tmp_path / "c.pt")
@@ -50,7 +50,7 @@ def refused(tmp_path, content, change):
 
 
 def put(*path, value):
-    """A change that puts a value at a path of the learner."""
+    """Return a function that sets the value at a path of the learner's state."""
 
     def change(_, learner):
         for key in path[:-1]:
@@ -172,7 +172,7 @@ def nested(levels, wide):
         (lambda whole, _: whole.pop("run"), "is not a checkpoint of morphgen train"),
     ],
 )
-def test_a_checkpoint_that_cannot_be_right_is_refused(tmp_path, content, change, message):
+def test_an_invalid_checkpoint_is_rejected(tmp_path, content, change, message):
     assert message in refused(tmp_path, content, change)
 
 
@@ -185,7 +185,7 @@ def test_the_hash_is_stored_and_the_content_read_back(run, tmp_path):
     assert again["sha256"] == stored["sha256"]
 
 
-def test_flipped_bits_change_nothing_or_are_noticed(run, tmp_path):
+def test_flipped_bits_are_detected_or_harmless(run, tmp_path):
     whole = (run / CHECKPOINT).read_bytes()
     drawn, noticed = random.Random(0), 0
     for _ in range(200):
@@ -199,7 +199,7 @@ def test_flipped_bits_change_nothing_or_are_noticed(run, tmp_path):
     assert noticed > 100
 
 
-def test_a_weight_that_changed_is_noticed(run, tmp_path, content):
+def test_a_changed_weight_is_detected(run, tmp_path, content):
     data = torch.load(run / CHECKPOINT, weights_only=True)
     data["learner"]["actor"][ENTER][0, 0] += 1e-6
     torch.save(data, tmp_path / CHECKPOINT)
@@ -207,7 +207,7 @@ def test_a_weight_that_changed_is_noticed(run, tmp_path, content):
         read_checkpoint(tmp_path)
 
 
-def test_a_checkpoint_of_before_there_was_a_hash_is_read_with_a_warning(tmp_path, content, caplog):
+def test_a_checkpoint_without_a_hash_is_read_with_a_warning(tmp_path, content, caplog):
     torch.save(content, tmp_path / CHECKPOINT)
     with caplog.at_level(logging.WARNING):
         read_checkpoint(tmp_path), read_checkpoint(tmp_path)
@@ -227,7 +227,7 @@ def test_compressed_content_is_not_unpacked(run, tmp_path):
         read_checkpoint(tmp_path)
 
 
-def test_a_tensor_that_claims_more_than_the_file_has_reaches_nothing_else(run, tmp_path):
+def test_a_tensor_cannot_reach_beyond_its_storage(run, tmp_path):
     with (
         zipfile.ZipFile(run / CHECKPOINT) as whole,
         zipfile.ZipFile(tmp_path / CHECKPOINT, "w") as claim,
@@ -250,7 +250,7 @@ def test_a_tensor_that_claims_more_than_the_file_has_reaches_nothing_else(run, t
         ("MAX_INSTRUCTIONS", "more than 100 instructions"),
     ],
 )
-def test_a_file_beyond_a_limit_is_refused(run, monkeypatch, limit, message):
+def test_a_file_beyond_a_limit_is_rejected(run, monkeypatch, limit, message):
     monkeypatch.setattr(checkpoint_file, limit, 100)
     with pytest.raises(TaskError, match=message):
         read_checkpoint(run)
@@ -266,7 +266,7 @@ class Bomb:
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("command", ["play", "eval"])
-def test_the_command_line_refuses_a_bomb_in_a_line(tmp_path, content, capfd, command):
+def test_the_command_line_runs_no_code_of_a_checkpoint(tmp_path, content, capfd, command):
     crater = tmp_path / "crater"
     torch.save({**content, "more": Bomb(crater)}, tmp_path / "zip.pt")
     torch.save({"more": Bomb(crater)}, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
@@ -279,7 +279,7 @@ def test_the_command_line_refuses_a_bomb_in_a_line(tmp_path, content, capfd, com
 
 
 @pytest.mark.parametrize("command", ["play", "eval", "finetune"])
-def test_every_command_refuses_weights_that_are_not_finite(tmp_path, run, content, capfd, command):
+def test_every_command_rejects_weights_that_are_not_finite(tmp_path, run, content, capfd, command):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.json").write_bytes((run / "config.json").read_bytes())
@@ -304,7 +304,7 @@ def test_weights_that_are_not_finite_do_not_replace_the_last_checkpoint(run, tmp
 
 
 def refusal(command, path, capfd):
-    """The one line with which a command refuses a checkpoint."""
+    """Return the one-line error of a command for a checkpoint."""
     words = {
         "play": ["play", "reach", "planar-cube", "--policy", path],
         "eval": ["eval", path],

@@ -1,4 +1,4 @@
-"""The baseline ``ik`` reaches goals by free paths; results of episodes."""
+"""The baseline ``ik`` reaches goals along collision-free paths; results of episodes."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def made(tmp_path):
         batch.close()
 
 
-def test_random_starts_leave_fingers_alone(made):
+def test_random_starts_do_not_move_fingers(made):
     batch = made(CLAW, 6)
     near = batch.targets.clone()
     starts = random_starts(batch, torch.arange(6), torch.Generator().manual_seed(0))
@@ -51,7 +51,7 @@ def test_goals_are_reached_by_robots_whose_links_obstruct_each_other(made, words
     assert sum(episode.success for episode in episodes) >= 7
 
 
-def test_an_episode_of_push_scores_its_success_and_takes_its_time(made):
+def test_a_push_episode_scores_its_success_and_counts_its_steps(made):
     batch = made("prims", 3, "push")
     episodes = run_episodes(batch, ScriptedPush(0), 1)
     assert any(episode.success for episode in episodes)
@@ -60,7 +60,7 @@ def test_an_episode_of_push_scores_its_success_and_takes_its_time(made):
         assert episode.seconds == pytest.approx(episode.steps * CONTROL_PERIOD)
 
 
-def test_an_episode_of_reach_scores_the_mean_of_its_steps(made):
+def test_a_reach_episode_scores_the_mean_of_its_steps(made):
     batch, scores = made("prims", 1), []
     step = batch.step
 

@@ -1,4 +1,4 @@
-"""Averages and their bootstrap intervals."""
+"""Means and their bootstrap intervals."""
 
 import math
 from itertools import product
@@ -14,13 +14,13 @@ def all_resamples(values):
     return [np.mean(chosen) for chosen in product(values, repeat=len(values))]
 
 
-def test_the_interquartile_mean_leaves_a_quarter_away_at_each_end():
+def test_the_interquartile_mean_drops_a_quarter_at_each_end():
     scores = [[-1000.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 1000.0]]
     assert iqm_interval(scores, together=True).value == pytest.approx(np.mean([2, 3, 4, 5]))
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_of_one_robot_it_is_where_95_of_100_resamples_are(together):
+def test_the_interval_of_one_robot_contains_95_percent_of_the_resamples(together):
     values = [1.0, 2.0, 4.0]
     found = iqm_interval(np.array(values)[:, None], together=together)
     low, high = np.quantile(all_resamples(values), (0.025, 0.975), method="inverted_cdf")
@@ -29,7 +29,7 @@ def test_of_one_robot_it_is_where_95_of_100_resamples_are(together):
     assert (alone.low, alone.high) == pytest.approx((low, high))
 
 
-def test_seeds_that_are_drawn_whole_keep_robots_together():
+def test_resampled_seeds_keep_their_robots_together():
     # Robots go up and down together: by themselves they make up for each other.
     scores = np.array([0.0, 1.0, 2.0, 3.0])[:, None] + np.zeros(8)
     whole, apart = (iqm_interval(scores, together=together) for together in (True, False))
@@ -37,7 +37,7 @@ def test_seeds_that_are_drawn_whole_keep_robots_together():
     assert whole.high - whole.low > 2 * (apart.high - apart.low) > 0
 
 
-def test_robots_are_strata():
+def test_robots_are_strata_of_the_bootstrap():
     # Scores differ between robots only: no resample is another.
     scores = np.tile([1.0, 5.0, 9.0, 100.0], (3, 1))
     for together in (True, False):
@@ -45,7 +45,7 @@ def test_robots_are_strata():
         assert found.low == found.value == found.high == 7.0
 
 
-def test_it_is_the_same_again():
+def test_intervals_are_repeatable():
     scores = np.random.default_rng(0).normal(size=(3, 5))
     assert iqm_interval(scores, together=True) == iqm_interval(scores, together=True)
 
@@ -59,6 +59,6 @@ def test_one_seed_has_no_interval():
 
 
 @pytest.mark.parametrize("scores", [[], [[]], [1.0, 2.0]])
-def test_nothing_has_no_average(scores):
+def test_empty_or_one_dimensional_scores_are_rejected(scores):
     with pytest.raises(ValueError, match="expected 2 axes"):
         iqm_interval(scores, together=True)

@@ -17,7 +17,7 @@ from morphgen.tasks.make import make_batch
 
 
 def arm_of_three_joints():
-    """An arm3 whose base does not turn, nor its wrist."""
+    """An arm3 with a fixed base and a fixed wrist."""
     made = morphgen.compose("arm3")
     moving = [k for k in made.joint_chain(made.frame(TOOL).link) if made.joints[k].is_movable]
     fixed = {made.joints[k].name for k in (moving[0], moving[-1])}

@@ -61,7 +61,7 @@ def test_a_declared_field_reaches_the_networks_and_the_checkpoint(windy, agent):
         policy.act(observation)
 
 
-def test_layouts_without_such_fields_are_stored_as_before(windy):
+def test_layouts_without_declared_fields_are_stored_without_the_key(windy):
     layout = layout_of(OnALine(2).observe())
     assert layout.fields == ()
     assert "fields" not in layout.as_data()
@@ -69,12 +69,12 @@ def test_layouts_without_such_fields_are_stored_as_before(windy):
     assert isinstance(layout, Layout)
 
 
-def test_an_undeclared_field_is_refused_when_training_begins():
+def test_training_rejects_an_undeclared_field():
     with pytest.raises(TaskError, match=r"observation entry 'wind'.*declare an ObservationField"):
         Learner(WindyLine(8), PolicyConfig("me-mlp"), CONFIG)
 
 
-def test_a_field_of_another_size_is_refused(windy):
+def test_a_field_of_another_size_is_rejected(windy):
     observation = WindyLine(2).observe()
     observation["wind"] = observation["wind"][:, :2]
     with pytest.raises(TaskError, match=r"'wind' has shape \(2, 2\); expected \(n, 3\)"):

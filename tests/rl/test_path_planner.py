@@ -87,7 +87,7 @@ def test_rrt_connect_finds_a_way_out_of_a_pocket():
         assert space.free(np.array(tree.nodes)).all()
 
 
-def test_joints_that_may_not_move_stay():
+def test_immovable_joints_keep_their_position():
     """A ball on slides along x and y, and a slide that does not move it."""
     links = [Link("base"), Link("cart"), Link("ball", collisions=(Shape(Sphere(0.1)),))]
     joints = (
@@ -157,7 +157,7 @@ def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
 
 
 def test_the_cheapest_path_along_a_tree_is_taken():
-    """Not the one to the cheapest goal, which is far."""
+    """The cheapest goal is far, so that the path to another goal is cheaper."""
     planner, start = planner_of(), np.array([0.0, 0.0])
     _, tree = planner.plan_rrt(start, NO_GOALS, block=FAR_AWAY, iterations=400)
     goals, goal_cost = np.array([[1.8, 1.8], [0.3, 0.0]]), np.array([0.0, 40.0])

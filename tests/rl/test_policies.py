@@ -1,4 +1,4 @@
-"""What is not there has no influence on actions, values and gradients; what is there has."""
+"""Masked entries change no actions, values or gradients; other entries do."""
 
 import math
 
@@ -60,19 +60,19 @@ def observed(seed=0, *, extras=True):
 
 
 def mask_of(seen, name):
-    """Where numbers of an entry are there, of the entry's shape."""
+    """Return the mask of an observation entry, in the entry's shape."""
     mask = seen[MASKS[name]] if name in MASKS else torch.ones(N).bool()
     return mask.reshape(mask.shape + (1,) * (seen[name].dim() - mask.dim())).expand_as(seen[name])
 
 
 def filled(seen, value):
-    """The same observation with something else where nothing is."""
+    """Return the observation with its masked entries filled with a value."""
     values = {k: seen[k].masked_fill(~mask_of(seen, k), value) for k in MASKS if k in seen}
     return {**seen, **values}
 
 
 def networks(agent="me-tf", seen=None, *, discrete=True, proprioceptive_only=False, lively=True):
-    """An actor and a critic; ``lively`` ones are as if they had learned. Logits are not scaled."""
+    """Return an actor and a critic; ``lively`` ones have noise on the initial weights."""
     layout = layout_of(seen or observed())
     config = PolicyConfig(
         agent=agent,
@@ -90,7 +90,7 @@ def networks(agent="me-tf", seen=None, *, discrete=True, proprioceptive_only=Fal
 
 
 def outputs(actor, critic, seen):
-    """Actions, their probability, and values."""
+    """Return the modes, the log-probabilities of sampled actions, and the values."""
     head = actor.distribution(seen)
     return head.mode(), head.log_prob(head.sample(torch.Generator().manual_seed(0))), critic(seen)
 
@@ -102,7 +102,7 @@ kinds = pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "con
 @agents
 @kinds
 @pytest.mark.parametrize("garbage", [-7.5, 1e30, -3e38, math.inf, math.nan])
-def test_garbage_in_the_padding_changes_nothing(agent, discrete, garbage):
+def test_invalid_numbers_in_the_padding_change_nothing(agent, discrete, garbage):
     seen = observed()
     pair = networks(agent, seen, discrete=discrete)
     clean, dirty = outputs(*pair, filled(seen, 0.0)), outputs(*pair, filled(seen, garbage))
@@ -114,7 +114,7 @@ def test_garbage_in_the_padding_changes_nothing(agent, discrete, garbage):
 @agents
 @kinds
 @pytest.mark.parametrize("garbage", [1e30, math.nan])
-def test_garbage_in_the_padding_changes_no_gradient_of_a_weight(agent, discrete, garbage):
+def test_invalid_numbers_in_the_padding_change_no_gradient(agent, discrete, garbage):
     seen = observed()
 
     def gradients(fill):
@@ -158,7 +158,7 @@ def test_permuting_padding_changes_nothing(agent):
         assert one.equal(other)
 
 
-def test_the_transformer_does_not_care_how_much_padding_there_is():
+def test_the_amount_of_padding_does_not_change_the_transformer():
     seen = observed()
     pair = networks("me-tf", seen)
     more = torch.full((N, 5, 13), 9.0)
@@ -172,7 +172,7 @@ def test_the_transformer_does_not_care_how_much_padding_there_is():
 
 
 @kinds
-def test_the_transformer_says_and_learns_the_same_without_rows_that_no_robot_has(discrete):
+def test_the_transformer_acts_and_learns_the_same_without_unused_rows(discrete):
     seen = {name: each[1:] for name, each in observed().items()}
     rows = rows_needed(PolicyConfig("me-tf"), seen)
     assert rows == COUNT[1:].max() == LINKS - 2
@@ -191,11 +191,11 @@ def test_the_transformer_says_and_learns_the_same_without_rows_that_no_robot_has
 
 
 @pytest.mark.parametrize("agent", ["se", "me-mlp"])
-def test_an_mlp_sees_the_rows_that_it_was_made_for(agent):
+def test_an_mlp_takes_all_rows_of_its_layout(agent):
     assert rows_needed(PolicyConfig(agent), observed()) == LINKS
 
 
-def test_the_transformer_learns_nothing_of_the_index_of_a_link_that_is_not_there():
+def test_position_embeddings_of_absent_links_get_no_gradient():
     seen = {name: each[1:2] for name, each in observed().items()}
     actor, critic = networks("me-tf", seen)
     _, log_prob, value = outputs(actor, critic, seen)
@@ -205,7 +205,7 @@ def test_the_transformer_learns_nothing_of_the_index_of_a_link_that_is_not_there
         assert not network.index.grad[4:].any()
 
 
-def test_the_transformer_does_not_care_for_the_order_of_obstacles():
+def test_the_order_of_obstacles_does_not_change_the_transformer():
     seen = observed()
     pair = networks("me-tf", seen)
     order = torch.tensor([2, 0, 1])
@@ -215,7 +215,7 @@ def test_the_transformer_does_not_care_for_the_order_of_obstacles():
 
 
 @agents
-def test_points_that_are_not_there_do_not_count(agent):
+def test_masked_points_change_nothing(agent):
     seen = {name: each[:1] for name, each in observed().items()}
     pair = networks(agent, seen)
     fewer = {k: v[:, :5] if k.startswith("point") else v for k, v in seen.items()}
@@ -225,7 +225,7 @@ def test_points_that_are_not_there_do_not_count(agent):
 
 
 @agents
-def test_what_is_not_there_is_zeros(agent):
+def test_absent_entities_are_encoded_as_zeros(agent):
     seen = observed()
     vectors, mask = networks(agent, seen)[0].network.entities(seen)
     assert mask.sum(dim=1).tolist() == [6 + 1 + 2 + 1, 4 + 1 + 3 + 1, 1 + 2 + 1, 3 + 2 + 1]
@@ -234,7 +234,7 @@ def test_what_is_not_there_is_zeros(agent):
 
 
 @agents
-def test_order_of_points_means_nothing(agent):
+def test_the_order_of_points_changes_nothing(agent):
     seen = observed()
     pair = networks(agent, seen)
     other = {k: v.flip(1) if k.startswith("point") else v for k, v in seen.items()}
@@ -243,7 +243,7 @@ def test_order_of_points_means_nothing(agent):
 
 
 @agents
-def test_environments_do_not_mix(agent):
+def test_environments_are_independent(agent):
     seen = observed()
     actor, critic = networks(agent, seen)
     for i in range(N):
@@ -253,7 +253,7 @@ def test_environments_do_not_mix(agent):
 
 
 @agents
-def test_numbers_of_links_that_no_action_moves_are_zero(agent):
+def test_outputs_of_immovable_links_are_zero(agent):
     seen = observed()
     actor, _ = networks(agent, seen)
     numbers = actor(seen)
@@ -262,7 +262,7 @@ def test_numbers_of_links_that_no_action_moves_are_zero(agent):
 
 
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
-def test_morphology_is_hidden_if_asked_for(agent):
+def test_proprioceptive_only_hides_the_morphology(agent):
     seen, other = observed(), observed(1)
     positions = seen["tokens"].clone()
     positions[..., POSITION.columns] = other["tokens"][..., POSITION.columns]
@@ -274,7 +274,7 @@ def test_morphology_is_hidden_if_asked_for(agent):
         assert not critic(seen).isclose(critic({**seen, "tokens": positions})).any()
 
 
-def test_se_sees_no_morphology_and_is_the_mlp_otherwise():
+def test_se_is_the_mlp_without_morphology():
     seen = observed()
     _, se = networks("se", seen)
     _, mlp = networks("me-mlp", seen, proprioceptive_only=True)
@@ -286,7 +286,7 @@ def test_se_sees_no_morphology_and_is_the_mlp_otherwise():
 @pytest.mark.parametrize(
     "name", ["tokens", "goal", "object", "line", "tool", "obstacles", "points"]
 )
-def test_all_that_is_there_counts(agent, name):
+def test_every_observation_entry_changes_the_outputs(agent, name):
     seen = observed()
     actor, critic = networks(agent, seen)
     other = {**seen, name: observed(1)[name]}
@@ -309,9 +309,7 @@ def test_sizes_are_those_of_the_paper():
 
 @agents
 @kinds
-def test_logits_begin_alike_and_those_of_the_transformer_go_farther_with_every_change(
-    agent, discrete
-):
+def test_logit_scale_keeps_initial_logits_and_enlarges_their_changes(agent, discrete):
     factor = 16 if discrete and agent == "me-tf" else 1
     seen, layout = observed(), layout_of(observed())
     sizes = [transformer.Config(logit_scale=scale) for scale in (1.0, 16.0)]
@@ -336,7 +334,7 @@ def test_logits_begin_alike_and_those_of_the_transformer_go_farther_with_every_c
 
 
 @agents
-def test_all_actions_begin_alike_and_values_near_zero(agent):
+def test_initial_actions_are_equally_likely_and_values_near_zero(agent):
     seen = observed()
     actor, critic = networks(agent, seen, lively=False)
     spread = actor(seen).softmax(dim=-1)[seen["actions"]]
@@ -346,7 +344,7 @@ def test_all_actions_begin_alike_and_values_near_zero(agent):
     assert calm.distribution(seen).mode().abs().max() < 0.1
 
 
-def test_weights_follow_from_the_seed_and_leave_torchs_own_stream_alone():
+def test_the_seed_determines_the_weights_and_torchs_generator_is_unchanged():
     config, layout = PolicyConfig(tool_position=True), layout_of(observed())
     before = torch.random.get_rng_state()
     first, again, other = (make_networks(config, layout, seed)[0] for seed in (3, 3, 4))
@@ -357,7 +355,7 @@ def test_weights_follow_from_the_seed_and_leave_torchs_own_stream_alone():
 
 
 @agents
-def test_an_observation_without_obstacles_and_extras_will_do(agent):
+def test_networks_accept_observations_without_obstacles_and_optional_channels(agent):
     seen = observed(extras=False)
     seen["obstacles"], seen["obstacle_mask"] = torch.zeros(N, 0, 13), torch.zeros(N, 0).bool()
     for found in outputs(*networks(agent, seen), seen):
@@ -366,7 +364,7 @@ def test_an_observation_without_obstacles_and_extras_will_do(agent):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
-def test_networks_compile_whole_and_are_the_same(agent):
+def test_networks_compile_as_one_graph_with_the_same_outputs(agent):
     seen = observed()
     actor, critic = networks(agent, seen)
     for network in (actor, critic):
@@ -377,7 +375,7 @@ def test_networks_compile_whole_and_are_the_same(agent):
 
 @agents
 @pytest.mark.parametrize("garbage", [1e30, math.nan])
-def test_bfloat16_is_close_and_masks_hold_there_too(agent, garbage):
+def test_bfloat16_outputs_are_close_and_masked(agent, garbage):
     seen = observed()
     actor, critic = networks(agent, seen)
     with torch.autocast("cpu", torch.bfloat16):
@@ -391,7 +389,7 @@ def test_bfloat16_is_close_and_masks_hold_there_too(agent, garbage):
     assert 0 < (value - critic(seen)).abs().max() < 0.05 * critic(seen).abs().max()
 
 
-def test_weights_for_other_observations_are_refused_with_the_difference():
+def test_weights_for_other_observations_are_rejected_with_the_difference():
     here = layout_of(observed())
     words = (
         r"a\.pt is for other .*: obstacles 0, here 3; points 0, here 8; channels \(\), here .*; "
@@ -403,7 +401,7 @@ def test_weights_for_other_observations_are_refused_with_the_difference():
 
 
 @pytest.mark.parametrize("shown", [True, False])
-def test_a_policy_sees_the_tool_if_it_is_to_and_only_then(shown):
+def test_tool_position_must_match_the_environments(shown):
     layout = layout_of(observed(extras=shown))
     assert layout.tool == shown
     make_networks(PolicyConfig(tool_position=shown), layout, 0)
@@ -431,8 +429,8 @@ def test_kinds_of_entities_are_matched_by_name(monkeypatch):
 
 
 @pytest.mark.parametrize("extras", [True, False], ids=["cloud", "no cloud"])
-def test_the_rows_of_kinds_in_a_checkpoint_keep_their_meaning(extras):
-    """Each row is added to the vectors of one kind alone, in the order of older checkpoints."""
+def test_rows_of_entity_kinds_in_a_checkpoint_keep_their_order(extras):
+    """Each row is added to the vectors of one kind, in the order of older checkpoints."""
     seen = observed(extras=extras)
     found = Entities(layout_of(seen), 8, proprioceptive_only=False)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""PPO, part by part against known answers, and as a whole against a task that it must solve."""
+"""Parts of PPO against known values, and the whole on a task that it must solve."""
 
 import math
 from dataclasses import replace
@@ -31,13 +31,13 @@ def test_policy_loss_by_hand():
     torch.testing.assert_close(found, torch.tensor([-1.2, 1.5, -0.5, 0.8, -2.2]))
 
 
-def test_policy_loss_has_a_slope_only_where_it_is_not_clipped():
+def test_policy_loss_has_a_gradient_only_where_it_is_not_clipped():
     log_ratio = torch.tensor([1.5, 1.5, 0.5, 0.5]).log().requires_grad_()
     policy_loss(log_ratio, torch.tensor([1.0, -1.0, 1.0, -1.0]), 0.2).sum().backward()
     torch.testing.assert_close(log_ratio.grad, torch.tensor([0.0, 1.5, -0.5, 0.0]))
 
 
-def test_the_learning_rate_falls_over_the_updates_that_happen():
+def test_the_learning_rate_falls_linearly_over_the_updates():
     trainer = learner()
     rates = []
     while not trainer.done:
@@ -46,7 +46,7 @@ def test_the_learning_rate_falls_over_the_updates_that_happen():
     assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
 
 
-def test_the_actors_share_of_the_rate_follows_the_divergence():
+def test_the_actors_learning_rate_follows_the_kl_divergence():
     config = replace(SMALL, desired_kl=0.01)
     assert next_actor_lr_scale(config, 1.0, 0.02) == 1 / KL_FACTOR
     assert next_actor_lr_scale(config, 0.5, 0.02) == 0.5 / KL_FACTOR
@@ -55,7 +55,7 @@ def test_the_actors_share_of_the_rate_follows_the_divergence():
     assert next_actor_lr_scale(SMALL, 1.0, 9.9) == 1
 
 
-def test_the_actors_share_of_the_rate_has_a_floor():
+def test_the_actors_learning_rate_has_a_minimum():
     config, share = replace(SMALL, desired_kl=0.01), 1.0
     for _ in range(1000):
         share = next_actor_lr_scale(config, share, 9.9)
@@ -67,7 +67,7 @@ def test_the_actors_share_of_the_rate_has_a_floor():
 
 
 @pytest.mark.slow
-def test_a_target_of_the_divergence_is_kept_by_the_actor_alone():
+def test_desired_kl_changes_only_the_actors_learning_rate():
     options = {"learning_rate": 5e-3, "total_timesteps": 30 * 64}
     divergence = {0: [], 0.01: []}
     for target, seed in product(divergence, range(4)):
@@ -108,7 +108,7 @@ def test_the_metrics_of_a_rollout_by_hand():
     assert (metrics["success"], metrics["episodes"], metrics["unstable"]) == (0.5, 4, 1)
 
 
-def test_a_moving_average_by_hand():
+def test_ema_update_by_hand():
     slow, fast = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
     slow.weight.data.fill_(1.0)
     fast.weight.data.fill_(3.0)
@@ -133,7 +133,7 @@ def test_the_slow_critic_follows_every_gradient_step():
 
 
 class Answers(torch.nn.Module):
-    """A critic that knows its answers: ten times the place on the line."""
+    """A critic with known values: ten times the position on the line."""
 
     def forward(self, seen):
         return 10 * seen["tokens"][..., 32].sum(dim=1)
@@ -141,7 +141,7 @@ class Answers(torch.nn.Module):
 
 @pytest.mark.parametrize("slow", [True, False])
 @pytest.mark.parametrize("logarithmic", [True, False])
-def test_targets_by_hand(slow, logarithmic):
+def test_returns_by_hand(slow, logarithmic):
     # With lambda 0 a return is the reward and the discounted value of what the action led to.
     batch = OnALine(4, horizon=3)
     trainer = learner(batch, slow_critic=slow, symlog=logarithmic, gae_lambda=0.0, minibatches=4)
@@ -182,7 +182,7 @@ def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
     assert (values - other).square().mean() > 0.2 * other.var()
 
 
-def test_minibatches_hold_every_transition_once_an_epoch():
+def test_each_epoch_has_every_transition_in_one_minibatch():
     trainer = learner(epochs=3)
     seen = []
     loss = trainer._run_loss
@@ -203,7 +203,7 @@ def test_minibatches_hold_every_transition_once_an_epoch():
     assert first.sort().values.equal(second.sort().values)
 
 
-def test_a_transition_keeps_its_observation_action_and_robot_through_shuffling():
+def test_shuffling_keeps_transitions_together():
     trainer = learner()
     pairs = []
     loss = trainer._run_loss
@@ -226,7 +226,7 @@ def test_before_the_first_step_no_ratio_is_clipped_and_kl_is_zero():
     assert 0 < far.clip_fraction < 1
 
 
-def test_gradients_of_actor_and_critic_are_clipped_apart():
+def test_gradients_of_actor_and_critic_are_clipped_separately():
     trainer = learner(max_grad_norm=1e-3, epochs=1, minibatches=1)
     report = trainer.iterate()
     for network, norm in ((trainer.actor, "actor_gradient"), (trainer.critic, "critic_gradient")):
@@ -235,7 +235,7 @@ def test_gradients_of_actor_and_critic_are_clipped_apart():
         assert left.item() == pytest.approx(1e-3, rel=1e-2)
 
 
-def test_a_report_says_what_happened():
+def test_update_metrics_match_the_rollout():
     batch = OnALine(8, horizon=4)
     steps = []
     step = batch.step
@@ -257,7 +257,7 @@ def test_a_report_says_what_happened():
     )
 
 
-def test_entropy_grows_if_it_is_all_that_counts():
+def test_a_large_entropy_bonus_increases_the_entropy():
     trainer = learner(discrete=False, ent_coef=10.0, learning_rate=1e-2)
     reports = []
     while not trainer.done:
@@ -266,7 +266,7 @@ def test_entropy_grows_if_it_is_all_that_counts():
 
 
 @pytest.mark.parametrize("fixed", [False, True])
-def test_the_deviation_is_learned_or_stays(fixed):
+def test_the_std_is_learned_unless_fixed(fixed):
     policy = PolicyConfig("me-mlp", discrete=False, fixed_std=fixed)
     trainer = Learner(OnALine(8, kind="continuous"), policy, replace(SMALL, ent_coef=1.0))
     reports = [trainer.iterate() for _ in range(3)]
@@ -274,7 +274,7 @@ def test_the_deviation_is_learned_or_stays(fixed):
     assert (reports[0].entropy == pytest.approx(reports[2].entropy, rel=1e-6)) == fixed
 
 
-def test_robots_count_alike_or_with_random_weights_of_mean_one():
+def test_robot_weights_are_one_or_random_with_mean_one():
     assert learner()._robot_weights().tolist() == [1, 1]
     trainer = learner(task_reweighting=True)
     drawn = torch.stack([trainer._robot_weights() for _ in range(4000)])
@@ -286,7 +286,7 @@ def test_robots_count_alike_or_with_random_weights_of_mean_one():
     assert odds.var().item() == pytest.approx(2, rel=0.1)
 
 
-def test_a_robot_without_weight_is_not_learned_from():
+def test_a_robot_of_weight_zero_does_not_change_the_networks():
     def steps(weight, change=lambda learner: None):
         trainer = learner(epochs=1, minibatches=1, ent_coef=0.01)
         trainer._robot_weights = lambda: torch.tensor(weight)
@@ -310,7 +310,7 @@ def test_a_robot_without_weight_is_not_learned_from():
 
 
 @pytest.mark.parametrize("moves", [True, False])
-def test_the_curriculum_goes_with_the_updates(moves):
+def test_the_curriculum_follows_the_updates(moves):
     batch = OnALine(8)
     trainer = learner(batch, curriculum=moves)
     while not trainer.done:
@@ -318,12 +318,12 @@ def test_the_curriculum_goes_with_the_updates(moves):
     assert batch.progress == ([0.0, 0.0, 0.25, 0.5, 0.75] if moves else [])
 
 
-def test_a_batch_of_other_actions_is_refused():
+def test_a_batch_of_other_actions_is_rejected():
     with pytest.raises(TaskError, match="actions are discrete, the batch's continuous"):
         learner(OnALine(8, kind="continuous"))
 
 
-def test_numbers_that_are_lost_stop_the_run():
+def test_metrics_that_are_not_finite_stop_the_run():
     batch = OnALine(8)
     trainer = learner(batch)
     step = batch.step
@@ -341,7 +341,7 @@ def test_bfloat16_gives_nearly_the_same_update():
 
 
 def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
-    """Reports of a run on 32 points that learns fast."""
+    """Return the metrics of a short run on 32 points with a high learning rate."""
     batch = OnALine(32, kind="discrete" if discrete else "continuous")
     config = PPOConfig(
         total_timesteps=updates * 32 * 24,
@@ -364,7 +364,7 @@ def trained(*, agent="me-mlp", discrete=True, updates=14, **changes):
     [(True, {}), (False, {"symlog": False, "slow_critic": False, "task_reweighting": True})],
     ids=["discrete", "continuous"],
 )
-def test_it_learns_two_bodies_and_two_tasks_at_once(discrete, options):
+def test_one_policy_learns_two_robots_and_two_tasks(discrete, options):
     reports = trained(discrete=discrete, updates=20, **options)
     assert reports[0].success < 0.4
     assert reports[-1].success > 0.85
@@ -373,7 +373,7 @@ def test_it_learns_two_bodies_and_two_tasks_at_once(discrete, options):
 
 
 @pytest.mark.slow
-def test_the_transformer_learns_them_too():
+def test_the_transformer_learns_two_robots_and_two_tasks():
     reports = trained(agent="me-tf", updates=24)
     assert reports[0].success < 0.4
     assert reports[-1].success > 0.9

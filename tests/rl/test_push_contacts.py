@@ -1,4 +1,4 @@
-"""Where a robot would touch the block, and how far it leans over it."""
+"""Contacts of a robot with the block, and its overhang."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
 
 
-def test_contacts_are_where_the_block_would_be_touched():
+def test_contacts_are_found_where_the_robot_touches_the_block():
     block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
     q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
 
@@ -29,7 +29,7 @@ def test_contacts_are_where_the_block_would_be_touched():
 
 
 @pytest.mark.parametrize(("ahead", "over"), [(0.01, 0.025), (0.002, 0.005), (-0.01, 0.0)])
-def test_a_brim_that_is_ahead_leans_over_the_block_by_as_much(ahead, over):
+def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
     """A box that touches the block below its middle, and a brim at its upper edge."""
     foot = Shape(Box((0.2, 0.1, 0.1)))
     brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
@@ -46,7 +46,7 @@ def test_a_brim_that_is_ahead_leans_over_the_block_by_as_much(ahead, over):
     assert each[1] == 0
 
 
-def test_a_plate_touches_on_its_whole_breadth():
+def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
     plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
     wide = ball(0.2).with_links([plate])
     scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)

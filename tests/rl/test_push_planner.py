@@ -1,4 +1,4 @@
-"""Plans of pushes: behind the block by a free way, without leaning over it."""
+"""Push plans: a collision-free path behind the block, without overhang."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -24,7 +24,7 @@ PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 
 
 @pytest.mark.slow
-def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
+def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
     space, tool = FreeSpace(setting.scene), ToolKinematics(build_robot_tables([setting.robot]), 0)
@@ -43,8 +43,8 @@ def test_a_plan_goes_behind_the_block_by_a_free_way(tmp_path):
     assert planner.plan(q, block, steps_left=across - 1) is None
 
 
-def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
-    """Configurations near the first plan's last one are said to, on the way of the push."""
+def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
+    """A patched overhang penalises configurations near the end of the first plan."""
     setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
     planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
     q, block = setting.goals.q[0], setting.goals.blocks[0]
@@ -63,15 +63,15 @@ def test_a_plan_does_not_come_to_lean_over_the_block(tmp_path, monkeypatch):
     assert not near(planner.plan(q, block).path[-1])
 
 
-def test_a_setting_of_another_task_is_refused(tmp_path):
+def test_the_planner_rejects_other_tasks(tmp_path):
     setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
         PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
 
 
 @pytest.mark.slow
-def test_arms_in_each_others_way_push_below_the_middle(tmp_path):
-    """Starts of YuMi from which no simple way leads behind the block."""
+def test_obstructed_arms_push_below_the_middle(tmp_path):
+    """Starts of YuMi without a straight path behind the block."""
     members = read_split("extrapolation/arms/push").train
     member = next(each for each in members if each.name == "yumi")
     setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
@@ -87,7 +87,7 @@ def test_arms_in_each_others_way_push_below_the_middle(tmp_path):
     assert (np.array(over) < 0.05).sum() >= 5
 
 
-def test_a_tool_turns_around():
+def test_the_tool_can_turn_around():
     tables = build_robot_tables([robot(PANDA)])
     tool, q = ToolKinematics(tables, 0), np.array([tables.robots[0].home])
     position, rotation = tool.poses(q)

@@ -53,7 +53,7 @@ def report(update, success=0.5):
     )
 
 
-def test_a_config_is_saved_whole(tmp_path):
+def test_every_field_of_a_config_is_saved(tmp_path):
     config = replace(
         small_config(small_source(), agent="se", gamma=0.9),
         device="cuda",
@@ -69,7 +69,7 @@ def test_a_config_is_saved_whole(tmp_path):
     assert config_from(stored) == config
 
 
-def test_a_run_is_only_continued_on_purpose_and_as_it_was(tmp_path):
+def test_a_run_continues_only_with_resume_and_the_same_config(tmp_path):
     folder, config = tmp_path / "runs" / "one", small_config()
     open_run(folder, config, resume=True)
     write_checkpoint(folder, config, {"update": 1})
@@ -86,7 +86,7 @@ def test_a_run_is_only_continued_on_purpose_and_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize("resume", [True, False])
-def test_a_run_that_has_no_checkpoint_yet_may_become_another(tmp_path, resume):
+def test_a_run_without_a_checkpoint_may_be_replaced(tmp_path, resume):
     first, other = small_config(), small_config(small_source(), agent="se")
     open_run(tmp_path, first, resume=False)
     open_run(tmp_path / ROBOTS / "a", first, resume=False)
@@ -97,7 +97,7 @@ def test_a_run_that_has_no_checkpoint_yet_may_become_another(tmp_path, resume):
         open_run(tmp_path, first, resume=False)
 
 
-def test_which_gpu_it_was_makes_no_other_run(tmp_path):
+def test_a_run_may_resume_on_another_gpu(tmp_path):
     config = replace(small_config(), device="cuda:0")
     open_run(tmp_path, config, resume=False)
     write_checkpoint(tmp_path, config, {"update": 1})
@@ -107,7 +107,7 @@ def test_which_gpu_it_was_makes_no_other_run(tmp_path):
         open_run(tmp_path, replace(config, device="cpu"), resume=True)
 
 
-def test_the_config_of_something_else_is_left_alone(tmp_path):
+def test_a_config_of_another_program_is_not_overwritten(tmp_path):
     (tmp_path / CONFIG).write_text('{"model": "mine"}')
     for resume in (True, False):
         with pytest.raises(TaskError, match="is not the config of a run"):
@@ -115,7 +115,7 @@ def test_the_config_of_something_else_is_left_alone(tmp_path):
     assert tree(tmp_path) == {CONFIG: b'{"model": "mine"}'}
 
 
-def test_what_is_no_run_is_left_alone(tmp_path):
+def test_a_folder_or_file_that_is_not_a_run_is_not_changed(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     for name, says in (("mine", "not the folder of a run"), ("mine/letter.txt", "is a file")):
@@ -126,13 +126,13 @@ def test_what_is_no_run_is_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", "so", '{"format": 2}', '{"source": {"name": "a"}}'])
-def test_a_broken_config_is_refused(tmp_path, text):
+def test_an_invalid_config_is_rejected(tmp_path, text):
     (tmp_path / CONFIG).write_text(text)
     with pytest.raises(TaskError, match="is not the config of a run"):
         read_config(tmp_path)
 
 
-def test_a_checkpoint_tells_its_run(tmp_path):
+def test_a_checkpoint_stores_the_config_of_its_run(tmp_path):
     config = small_config(robot_source("planar-cube", "push", obstacles=True))
     write_checkpoint(
         tmp_path, config, {**state_of(learner()), "update": 3, "weight": torch.ones(2)}
@@ -145,7 +145,7 @@ def test_a_checkpoint_tells_its_run(tmp_path):
     assert list(tree(tmp_path)) == [CHECKPOINT]
 
 
-def test_a_run_of_another_format_is_refused(tmp_path):
+def test_other_format_versions_are_rejected(tmp_path):
     open_run(tmp_path, small_config(), resume=False)
     write_checkpoint(tmp_path, small_config(), {"update": 3})
     config = tmp_path / CONFIG
@@ -168,7 +168,7 @@ class Bomb:
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
-def test_a_checkpoint_executes_nothing(tmp_path):
+def test_a_checkpoint_runs_no_code(tmp_path):
     torch.save({"run": Bomb(tmp_path / "crater")}, tmp_path / "evil.pt")
     (tmp_path / "evil.pickle").write_bytes(pickle.dumps(Bomb(tmp_path / "crater")))
     for name in ("evil.pt", "evil.pickle"):
@@ -177,7 +177,7 @@ def test_a_checkpoint_executes_nothing(tmp_path):
     assert not (tmp_path / "crater").exists()
 
 
-def test_what_is_no_checkpoint_is_refused(tmp_path):
+def test_files_that_are_not_checkpoints_are_rejected(tmp_path):
     write_checkpoint(tmp_path, small_config(), {"update": 1})
     whole = (tmp_path / CHECKPOINT).read_bytes()
     torch.save({"weights": torch.ones(1)}, tmp_path / "other.pt")
@@ -191,7 +191,7 @@ def test_what_is_no_checkpoint_is_refused(tmp_path):
         read_checkpoint(tmp_path / "none.pt")
 
 
-def test_metrics_go_on_after_the_checkpoint_and_forget_what_came_later(tmp_path):
+def test_resumed_metrics_drop_lines_after_the_checkpoint(tmp_path):
     kept = Metrics(tmp_path, 0)
     for update in (1, 2, 3):
         kept.record(report(update, success=math.nan if update == 1 else 0.5))
@@ -210,7 +210,7 @@ def test_metrics_go_on_after_the_checkpoint_and_forget_what_came_later(tmp_path)
     assert found[1] == json.loads(json.dumps(asdict(report(2)) | {"scores": [1.0, None]}))
 
 
-def test_events_are_tensorboards(tmp_path):
+def test_tensorboard_reads_the_events(tmp_path):
     accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     for begins in (0, 2):
         board = TensorBoard(tmp_path, begins)
@@ -223,7 +223,7 @@ def test_events_are_tensorboards(tmp_path):
     assert [each.value for each in shown.Scalars("terms/distance")] == [-0.5] * 3
 
 
-def test_what_is_not_installed_is_asked_for(tmp_path, monkeypatch):
+def test_a_missing_recorder_names_its_package_or_option(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(MissingDependencyError, match="pip install wandb"):
         require_wandb()
@@ -235,13 +235,13 @@ def test_what_is_not_installed_is_asked_for(tmp_path, monkeypatch):
 
 
 class UsageError(Exception):
-    """As that of wandb where nobody is logged in."""
+    """Stands for the error of wandb without a login."""
 
 
 wandb_errors = SimpleNamespace(Error=UsageError)
 
 
-def test_what_weights_and_biases_says_is_one_line(tmp_path, monkeypatch):
+def test_a_wandb_error_is_one_line(tmp_path, monkeypatch):
     class Wandb:
         errors = wandb_errors
 
@@ -257,7 +257,7 @@ def test_what_weights_and_biases_says_is_one_line(tmp_path, monkeypatch):
         pass
 
 
-def test_a_report_that_is_none_is_named(tmp_path):
+def test_an_invalid_metrics_line_is_named(tmp_path):
     with recording(tmp_path, small_config(), 0, tensorboard=False, wandb=False) as kept:
         kept[0].record(report(1))
         kept[0].record(report(2))
@@ -268,7 +268,7 @@ def test_a_report_that_is_none_is_named(tmp_path):
             read_metrics(tmp_path)
 
 
-def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
+def test_wandb_gets_scalars(tmp_path, monkeypatch):
     sent = []
 
     class Run:
@@ -294,7 +294,7 @@ def test_weights_and_biases_gets_scalars(tmp_path, monkeypatch):
     assert (step, data["score"], data["terms/distance"], end) == (1, 0.25, -0.5, "finished")
 
 
-def test_a_source_of_neither_a_split_nor_a_robot_at_a_task_is_refused():
+def test_a_source_needs_a_split_or_a_robot_with_a_task():
     config = small_config().as_data()
     config["source"]["task"] = None
     source = config_from(json.loads(json.dumps(config))).source

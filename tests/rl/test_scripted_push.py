@@ -1,4 +1,4 @@
-"""The scripted push: it plans where nothing is in its way, and blocks get across."""
+"""The scripted push moves blocks across the line, and plans again after failures."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def batch(words, n, cache, task="push", **options):
 
 
 def successes(task, controller, steps=PUSH.max_episode_steps):
-    """Which of the first episodes end with the block across, shape (n,), bool."""
+    """Return which first episodes end with the block across the line, shape (n,), bool."""
     task.reset()
     over = torch.zeros(task.num_envs, dtype=torch.bool)
     across = over.clone()
@@ -38,7 +38,7 @@ def successes(task, controller, steps=PUSH.max_episode_steps):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
-def test_blocks_get_across(sim, tmp_path):
+def test_the_block_crosses_the_line(sim, tmp_path):
     across = successes(batch([PLANE, UR5], 6, tmp_path, sim=sim), ScriptedPush(0))
     assert across[::2].sum() >= 2
     assert across[1::2].sum() >= 2
@@ -47,7 +47,7 @@ def test_blocks_get_across(sim, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
 @pytest.mark.parametrize("words", [UR5, PANDA, PLANE])
-def test_four_of_five_blocks_get_across(words, sim, tmp_path):
+def test_four_of_five_blocks_cross_the_line(words, sim, tmp_path):
     across = successes(batch([words], 20, tmp_path, sim=sim), ScriptedPush(0))
     assert across.float().mean() >= 0.8
 
@@ -59,7 +59,7 @@ def test_actions_may_be_discrete(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_seed_does_the_same(tmp_path):
+def test_the_seed_determines_the_actions(tmp_path):
     def actions(seed):
         task, controller = batch([UR5], 2, tmp_path, sim="mujoco"), ScriptedPush(seed)
         task.reset()
@@ -74,7 +74,7 @@ def test_the_same_seed_does_the_same(tmp_path):
     assert not torch.equal(actions(0), actions(1))
 
 
-def test_actions_are_in_range_and_reaching_robots_stand_still(tmp_path):
+def test_actions_are_in_range_and_reach_robots_do_not_move(tmp_path):
     task = batch([UR5, PLANE], 4, tmp_path, task=["reach", "push"], sim="mujoco")
     controller = ScriptedPush(0)
     task.reset()
@@ -88,7 +88,7 @@ def test_actions_are_in_range_and_reaching_robots_stand_still(tmp_path):
     assert moved.tolist() == [False, True, False, True]
 
 
-def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
+def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
     made = []
     plan = PushPlanner.plan
 
@@ -119,7 +119,7 @@ def test_a_block_that_slips_away_is_planned_for_again(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("free", [True, False])
-def test_a_tool_whose_arm_gets_into_something_rises(free, tmp_path, monkeypatch):
+def test_a_tool_rises_when_its_arm_collides(free, tmp_path, monkeypatch):
     def said(self, q):
         assert q.ndim == 2
         return np.full(len(q), free)

@@ -1,4 +1,4 @@
-"""A study: its cells, what it does again, what it shows of what is missing."""
+"""Studies: cells, resumption, tables and curves."""
 
 import csv
 import json
@@ -54,7 +54,7 @@ def finished(cells):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A study that was never interrupted."""
+    """The cells of an uninterrupted study."""
     cells = cells_in(tmp_path_factory.mktemp("study"))
     finished(cells)
     return cells
@@ -64,7 +64,7 @@ def results(cells):
     return {cell: read_scores(cell) for cell in cells}
 
 
-def test_a_cell_is_a_runs_folder_with_scores(whole):
+def test_a_cell_is_a_run_folder_with_scores(whole):
     names = [cell.agent for cell in whole]
     assert names == ["random", "zero", "ik", "se", "se", "me-mlp", "me-mlp"]
     for cell in whole:
@@ -75,7 +75,7 @@ def test_a_cell_is_a_runs_folder_with_scores(whole):
         assert (cell.folder / CHECKPOINT).is_file() == (cell.agent == "me-mlp")
 
 
-def test_what_is_done_is_not_done_again(whole, monkeypatch):
+def test_finished_cells_are_not_repeated(whole, monkeypatch):
     folder = whole[0].folder.parents[2]
     before = tree(folder)
     for name in ("train", "evaluate_run", "evaluate_baseline"):
@@ -85,10 +85,10 @@ def test_what_is_done_is_not_done_again(whole, monkeypatch):
 
 
 class Killed(BaseException):
-    """As a kill: nobody catches it."""
+    """Stands for a killed process: no code catches it."""
 
 
-def test_a_killed_study_goes_on_where_it_was(whole, tmp_path):
+def test_a_killed_study_resumes_where_it_stopped(whole, tmp_path):
     cells = cells_in(tmp_path)
     begun = []
 
@@ -118,7 +118,7 @@ def test_a_killed_study_goes_on_where_it_was(whole, tmp_path):
         assert equal(weights(one.folder), weights(other.folder))
 
 
-def test_a_cell_that_another_process_works_on_is_left_for_last(tmp_path, monkeypatch):
+def test_a_cell_locked_by_another_process_is_done_last(tmp_path, monkeypatch):
     cells = cells_in(tmp_path, agents=(), seeds=())
     cells[0].folder.mkdir(parents=True)
     other = FileLock(cells[0].folder / LOCK, thread_local=False)
@@ -135,7 +135,7 @@ def test_a_cell_that_another_process_works_on_is_left_for_last(tmp_path, monkeyp
     assert waits
 
 
-def test_a_cell_that_fails_is_told_and_does_not_stop_the_others(tmp_path):
+def test_a_failed_cell_is_reported_and_the_others_continue(tmp_path):
     good, bad = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1))[-2:]
     other = replace(bad, config=replace(bad.config, ppo=replace(bad.config.ppo, gamma=0.5)))
     finished([other])
@@ -146,7 +146,7 @@ def test_a_cell_that_fails_is_told_and_does_not_stop_the_others(tmp_path):
     assert read_scores(bad) is None
 
 
-def test_scores_of_another_evaluation_are_not_mixed_in(whole):
+def test_scores_of_another_evaluation_are_rejected(whole):
     with pytest.raises(TaskError, match="of another evaluation"):
         read_scores(replace(whole[0], eval_config=replace(EVAL, episodes=5)))
     for cell in (whole[0], whole[-1]):
@@ -154,7 +154,7 @@ def test_scores_of_another_evaluation_are_not_mixed_in(whole):
             read_scores(replace(cell, source=replace(cell.source, goal_seed=1)))
 
 
-def test_what_nobody_foresaw_does_not_stop_the_others_either(tmp_path, monkeypatch, capsys):
+def test_an_unexpected_error_does_not_stop_the_other_cells(tmp_path, monkeypatch, capsys):
     bad, good = cells_in(tmp_path, agents=("me-mlp",), seeds=(0, 1))[-2:]
     train = study.train
 
@@ -169,7 +169,7 @@ def test_what_nobody_foresaw_does_not_stop_the_others_either(tmp_path, monkeypat
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_curves_go_as_far_as_the_farthest_seed(whole, tmp_path, monkeypatch):
+def test_curves_are_as_long_as_the_longest_seed(whole, tmp_path, monkeypatch):
     drawn = []
     from matplotlib.axes import Axes
 
@@ -198,7 +198,7 @@ def score(side, value, robot="a"):
 
 
 def by_hand(cells, values):
-    """Results of cells with given scores of two train robots and one test robot; None: missing."""
+    """Return results with given scores of two train robots and a test robot; None: missing."""
     found = {}
     for cell, value in zip(cells, values, strict=True):
         found[cell] = None
@@ -223,7 +223,7 @@ def test_rows_are_averages_over_seeds_and_robots(tmp_path):
     assert [each.strip() for each in line[4:7]] == ["5.00", "5.00 [5.00, 5.00]", "50%"]
 
 
-def test_a_table_says_how_many_episodes_became_unstable(tmp_path):
+def test_the_table_counts_unstable_episodes(tmp_path):
     cells = cells_in(tmp_path, ("me-mlp",))[3:]
     found = by_hand(cells, [(1, 3, 10), (2, 6, 20)])
     assert "unstable" not in table_text(rows(found))
@@ -233,7 +233,7 @@ def test_a_table_says_how_many_episodes_became_unstable(tmp_path):
     assert last == f"me-mlp deterministic: {UNSTABLE}: 4"
 
 
-def test_robots_of_se_on_the_test_robots_are_drawn_by_themselves(tmp_path):
+def test_se_policies_trained_on_the_test_robots_are_resampled_independently(tmp_path):
     source = other_side(small_source(), "test")
     cells = [
         agent_cell(tmp_path, "se@test", small_config(source, agent="se", seed=seed), EVAL)
@@ -248,7 +248,7 @@ def test_robots_of_se_on_the_test_robots_are_drawn_by_themselves(tmp_path):
     assert (row.groups["test"].iqm.low, row.groups["test"].iqm.high) == (0, 10)
 
 
-def test_what_is_missing_is_shown_as_missing(tmp_path):
+def test_missing_scores_are_shown_as_missing(tmp_path):
     cells = cells_in(tmp_path)
     random, _, _, se0, se1, mlp0, mlp1 = cells
     own = {random: {"random": [score("train", 0.0), score("test", 0.0)]}}
@@ -279,7 +279,7 @@ def test_what_is_missing_is_shown_as_missing(tmp_path):
     assert (row["groups"], row["missing"]) == ({}, [0, 1])
 
 
-def test_curves_are_of_those_that_learned(whole, tmp_path, monkeypatch):
+def test_only_trained_agents_have_curves(whole, tmp_path, monkeypatch):
     drawn = []
     from matplotlib.axes import Axes
 
@@ -301,7 +301,7 @@ def test_curves_are_of_those_that_learned(whole, tmp_path, monkeypatch):
         assert image.size[0] > 500
 
 
-def test_an_agent_trained_on_the_test_robots_has_no_other_score(tmp_path):
+def test_an_agent_trained_on_the_test_robots_has_only_test_scores(tmp_path):
     source = other_side(small_source(), "test")
     config = small_config(source, agent="se", total_timesteps=32)
     cell = agent_cell(tmp_path, "se@test", config, EVAL)
@@ -313,7 +313,7 @@ def test_an_agent_trained_on_the_test_robots_has_no_other_score(tmp_path):
     assert "missing" not in table_text([row])
 
 
-def test_an_agent_on_the_test_robots_has_as_much_data_of_each_as_on_the_train_robots():
+def test_matched_budget_gives_test_robots_as_much_data_as_train_robots():
     source = other_side(small_source(), "test")
     train, test = (len(members(other_side(source, side))) for side in ("train", "test"))
     config = small_config(source, agent="se", total_timesteps=6400)
@@ -327,7 +327,7 @@ def test_an_agent_on_the_test_robots_has_as_much_data_of_each_as_on_the_train_ro
 
 
 @pytest.mark.slow
-def test_ray_does_the_same(whole, tmp_path):
+def test_ray_gives_the_same_scores(whole, tmp_path):
     pytest.importorskip("ray")
     cells = cells_in(tmp_path, seeds=(0,))
     for _ in range(2):

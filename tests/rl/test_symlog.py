@@ -1,4 +1,4 @@
-"""Symlog goes there and back, and what is learned with it is the mean of returns."""
+"""Symlog and its inverse; the matching loss learns the mean of returns."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ def test_symexp_is_the_inverse_of_symlog():
     torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-5, atol=0)
 
 
-def test_symlog_is_odd_near_the_identity_and_logarithmic():
+def test_symlog_is_odd_and_linear_near_zero_and_logarithmic_beyond():
     torch.testing.assert_close(symlog(torch.tensor(torch.e - 1)), torch.tensor(1.0))
     x = torch.linspace(0, 9, 10)
     assert symlog(-x).equal(-symlog(x))
@@ -25,14 +25,14 @@ def test_symlog_has_slope_one_at_zero_on_both_sides():
     torch.testing.assert_close(x.grad, torch.ones(2))
 
 
-def test_the_slope_of_the_matching_loss_is_what_is_missing():
+def test_the_gradient_of_the_matching_loss_is_the_error():
     x = torch.linspace(-4, 4, 33).requires_grad_()
     y = torch.linspace(30, -30, 33)
     matching_loss(x, y).sum().backward()
     torch.testing.assert_close(x.grad, symexp(x.detach()) - y)
 
 
-def test_the_matching_loss_is_nothing_where_they_agree_and_more_elsewhere():
+def test_the_matching_loss_is_zero_only_at_the_target():
     y = torch.tensor([-20.0, -0.1, 0.0, 3.0, 50.0])
     at = symlog(y)
     torch.testing.assert_close(matching_loss(at, y), torch.zeros(5), atol=1e-5, rtol=0)
@@ -43,7 +43,7 @@ def test_the_matching_loss_is_nothing_where_they_agree_and_more_elsewhere():
 @pytest.mark.parametrize(
     ("loss", "read"), [(matching_loss, symexp), (half_square, lambda x: x)], ids=["symlog", "plain"]
 )
-def test_what_is_learned_is_the_mean(loss, read):
+def test_the_minimum_of_the_loss_is_the_mean(loss, read):
     returns = torch.tensor([-3.0, 0.0, 1.0, 20.0])
     x = torch.zeros((), requires_grad=True)
     optimiser = torch.optim.LBFGS([x], max_iter=50)

@@ -1,4 +1,4 @@
-"""Training: what it leaves, and that it may be stopped at any time."""
+"""Training writes a run's folder, and resumes after an interruption at any time."""
 
 import json
 import os
@@ -35,7 +35,7 @@ TIMED = ("collect_seconds", "learn_seconds", "steps_per_second")
 
 
 class StoppedError(Exception):
-    """As Ctrl-C: at any update, after it was recorded."""
+    """Stands for Ctrl-C after a recorded update."""
 
 
 def stop_after(update):
@@ -53,7 +53,7 @@ def untimed(folder):
     return [{k: v for k, v in each.items() if k not in TIMED} for each in read_metrics(folder)]
 
 
-def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
+def test_a_run_writes_config_checkpoint_and_metrics(tmp_path):
     seen = []
     config = small_config()
     (part,) = train(
@@ -75,7 +75,7 @@ def test_a_run_leaves_config_checkpoint_and_metrics(tmp_path):
 @pytest.mark.parametrize(
     "stops", [pytest.param((1,), marks=pytest.mark.slow), (8,), (7, 13)], ids=str
 )
-def test_a_run_that_was_stopped_and_taken_up_again_comes_to_the_same_weights(tmp_path, stops):
+def test_a_resumed_run_ends_with_the_same_weights(tmp_path, stops):
     config = small_config(small_source(), total_timesteps=24 * 4 * 8, slow_critic=True)
     train(tmp_path / "whole", config, execution=QUIET)
     assert config.num_updates == 24
@@ -116,7 +116,7 @@ def test_checkpoints_are_five_to_ten_episodes_apart_and_four_at_least(updates, s
     assert updates_between(config) == expected
 
 
-def test_no_checkpoint_is_made_right_before_the_last(tmp_path, monkeypatch):
+def test_no_checkpoint_is_written_right_before_the_last(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
         training, "write_checkpoint", lambda folder, config, state: made.append(state["update"])
@@ -125,7 +125,7 @@ def test_no_checkpoint_is_made_right_before_the_last(tmp_path, monkeypatch):
     assert made == [2, 4, 6, 9]
 
 
-def test_other_seeds_come_to_other_weights_and_other_workers_to_the_same(tmp_path):
+def test_weights_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     ways = {"a": (0, QUIET), "b": (0, ExecutionConfig(2, tensorboard=False)), "c": (1, QUIET)}
     for name, (seed, execution) in ways.items():
         train(tmp_path / name, small_config(seed=seed, total_timesteps=64), execution=execution)
@@ -145,7 +145,7 @@ def test_a_finished_run_is_not_trained_again(tmp_path):
     assert tree(tmp_path) == before
 
 
-def test_se_trains_a_policy_for_each_robot_which_share_environments_and_transitions(tmp_path):
+def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=128)
     parts = train(tmp_path / "run", config, execution=QUIET)
     names = [part.folder.name for part in parts]
@@ -163,7 +163,7 @@ def test_se_trains_a_policy_for_each_robot_which_share_environments_and_transiti
     ] * 2
 
 
-def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
+def test_a_stopped_se_run_resumes_at_the_same_robot(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=128)
     train(tmp_path / "whole", config, execution=QUIET)
     parts = subruns_of(tmp_path / "cut", config)
@@ -184,7 +184,7 @@ def test_a_stopped_se_goes_on_with_the_robot_that_it_was_at(tmp_path):
         assert equal(weights(part.folder), weights(same.folder))
 
 
-def test_a_run_of_se_with_robots_that_have_no_policy_yet_is_not_taken_for_whole(tmp_path):
+def test_an_incomplete_se_run_has_no_checkpoint_files(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=64)
     parts = train(tmp_path / "run", config, execution=QUIET)
     (parts[0].folder / CHECKPOINT).unlink()
@@ -193,7 +193,7 @@ def test_a_run_of_se_with_robots_that_have_no_policy_yet_is_not_taken_for_whole(
         list(checkpoint_files(tmp_path / "run"))
 
 
-def test_a_robot_that_was_changed_since_is_another_run(tmp_path, monkeypatch):
+def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in ("base=planar ee=cube", "base=planar ee=plane"):
         body = replace(morphgen.compose(words), name="own")
@@ -209,12 +209,12 @@ def test_a_robot_that_was_changed_since_is_another_run(tmp_path, monkeypatch):
         train(tmp_path / "run", config, resume=True, execution=QUIET)
 
 
-def test_an_agent_of_many_robots_and_one_robot_are_one_run(tmp_path):
+def test_multi_embodiment_agents_and_single_robots_are_one_run(tmp_path):
     assert len(subruns_of(tmp_path, small_config(small_source()))) == 1
     assert len(subruns_of(tmp_path, small_config(agent="se"))) == 1
 
 
-def test_fine_tuning_begins_with_the_networks_of_a_checkpoint(tmp_path):
+def test_fine_tuning_starts_from_the_networks_of_a_checkpoint(tmp_path):
     train(tmp_path / "first", small_config(total_timesteps=64), execution=QUIET)
     config = replace(
         small_config(total_timesteps=32, learning_rate=1e-30, slow_critic=False),
@@ -229,7 +229,7 @@ def test_fine_tuning_begins_with_the_networks_of_a_checkpoint(tmp_path):
     assert not (tmp_path / "third").exists()
 
 
-def test_what_cannot_begin_leaves_nothing(tmp_path):
+def test_a_run_that_cannot_start_writes_nothing(tmp_path):
     config = small_config()
     with pytest.raises(TaskError, match="--envs 0: expected 1 or more"):
         replace(config, num_envs=0)
@@ -254,7 +254,7 @@ def test_what_cannot_begin_leaves_nothing(tmp_path):
     require_runnable(config)
 
 
-def test_links_are_enough_for_what_it_is_tested_on_before_it_begins(tmp_path):
+def test_training_requires_enough_links_for_the_test_robots(tmp_path):
     long = split((member("base=planar ee=cube", task="reach"),), (member("chain beads=7"),))
     config = small_config(split_source(long), total_timesteps=64)
     with pytest.raises(BenchmarkError, match=r"test robot '.*' has 25 links, more than max_links"):
@@ -264,7 +264,7 @@ def test_links_are_enough_for_what_it_is_tested_on_before_it_begins(tmp_path):
     assert read_checkpoint(tmp_path / "run")[1]["layout"]["links"] == 25
 
 
-def test_two_runs_do_not_write_to_one_folder(tmp_path):
+def test_a_run_folder_is_locked(tmp_path):
     config = small_config(total_timesteps=64)
     with pytest.raises(StoppedError):
         train(tmp_path / "run", config, execution=QUIET, show=stop_after(1))
@@ -273,7 +273,7 @@ def test_two_runs_do_not_write_to_one_folder(tmp_path):
     train(tmp_path / "run", config, resume=True, execution=QUIET)
 
 
-def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(tmp_path):
+def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(tmp_path):
     config = small_config(total_timesteps=64)
     train(tmp_path / "wide", replace(config, max_links=30), execution=QUIET)
     train(tmp_path / "run", config, execution=QUIET)
@@ -283,14 +283,14 @@ def test_a_checkpoint_of_another_layout_is_refused_with_the_difference(tmp_path)
         train(tmp_path / "run", config, resume=True, execution=QUIET)
 
 
-def test_first_episodes_do_not_all_end_at_once():
+def test_the_first_episodes_are_spread():
     batch = OnALine(8)
     Learner(batch, replace(POLICY, discrete=True), replace(PPO, total_timesteps=64))
     assert batch.spread
 
 
 @pytest.mark.slow
-def test_nothing_on_the_way_needs_pybullet(tmp_path):
+def test_training_and_evaluation_do_not_need_pybullet(tmp_path):
     code = (
         "import sys; sys.modules['pybullet'] = None\n"
         "from pathlib import Path\n"
