@@ -149,7 +149,12 @@ def audit_survey(
         if finding.code in split.accepted
     )
     codes = {finding.code for finding in findings}
-    unused = tuple(_unused(code) for code in split.accepted if code not in codes)
+    why = "the split accepts it, but nothing of that code is found"
+    unused = tuple(
+        Finding("accepted-unused", "warning", f"accepted {code}", why, "delete the entry")
+        for code in split.accepted
+        if code not in codes
+    )
     return Audit(split.name, (*remaining, *unused), accepted, tuple(_neighbours(survey)))
 
 
@@ -174,9 +179,8 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
         rivals = [i for i, other in enumerate(split.train) if other.task == member.task]
         shared = [i for i in rivals if split.train[i].robot_hash == member.robot_hash]
         if shared:
-            why = (
-                f"train robot {_others(split, shared)} has the same body, and learns the same task"
-            )
+            twin = _first_of(split, shared)
+            why = f"train robot {twin} has the same body, and learns the same task"
             yield _finding("body-shared", "test", member, why)
         close = (tree[:, j] < near.tree) & (cosine[:, j] > near.cosine)
         duplicates = sorted(
@@ -185,7 +189,7 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
         if duplicates:
             first = duplicates[0]
             why = (
-                f"train robot {_others(split, duplicates)} is nearly the same: tree distance "
+                f"train robot {_first_of(split, duplicates)} is nearly the same: tree distance "
                 f"{tree[first, j]:.2g} (below {near.tree:g}), cosine {cosine[first, j]:.6f} "
                 f"(above {near.cosine:g})"
             )
@@ -260,15 +264,11 @@ def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot |
             yield side, member, robot
 
 
-def _others(split: Split, indices: Sequence[int]) -> str:
+def _first_of(split: Split, indices: Sequence[int]) -> str:
+    """Return the name of the first of some train robots, and how many more there are."""
     more = f" (and {len(indices) - 1} more)" if indices[1:] else ""
     return split.train[indices[0]].name + more
 
 
 def _finding(code: str, side: Side, member: Member, why: str) -> Finding:
     return Finding(code, "error", f"{side} robot {member.name}", why, _FIXES[code])
-
-
-def _unused(code: str) -> Finding:
-    why = "the split accepts it, but nothing of that code is found"
-    return Finding("accepted-unused", "warning", f"accepted {code}", why, "delete the entry")

@@ -68,28 +68,30 @@ def composition(
         BenchmarkError: If the candidates allow no such split; the message gives the reason.
         MorphgenError: If a pattern names an unknown part, or parts do not fit.
     """
-    cells = list(_cells(patterns, request.tasks, library))
+    candidates = list(_candidates(patterns, request.tasks, library))
     sequence = np.random.SeedSequence(request.seed)
-    test, train = hold_out(cells, request.test, max(request.train, default=1), sequence)
+    test, train = hold_out(candidates, request.test, max(request.train, default=1), sequence)
     shortest = num_covering(train, test)
     if request.train and request.train[0] < shortest:
-        names = ", ".join(cell.name for cell in train[:shortest])
+        names = ", ".join(candidate.name for candidate in train[:shortest])
         raise BenchmarkError(
             f"--train {request.train[0]}: {shortest} robots at least are needed so that every part "
             f"of the test robots is trained, such as {names}"
         )
-    chosen = [*train[: request.train[-1] if request.train else None], *test]
-    unique = {cell.text: ComposedRecipe(cell.words, cell.name) for cell in chosen}
+    members = [*train[: request.train[-1] if request.train else None], *test]
+    unique = {
+        candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
+    }
     factory = RobotFactory(library.folders, max_links=request.max_links)
-    made = make_robots(list(unique.values()), factory, jobs=jobs, progress=progress)
-    bodies = dict(zip(unique, made, strict=True))
+    composed_robots = make_robots(list(unique.values()), factory, jobs=jobs, progress=progress)
+    robot_of = dict(zip(unique, composed_robots, strict=True))
     robots = []
-    for cell in chosen:
-        body = bodies[cell.text]
-        name = f"{cell.name}-{cell.task}" if len(request.tasks) > 1 else cell.name
-        task = (cell.task, request.obstacles)
-        robots.append(Member(name, body.category, str(body.derivation), *task, body.hash))
-    kinds = len({cell.combination for cell in cells})
+    for candidate in members:
+        robot = robot_of[candidate.text]
+        name = f"{candidate.name}-{candidate.task}" if len(request.tasks) > 1 else candidate.name
+        task = (candidate.task, request.obstacles)
+        robots.append(Member(name, robot.category, str(robot.derivation), *task, robot.hash))
+    kinds = len({candidate.combination for candidate in candidates})
     return assemble(
         request,
         "composition",
@@ -117,22 +119,22 @@ def _choices(word: str, pattern: str) -> list[str]:
     ]
 
 
-def _cells(
+def _candidates(
     patterns: Sequence[str], tasks: Sequence[str], library: Library
 ) -> Iterator[HoldoutCandidate]:
     """Yield every robot of the patterns once for each task."""
-    seen: dict[str, str] = {}
+    name_by_derivation: dict[str, str] = {}
     for words in itertools.chain.from_iterable(map(expand, patterns)):
         derivation, name = parse_words(words, library)
-        if str(derivation) in seen:
+        if str(derivation) in name_by_derivation:
             continue
-        if name in seen.values():
+        if name in name_by_derivation.values():
             name = f"{name}-{derivation.digest[:8]}"
-        seen[str(derivation)] = name
+        name_by_derivation[str(derivation)] = name
         *_, last = (node.part for node in derivation.walk() if node.part != NOTHING)
-        about = (str(derivation), combination(derivation), parts(derivation), last)
+        properties = (str(derivation), combination(derivation), parts(derivation), last)
         for task in tasks:
-            yield HoldoutCandidate(name, words, *about, task)
+            yield HoldoutCandidate(name, words, *properties, task)
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ class HoldoutCandidate:
 
 
 def hold_out(
-    cells: Sequence[HoldoutCandidate], n: int, left: int, seed: np.random.SeedSequence
+    candidates: Sequence[HoldoutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
 ) -> tuple[list[HoldoutCandidate], list[HoldoutCandidate]]:
     """Choose test candidates, of as many different combinations as possible.
 
@@ -167,9 +169,9 @@ def hold_out(
     excluded, too. The remaining candidates cover every part and task of the test candidates.
 
     Args:
-        cells: The candidates.
+        candidates: The candidates.
         n: Number of test candidates.
-        left: Smallest number of candidates that remain for training.
+        min_train: Smallest number of candidates that remain for training.
         seed: Seed of the random orders in which candidates are tried.
 
     Returns:
@@ -180,28 +182,28 @@ def hold_out(
         BenchmarkError: If too few candidates can be held out; the message gives the reason.
     """
     rng = np.random.default_rng(seed)
-    most = 0
+    max_held = 0
     for _ in range(NUM_ATTEMPTS):
-        pool = _TrainPool(cells)
-        order = [int(i) for i in rng.permutation(len(cells))]
+        pool = _TrainPool(candidates)
+        order = [int(i) for i in rng.permutation(len(candidates))]
         for fresh in (True, False):
             for i in order:
                 if len(pool.held) < n and pool.is_fresh(i) == fresh:
-                    pool.hold(i, left)
+                    pool.hold(i, min_train)
         if len(pool.held) == n:
-            test = [cells[i] for i in pool.held]
-            train = [cells[i] for i in order if i in pool.left]
+            test = [candidates[i] for i in pool.held]
+            train = [candidates[i] for i in order if i in pool.remaining]
             return test, _covering_first(train, pool.needed)
-        most = max(most, len(pool.held))
-    raise BenchmarkError(_why_not(cells, n, left, most))
+        max_held = max(max_held, len(pool.held))
+    raise BenchmarkError(_why_not(candidates, n, min_train, max_held))
 
 
-def num_covering(cells: Sequence[HoldoutCandidate], test: Sequence[HoldoutCandidate]) -> int:
+def num_covering(candidates: Sequence[HoldoutCandidate], test: Sequence[HoldoutCandidate]) -> int:
     """Return how many of the first candidates cover each part and task of the test ones."""
-    needed = {item for cell in test for item in cell.covers}
+    needed = {item for candidate in test for item in candidate.covers}
     n = 0
     while needed:
-        needed -= cells[n].covers
+        needed -= candidates[n].covers
         n += 1
     return n
 
@@ -209,67 +211,71 @@ def num_covering(cells: Sequence[HoldoutCandidate], test: Sequence[HoldoutCandid
 class _TrainPool:
     """The candidates that remain for training while others are held out, by their index."""
 
-    def __init__(self, cells: Sequence[HoldoutCandidate]) -> None:
-        self._cells = cells
-        self._mixed = len({cell.task for cell in cells}) > 1
+    def __init__(self, candidates: Sequence[HoldoutCandidate]) -> None:
+        self._candidates = candidates
+        self._mixed = len({candidate.task for candidate in candidates}) > 1
         self._same_combination: dict[str, list[int]] = defaultdict(list)
         self._pairs: dict[tuple[str, str], list[int]] = defaultdict(list)
-        for i, cell in enumerate(cells):
-            self._same_combination[cell.combination].append(i)
-            for part in cell.parts:
-                self._pairs[part, cell.task].append(i)
-        self.left = set(range(len(cells)))
-        self._covered = Counter(item for cell in cells for item in cell.covers)
+        for i, candidate in enumerate(candidates):
+            self._same_combination[candidate.combination].append(i)
+            for part in candidate.parts:
+                self._pairs[part, candidate.task].append(i)
+        self.remaining = set(range(len(candidates)))
+        self._covered = Counter(item for candidate in candidates for item in candidate.covers)
         self.held: list[int] = []
         self.needed: set[str] = set()
         """Parts and tasks of the candidates that are held out."""
 
     def is_fresh(self, i: int) -> bool:
         """Test that no candidate of the same combination is held out."""
-        return all(self._cells[i].combination != self._cells[j].combination for j in self.held)
+        return all(
+            self._candidates[i].combination != self._candidates[j].combination for j in self.held
+        )
 
-    def hold(self, i: int, left: int) -> None:
+    def hold(self, i: int, min_train: int) -> None:
         """Hold a candidate out, if the rest still covers all that is needed and is large enough."""
-        cell = self._cells[i]
-        excluded = set(self._same_combination[cell.combination])
+        candidate = self._candidates[i]
+        excluded = set(self._same_combination[candidate.combination])
         if self._mixed:
-            excluded.update(self._pairs[cell.outermost, cell.task])
-        excluded &= self.left
-        lost = Counter(item for j in excluded for item in self._cells[j].covers)
-        needed = self.needed | cell.covers
+            excluded.update(self._pairs[candidate.outermost, candidate.task])
+        excluded &= self.remaining
+        lost = Counter(item for j in excluded for item in self._candidates[j].covers)
+        needed = self.needed | candidate.covers
         is_covered = all(self._covered[item] > lost[item] for item in needed)
-        if i in self.held or not is_covered or len(self.left) - len(excluded) < left:
+        if i in self.held or not is_covered or len(self.remaining) - len(excluded) < min_train:
             return
         self.held.append(i)
         self.needed = needed
-        self.left -= excluded
+        self.remaining -= excluded
         self._covered -= lost
 
 
-def _covering_first(cells: Sequence[HoldoutCandidate], needed: set[str]) -> list[HoldoutCandidate]:
+def _covering_first(
+    candidates: Sequence[HoldoutCandidate], needed: set[str]
+) -> list[HoldoutCandidate]:
     """Move candidates that cover all that is needed to the front (greedy set cover)."""
     first: list[HoldoutCandidate] = []
-    rest = list(cells)
+    rest = list(candidates)
     missing = set(needed)
     while missing:
-        best = max(rest, key=lambda cell: len(missing & cell.covers))
+        best = max(rest, key=lambda candidate: len(missing & candidate.covers))
         missing -= best.covers
         rest.remove(best)
         first.append(best)
     return first + rest
 
 
-def _why_not(cells: Sequence[HoldoutCandidate], n: int, left: int, most: int) -> str:
-    combinations = {cell.combination: cell.parts for cell in cells}
+def _why_not(candidates: Sequence[HoldoutCandidate], n: int, min_train: int, max_held: int) -> str:
+    combinations = {candidate.combination: candidate.parts for candidate in candidates}
     counts = Counter(part for parts in combinations.values() for part in parts)
     alone = sorted(part for part, times in counts.items() if times == 1)
     text = (
-        f"{most} of {n} test robots can be held out of {len(combinations)} combinations such that "
-        "their parts are trained in others"
+        f"{max_held} of {n} test robots can be held out of {len(combinations)} combinations such "
+        "that their parts are trained in others"
     )
-    if len({cell.task for cell in cells}) > 1:
+    if len({candidate.task for candidate in candidates}) > 1:
         text += ", the outermost at another task only,"
-    text += f" and at least {left} are left to train on"
+    text += f" and at least {min_train} are left to train on"
     if alone:
         text += f"; in one combination only: {', '.join(alone)}"
     return f"{text}; give --from more choices, or ask for fewer robots"

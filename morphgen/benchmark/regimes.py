@@ -172,48 +172,50 @@ Rule = Callable[[Split, _Parsed, Sequence[_Parsed]], Iterator[Finding]]
 
 
 def _interpolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
-    alike = [robot for robot in train if robot.structure == test.structure]
-    if not alike:
+    same_structure = [robot for robot in train if robot.structure == test.structure]
+    if not same_structure:
         yield test.finding(
             "structure-unseen",
             f"no train robot has its structure, {test.structure}",
             "draw test robots from the grammar of train robots",
         )
         return
-    wanted = str(split.provenance.get("hull", "any"))
-    if wanted not in HULLS[:2]:
+    hull = str(split.provenance.get("hull", "any"))
+    if hull not in HULLS[:2]:
         return
-    distance = hull_distance(test.parameters, [robot.parameters for robot in alike])
-    if (distance <= ON_HULL) != (wanted == "inside"):
+    distance = hull_distance(test.parameters, [robot.parameters for robot in same_structure])
+    if (distance <= ON_HULL) != (hull == "inside"):
         is_where = "inside" if distance <= ON_HULL else f"outside, by {distance:.3g} ranges,"
         yield test.finding(
             "hull",
-            f"its parameters lie {is_where} of the convex hull of the {len(alike)} train robots "
-            f"of its structure; the split says {wanted}",
+            f"its parameters lie {is_where} of the convex hull of the {len(same_structure)} train "
+            f"robots of its structure; the split says {hull}",
             "draw another test robot",
         )
 
 
 def _composition(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
-    trained = frozenset[str]().union(*(robot.parts for robot in train))
-    unseen = sorted(test.parts - trained)
+    trained_parts = frozenset[str]().union(*(robot.parts for robot in train))
+    unseen = sorted(test.parts - trained_parts)
     if unseen:
         yield test.finding(
             "part-unseen",
-            f"no train robot has {_listed(unseen)}",
+            f"no train robot has {', '.join(map(repr, unseen))}",
             "train on a robot that has it, or test another",
         )
-    same = [robot.member.name for robot in train if robot.combination == test.combination]
-    if same:
+    same_combination = [
+        robot.member.name for robot in train if robot.combination == test.combination
+    ]
+    if same_combination:
         yield test.finding(
             "combination-seen",
-            f"train robot {same[0]} is the same combination, {test.combination}",
+            f"train robot {same_combination[0]} is the same combination, {test.combination}",
             "leave the combination out of train",
         )
     if len({robot.member.task for robot in train}) > 1 and not unseen:
         task = test.member.task
-        at_task = frozenset[str]().union(*(r.parts for r in train if r.member.task == task))
-        if test.parts <= at_task:
+        parts_at_task = frozenset[str]().union(*(r.parts for r in train if r.member.task == task))
+        if test.parts <= parts_at_task:
             yield test.finding(
                 "pair-seen",
                 f"every part of it is in a train robot that learns to {task}",
@@ -229,18 +231,18 @@ def _extrapolation(split: Split, test: _Parsed, train: Sequence[_Parsed]) -> Ite
             f"category {category!r} is in train",
             "test a category that is not trained",
         )
-    same = [robot.member.name for robot in train if robot.structure == test.structure]
-    if same:
+    same_structure = [robot.member.name for robot in train if robot.structure == test.structure]
+    if same_structure:
         yield test.finding(
             "structure-seen",
-            f"train robot {same[0]} has the same structure, {test.structure}",
+            f"train robot {same_structure[0]} has the same structure, {test.structure}",
             "test a structure that is not trained",
         )
 
 
 def _task_findings(test: _Parsed, train: Sequence[_Parsed]) -> Iterator[Finding]:
-    trained = {robot.member.task for robot in train}
-    if test.member.task not in trained:
+    trained_tasks = {robot.member.task for robot in train}
+    if test.member.task not in trained_tasks:
         yield test.finding(
             "task-unseen",
             f"no train robot learns to {test.member.task}",
@@ -269,7 +271,3 @@ def _is_count(name: str, node: Derivation, library: Library) -> bool:
 def _bracketed(brackets: str, entries: Iterable[str]) -> str:
     text = ", ".join(entries)
     return brackets.format(text) if text else ""
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(map(repr, names))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from morphgen.errors import MeshError
 from morphgen.formats.resolve import file_stamp
-from morphgen.model.geometry import Geometry, Mesh, Pose, Shape, dimensions
+from morphgen.model.geometry import Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
@@ -71,7 +71,10 @@ def _grid(values: Iterable[float], step: float = _GRID) -> list[int]:
 
 
 def _link(link: Link) -> list[object]:
-    shapes = [[_shape(shape) for shape in kind] for kind in (link.visuals, link.collisions)]
+    shapes = [
+        [[*_geometry(shape.geometry), _pose(shape.T_link_shape)] for shape in kind]
+        for kind in (link.visuals, link.collisions)
+    ]
     return [_inertial(link.inertial), *shapes]
 
 
@@ -80,10 +83,6 @@ def _inertial(inertial: Inertial | None) -> list[int] | None:
         return None
     gyration = [value / inertial.mass for value in inertial.inertia]
     return [*_grid([inertial.mass, *inertial.com]), *_grid(gyration, _GYRATION_GRID)]
-
-
-def _shape(shape: Shape) -> list[object]:
-    return [*_geometry(shape.geometry), _pose(shape.T_link_shape)]
 
 
 def _geometry(geometry: Geometry) -> list[object]:
@@ -104,7 +103,7 @@ def _joint(joint: Joint, robot: Robot) -> list[object]:
     if not joint.is_movable:
         return ["fixed", *attachment]
     unlimited = joint.kind == "continuous" or joint.limits is None
-    kind = "continuous" if unlimited and joint.kind == "revolute" else joint.kind
+    kind = "continuous" if joint.is_continuous else joint.kind
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
     motion = [*joint.unit_axis, effort, velocity, joint.damping, joint.friction]

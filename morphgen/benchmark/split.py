@@ -81,13 +81,13 @@ class Split:
         Raises:
             BenchmarkError: If the split's provenance has a value that is not an integer above 1.
         """
-        given = self.provenance.get(MAX_LINKS_KEY, MAX_LINKS)
-        if type(given) is not int or given < 2:
+        max_links = self.provenance.get(MAX_LINKS_KEY, MAX_LINKS)
+        if type(max_links) is not int or max_links < 2:
             raise BenchmarkError(
-                f"split {self.name!r}: made: {MAX_LINKS_KEY}: {given!r}; expected a whole number, "
-                "2 or more"
+                f"split {self.name!r}: made: {MAX_LINKS_KEY}: {max_links!r}; expected a whole "
+                "number, 2 or more"
             )
-        return given
+        return max_links
 
     def side(self, side: Side) -> tuple[Member, ...]:
         """Return the members of a side."""

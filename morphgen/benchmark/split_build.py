@@ -83,19 +83,20 @@ def build_split(
             content or cannot be written.
         MorphgenError: If a robot cannot be composed.
     """
-    home = split_folder_path(split, folder)
-    firsts = unique_robots(split)
-    with _writing(home):
-        _prepare(home, split, settings)
-        with locked_folder(home):
-            (home / SUMS_FILE).unlink(missing_ok=True)
-            _sweep(home / ROBOTS_DIR)
-            maker = _RobotWriter(library.folders, home, settings, split.max_links)
-            results = parallel_map(maker, firsts, jobs, progress)
-            made = {member.robot_hash: one for member, one in zip(firsts, results, strict=True)}
-            _finish(home, split, settings, made)
-    written = sum(one.is_new for one in made.values())
-    return BuildReport(home, written, len(made) - written)
+    split_folder = split_folder_path(split, folder)
+    members = unique_robots(split)
+    with _writing(split_folder):
+        _prepare(split_folder, split, settings)
+        with locked_folder(split_folder):
+            (split_folder / SUMS_FILE).unlink(missing_ok=True)
+            for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
+                shutil.rmtree(leftover, ignore_errors=True)
+            writer = _RobotWriter(library.folders, split_folder, settings, split.max_links)
+            results = parallel_map(writer, members, jobs, progress)
+            robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
+            _finish(split_folder, split, settings, robots)
+    num_written = sum(robot.is_new for robot in robots.values())
+    return BuildReport(split_folder, num_written, len(robots) - num_written)
 
 
 def split_folder_path(split: Split, folder: Path) -> Path:
@@ -123,7 +124,7 @@ class _RobotWriter:
     """Write the folder of a member; sent to worker processes."""
 
     folders: tuple[Path, ...]
-    home: Path
+    split_folder: Path
     settings: BuildSettings
     max_links: int
 
@@ -134,7 +135,7 @@ class _RobotWriter:
     def __call__(self, member: Member) -> _WrittenRobot:
         robot = compose_member(member, self.library)
         require_max_links(len(robot.links), f"robot {member.name!r}", self.max_links)
-        folder = bundle_folder(self.home / ROBOTS_DIR, member.name)
+        folder = bundle_folder(self.split_folder / ROBOTS_DIR, member.name)
         light, picture = self.settings.light, self.settings.picture
         is_kept = not differences(folder, robot, light=light) and is_current(
             folder, light=light, picture=picture
@@ -146,56 +147,55 @@ class _RobotWriter:
         )
 
 
-def _prepare(home: Path, split: Split, settings: BuildSettings) -> None:
+def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
     """Create the folder, or check that it has the same split with the same settings."""
-    wanted = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
-    if not (home / BUILD_FILE).is_file():
-        leftover = {partial_path(home / BUILD_FILE)}
-        if home.exists() and not (home.is_dir() and leftover >= set(home.iterdir())):
+    texts = {BUILD_FILE: settings_text(split, settings), SPLIT_FILE: split_text(split)}
+    if not (split_folder / BUILD_FILE).is_file():
+        leftover = {partial_path(split_folder / BUILD_FILE)}
+        if split_folder.exists() and not (
+            split_folder.is_dir() and leftover >= set(split_folder.iterdir())
+        ):
             raise BenchmarkError(
-                f"{home} exists and is no built split (no {BUILD_FILE}); name another folder"
+                f"{split_folder} exists and is no built split (no {BUILD_FILE}); name another "
+                "folder"
             )
-        home.mkdir(parents=True, exist_ok=True)
-        write_atomic(home / BUILD_FILE, wanted[BUILD_FILE])
-    found = read_json(home / BUILD_FILE)
-    if not isinstance(found, dict):
-        raise BenchmarkError(f"{home / BUILD_FILE}: expected an object, not {type(found).__name__}")
-    for key, value in json.loads(wanted[BUILD_FILE]).items():
-        if found.get(key) != value:
+        split_folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(split_folder / BUILD_FILE, texts[BUILD_FILE])
+    existing = read_json(split_folder / BUILD_FILE)
+    if not isinstance(existing, dict):
+        raise BenchmarkError(
+            f"{split_folder / BUILD_FILE}: expected an object, not {type(existing).__name__}"
+        )
+    for key, value in json.loads(texts[BUILD_FILE]).items():
+        if existing.get(key) != value:
             raise BenchmarkError(
-                f"{home} holds another build: its {key} is {found.get(key)!r}, not {value!r}; "
-                "name another folder"
+                f"{split_folder} holds another build: its {key} is {existing.get(key)!r}, not "
+                f"{value!r}; name another folder"
             )
-    write_atomic(home / SPLIT_FILE, wanted[SPLIT_FILE])
-
-
-def _sweep(folder: Path) -> None:
-    """Remove the partial folders of an interrupted build."""
-    for leftover in folder.glob(".*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+    write_atomic(split_folder / SPLIT_FILE, texts[SPLIT_FILE])
 
 
 def _finish(
-    home: Path, split: Split, settings: BuildSettings, made: Mapping[str, _WrittenRobot]
+    split_folder: Path, split: Split, settings: BuildSettings, robots: Mapping[str, _WrittenRobot]
 ) -> None:
     """Write the files of the whole split, the hashes last."""
-    known = {robot_hash: robot.data for robot_hash, robot in made.items()}
-    write_atomic(home / ROBOTS_FILE, records_text(split, known))
-    write_atomic(home / TOKENS_FILE, tokens_npz(split, known))
-    write_atomic(home / README_FILE, readme_text(split, settings))
+    known = {robot_hash: robot.data for robot_hash, robot in robots.items()}
+    write_atomic(split_folder / ROBOTS_FILE, records_text(split, known))
+    write_atomic(split_folder / TOKENS_FILE, tokens_npz(split, known))
+    write_atomic(split_folder / README_FILE, readme_text(split, settings))
     single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
-    sums = {name: hashlib.sha256((home / name).read_bytes()).hexdigest() for name in single}
+    sums = {name: hashlib.sha256((split_folder / name).read_bytes()).hexdigest() for name in single}
     paths = robot_paths(split)
-    for robot_hash, robot in made.items():
+    for robot_hash, robot in robots.items():
         sums |= {f"{paths[robot_hash]}/{name}": value for name, value in robot.hashes.items()}
-    write_atomic(home / SUMS_FILE, sums_text(sums))
+    write_atomic(split_folder / SUMS_FILE, sums_text(sums))
 
 
 @contextmanager
-def _writing(home: Path) -> Iterator[None]:
+def _writing(split_folder: Path) -> Iterator[None]:
     """Convert an ``OSError`` to an error of one line."""
     try:
         yield
     except OSError as error:
-        path = error.filename or home
+        path = error.filename or split_folder
         raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error

@@ -218,7 +218,7 @@ class _Reader:
         return value
 
     def _free(self, node: Node | None, key: str) -> dict[str, object]:
-        """Return a mapping of any content."""
+        """Return the keys and values of a mapping whose content is not checked."""
         if node is None:
             return {}
         if not isinstance(node, MappingNode):
@@ -280,14 +280,14 @@ def read_split(name_or_path: str | Path, folders: Iterable[Path] = ()) -> Split:
     Raises:
         BenchmarkError: If it does not exist, is malformed, or was changed since it was written.
     """
-    read = read_split_file(find_split(name_or_path, folders))
-    if not read.is_whole:
+    stored = read_split_file(find_split(name_or_path, folders))
+    if not stored.is_whole:
         raise BenchmarkError(
-            f"{read.path}:{read.id_line}: id: {read.id} is not that of its robots, which is "
-            f"{split_id(read.split)}; the file was changed since it was written (if on purpose, "
+            f"{stored.path}:{stored.id_line}: id: {stored.id} is not that of its robots, which is "
+            f"{split_id(stored.split)}; the file was changed since it was written (if on purpose, "
             "write the new id)"
         )
-    return read.split
+    return stored.split
 
 
 def read_split_file(path: Path) -> SplitFile:
@@ -373,9 +373,9 @@ def _block(key: str, value: Mapping[str, object]) -> str:
 def _plain_data(value: object) -> object:
     """Convert mappings and sequences of any type to dictionaries and lists."""
     if isinstance(value, Mapping):
-        return {str(key): _plain_data(each) for key, each in value.items()}
+        return {str(key): _plain_data(entry) for key, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain_data(each) for each in value]
+        return [_plain_data(entry) for entry in value]
     return value
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split import Member, Side, Split, split_id
+from morphgen.benchmark.split import Member, Split, sided_members, split_id
 from morphgen.benchmark.split_folder import (
     BUILD_FILE,
     FORMAT,
@@ -218,9 +218,3 @@ def readme_text(split: Split, settings: BuildSettings) -> str:
 def sums_text(sums: Mapping[str, str]) -> str:
     """Return the text of ``SHA256SUMS`` for hexadecimal hashes by path."""
     return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
-
-
-def sided_members(split: Split) -> list[tuple[Side, Member]]:
-    """Every member with its side, in the order of all files."""
-    train: list[tuple[Side, Member]] = [("train", member) for member in split.train]
-    return [*train, *(("test", member) for member in split.test)]

@@ -83,7 +83,9 @@ def tokens(
     for row, link, joint in zip(static, robot.links, (None, *robot.joints), strict=True):
         row[layout.TOOL.columns] = link.name == tool
         try:
-            _write_shape(row, shapes.get(link.name))
+            if shape := shapes.get(link.name):
+                row[layout.GEOMETRY.columns] = layout.encode_primitive(shape.geometry)
+                row[layout.SHAPE_POSE.columns] = layout.encode_pose(shape.T_link_shape)
             _write_joint(row, joint)
         except ValueError as error:
             raise BenchmarkError(f"robot {robot.name!r}: link {link.name!r}: {error}") from error
@@ -147,16 +149,10 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
             f"robot {robot.name!r}: joint {joints[invalid[0, -1]].name!r}: q is not finite"
         )
     limits = np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
-    unlimited = np.array(
-        [
-            joint.kind == "continuous" or (joint.kind == "revolute" and joint.limits is None)
-            for joint in joints
-        ],
-        dtype=bool,
-    )
+    continuous = np.array([joint.is_continuous for joint in joints], dtype=bool)
     wrapped = positions - math.tau * np.ceil((positions - math.pi) / math.tau)
     half_range = (limits[:, 1] - limits[:, 0]) / 2
-    centred = np.where(unlimited, wrapped, positions) - limits.mean(axis=1)
+    centred = np.where(continuous, wrapped, positions) - limits.mean(axis=1)
     return np.asarray(centred / half_range)
 
 
@@ -208,12 +204,6 @@ def robot_from_tokens(
     return robot, shapes
 
 
-def _write_shape(row: Array, shape: Shape | None) -> None:
-    if shape is not None:
-        row[layout.GEOMETRY.columns] = layout.encode_primitive(shape.geometry)
-        row[layout.SHAPE_POSE.columns] = layout.encode_pose(shape.T_link_shape)
-
-
 def _write_joint(row: Array, joint: Joint | None) -> None:
     """Write all joint fields but the position; the root counts as fixed at the identity."""
     row[layout.KIND.columns] = layout.encode_kind(joint.kind if joint else "fixed")
@@ -227,8 +217,11 @@ class _Token:
     """The token of one link, with what its error messages name."""
 
     what: str
+    """Name of the tokens, for messages."""
     index: int
+    """Row of the token, and index of its link."""
     numbers: Array
+    """The numbers of the token, shape (48,)."""
 
     def decode(self, field: Field, decode: Callable[[Array], T]) -> T:
         """Decode a field.
@@ -244,10 +237,11 @@ class _Token:
     def error(self, field: Field, why: str) -> BenchmarkError:
         return BenchmarkError(f"{self.what}: link {self.index}: {field.name}: {why}")
 
-    def require_zeros(self, *fields: Field, of: str) -> None:
+    def require_zeros(self, *fields: Field, why: str) -> None:
+        """Require that fields are zero; ``why`` gives the reason in the error."""
         for field in fields:
             if np.abs(self.numbers[field.columns]).max() > layout.TOLERANCE:
-                raise self.error(field, f"it is not zero, but {of}")
+                raise self.error(field, f"it is not zero, but {why}")
 
 
 def _require_index(token: _Token, scale: int) -> None:
@@ -274,7 +268,7 @@ def _read_parent(token: _Token, scale: int) -> int:
 def _read_shape(token: _Token) -> Shape | None:
     primitive = token.decode(layout.GEOMETRY, layout.decode_primitive)
     if primitive is None:
-        token.require_zeros(layout.SHAPE_POSE, of="the link has no geometry")
+        token.require_zeros(layout.SHAPE_POSE, why="the link has no geometry")
         return None
     return Shape(primitive, token.decode(layout.SHAPE_POSE, layout.decode_pose))
 
@@ -293,7 +287,7 @@ def _read_joint(token: _Token, parent: int) -> tuple[Joint, float]:
     name, child = f"joint{token.index}", f"link{token.index}"
     origin = token.decode(layout.ORIGIN, layout.decode_pose)
     if kind == "fixed":
-        token.require_zeros(layout.AXIS, layout.POSITION, of="the joint is fixed")
+        token.require_zeros(layout.AXIS, layout.POSITION, why="the joint is fixed")
         return Joint(name, kind, f"link{parent}", child, origin), 0.0
     axis = token.decode(layout.AXIS, layout.decode_axis)
     q = token.decode(layout.POSITION, layout.decode_position)

@@ -127,7 +127,10 @@ def _node(
         # A joint's motion does not change its own axis, so the child link's rotation serves.
         axis = R_root_link @ np.array(joint.unit_axis)
     shape_kind = _shape_kind(shape)  # before the extents, because it rejects meshes
-    extents = np.zeros(3) if shape is None else _extents(shape)
+    extents = np.zeros(3)
+    if shape is not None:  # edge lengths of the bounding box along the shape's own axes
+        low, high = bounding_box([Shape(shape.geometry)])
+        extents = np.sort(high - low)
     return _Node(kind, axis, length / reach, shape_kind, extents / reach)
 
 
@@ -245,9 +248,3 @@ def change_costs(a: LabelledTree, b: LabelledTree) -> Array:
 def _relative(a: Array, b: Array) -> Array:
     """Return |a - b| / (a + b + s), in [0, 1): the Canberra metric, with s to be smooth at zero."""
     return np.asarray(np.abs(a - b) / (a + b + SOFTENING))
-
-
-def _extents(shape: Shape) -> Array:
-    """Return the edge lengths of a shape's bounding box in its own frame, ascending [m]."""
-    low, high = bounding_box([Shape(shape.geometry)])
-    return np.asarray(np.sort(high - low))

@@ -79,26 +79,26 @@ def verify(
         progress: Receives the number of robots that are finished, and of all.
 
     Raises:
-        BenchmarkError: If the split does not exist or cannot be read.
+        BenchmarkError: If the split does not exist or cannot be split_file.
     """
     folder = Path(name_or_path)
     is_built = folder.is_dir()
     if is_built:
         require_split_folder(folder)
     path = folder / SPLIT_FILE if is_built else find_split(name_or_path)
-    read = read_split_file(path)
-    computed_id = split_id(read.split)
+    split_file = read_split_file(path)
+    computed_id = split_id(split_file.split)
     differences = []
-    if read.id != computed_id:
-        why = f"its id is {read.id}, but that of its robots is {computed_id}"
+    if split_file.id != computed_id:
+        why = f"its id is {split_file.id}, but that of its robots is {computed_id}"
         differences.append(Difference(str(path), why))
     if is_built:
-        differences += _folder_differences(folder, read.split, library, jobs, progress)
+        differences += _folder_differences(folder, split_file.split, library, jobs, progress)
     else:
-        inspector = _Inspector(library.folders, read.split.max_links)
-        inspected = _inspect(read.split, inspector, jobs, progress)
-        differences += _robot_differences(read.split, inspected)
-    return Verification(read.split, computed_id, tuple(differences))
+        inspector = _Inspector(library.folders, split_file.split.max_links)
+        inspected = _inspect(split_file.split, inspector, jobs, progress)
+        differences += _robot_differences(split_file.split, inspected)
+    return Verification(split_file.split, computed_id, tuple(differences))
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,20 +209,20 @@ def _record_differences(
 ) -> Iterator[Difference]:
     """Yield entries of ``robots.jsonl`` that differ from the robots."""
     try:
-        found = read_records(path)
+        stored = read_records(path)
     except BenchmarkError as error:
         yield Difference(path.name, str(error))
         return
     expected = records(split, known)
-    if len(found) != len(expected):
-        yield Difference(path.name, f"it has {len(found)} robots, not {len(expected)}")
+    if len(stored) != len(expected):
+        yield Difference(path.name, f"it has {len(stored)} robots, not {len(expected)}")
         return
-    for i, (line, wanted) in enumerate(zip(found, expected, strict=True), 1):
-        keys = sorted(line.keys() | wanted.keys())
-        wrong = [key for key in keys if not same(line.get(key), wanted.get(key))]
+    for i, (line, computed) in enumerate(zip(stored, expected, strict=True), 1):
+        keys = sorted(line.keys() | computed.keys())
+        wrong = [key for key in keys if not same(line.get(key), computed.get(key))]
         for key in wrong:
-            why = f"{path.name}:{i}: {key} is {line.get(key)!r}, not {wanted.get(key)!r}"
-            yield Difference(str(wanted["name"]), why)
+            why = f"{path.name}:{i}: {key} is {line.get(key)!r}, not {computed.get(key)!r}"
+            yield Difference(str(computed["name"]), why)
 
 
 def _token_differences(
@@ -234,16 +234,16 @@ def _token_differences(
     except BenchmarkError as error:
         yield Difference(path.name, str(error))
         return
-    wanted, wanted_mask = token_tables(split, known)
+    computed, computed_mask = token_tables(split, known)
     expected = [member.name for _, member in sided_members(split)]
-    if names != expected or tokens.shape != wanted.shape:
+    if names != expected or tokens.shape != computed.shape:
         yield Difference(path.name, f"it is not of the {len(expected)} robots of {SPLIT_FILE}")
         return
-    errors = np.abs(tokens - wanted)
+    errors = np.abs(tokens - computed)
     for shape in (GEOMETRY, SHAPE_POSE):
         errors[..., shape.columns] *= TOLERANCE / FITTED_TOLERANCE
     for i, name in enumerate(expected):
-        if (mask[i] != wanted_mask[i]).any():
+        if (mask[i] != computed_mask[i]).any():
             yield Difference(name, f"{path.name}: its mask is not that of its links")
         wrong = ~(errors[i] <= TOLERANCE)  # NaN is wrong, too
         if wrong.any():

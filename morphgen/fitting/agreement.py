@@ -7,7 +7,7 @@ which simulators use, are compared with the same reference.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import cast
@@ -18,10 +18,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
-from morphgen.model.geometry import Mesh, Shape
-from morphgen.model.inertia import solid_mesh
+from morphgen.model.geometry import Shape
+from morphgen.model.inertia import link_frame_mesh
 from morphgen.model.kinematics import forward_kinematics, random_configurations
-from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Pair, Robot, sorted_pair
 
 
@@ -32,8 +31,11 @@ class Agreement:
     both: int
     """Both the meshes and the substitute collide."""
     neither: int
+    """Neither the meshes nor the substitute collide."""
     only_meshes: int
+    """The meshes collide, the substitute does not."""
     only_other: int
+    """The substitute collides, the meshes do not."""
 
     @property
     def precision(self) -> float:
@@ -74,11 +76,14 @@ def agreement(
     """
     ignored = {*untested_pairs(meshes), *primitives.ignore_pairs}
     q = random_configurations(meshes, n, np.random.default_rng(seed))
-    truth = list(_mesh_collisions(meshes, ignored, q))
+    mesh_collisions = list(_mesh_collisions(meshes, ignored, q))
+    # In the order of the fields of Agreement: do the meshes collide, does the substitute?
+    cases = ((True, True), (False, False), (True, False), (False, True))
     agreements = []
     for robot in (primitives, meshes):
         penetrations = SelfCollisionChecker(robot, ignored).penetrations(q)
-        agreements.append(_counts(truth, [bool(pairs) for pairs in penetrations]))
+        counts = Counter(zip(mesh_collisions, map(bool, penetrations), strict=True))
+        agreements.append(Agreement(*(counts[case] for case in cases)))
     return agreements[0], agreements[1]
 
 
@@ -98,23 +103,13 @@ def _mesh_collisions(robot: Robot, ignored: set[Pair], q: NDArray[np.float64]) -
 
 
 def _model(shapes: tuple[Shape, ...]) -> fcl.CollisionObject:
-    meshes = []
-    for shape in shapes:
-        geometry = shape.geometry
-        mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
-        meshes.append(mesh.copy().apply_transform(shape.T_link_shape.matrix))
-    whole = cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
+    """Return the triangles of a link's shapes as one collision object in the link frame."""
+    whole = cast(trimesh.Trimesh, trimesh.util.concatenate([*map(link_frame_mesh, shapes)]))
     model = fcl.BVHModel()
     model.beginModel(len(whole.vertices), len(whole.faces))
     model.addSubModel(np.asarray(whole.vertices), np.asarray(whole.faces))
     model.endModel()
     return fcl.CollisionObject(model)
-
-
-def _counts(meshes: Sequence[bool], other: Sequence[bool]) -> Agreement:
-    counts = Counter(zip(meshes, other, strict=True))
-    cases = ((True, True), (False, False), (True, False), (False, True))
-    return Agreement(*(counts[case] for case in cases))
 
 
 def _share(hits: int, misses: int) -> float:

@@ -48,14 +48,16 @@ def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) 
         return None
     if np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces):
         return np.eye(4)
-    ours, theirs = _centred(a), _centred(b)
-    radii, other_radii = (np.linalg.norm(points, axis=1) for points in (ours, theirs))
+    centred_a, centred_b = _centred(a), _centred(b)
+    radii, other_radii = (np.linalg.norm(points, axis=1) for points in (centred_a, centred_b))
     error = tolerance * 2 * float(radii.max())
     # If vertices move by the error, their mean moves by at most as much, and distances by twice.
     if np.abs(np.sort(radii) - np.sort(other_radii)).max() > 2 * error:
         return None
-    for R in _candidate_rotations(ours, theirs, 2 * error):
-        sample = ours[:: max(len(ours) // _NUM_SAMPLES, 1)] @ R.T + b.vertices.mean(axis=0)
+    for R in _candidate_rotations(centred_a, centred_b, 2 * error):
+        sample = centred_a[:: max(len(centred_a) // _NUM_SAMPLES, 1)] @ R.T + b.vertices.mean(
+            axis=0
+        )
         if b.kdtree.query(sample)[0].max() > _ROUGH_TOLERANCE * error:
             continue
         for T_b_a in (_transform(a, b, R), _refine(a, b, R)):
@@ -162,20 +164,20 @@ def _refine(a: trimesh.Trimesh, b: trimesh.Trimesh, R: Array) -> Array:
     Orthogonal Procrustes: Umeyama, "Least-squares estimation of transformation parameters between
     two point patterns", 1991.
     """
-    ours, theirs = _centred(a), _centred(b)
-    _, nearest = b.kdtree.query(ours @ R.T + b.vertices.mean(axis=0))
-    U, _, Vt = np.linalg.svd(theirs[nearest].T @ ours)
+    centred_a, centred_b = _centred(a), _centred(b)
+    _, nearest = b.kdtree.query(centred_a @ R.T + b.vertices.mean(axis=0))
+    U, _, Vt = np.linalg.svd(centred_b[nearest].T @ centred_a)
     handedness = np.sign(np.linalg.det(R) * np.linalg.det(U @ Vt))
     return _transform(a, b, U @ np.diag([1.0, 1.0, handedness]) @ Vt)
 
 
 def _maps(a: trimesh.Trimesh, b: trimesh.Trimesh, T_b_a: Array, error: float) -> bool:
     """Test that vertices map to vertices, both ways, and triangle centres to triangles."""
-    onto = trimesh.transform_points(a.vertices, T_b_a)
-    if b.kdtree.query(onto)[0].max() > error:
+    moved_vertices = trimesh.transform_points(a.vertices, T_b_a)
+    if b.kdtree.query(moved_vertices)[0].max() > error:
         return False
-    back = trimesh.transform_points(b.vertices, np.linalg.inv(T_b_a))
-    if a.kdtree.query(back)[0].max() > error:
+    moved_back = trimesh.transform_points(b.vertices, np.linalg.inv(T_b_a))
+    if a.kdtree.query(moved_back)[0].max() > error:
         return False
     centres = trimesh.transform_points(a.triangles_center, T_b_a)
     squared, _, _ = igl.point_mesh_squared_distance(

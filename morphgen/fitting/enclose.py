@@ -119,8 +119,8 @@ def _heaviest(directions: Array, weights: Array) -> Array:
     """Return the directions of largest weight; directions that are nearly equal count as one."""
     # A direction and its opposite are the same axis.
     directions = np.where(directions @ [1, 1e-3, 1e-6] < 0, -directions.T, directions.T).T
-    _, first, alike = np.unique(directions.round(3), axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(-np.bincount(alike.ravel(), weights), kind="stable")
+    _, first, group = np.unique(directions.round(3), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(-np.bincount(group.ravel(), weights), kind="stable")
     return np.asarray(directions[first[order[:_NUM_FEATURES]]])
 
 

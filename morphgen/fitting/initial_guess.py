@@ -37,7 +37,9 @@ def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candida
             principal axes of the points.
         sphere: Add a sphere.
     """
-    guesses = [guess for R in (*axes, _principal_axes(points)) for guess in _along(points, R)]
+    _, principal_axes = np.linalg.eigh(np.cov(points.T))
+    principal_axes *= (1.0, 1.0, np.linalg.det(principal_axes))  # right-handed
+    guesses = [guess for R in (*axes, principal_axes) for guess in _along(points, R)]
     if sphere:
         centre = points.mean(axis=0)
         # The mean squared distance from the centre of a ball is 3/5 of its squared radius.
@@ -113,11 +115,20 @@ def by_growth(
     return Candidates.stack(rows) if rows else None
 
 
-def _best_of_each_kind(piece: Array, counts: Array, outside: Array, others: Array) -> Candidates:
-    """Return three guesses around a cluster: the best, the best box, the best cylinder."""
+def _best_of_each_kind(
+    piece: Array, piece_weights: Array, outside: Array, outside_weights: Array
+) -> Candidates:
+    """Return three guesses around a cluster: the best, the best box, the best cylinder.
+
+    Args:
+        piece: Points of the cluster, shape (n, 3).
+        piece_weights: Weights of these points, shape (n,).
+        outside: Points outside the solid, shape (m, 3).
+        outside_weights: Weights of these points, shape (m,).
+    """
     guesses = around(piece, [np.eye(3)])
     points = np.concatenate([piece, outside])
-    weights = np.concatenate([counts, others])
+    weights = np.concatenate([piece_weights, outside_weights])
     ious = overlaps(guesses, points, np.arange(len(points)) < len(piece), weights)
     kinds = guesses.kinds[:, 0]
     best = [
@@ -125,11 +136,6 @@ def _best_of_each_kind(piece: Array, counts: Array, outside: Array, others: Arra
         for allowed in (kinds >= 0, kinds == _BOX, kinds == _CYLINDER)
     ]
     return guesses.take(np.array(best))
-
-
-def _principal_axes(points: Array) -> Array:
-    _, axes = np.linalg.eigh(np.cov(points.T))
-    return np.asarray(axes * (1.0, 1.0, np.linalg.det(axes)))
 
 
 def _along(points: Array, R: Array) -> list[tuple[int, Array, Array, Array]]:

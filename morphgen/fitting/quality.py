@@ -132,7 +132,8 @@ def signed_distance(primitives: Sequence[Shape], points: Array) -> Array:
     return np.asarray(np.min([_distance(shape, points) for shape in primitives], axis=0))
 
 
-def _body(shape: Shape) -> SolidPrimitive:
+def _solid_primitive(shape: Shape) -> SolidPrimitive:
+    """Return the geometry of a shape, a sphere as a capsule of length 0."""
     geometry = shape.geometry
     if isinstance(geometry, Mesh) or not volume(geometry) > 0:
         raise ValueError(f"{geometry} is not a primitive with a volume")
@@ -142,7 +143,7 @@ def _body(shape: Shape) -> SolidPrimitive:
 def _distance(shape: Shape, points: Array) -> Array:
     T = shape.T_link_shape.matrix
     x, y, z = T[:3, :3].T @ (points - T[:3, 3]).T
-    match _body(shape):
+    match _solid_primitive(shape):
         case Box((a, b, c)):
             return _rounded(abs(x) - a / 2, abs(y) - b / 2, abs(z) - c / 2)
         case Cylinder(radius, length):
@@ -175,7 +176,7 @@ def _bounding_box(primitives: Sequence[Shape], points: Array) -> tuple[Array, Ar
 def _half_extents(shape: Shape, R: Array) -> Array:
     """Return the half extents of a primitive along the columns of a rotation, shape (3,)."""
     axes = abs(R.T @ shape.T_link_shape.matrix[:3, :3])
-    match _body(shape):
+    match _solid_primitive(shape):
         case Box(size):
             return np.asarray(axes @ size / 2)
         case Cylinder(radius, length):
@@ -193,8 +194,8 @@ def _sobol(n: int, rng: np.random.Generator) -> Array:
 
 def _outer_surface(primitives: Sequence[Shape], n: int, rng: np.random.Generator) -> Array:
     """Sample the outer surface of the union of primitives evenly."""
-    bodies = enumerate(map(_body, primitives))
-    patches = [(owner, *patch) for owner, body in bodies for patch in _patches(body)]
+    geometries = enumerate(map(_solid_primitive, primitives))
+    patches = [(owner, *patch) for owner, geometry in geometries for patch in _patches(geometry)]
     ends = np.cumsum([area for _, area, _ in patches])
     unit = _sobol(n, rng)
     chosen = np.searchsorted(ends[:-1] / ends[-1], unit[:, 0], side="right")
@@ -209,7 +210,7 @@ def _outer(primitives: Sequence[Shape], owner: int, points: Array, normals: Arra
     """
     T = primitives[owner].T_link_shape.matrix
     points, normals = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
-    step = _step(primitives) * normals
+    step = _test_offset(primitives) * normals
     covered = np.zeros(len(points), dtype=bool)
     for index, other in enumerate(primitives):
         if index != owner:
@@ -219,23 +220,23 @@ def _outer(primitives: Sequence[Shape], owner: int, points: Array, normals: Arra
     return points[~covered]
 
 
-def _step(primitives: Sequence[Shape]) -> float:
+def _test_offset(primitives: Sequence[Shape]) -> float:
     """Return the offset from a surface at which other primitives are tested for [m]."""
-    return 1e-6 * math.pow(min(volume(_body(shape)) for shape in primitives), 1 / 3)
+    return 1e-6 * math.pow(min(volume(_solid_primitive(shape)) for shape in primitives), 1 / 3)
 
 
-def _patches(body: SolidPrimitive) -> list[Patch]:
+def _patches(geometry: SolidPrimitive) -> list[Patch]:
     """Return the patches of a primitive's surface."""
-    match body:
+    match geometry:
         case Box((a, b, c)):
             sides = itertools.product(enumerate((b * c, c * a, a * b)), (-1, 1))
-            return [(area, partial(_on_face, body, axis, sign)) for (axis, area), sign in sides]
+            return [(area, partial(_on_face, geometry, axis, sign)) for (axis, area), sign in sides]
         case Cylinder(radius, length):
-            ends = (math.tau * radius**2, partial(_on_caps, body))
-            return [(math.tau * radius * length, partial(_on_tube, body)), ends]
+            ends = (math.tau * radius**2, partial(_on_caps, geometry))
+            return [(math.tau * radius * length, partial(_on_tube, geometry)), ends]
         case Capsule(radius, length):
-            ends = (4 * math.pi * radius**2, partial(_on_ball, body))
-            return [(math.tau * radius * length, partial(_on_tube, body)), ends]
+            ends = (4 * math.pi * radius**2, partial(_on_ball, geometry))
+            return [(math.tau * radius * length, partial(_on_tube, geometry)), ends]
 
 
 def _on_face(box: Box, axis: int, sign: int, unit: Array) -> SurfacePoints:
@@ -244,14 +245,14 @@ def _on_face(box: Box, axis: int, sign: int, unit: Array) -> SurfacePoints:
     return np.insert(2 * unit - 1, axis, sign, axis=1) * box.size / 2, normals
 
 
-def _on_tube(body: Cylinder | Capsule, unit: Array) -> SurfacePoints:
+def _on_tube(tube: Cylinder | Capsule, unit: Array) -> SurfacePoints:
     normals = _spun(np.ones(len(unit)), unit[:, 0], np.zeros(len(unit)))
-    return normals * body.radius + np.outer(unit[:, 1] - 0.5, (0, 0, body.length)), normals
+    return normals * tube.radius + np.outer(unit[:, 1] - 0.5, (0, 0, tube.length)), normals
 
 
 def _on_caps(cylinder: Cylinder, unit: Array) -> SurfacePoints:
-    side, away = np.copysign(1.0, unit[:, 1] - 0.5), np.sqrt(abs(2 * unit[:, 1] - 1))
-    points = _spun(cylinder.radius * away, unit[:, 0], side * cylinder.length / 2)
+    side, distance = np.copysign(1.0, unit[:, 1] - 0.5), np.sqrt(abs(2 * unit[:, 1] - 1))
+    points = _spun(cylinder.radius * distance, unit[:, 0], side * cylinder.length / 2)
     return points, np.outer(side, (0.0, 0.0, 1.0))
 
 
@@ -271,7 +272,7 @@ def _spun(radius: Array, turns: Array, z: Array) -> Array:
 def _corners(shape: Shape) -> SurfacePoints:
     """Return a box's corners, 64 points on each rim of a cylinder, nothing of a capsule."""
     points = np.zeros((0, 3))
-    match _body(shape):
+    match _solid_primitive(shape):
         case Box(size):
             points = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
         case Cylinder(radius, length):
@@ -290,7 +291,7 @@ def _depth(primitives: Sequence[Shape], points: Array, n: int, rng: np.random.Ge
     depth = -signed_distance(primitives, points)
     if len(primitives) == 1:
         return depth
-    step = _step(primitives)
+    step = _test_offset(primitives)
     ahead = [signed_distance(primitives, points + step * axis) for axis in np.eye(3)]
     gradient = (np.stack(ahead, axis=1) + depth[:, None]) / step
     beyond = signed_distance(primitives, points + (depth + 10 * step)[:, None] * gradient)

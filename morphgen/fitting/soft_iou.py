@@ -41,18 +41,18 @@ class Candidates:
         )
 
     @staticmethod
-    def stack(several: list[Candidates]) -> Candidates:
+    def stack(blocks: list[Candidates]) -> Candidates:
         """Concatenate candidates with the same number of primitives."""
-        return Candidates._concatenate(several, axis=0)
+        return Candidates._concatenate(blocks, axis=0)
 
     @staticmethod
-    def join(several: list[Candidates]) -> Candidates:
-        """Join candidates row by row: row i of the result has the primitives of all rows i."""
-        return Candidates._concatenate(several, axis=1)
+    def join(blocks: list[Candidates]) -> Candidates:
+        """Concatenate primitives: candidate i of the result has those of every candidate i."""
+        return Candidates._concatenate(blocks, axis=1)
 
     @staticmethod
-    def _concatenate(several: list[Candidates], axis: int) -> Candidates:
-        arrays = zip(*(vars(candidates).values() for candidates in several), strict=True)
+    def _concatenate(blocks: list[Candidates], axis: int) -> Candidates:
+        arrays = zip(*(vars(candidates).values() for candidates in blocks), strict=True)
         return Candidates(*(np.concatenate(array, axis=axis) for array in arrays))
 
 
@@ -98,16 +98,16 @@ def ascend(
     ]
     optimizer = torch.optim.Adam(groups, lr=rate[0], betas=(0.8, 0.98))
     for step in range(num_steps):
-        part = step / max(num_steps - 1, 1)
-        softness = tau[0] * (tau[1] / tau[0]) ** part
+        progress = step / max(num_steps - 1, 1)
+        softness = tau[0] * (tau[1] / tau[0]) ** progress
         for group in optimizer.param_groups:
-            group["lr"] = group["unit"] * rate[0] * (rate[1] / rate[0]) ** part
+            group["lr"] = group["unit"] * rate[0] * (rate[1] / rate[0]) ** progress
         optimizer.zero_grad(set_to_none=True)
         distance = _distance(x, kinds, centres, quaternions, logs.exp())
         member = 1 - torch.exp(-torch.nn.functional.softplus(-distance / softness).sum(dim=1))
-        member, wanted = member * weight, (target * weight).expand_as(member)
+        member, weighted_target = member * weight, (target * weight).expand_as(member)
         intersection = (member * target).sum(dim=1)
-        union = member.sum(dim=1) + wanted.sum(dim=1) - intersection
+        union = member.sum(dim=1) + weighted_target.sum(dim=1) - intersection
         loss = -(intersection / (union + 1e-9)).sum()
         torch.autograd.backward(loss)
         optimizer.step()
@@ -178,12 +178,13 @@ def _distance(
     if boxes:
         distances.append(_rounded(local[:boxes].abs() - size[:boxes]))
     if cylinders:
-        some, h = local[boxes : boxes + cylinders], size[boxes : boxes + cylinders]
-        radial = (some[:, :2].square().sum(dim=1) + 1e-12).sqrt() - h[:, 0]
-        distances.append(_rounded(torch.stack([radial, some[:, 2].abs() - h[:, 2]], dim=1)))
+        points, half = local[boxes : boxes + cylinders], size[boxes : boxes + cylinders]
+        radial = (points[:, :2].square().sum(dim=1) + 1e-12).sqrt() - half[:, 0]
+        axial = points[:, 2].abs() - half[:, 2]
+        distances.append(_rounded(torch.stack([radial, axial], dim=1)))
     if boxes + cylinders < len(flat):
-        some, h = local[boxes + cylinders :], size[boxes + cylinders :]
-        distances.append((some.square().sum(dim=1) + 1e-12).sqrt() - h[:, 0])
+        points, half = local[boxes + cylinders :], size[boxes + cylinders :]
+        distances.append((points.square().sum(dim=1) + 1e-12).sqrt() - half[:, 0])
     return torch.cat(distances)[torch.argsort(order)].reshape(n, k, -1)
 
 

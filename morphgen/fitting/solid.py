@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from morphgen.errors import FitError
-from morphgen.model.geometry import Mesh, Shape
-from morphgen.model.inertia import solid_mesh
-from morphgen.model.mesh import FLATNESS_TOLERANCE, is_flat, load_mesh
+from morphgen.model.geometry import Shape
+from morphgen.model.inertia import link_frame_mesh
+from morphgen.model.mesh import FLATNESS_TOLERANCE, is_flat
 from morphgen.typing import Array
 
 Method = Literal["watertight", "repaired", "winding", "filled", "hull"]
@@ -126,7 +126,8 @@ def solid_of(shapes: Sequence[Shape]) -> Solid:
     """
     if not shapes:
         raise FitError("there are no shapes")
-    solids = [solid for shape in shapes if (solid := _solid_of_shape(shape)) is not None]
+    meshes = map(link_frame_mesh, shapes)
+    solids = [solid for mesh in meshes if (solid := solid_of_mesh(mesh)) is not None]
     if not solids:
         raise FitError("the shapes are flat: they have no volume")
     if len(solids) == 1:
@@ -166,12 +167,6 @@ def solid_of_mesh(mesh: trimesh.Trimesh) -> Solid | None:
     return solid
 
 
-def _solid_of_shape(shape: Shape) -> Solid | None:
-    geometry = shape.geometry
-    mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
-    return solid_of_mesh(mesh.copy().apply_transform(shape.T_link_shape.matrix))
-
-
 def _orient_outwards(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
     """Turn the normals of every connected component outwards; return also if anything changed."""
     oriented = _without_duplicates(mesh)
@@ -201,7 +196,7 @@ def _orient_outwards(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
 def _without_duplicates(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Keep one of several triangles with the same corners, and none of two that face each other.
 
-    Two triangles that face each other are a wall within a body, unless the whole mesh is doubled.
+    Two triangles that face each other are a wall within a solid, unless the whole mesh is doubled.
     """
     corners = np.sort(mesh.faces, axis=1)
     _, first, group = np.unique(corners, axis=0, return_index=True, return_inverse=True)
@@ -230,11 +225,12 @@ def _fill_cavity(solid: Solid) -> Solid:
         return solid
     filled = replace(solid, method="filled")
     points = _probes(solid)
-    walls, body = solid.contains(points).sum(), filled.contains(points).sum()
-    return filled if body > (1 + MIN_CAVITY) * walls else solid
+    num_in_walls, num_in_filled = solid.contains(points).sum(), filled.contains(points).sum()
+    return filled if num_in_filled > (1 + MIN_CAVITY) * num_in_walls else solid
 
 
 def _probes(solid: Solid) -> Array:
+    """Return random points in the bounding box of a solid, shape (_NUM_PROBES, 3)."""
     low, high = solid.mesh.bounds
     return np.random.default_rng(0).uniform(low, high, (_NUM_PROBES, 3))
 

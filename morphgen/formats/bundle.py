@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import trimesh
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.stl import export_stl
 
@@ -225,9 +224,20 @@ def _write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
             if not isinstance(mesh, Mesh) or mesh in files:
                 continue
             folder.mkdir(exist_ok=True)
-            data, suffix = _mesh_bytes(load_mesh(mesh))
+            triangles = load_mesh(mesh)
+            if len(triangles.faces) <= MAX_STL_FACES:
+                data, suffix = export_stl(triangles), "stl"
+            else:  # too large for MuJoCo's STL reader
+                obj = export_obj(triangles, include_normals=False, header=None)
+                data, suffix = obj.encode(), "obj"
             digest = hashlib.sha256(data).hexdigest()[:8]
-            name = f"{_safe(mesh.path.stem)}-{digest}.{suffix}"
+            # The name of a mesh that another bundle wrote already ends with a digest.
+            base, dash, last_word = mesh.path.stem.rpartition("-")
+            stem = base if dash and len(last_word) == 8 else mesh.path.stem
+            safe_stem = "".join(
+                c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in stem
+            )
+            name = f"{safe_stem}-{digest}.{suffix}"
             (folder / name).write_bytes(data)
             files[mesh] = f"{MESHES}/{name}"
     return files
@@ -248,15 +258,3 @@ def _write_fits(robot: Robot, folder: Path) -> None:
             fits[shapes_key(shapes)] = replace(fit, link=link.name)
     if fits:
         (folder / FITS).write_text(fits_text(fits), encoding="utf-8")
-
-
-def _mesh_bytes(mesh: trimesh.Trimesh) -> tuple[bytes, str]:
-    """Return binary STL and its suffix, or OBJ for meshes too large for MuJoCo's STL reader."""
-    if len(mesh.faces) <= MAX_STL_FACES:
-        return export_stl(mesh), "stl"
-    return export_obj(mesh, include_normals=False, header=None).encode(), "obj"
-
-
-def _safe(stem: str) -> str:
-    base = stem.rsplit("-", 1)[0] if len(stem.rsplit("-", 1)[-1]) == 8 else stem
-    return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in base)

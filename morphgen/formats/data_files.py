@@ -138,5 +138,14 @@ def require_plain_yaml(text: str | bytes, origin: str) -> None:
             raise FormatError(f"{origin}: holds more than {MAX_YAML_VALUES} values")
 
 
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """Return what is wrong with YAML, with its location: text to append to the file's name."""
+    if not isinstance(error, yaml.MarkedYAMLError):
+        return f": invalid YAML: {' '.join(str(error).split())}"
+    mark = error.problem_mark
+    location = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
+    return f"{location}: invalid YAML: {error.problem}"
+
+
 def _too_deep(origin: str) -> FormatError:
     return FormatError(f"{origin}: is nested deeper than {MAX_DEPTH} levels")

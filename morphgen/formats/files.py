@@ -75,6 +75,7 @@ def write_cache_file(path: Path, content: str | bytes) -> None:
 
 
 def _replace(path: Path, content: str | bytes) -> None:
+    """Write a file by way of ``replacing_file``."""
     with replacing_file(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -98,9 +99,8 @@ def locked_folder(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        (folder / LOCK).unlink(
-            missing_ok=True
-        )  # before the release, when nobody else can have locked it
+        # Before the release, when no other run can have locked it.
+        (folder / LOCK).unlink(missing_ok=True)
         lock.release()
 
 

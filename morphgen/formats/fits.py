@@ -48,6 +48,7 @@ FITTER_VERSION = 2
 """Version of the fitter; it rises when the fitter gives other primitives for the same meshes."""
 
 _Iou = Annotated[float, Meta(ge=0, le=1)]
+"""Intersection over union of the fitted and the original volume."""
 
 
 class ShapeRecord(Record, frozen=True):
@@ -85,12 +86,14 @@ class ShapeRecord(Record, frozen=True):
 
 
 class _LinkRecord(Record, frozen=True):
-    """The fit of one link."""
+    """The fit of one link in a file of fits."""
 
     link: str
+    """Name of the link that was fitted."""
     shapes: str
     """The ``shapes_key`` of the fitted shapes."""
     token: ShapeRecord
+    """The single primitive for the link's token."""
     token_iou: _Iou
     collision: Annotated[tuple[ShapeRecord, ...], Meta(min_length=1, max_length=MAX_PRIMITIVES)]
     collision_iou: _Iou
@@ -103,6 +106,7 @@ class _LinkRecord(Record, frozen=True):
 
 class _FileRecord(Record, frozen=True):
     fitter: int
+    """The ``FITTER_VERSION`` that wrote the file."""
     links: list[_LinkRecord]
 
 
@@ -144,7 +148,12 @@ def shapes_key(shapes: Sequence[Shape]) -> str:
         FormatError: If a mesh file cannot be read.
     """
     factor = 1 / shapes_scale(shapes)
-    text = "\n".join(sorted(_shape_text(scale_shape(shape, factor)) for shape in shapes))
+    lines = []
+    for shape in (scale_shape(shape, factor) for shape in shapes):
+        pose = shape.T_link_shape
+        numbers = map(format_number, (*pose.position, *pose.quaternion))
+        lines.append(" ".join([_geometry_text(shape.geometry), *numbers]))
+    text = "\n".join(sorted(lines))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -243,12 +252,6 @@ def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
     if isinstance(data, dict) and data.get("fitter", FITTER_VERSION) != FITTER_VERSION:
         return {}
     return {link.shapes: link.fit for link in read_record(data, _FileRecord, str(path)).links}
-
-
-def _shape_text(shape: Shape) -> str:
-    pose = shape.T_link_shape
-    placed = [format_number(value) for value in (*pose.position, *pose.quaternion)]
-    return " ".join([_geometry_text(shape.geometry), *placed])
 
 
 def _geometry_text(geometry: Geometry) -> str:

@@ -37,6 +37,7 @@ class View:
     """A camera looking at a point from a distance."""
 
     target: tuple[float, float, float]
+    """Point in the centre of the picture, in the root frame [m]."""
     distance: float
     """Distance of the camera from the target [m]."""
 
@@ -74,7 +75,7 @@ def render(
 
 
 def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
-    """Return the closest view that shows all of the robot and its root's origin, centred."""
+    """Return the closest view that shows the whole robot and its root's origin, centred."""
     T_root_link = forward_kinematics(robot, q)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
@@ -86,10 +87,10 @@ def _framing(robot: Robot, q: NDArray[np.float64], aspect: float) -> View:
     across, ahead, up = (np.concatenate(points) @ axes).T
     middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
     tangent = _MARGIN * math.tan(math.radians(_FOV / 2))
-    needed = np.maximum(
+    distances = np.maximum(
         np.abs(across - middle[0]) / (tangent * aspect), np.abs(up - middle[2]) / tangent
     )
-    distance = max(float((needed - (ahead - middle[1])).max()), 0.05)
+    distance = max(float((distances - (ahead - middle[1])).max()), 0.05)
     x, y, z = (axes @ middle).tolist()
     return View((x, y, z), distance)
 

@@ -24,9 +24,9 @@ _DATA_ROOTS = {
     "rtb-data": ("rtbdata/xacro", "rtbdata"),
     "example-robot-data": ("cmeel.prefix/share", "cmeel.prefix/share/example-robot-data/robots"),
 }
-_OWN_PACKAGES = ("morphgen.templates", "morphgen.robots_real")
+_MORPHGEN_PACKAGES = ("morphgen.templates", "morphgen.robots_real")
 _SUBFOLDERS = ("urdf", "urdfs", "xacro", "xacros", "robot", "robots")
-_WIDEN = "name the folder that it may come from as root (--root DIR of morphgen import)"
+_ROOT_HINT = "name the folder that it may come from as root (--root DIR of morphgen import)"
 _PACKAGE_SUFFIX = re.compile(r"_(description|support)$")
 _PACKAGE_NAME = re.compile(r"[A-Za-z][\w-]*$")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?://)?")
@@ -57,10 +57,10 @@ class PackageFinder:
         Raises:
             FormatError: The name is invalid, or no folder was found.
         """
-        place = f"{files[0]}: " if files else ""
+        prefix = f"{files[0]}: " if files else ""
         if not _PACKAGE_NAME.match(package):
             raise FormatError(
-                f"{place}{package!r} is not a package name (letters, digits, _ and -)"
+                f"{prefix}{package!r} is not a package name (letters, digits, _ and -)"
             )
         for name, folder in self.packages:
             if name == package:
@@ -72,11 +72,12 @@ class PackageFinder:
         around = f"in or beside the folders above {files[0]}, " if files else ""
         roots = ", ".join(map(str, self.roots)) or "(none)"
         raise FormatError(
-            f"{place}package {package!r} not found: looked {around}in the roots {roots};"
+            f"{prefix}package {package!r} not found: looked {around}in the roots {roots};"
             " give the folder that holds it as another root"
         )
 
     def _candidates(self, name: str, files: Iterable[Path]) -> Iterator[Path]:
+        """Yield the folders that may be the package ``name``, in search order."""
         for file in files:
             for folder in _ancestors(file):
                 if folder.name == name or _declared_name(folder) == name:
@@ -168,7 +169,7 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
         if not inside and not (absolute and _is_in_package(path, finder)):
             raise FormatError(
                 f"{base}: {uri!r} leaves {boundary}, the folder of its description;"
-                f" move the file inside, refer to it by package://, or {_WIDEN}"
+                f" move the file inside, refer to it by package://, or {_ROOT_HINT}"
             )
         if path.is_file():
             real = path.resolve()
@@ -176,7 +177,7 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
             if not _is_in(real, trees) and not _is_in_package(real, finder):
                 raise FormatError(
                     f"{base}: {uri!r} is a symbolic link that leaves {boundary}, the folder of its"
-                    f" description; put the file itself there, or {_WIDEN}"
+                    f" description; put the file itself there, or {_ROOT_HINT}"
                 )
             return path
         missing.append(path)
@@ -203,18 +204,18 @@ def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> Non
     real = path.resolve()
     if _is_in(real, (*finder.roots, *(folder for _, folder in finder.packages), finder.root)):
         return
-    trees = [_text_tree(place) for file in files for place in (_absolute(file), file.resolve())]
+    trees = [_tree(path, for_text=True) for file in files for path in (file, file.resolve())]
     packaged = any((folder / "package.xml").is_file() for folder in _ancestors(real))
     if not packaged and not _is_in(real, trees):
         raise RefusedError(
             f"{str(path)!r} is not in {trees[0]}, the folder of the description, nor in a ROS"
-            f" package; move the file inside, or {_WIDEN}"
+            f" package; move the file inside, or {_ROOT_HINT}"
         )
 
 
 def is_installed(path: Path) -> bool:
     """Return whether a file was installed with morphgen or one of the data packages."""
-    return _is_in(path.resolve(), (*_own_folders(), *_data_roots()))
+    return _is_in(path.resolve(), (*_morphgen_folders(), *_data_roots()))
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
@@ -266,24 +267,19 @@ def distribution_file(package: str, relative: str) -> Path:
     return path
 
 
-def _tree(base: Path) -> Path:
-    """Return the folder that a description's relative paths must not leave."""
-    ancestors = _ancestors(base)
-    declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
-    named = [folder for folder in ancestors if _has_suffix(folder)]
-    return (declared + named + ancestors[1:2] + [base.parent])[0]
+def _tree(file: Path, *, for_text: bool = False) -> Path:
+    """Return the folder that a description's mesh paths must not leave.
 
-
-def _text_tree(file: Path) -> Path:
-    """Return the folder that a xacro's includes and YAML must not leave.
-
-    It is stricter than ``_tree``, which is for meshes: text would be copied literally, and the
-    folder above a download may be the user's home.
+    With ``for_text``, return the folder that a xacro's includes and YAML must not leave. It is the
+    stricter one: text would be copied literally, and the folder above a download may be the user's
+    home.
     """
+    file = _absolute(file)
     ancestors = _ancestors(file)
     declared = [folder for folder in ancestors if (folder / "package.xml").is_file()]
     named = [folder for folder in ancestors if _has_suffix(folder)]
-    above = ancestors[1:2] if file.parent.name.lower() in _SUBFOLDERS else []
+    is_above_allowed = not for_text or file.parent.name.lower() in _SUBFOLDERS
+    above = ancestors[1:2] if is_above_allowed else []
     return (declared + named + above + [file.parent])[0]
 
 
@@ -335,9 +331,9 @@ def _read_name(manifest: Path, mtime_ns: int) -> str | None:
 
 
 @lru_cache(maxsize=1)
-def _own_folders() -> tuple[Path, ...]:
+def _morphgen_folders() -> tuple[Path, ...]:
     """Return the folders of morphgen's own parts."""
-    return tuple(Path(str(files(package))).resolve() for package in _OWN_PACKAGES)
+    return tuple(Path(str(files(package))).resolve() for package in _MORPHGEN_PACKAGES)
 
 
 @lru_cache(maxsize=1)

@@ -16,17 +16,16 @@ from morphgen.model.robot import (
     DEFAULT_VELOCITY,
     Inertial,
     Joint,
-    Link,
     Mimic,
     Robot,
 )
 from morphgen.model.rotation import Vec3, normalize
 
-_TURN_DECIMALS = 10
+_ROTATION_DECIMALS = 10
 """Decimals of a quaternion divided by its largest entry; angles of 12 digits err up to 1.5e-11."""
-_LARGEST = 1e-6
+_TIE_TOLERANCE = 1e-6
 """Entries of a quaternion that differ by less from the largest count as equal to it."""
-_UNIT = 1e-9
+_UNIT_TOLERANCE = 1e-9
 """Largest difference of a rounded unit axis's length from 1."""
 
 
@@ -55,8 +54,8 @@ def rounded_pose(pose: Pose) -> Pose:
     if not all(map(math.isfinite, entries)) or largest == 0:
         return pose
     # The first of nearly equal entries, so that rounding errors do not change the choice.
-    lead = next(value for value in entries if abs(value) > largest - _LARGEST)
-    w, x, y, z = (round(value / lead, _TURN_DECIMALS) for value in entries)
+    lead = next(value for value in entries if abs(value) > largest - _TIE_TOLERANCE)
+    w, x, y, z = (round(value / lead, _ROTATION_DECIMALS) for value in entries)
     return Pose(_vector(pose.position), normalize((w, x, y, z)))
 
 
@@ -66,7 +65,7 @@ def rounded_axis(joint: Joint) -> Vec3:
     Raises:
         RobotError: If the axis is zero.
     """
-    is_unit = abs(math.hypot(*joint.axis) - 1) < _UNIT
+    is_unit = abs(math.hypot(*joint.axis) - 1) < _UNIT_TOLERANCE
     return _vector(joint.axis if is_unit else joint.unit_axis)
 
 
@@ -94,7 +93,12 @@ def as_written(robot: Robot) -> Robot:
     """
     return replace(
         robot,
-        links=tuple(_link(link) for link in robot.links),
+        links=tuple(
+            replace(
+                link, inertial=_inertial(link.inertial), collisions=rounded_shapes(link.collisions)
+            )
+            for link in robot.links
+        ),
         joints=tuple(_joint(joint) for joint in robot.joints),
         frames=tuple(replace(f, T_link_frame=rounded_pose(f.T_link_frame)) for f in robot.frames),
         home=tuple(map(round_number, robot.home)),
@@ -109,12 +113,6 @@ def rounded_shapes(shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
         )
         for shape in shapes
         for piece in urdf_pieces(shape)
-    )
-
-
-def _link(link: Link) -> Link:
-    return replace(
-        link, inertial=_inertial(link.inertial), collisions=rounded_shapes(link.collisions)
     )
 
 
@@ -141,13 +139,11 @@ def _joint(joint: Joint) -> Joint:
     T_parent_joint = rounded_pose(joint.T_parent_joint)
     if not joint.is_movable:
         return Joint(joint.name, joint.kind, joint.parent, joint.child, T_parent_joint)
-    is_continuous = joint.kind == "continuous" or (
-        joint.kind == "revolute" and joint.limits is None
-    )
-    limits = None if is_continuous or joint.limits is None else joint.limits
+    limits = None if joint.is_continuous else joint.limits
+    mimic = joint.mimic
     return Joint(
         joint.name,
-        "continuous" if is_continuous else joint.kind,
+        "continuous" if joint.is_continuous else joint.kind,
         joint.parent,
         joint.child,
         T_parent_joint,
@@ -157,12 +153,8 @@ def _joint(joint: Joint) -> Joint:
         DEFAULT_VELOCITY if joint.velocity is None else round_number(joint.velocity),
         round_number(joint.damping),
         round_number(joint.friction),
-        joint.mimic and _mimic(joint.mimic),
+        mimic and Mimic(mimic.joint, round_number(mimic.multiplier), round_number(mimic.offset)),
     )
-
-
-def _mimic(mimic: Mimic) -> Mimic:
-    return Mimic(mimic.joint, round_number(mimic.multiplier), round_number(mimic.offset))
 
 
 def _vector(vector: Vec3) -> Vec3:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from lxml import etree
 
 from morphgen.errors import nearest
-from morphgen.formats.urdf_schema import SourceLocation, content_findings
+from morphgen.formats.urdf_schema import UrdfLocation, content_findings
 from morphgen.model.findings import Finding
 from morphgen.model.robot import JOINT_KINDS
 
@@ -45,29 +45,29 @@ def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]
     # Loaders ignore an unexpanded xacro call, so alone it is a warning. Next to other errors it is
     # their likely cause, and reported alone.
     broken = any(finding.severity == "error" for finding in findings)
-    left = SourceLocation.of(root, origin).finding(
+    xacro_finding = UrdfLocation.of(root, origin).finding(
         unexpanded,
         "xacro-unexpanded",
         f"<xacro:{etree.QName(unexpanded).localname}> is left in the document",
         "give the file the suffix .xacro, or expand it first",
         "" if broken else f"<xacro:{etree.QName(unexpanded).localname}> was left out",
     )
-    return (left,) if broken else (left, *findings)
+    return (xacro_finding,) if broken else (xacro_finding, *findings)
 
 
 def _size_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     """Check the number of elements first: later checks would take too long on a huge document."""
-    for tag, elements, most in (
+    for tag, elements, max_count in (
         ("link", root.iterfind("link"), MAX_LINKS),
         ("joint", root.iterfind("joint"), MAX_LINKS),
         ("visual and collision", root.iter("visual", "collision"), MAX_SHAPES),
     ):
         count = sum(1 for _ in elements)
-        if count > most:
-            yield SourceLocation.of(root, origin).finding(
+        if count > max_count:
+            yield UrdfLocation.of(root, origin).finding(
                 root,
                 "robot-too-large",
-                f"it has {count} <{tag}> elements; at most {most} are read",
+                f"it has {count} <{tag}> elements; at most {max_count} are read",
                 "leave out everything that is not part of the robot",
             )
 
@@ -86,9 +86,9 @@ def _first(findings: Iterator[Finding]) -> list[Finding]:
 
 def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     links, joints = root.findall("link"), root.findall("joint")
-    yield from content_findings(root, SourceLocation.of(root, origin))
+    yield from content_findings(root, UrdfLocation.of(root, origin))
     if not links:
-        yield SourceLocation.of(root, origin).finding(
+        yield UrdfLocation.of(root, origin).finding(
             root, "link-missing", "<robot> has no <link>", "add at least one link"
         )
     yield from _duplicates(links, origin)
@@ -97,7 +97,7 @@ def _robot_findings(root: etree._Element, origin: str) -> Iterator[Finding]:
     yield from _kinds(joints, origin)
     yield from _mimics(joints, origin)
     for element in [*links, *joints, *root.findall("material")]:
-        yield from content_findings(element, SourceLocation.of(element, origin))
+        yield from content_findings(element, UrdfLocation.of(element, origin))
 
 
 def _wrong_root(root: etree._Element, origin: str) -> Finding:
@@ -106,7 +106,7 @@ def _wrong_root(root: etree._Element, origin: str) -> Finding:
     if name.localname == "robot":
         fix = f"remove the default namespace {name.namespace!r}"
     why = f"the root element is <{name.localname}>, not <robot>"
-    return SourceLocation(origin, f"<{name.localname}>").finding(root, "root-not-robot", why, fix)
+    return UrdfLocation(origin, f"<{name.localname}>").finding(root, "root-not-robot", why, fix)
 
 
 def _first_xacro(root: etree._Element) -> etree._Element | None:
@@ -122,7 +122,7 @@ def _duplicates(elements: Sequence[etree._Element], origin: str) -> Iterator[Fin
     for element in elements:
         name = element.get("name")
         if name in first:
-            yield SourceLocation.of(element, origin).finding(
+            yield UrdfLocation.of(element, origin).finding(
                 element,
                 f"{element.tag}-duplicate",
                 f"the name is taken by the {element.tag} on line {first[name].sourceline}",
@@ -145,9 +145,10 @@ def _tree(
 ) -> Iterator[Finding]:
     by_name = {name: link for link in links if (name := link.get("name"))}
     parent_of: dict[str, str] = {}
-    above: dict[str, etree._Element] = {}
+    joint_above: dict[str, etree._Element] = {}
+    """Joint whose child a link is, by the link's name."""
     for joint in joints:
-        location = SourceLocation.of(joint, origin)
+        location = UrdfLocation.of(joint, origin)
         parent, child = _ends(joint)
         for role, name in (("parent", parent), ("child", child)):
             if name and name not in by_name:
@@ -159,28 +160,28 @@ def _tree(
                 )
         if not child or child not in by_name:
             continue
-        if child in above:
+        if child in joint_above:
             yield location.finding(
                 joint,
                 "link-two-parents",
-                f"link {child!r} is already the child of joint {above[child].get('name')!r} "
-                f"(line {above[child].sourceline})",
+                f"link {child!r} is already the child of joint {joint_above[child].get('name')!r} "
+                f"(line {joint_above[child].sourceline})",
                 "remove one joint: a robot is a tree, loops are not supported",
             )
             continue
-        above[child] = joint
+        joint_above[child] = joint
         if parent in by_name:
             parent_of[child] = parent
     for cycle in _cycles(parent_of):
-        yield SourceLocation.of(above[cycle[0]], origin).finding(
-            above[cycle[0]],
+        yield UrdfLocation.of(joint_above[cycle[0]], origin).finding(
+            joint_above[cycle[0]],
             "cycle",
             "links form a loop: " + " -> ".join([*cycle, cycle[0]]),
             "remove one of the joints",
         )
-    roots = [name for name in by_name if name not in above]
+    roots = [name for name in by_name if name not in joint_above]
     for name in roots[1:]:
-        yield SourceLocation.of(by_name[name], origin).finding(
+        yield UrdfLocation.of(by_name[name], origin).finding(
             by_name[name],
             "disconnected",
             f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root",
@@ -188,16 +189,16 @@ def _tree(
         )
 
 
-def _cycles(above: dict[str, str]) -> Iterator[list[str]]:
+def _cycles(parent_of: dict[str, str]) -> Iterator[list[str]]:
     """Yield each cycle of a map from child to parent once, from the top down."""
     done: set[str] = set()
-    for start in above:
+    for start in parent_of:
         path: list[str] = []
         name: str | None = start
         while name is not None and name not in done:
             done.add(name)
             path.append(name)
-            name = above.get(name)
+            name = parent_of.get(name)
         if name in path:
             yield list(reversed(path[path.index(name) :]))
 
@@ -206,14 +207,14 @@ def _kinds(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
     for joint in joints:
         kind = joint.get("type")
         if kind in _REPLACEMENT:
-            yield SourceLocation.of(joint, origin).finding(
+            yield UrdfLocation.of(joint, origin).finding(
                 joint,
                 "joint-type-unsupported",
                 f"joints of type {kind!r} are not supported",
                 _REPLACEMENT[kind],
             )
         elif kind and kind not in JOINT_KINDS:
-            yield SourceLocation.of(joint, origin).finding(
+            yield UrdfLocation.of(joint, origin).finding(
                 joint,
                 "joint-type-unknown",
                 f"{kind!r} is not a joint type",
@@ -232,7 +233,7 @@ def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
         if leader in by_name:
             leader_of[name] = leader
         else:
-            yield SourceLocation.of(joint, origin).finding(
+            yield UrdfLocation.of(joint, origin).finding(
                 mimic,
                 "mimic-unknown",
                 f"it mimics {leader!r}, which is not a joint",
@@ -241,7 +242,7 @@ def _mimics(joints: Sequence[etree._Element], origin: str) -> Iterator[Finding]:
                 "it moves independently",
             )
     for cycle in _cycles(leader_of):
-        yield SourceLocation.of(by_name[cycle[0]], origin).finding(
+        yield UrdfLocation.of(by_name[cycle[0]], origin).finding(
             by_name[cycle[0]],
             "mimic-cycle",
             "joints mimic each other: " + " -> ".join([*cycle, cycle[0]]),

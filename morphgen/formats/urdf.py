@@ -16,7 +16,7 @@ from morphgen.formats.data_files import read_bytes
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.structure import structure_findings
 from morphgen.formats.urdf_schema import CHILDREN
-from morphgen.formats.urdf_text import OWN
+from morphgen.formats.urdf_text import MORPHGEN_TAG
 from morphgen.formats.xacro import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.findings import Finding
@@ -157,7 +157,7 @@ def robot_from_xml(
         home=home,
         source_findings=source_findings,
     )
-    frames = [frame.get("name", "") for frame in root.iterfind(f"{OWN}/frame")]
+    frames = [frame.get("name", "") for frame in root.iterfind(f"{MORPHGEN_TAG}/frame")]
     return with_frames(robot, frames) if written_frames else robot
 
 
@@ -182,7 +182,7 @@ def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
 def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
     """Return the home positions by joint that ``urdf_text`` wrote."""
     home = {}
-    for element in root.iterfind(f"{OWN}/home"):
+    for element in root.iterfind(f"{MORPHGEN_TAG}/home"):
         text = element.get("position", "")
         try:
             position = float(text)
@@ -221,6 +221,7 @@ def _resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) ->
 
 
 def _parents_first(joints: Sequence[Joint], links: Mapping[str, Link]) -> bool:
+    """Return whether every joint comes after the joint that attaches its parent link."""
     known = {_root_name(links, joints)}
     for joint in joints:
         if joint.parent not in known:
@@ -230,6 +231,7 @@ def _parents_first(joints: Sequence[Joint], links: Mapping[str, Link]) -> bool:
 
 
 def _topological(joints: list[Joint], links: Mapping[str, Link]) -> list[Joint]:
+    """Return the joints depth first, so that parents precede their children."""
     children: dict[str, list[Joint]] = {}
     for joint in joints:
         children.setdefault(joint.parent, []).append(joint)
@@ -248,6 +250,7 @@ def _root_name(links: Mapping[str, Link], joints: Sequence[Joint]) -> str:
 
 
 def _default_position(joint: Joint) -> float:
+    """Return the home position without a stored one: zero if it is in range, else the middle."""
     lower, upper = joint.limits or (-math.inf, math.inf)
     if joint.kind == "continuous" or lower <= 0 <= upper or lower > upper:
         return 0.0

@@ -25,16 +25,16 @@ SHOWN_TEXT = 80
 
 
 @dataclass(frozen=True)
-class SourceLocation:
-    """The link, joint or robot of a URDF that an element belongs to."""
+class UrdfLocation:
+    """The file, and the link, joint or robot in it, that findings about an element name."""
 
     origin: str
     """Name of the file."""
     owner: str
-    """Kind and name of the top-level element, such as ``link 'base'``."""
+    """Tag and name of the top-level element that contains the element, such as ``link 'base'``."""
 
     @classmethod
-    def of(cls, element: etree._Element, origin: str) -> SourceLocation:
+    def of(cls, element: etree._Element, origin: str) -> UrdfLocation:
         """Return the location named after a link, joint or other top-level element."""
         name = element.get("name")
         owner = f"{element.tag} {shortened(name)!r}" if name else f"{element.tag} without a name"
@@ -61,6 +61,7 @@ class Numbers:
     counts: tuple[int, ...] = (1,)
     """Valid counts of numbers."""
     required: bool = False
+    """Whether a missing attribute is an error."""
     positive: bool = False
     nonzero: bool = False
     accepts_commas: bool = False
@@ -140,7 +141,7 @@ _NUMBERS = {
 }
 
 
-def content_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
+def content_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
     """Check an element and everything that is read inside it.
 
     Args:
@@ -168,7 +169,7 @@ def content_findings(element: etree._Element, location: SourceLocation) -> Itera
             yield from content_findings(child, location)
 
 
-def _text_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
+def _text_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
     tag = element.tag
     for name in _REQUIRED_TEXT.get(tag, ()):
         value = element.get(name, "")
@@ -189,7 +190,7 @@ def _text_findings(element: etree._Element, location: SourceLocation) -> Iterato
             )
 
 
-def _missing_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
+def _missing_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
     tag = element.tag
     for name, repair in _EXPECTED_CHILDREN.get(tag, {}).items():
         if element.find(name) is None:
@@ -202,7 +203,7 @@ def _missing_findings(element: etree._Element, location: SourceLocation) -> Iter
             )
 
 
-def _geometry_findings(element: etree._Element, location: SourceLocation) -> Iterator[Finding]:
+def _geometry_findings(element: etree._Element, location: UrdfLocation) -> Iterator[Finding]:
     kinds = CHILDREN["geometry"]
     shapes = [child for child in element if isinstance(child.tag, str)]
     if not shapes:
@@ -235,7 +236,7 @@ def _geometry_findings(element: etree._Element, location: SourceLocation) -> Ite
 
 
 def _number_findings(
-    element: etree._Element, numbers: Numbers, location: SourceLocation
+    element: etree._Element, numbers: Numbers, location: UrdfLocation
 ) -> Iterator[Finding]:
     name = numbers.attribute
     text = element.get(name)
@@ -252,7 +253,7 @@ def _number_findings(
     counts = " or ".join(str(count) for count in numbers.counts)
     vector = max(numbers.counts) > 1
     words = text.replace(",", " ").split() if vector else text.split()
-    wrong = [word for word in words if not _is_number(word)]
+    wrong = [w for w in words if not (_DECIMAL.fullmatch(w) and math.isfinite(float(w)))]
     if wrong:
         yield location.finding(
             element,
@@ -304,10 +305,6 @@ def _number_findings(
             f"{shown} flattens the mesh",
             "write factors other than 0",
         )
-
-
-def _is_number(word: str) -> bool:
-    return _DECIMAL.fullmatch(word) is not None and math.isfinite(float(word))
 
 
 def _tags(names: tuple[str, ...]) -> str:

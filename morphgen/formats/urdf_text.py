@@ -17,7 +17,7 @@ from morphgen.formats.rounding import (
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Sphere
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
 
-OWN = "morphgen"
+MORPHGEN_TAG = "morphgen"
 """Tag of the URDF element for data that only morphgen reads."""
 BOUND_MASS = 1e-12
 """Mass that MuJoCo gives a massless link [kg]; it refuses moving bodies without mass."""
@@ -67,31 +67,31 @@ def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     for frame in robot.frames:
         T = frame.T_link_frame
         _write_joint(root, Joint(f"{frame.name}_joint", "fixed", frame.link, frame.name, T))
-    _write_own(root, robot)
+    _write_morphgen_element(root, robot)
     etree.indent(root)
     return etree.tostring(root, encoding="unicode", xml_declaration=False) + "\n"
 
 
-def _write_own(root: etree._Element, robot: Robot) -> None:
+def _write_morphgen_element(root: etree._Element, robot: Robot) -> None:
     if not (robot.home or robot.frames):
         return
-    own = etree.SubElement(root, OWN)
+    element = etree.SubElement(root, MORPHGEN_TAG)
     for row, position in zip(robot.independent_joints, robot.home, strict=True):
         home = {"joint": robot.joints[row].name, "position": format_number(position)}
-        etree.SubElement(own, "home", home)
+        etree.SubElement(element, "home", home)
     for frame in robot.frames:
-        etree.SubElement(own, "frame", name=frame.name)
+        etree.SubElement(element, "frame", name=frame.name)
 
 
 def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     element = etree.SubElement(root, "link", name=link.name)
-    body = link.inertial or Inertial(0.0)
-    inertial = etree.SubElement(element, "inertial")
-    _write_origin(inertial, Pose(body.com))
-    etree.SubElement(inertial, "mass", value=format_number(body.mass))
+    inertial = link.inertial or Inertial(0.0)
+    inertial_element = etree.SubElement(element, "inertial")
+    _write_origin(inertial_element, Pose(inertial.com))
+    etree.SubElement(inertial_element, "mass", value=format_number(inertial.mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    values = {name: format_inertia(v) for name, v in zip(names, body.inertia, strict=True)}
-    etree.SubElement(inertial, "inertia", values)
+    values = {name: format_inertia(v) for name, v in zip(names, inertial.inertia, strict=True)}
+    etree.SubElement(inertial_element, "inertia", values)
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
         for i, shape in enumerate(piece for whole in shapes for piece in urdf_pieces(whole)):
             holder = etree.SubElement(element, kind, name=f"{link.name}_{kind}_{i}")
@@ -127,7 +127,7 @@ def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshU
 
 
 def _write_joint(root: etree._Element, joint: Joint) -> None:
-    kind = "continuous" if joint.kind == "revolute" and joint.limits is None else joint.kind
+    kind = "continuous" if joint.is_continuous else joint.kind
     element = etree.SubElement(root, "joint", name=joint.name, type=kind)
     _write_origin(element, joint.T_parent_joint)
     etree.SubElement(element, "parent", link=joint.parent)

@@ -46,7 +46,7 @@ _UNTRACEABLE = (
     TypeError,
     LookupError,
 )
-"""Exceptions that tracing such a template can raise."""
+"""Exceptions that tracing an untraceable template can raise."""
 
 
 class Traced:
@@ -206,8 +206,8 @@ def trace(
         expansion.engine._global_symbols[name] = Function(name, _lifted(name, function))
     try:
         pieces = _MARK.split(expansion.run_file().decode())
-        same = _translated(pieces[::2], pieces[1::2]).fill(numbers)
-        if same != Expansion({**constants, **numbers}, path, finder).run_file():
+        filled = _translated(pieces[::2], pieces[1::2]).fill(numbers)
+        if filled != Expansion({**constants, **numbers}, path, finder).run_file():
             return None
     except _UNTRACEABLE:
         return None
@@ -215,9 +215,9 @@ def trace(
 
 
 def _translated(texts: Sequence[str], expressions: Sequence[str]) -> CompiledXacro:
-    different = list(dict.fromkeys(expressions))
-    order = tuple(map(different.index, expressions))
-    return CompiledXacro(tuple(texts), tuple(map(Expression, different)), order)
+    distinct = list(dict.fromkeys(expressions))
+    order = tuple(map(distinct.index, expressions))
+    return CompiledXacro(tuple(texts), tuple(map(Expression, distinct)), order)
 
 
 def _lifted(name: str, function: Callable[..., object]) -> Callable[..., object]:
@@ -244,6 +244,7 @@ def _code(operand: object) -> str:
 
 
 def _symbol(name: str) -> str:
+    """Return the name of a parameter in the expressions of a compiled document."""
     return f"p_{name}"
 
 

@@ -57,7 +57,7 @@ def thread_engine() -> Engine:
     engine.substitution_args_context = {}
     engine.verbosity = 0
     engine.node = None
-    for name in _READERS:  # those of the last expansion must not remain
+    for name in _READERS:  # the readers of the last expansion must not remain
         setattr(engine, name, _refuse_access)
     engine.elements = engine.text = 0
     engine._global_symbols = _symbols(engine)
@@ -86,7 +86,10 @@ def _safe_eval(
 
 
 def _shortcut(engine: Engine) -> Callable[[str, Any], object]:
-    """Skip the lexer, a quarter of an expansion's time, for texts without expressions."""
+    """Return ``eval_text`` with a limit on the size of its results.
+
+    It skips the lexer, a quarter of an expansion's time, for texts without expressions.
+    """
     eval_text = engine.eval_text
 
     def evaluated(text: str, symbols: Untyped) -> object:
@@ -103,6 +106,7 @@ def _shortcut(engine: Engine) -> Callable[[str, Any], object]:
 
 
 def _counting(engine: Engine) -> Callable[[Any, Any, Any], None]:
+    """Return ``eval_all`` with a limit on the number of elements; it stores the element."""
     eval_all = engine.eval_all
 
     def counted(node: Untyped, macros: Untyped, symbols: Untyped) -> None:
@@ -118,22 +122,22 @@ def _counting(engine: Engine) -> Callable[[Any, Any, Any], None]:
 def _returning(engine: Engine, function: Callable[..., object]) -> Callable[..., object]:
     """Wrap a function so that ``node`` is its element again after it processed other elements."""
 
-    def called(node: Untyped, *rest: Untyped) -> object:
+    def call_and_restore(node: Untyped, *rest: Untyped) -> object:
         engine.node = node
         result = function(node, *rest)
         engine.node = node
         return result
 
-    return called
+    return call_and_restore
 
 
 def _symbols(engine: Engine) -> dict[str, object]:
     """Return the names that every document may use, with and without a namespace."""
 
     def space(members: Mapping[str, object]) -> object:
-        made = engine.NameSpace()
-        dict.update(made, members)
-        return made
+        names = engine.NameSpace()
+        dict.update(names, members)
+        return names
 
     def fatal(*words: object) -> None:
         raise engine.XacroException(" ".join(map(str, words)))
@@ -148,14 +152,14 @@ def _symbols(engine: Engine) -> dict[str, object]:
         "abs_filename": engine.abs_filename_spec,
         "dotify": _same,
     }
-    own = {
+    calls = {
         **files,
         "arg": lambda name: engine.substitution_args_context["arg"][name],
         "fatal": fatal,
         "tokenize": tokenize,
         **dict.fromkeys(("message", "warning", "error", "print_location"), _record),
     }
-    functions = {name: Function(name, call) for name, call in own.items()}
+    functions = {name: Function(name, call) for name, call in calls.items()}
     return {
         **MATH,
         **BUILTINS,
@@ -167,7 +171,7 @@ def _symbols(engine: Engine) -> dict[str, object]:
 
 
 def _same(dictionary: dict[str, object]) -> dict[str, object]:
-    """Return a dictionary unchanged, as ``xacro.dotify``: dots reach the entries of all of them."""
+    """Return a dictionary unchanged: ``xacro.dotify``, but dots work on every dictionary here."""
     if not isinstance(dictionary, dict):
         raise TypeError("dotify() takes a dictionary")
     return dictionary

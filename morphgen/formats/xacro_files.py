@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape, quoteattr
 import yaml
 
 from morphgen.errors import FormatError
-from morphgen.formats.data_files import read_bytes
+from morphgen.formats.data_files import read_bytes, yaml_problem
 from morphgen.formats.xacro_functions import MAX_SIZE, RefusedError, size_of
 
 MAX_FILE = 16 * 2**20
@@ -115,12 +115,8 @@ def parse_yaml(data: bytes, path: Path, units: Iterable[Untyped]) -> object:
         Loader.add_constructor(f"tag:yaml.org,2002:{tag}", _refuse_tag)
     try:
         content = yaml.load(data, Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        location = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
-        raise FormatError(f"{path}{location}: invalid YAML: {error.problem}") from error
     except yaml.YAMLError as error:
-        raise FormatError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
+        raise FormatError(f"{path}{yaml_problem(error)}") from error
     size_of(content)
     return content
 

@@ -42,7 +42,8 @@ class Function:
     name: str
     call: Callable[..., object]
     applies: bool = False
-    """Whether its first argument is a function; ``call`` then gets a caller of functions first."""
+    """Whether its first argument is a function, as of ``map``; ``call`` then takes, before it, a
+    caller that calls that function within the limits."""
 
     def __str__(self) -> str:
         """Return its name, for messages."""
@@ -58,18 +59,18 @@ def size_of(value: object) -> int:
         RefusedError: If there are more than ``MAX_SIZE``; a value that contains itself has.
     """
     size = 0
-    waiting = [value]
-    while waiting:
-        item = waiting.pop()
+    pending = [value]
+    while pending:
+        item = pending.pop()
         if isinstance(item, str):
             size += len(item)
         elif isinstance(item, list | tuple):
-            waiting.extend(item)
+            pending.extend(item)
         elif isinstance(item, dict):
-            waiting.extend(item)
-            waiting.extend(item.values())
+            pending.extend(item)
+            pending.extend(item.values())
         size += 1
-        if size + len(waiting) > MAX_SIZE:
+        if size + len(pending) > MAX_SIZE:
             raise RefusedError(f"a value has more than {MAX_SIZE} characters and entries")
     return size
 
@@ -89,6 +90,7 @@ def checked(value: object) -> object:
 
 
 def _require(size: float, limit: int, what: str) -> None:
+    """Require that a size is within a limit; ``what`` names it in the error."""
     if size > limit:
         raise RefusedError(f"{what} is beyond {limit}")
 
@@ -186,10 +188,6 @@ def _limited(function: Callable[..., int], limit: int) -> Function:
     return Function(function.__name__, call)
 
 
-def _sorted(items: Iterable[Value], *, reverse: bool = False) -> list[Value]:
-    return sorted(items, reverse=reverse)
-
-
 def _replace(text: str, old: str, new: str, count: int = -1) -> str:
     occurrences = text.count(old)
     times = occurrences if count < 0 else min(count, occurrences)
@@ -262,7 +260,7 @@ _CALLS: Mapping[str, Callable[..., object]] = {
     "range": _range,
     "reversed": _as_list(reversed),
     "round": _round,
-    "sorted": _sorted,
+    "sorted": lambda items, *, reverse=False: sorted(items, reverse=reverse),
     "str": lambda value="": str(value),
     "sum": _sum,
     "tuple": tuple,

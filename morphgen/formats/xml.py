@@ -10,13 +10,13 @@ from lxml import etree
 from morphgen.errors import FormatError
 from morphgen.model.findings import Finding
 
-_PLACE = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
+_LOCATION = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
 _DECLARATION = re.compile(rb"<\?xml\s[^>]*\?>")
 _VERSION = re.compile(rb"""(<\?xml\s+version\s*=\s*["'])([^"'<>]{0,20})(?=["'])""")
 _START_TAG = re.compile(rb"<[A-Za-z_][^\s/>]*")
 _UNDECLARED = re.compile(r"Namespace prefix ([A-Za-z_][\w.-]*) ", re.ASCII)
 _BOM = b"\xef\xbb\xbf"
-_MOST_PREFIXES = 20
+_MAX_PREFIXES = 20
 """Largest number of undeclared prefixes in a document that is read."""
 
 
@@ -39,7 +39,7 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
         root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
         line, column = error.position
-        reason = " ".join(_PLACE.sub("", error.msg or "not XML").split())
+        reason = " ".join(_LOCATION.sub("", error.msg or "not XML").split())
         raise FormatError(f"{origin}:{line}:{column}: {reason}") from error
     if root.getroottree().docinfo.internalDTD is not None:
         raise FormatError(f"{origin}: has a DOCTYPE; a robot description needs none, remove it")
@@ -134,7 +134,7 @@ def _with_sound_declaration(data: bytes, origin: str) -> tuple[bytes, list[Findi
 def _undeclared_prefixes(data: bytes) -> list[str]:
     """Return prefixes without a namespace, in order; none if there are too many."""
     prefixes: list[str] = []
-    while len(prefixes) <= _MOST_PREFIXES:
+    while len(prefixes) <= _MAX_PREFIXES:
         parser = _parser()
         with suppress(etree.XMLSyntaxError):
             etree.fromstring(_with_prefixes(data, prefixes), parser)
@@ -150,15 +150,15 @@ def _undeclared_prefixes(data: bytes) -> list[str]:
 
 def _with_prefixes(data: bytes, prefixes: list[str]) -> bytes:
     """Return the document with prefixes declared in its first start tag."""
-    at = 0
+    position = 0
     while prefixes:
-        at = data.find(b"<", at)
-        tag = _START_TAG.match(data, max(at, 0))
+        position = data.find(b"<", position)
+        tag = _START_TAG.match(data, max(position, 0))
         if tag is not None:
             declared = "".join(f' xmlns:{name}="undeclared:{name}"' for name in prefixes)
             return data[: tag.end()] + declared.encode() + data[tag.end() :]
-        end = data.find(b"-->" if data.startswith(b"<!--", at) else b">", at)
-        if at < 0 or end < 0:
+        end = data.find(b"-->" if data.startswith(b"<!--", position) else b">", position)
+        if position < 0 or end < 0:
             break
-        at = end
+        position = end
     return data

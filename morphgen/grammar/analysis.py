@@ -196,24 +196,24 @@ def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     location = start.location if start else grammar.name
     is_infinite = count_structures(grammar) == math.inf
     roots: set[str] = set()
-    n = 0
+    num_structures = 0
     try:
         structures = enumerate_structures(grammar, library)
         limit = MAX_CHECKED_INFINITE if is_infinite else MAX_CHECKED
         for structure in islice(structures, limit):
-            n += 1
+            num_structures += 1
             if structure.part not in roots:
                 roots.add(structure.part)
                 require_root(load_part(library.manifest(structure.part), part_values(structure)))
     except CompositionError as error:
         yield f"{location}: {error}"
     except SearchError as error:
-        if n == 0:  # otherwise the structures found so far are valid
+        if num_structures == 0:  # otherwise the structures found so far are valid
             yield f"{location}: {error}"
     except GrammarError as error:
         yield str(error)
     else:
-        if n == 0:
+        if num_structures == 0:
             limits = f"{MAX_PARTS} parts and {MAX_PARTS} levels"
             yield f"{location}: found no structure of at most {limits}"
 

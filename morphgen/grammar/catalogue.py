@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from morphgen.grammar.part import Part
 
 FACTS_FILE = Path(__file__).with_name("part_facts.json")
+"""Facts about morphgen's own parts, so that ``catalogue`` need not load them; see ``main``."""
 
 
 def catalogue(library: Library, kind: str | None = None) -> list[dict[str, object]]:
@@ -33,7 +34,7 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
         Rows with name, kind, dof, reach (from the mount to the farthest port or tool, the largest
         over all configurations) [m], mass [kg], source, licence and summary.
     """
-    stored = _stored_facts()
+    stored: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
     rows: list[dict[str, object]] = []
     for manifest in library.manifests(cast(PartKind, kind)):
         facts = stored.get(manifest.name, {})
@@ -85,12 +86,6 @@ def _version(package: str) -> str:
         return "not installed"  # load_part explains what to install
 
 
-@lru_cache(maxsize=1)
-def _stored_facts() -> dict[str, dict[str, Any]]:
-    facts: dict[str, dict[str, Any]] = json.loads(FACTS_FILE.read_text(encoding="utf-8"))
-    return facts
-
-
 def _reach(part: Part) -> float:
     """Return the largest distance from the mount to a port or tool over all configurations [m]."""
     from dataclasses import replace
@@ -113,7 +108,7 @@ def _reach(part: Part) -> float:
 
 
 def main() -> None:
-    """Write ``part_facts.json`` again."""
+    """Compute the facts about morphgen's own parts and write ``part_facts.json``."""
     manifests = sorted(default_library().manifests(), key=lambda manifest: manifest.name)
     entries = [f"{json.dumps(m.name)}: {json.dumps(compute_facts(m))}" for m in manifests]
     FACTS_FILE.write_text("{\n" + ",\n".join(entries) + "\n}\n", encoding="utf-8")

@@ -69,31 +69,32 @@ class RandomChooser:
 
 @dataclass
 class RecordedChooser:
-    """Repeats given choices where they are valid, and records all choices."""
+    """Repeats recorded choices where they are valid, and records all choices made."""
 
     fallback: Chooser
-    """Makes the choices that are not given or not valid."""
-    given: Choices = field(default_factory=dict)
+    """Makes the choices that are not recorded or not valid."""
+    recorded: Choices = field(default_factory=dict)
+    """Choices to repeat."""
     choices: dict[str, float] = field(default_factory=dict)
     """All choices made so far."""
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """Return the given index if it exists."""
-        index = self.given.get(key)
+        """Return the recorded index if it exists."""
+        index = self.recorded.get(key)
         if index is None or index not in range(len(weights)):
             index = self.fallback.alternative(key, weights)
         return int(self._record(key, index))
 
     def count(self, key: str, low: int, high: int) -> int:
-        """Return the given count if it is in range."""
-        count = self.given.get(key)
+        """Return the recorded count if it is in range."""
+        count = self.recorded.get(key)
         if count is None or count not in range(low, high + 1):
             count = self.fallback.count(key, low, high)
         return int(self._record(key, count))
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """Return the given value if the distribution contains it."""
-        value = distribution.closest(self.given[key]) if key in self.given else None
+        """Return the recorded value if the distribution contains it."""
+        value = distribution.closest(self.recorded[key]) if key in self.recorded else None
         if value is None:
             value = self.fallback.value(key, distribution)
         return self._record(key, float(format_number(value)))

@@ -27,10 +27,13 @@ class _Node:
     """A part of an unfinished derivation."""
 
     label: str
+    """Prefix of the part's names in the robot, unique in the derivation."""
     part: str
     values: dict[str, float]
+    """Parameters of the part in SI units."""
     ports: tuple[str, ...]
     children: list[tuple[str, _Node]] = field(default_factory=list)
+    """(port, part attached to it)."""
 
     def derivation(self) -> Derivation:
         children = tuple((port, child.derivation()) for port, child in self.children)

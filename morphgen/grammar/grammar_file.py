@@ -33,11 +33,14 @@ class Grammar:
     """The statements of a grammar file and its includes."""
 
     name: str
+    """Name of the file without its suffix."""
     start: str
     """The symbol that derivations begin with: the first one of the file."""
     productions: tuple[Production, ...]
     lets: tuple[Let, ...] = ()
+    """Named values that are drawn once per robot."""
     wheres: tuple[Expression, ...] = ()
+    """Conditions that every robot meets."""
     digest: str = ""
     """SHA-256 of the texts that the grammar was read from, hexadecimal."""
 
@@ -132,8 +135,11 @@ def grammar_text(grammar: Grammar) -> str:
     ordered = sorted(grammar.productions, key=lambda p: p.symbol != grammar.start)
     lines = [f"let {let.name} = {let.expression}" for let in grammar.lets]
     for production in ordered:
-        alternatives = " | ".join(_alternative_text(a) for a in production.alternatives)
-        lines.append(f"{production.symbol} -> {alternatives}")
+        alternatives = []
+        for alternative in production.alternatives:
+            weight = f"@weight({alternative.weight}) " if alternative.weight else ""
+            alternatives.append(weight + " ".join(map(_item_text, alternative.items)))
+        lines.append(f"{production.symbol} -> {' | '.join(alternatives)}")
     lines += [f"where {condition}" for condition in grammar.wheres]
     text = "".join(f"{line}\n" for line in lines)
     if len(text) > MAX_TEXT:
@@ -141,11 +147,6 @@ def grammar_text(grammar: Grammar) -> str:
             f"{grammar.name}: {len(text):,} characters as one text; expected at most {MAX_TEXT:,}"
         )
     return text
-
-
-def _alternative_text(alternative: Alternative) -> str:
-    weight = f"@weight({alternative.weight}) " if alternative.weight else ""
-    return weight + " ".join(_item_text(item) for item in alternative.items)
 
 
 def _item_text(item: Item) -> str:
@@ -212,6 +213,7 @@ class _Reader:
         self.statements += statements
 
     def _text(self, path: Path) -> str:
+        """Read a file; the size limit applies to it and all files read before."""
         if len(self.texts) == MAX_FILES:
             raise GrammarError(
                 f"{path}: one file too many: a grammar is read from at most {MAX_FILES}"
@@ -232,6 +234,7 @@ class _Reader:
         return text
 
     def _included(self, include: Include, path: Path) -> Path:
+        """Return the file that an include in the file ``path`` names."""
         if not (include.target.endswith(SUFFIX) or "/" in include.target):
             try:
                 return find_grammar(include.target, self._folders)
@@ -239,33 +242,35 @@ class _Reader:
                 raise GrammarError(f"{include.location}: {error}") from error
         target = path.parent / include.target
         try:
-            inside = any(target.resolve().is_relative_to(root) for root in self._roots)
-            is_there = inside and target.is_file()
+            is_allowed = any(target.resolve().is_relative_to(root) for root in self._roots)
+            exists = is_allowed and target.is_file()
         except (OSError, ValueError):  # a name that is invalid for the file system
-            inside, is_there = True, False
-        if not inside:
+            is_allowed, exists = True, False
+        if not is_allowed:
             raise GrammarError(
                 f"{include.location}: include {include.target!r} leads outside of "
                 f"{self._roots[0]}; an include stays in the folder of its grammar or in a "
                 "library (--library DIR)"
             )
-        if not is_there:
+        if not exists:
             raise GrammarError(f"{include.location}: include {include.target!r}: no such file")
         return target
 
 
 def _require_unique(statements: Iterable[Statement]) -> None:
-    seen: dict[tuple[type, str], SourceLocation] = {}
+    """Require that a file defines no symbol and no ``let`` twice."""
+    definitions: dict[tuple[type, str], SourceLocation] = {}
     for statement in statements:
         if isinstance(statement, Production | Let):
             name = statement.symbol if isinstance(statement, Production) else statement.name
             key = (type(statement), name)
-            if key in seen:
+            if key in definitions:
                 raise GrammarError(
-                    f"{statement.location}: {name!r} is already defined at {seen[key]}"
+                    f"{statement.location}: {name!r} is already defined at {definitions[key]}"
                 )
-            seen[key] = statement.location
+            definitions[key] = statement.location
 
 
 def _shipped() -> Path:
+    """Return the folder of the grammars that come with morphgen."""
     return Path(str(files("morphgen.templates"))) / "grammars"

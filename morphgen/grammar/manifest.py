@@ -12,7 +12,7 @@ from msgspec import field
 from msgspec.structs import fields, replace
 
 from morphgen.errors import FormatError, PartError, nearest
-from morphgen.formats.data_files import read_bytes, require_plain_yaml
+from morphgen.formats.data_files import read_bytes, require_plain_yaml, yaml_problem
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.grammar.parameters import MOUNT_YAW, MOUNT_YAW_PARAMETER, Parameter
 
@@ -141,7 +141,7 @@ def read_manifest(path: Path) -> Manifest:
     text, data = _load_yaml(path)
     if isinstance(data, dict):
         data = {key: value for key, value in data.items() if value is not None}
-        keys = {each.encode_name for each in fields(Manifest)} - {"path"} | {"reference"}
+        keys = {entry.encode_name for entry in fields(Manifest)} - {"path"} | {"reference"}
         allowed = keys - (_TEMPLATE_ONLY if "source" in data else _REAL_ONLY)
         for key in data:
             if isinstance(key, str) and key not in allowed:
@@ -164,11 +164,9 @@ def _load_yaml(path: Path) -> tuple[bytes, Any]:
         text = read_bytes(path)
         require_plain_yaml(text, str(path))
         return text, yaml.load(text, Loader=_Loader) or {}
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        location = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
-        raise PartError(f"{path}{location}: invalid YAML: {error.problem}") from error
-    except (yaml.YAMLError, ValueError) as error:
+    except yaml.YAMLError as error:
+        raise PartError(f"{path}{yaml_problem(error)}") from error
+    except ValueError as error:
         raise PartError(f"{path}: invalid YAML: {' '.join(str(error).split())}") from error
     except FormatError as error:
         raise PartError(str(error)) from error
@@ -180,12 +178,12 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     """Safe loader that refuses repeated keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
+        keys: set[str] = set()
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
+            if key.value in keys:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key.value!r} is given twice", key.start_mark
                 )
-            seen.add(key.value)
+            keys.add(key.value)
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping

@@ -122,10 +122,10 @@ def _message(error: UnexpectedInput, text: str, origin: str) -> str:
     names = names or getattr(error, "allowed", None) or ()
     expected = sorted({_TOKEN_NAMES.get(name, name) for name in names})
     if ended:
-        found = "the end"
+        token_text = "the end"
     elif token is not None:
         word = str(token) if len(token) <= MAX_WORD else f"{token[:MAX_WORD]}..."
-        found = "the end of the line" if token.type == "_END" else repr(word)
+        token_text = "the end of the line" if token.type == "_END" else repr(word)
     else:
-        found = repr(text.split("\n")[line - 1][column - 1 : column])
-    return f"{origin}:{line}:{column}: found {found}, expected {' or '.join(expected)}"
+        token_text = repr(text.split("\n")[line - 1][column - 1 : column])
+    return f"{origin}:{line}:{column}: found {token_text}, expected {' or '.join(expected)}"

@@ -41,7 +41,9 @@ class Part:
     T_root_mount: Pose
     """Pose of the mount, the frame that is attached to the parent's port."""
     ports: Mapping[str, Frame]
+    """Frames that other parts can be attached to, by name."""
     tool: Frame | None
+    """Frame at the working point; None for a part without one."""
 
 
 def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> Part:

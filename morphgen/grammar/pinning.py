@@ -67,8 +67,8 @@ def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: 
     def pinned(item: Item) -> Item:
         if item.name != part:
             return item
-        others = tuple(entry for entry in item.arguments if entry[0] != name)
-        return replace(item, arguments=(*others, (name, number)))
+        other_arguments = tuple(entry for entry in item.arguments if entry[0] != name)
+        return replace(item, arguments=(*other_arguments, (name, number)))
 
     def with_items(alternative: Alternative) -> Alternative:
         return replace(alternative, items=tuple(map(pinned, alternative.items)))
@@ -96,11 +96,11 @@ def _pin_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
     if value.isdecimal() and len(value) <= MAX_WORD:
         pinned = _with_count(production, int(value))
     else:
-        kept = tuple(a for a in production.alternatives if a.items[0].name == value)
-        if not kept:
+        alternatives = tuple(a for a in production.alternatives if a.items[0].name == value)
+        if not alternatives:
             valid = [alternative.items[0].name for alternative in production.alternatives]
             raise GrammarError(f"{symbol}={value}: no such alternative{nearest(value, valid)}")
-        pinned = replace(production, alternatives=kept)
+        pinned = replace(production, alternatives=alternatives)
     return _with_productions(grammar, lambda p: pinned if p.symbol == symbol else p)
 
 
@@ -126,4 +126,5 @@ def _with_count(production: Production, count: int) -> Production:
 
 
 def _with_productions(grammar: Grammar, change: Callable[[Production], Production]) -> Grammar:
+    """Return the grammar with every production changed."""
     return replace(grammar, productions=tuple(map(change, grammar.productions)))

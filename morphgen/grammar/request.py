@@ -144,6 +144,7 @@ def default_name(derivation: Derivation, library: Library) -> str:
 
 
 def _parse_slots(words: Sequence[str]) -> dict[str, _Slot]:
+    """Return the parts that ``key=value`` words choose, with their parameters, by key."""
     slots: dict[str, _Slot] = {}
     values: dict[str, str] = {}
     for word in words:
@@ -223,6 +224,7 @@ def _limbs(
 def _node(
     slot: _Slot, manifest: Manifest, children: tuple[tuple[str, Derivation], ...] = ()
 ) -> Derivation:
+    """Return the derivation of a slot's part with its children, defaults filled in."""
     parameters = manifest.parameters if slot.kind == "base" else manifest.attached_parameters
     values = {}
     for name, text in slot.values.items():
@@ -238,8 +240,9 @@ def _node(
     return Derivation(slot.key.replace(".", "_"), manifest.name, tuple(complete.items()), children)
 
 
-def _require_port(manifest: Manifest, port: str, wanted: str) -> None:
+def _require_port(manifest: Manifest, port: str, key: str) -> None:
+    """Require that a part has a port; ``key`` names in the error what is attached to it."""
     if port not in manifest.ports:
         raise CompositionError(
-            f"{wanted}: {manifest.name!r} has no port {port!r}{nearest(port, manifest.ports)}"
+            f"{key}: {manifest.name!r} has no port {port!r}{nearest(port, manifest.ports)}"
         )

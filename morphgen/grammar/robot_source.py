@@ -61,7 +61,11 @@ def find_robots(words: Sequence[str], library: Library) -> list[RobotSource]:
         if request and not is_setting:
             sources.append(_request_source(request))
             request = []
-        if is_setting or (is_single and not is_file and _is_grammar(word, library)):
+        if is_setting or (
+            is_single
+            and not is_file
+            and (word.endswith(GRAMMAR_SUFFIX) or word in known_grammars(library))
+        ):
             request.append(word)
         elif is_file:
             sources += _file_sources(Path(word))
@@ -178,6 +182,7 @@ def robots_in(folder: Path) -> Iterator[Path]:
 
 
 def _file_sources(path: Path) -> list[RobotSource]:
+    """Return the robots of a file or folder."""
     if not path.exists():
         raise FormatError(f"{path}: no such file or folder")
     robots = [path] if path.is_file() else list(robots_in(path))
@@ -191,10 +196,6 @@ def _file_sources(path: Path) -> list[RobotSource]:
 
 def _request_source(words: Sequence[str]) -> RobotSource:
     return RobotSource(" ".join(words), words=tuple(words))
-
-
-def _is_grammar(word: str, library: Library) -> bool:
-    return word.endswith(GRAMMAR_SUFFIX) or word in known_grammars(library)
 
 
 def import_robot(

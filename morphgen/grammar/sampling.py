@@ -193,10 +193,10 @@ def _first_valid(
         if derivation == origin:
             rejected[UNCHANGED] += 1
             continue
-        built = _build_if_valid(derivation, library, conditions, name, chooser.choices)
-        if not isinstance(built, str):
-            return Sample(index, *built, derivation, chooser.choices, dict(rejected))
-        rejected[built] += 1
+        result = _build_if_valid(derivation, library, conditions, name, chooser.choices)
+        if not isinstance(result, str):
+            return Sample(index, *result, derivation, chooser.choices, dict(rejected))
+        rejected[result] += 1
     return rejected
 
 

@@ -45,7 +45,7 @@ def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivat
         GrammarError: If a structure cannot be derived, or ``MAX_SEARCH`` parts give no further
             one (``SearchError``).
     """
-    seen: set[str] = set()
+    digests: set[str] = set()
     is_infinite = count_structures(grammar) == math.inf
     wasted_parts = 0
     # Infinitely many structures are enumerated by size, a pass for each number of parts.
@@ -53,8 +53,8 @@ def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivat
         for derivation in _derivations(grammar, library, max_parts):
             size = max_parts if derivation is None else sum(1 for _ in derivation.walk())
             fits = not is_infinite or size == max_parts
-            if derivation is not None and fits and derivation.digest not in seen:
-                seen.add(derivation.digest)
+            if derivation is not None and fits and derivation.digest not in digests:
+                digests.add(derivation.digest)
                 wasted_parts = 0
                 yield derivation
                 continue
@@ -160,6 +160,7 @@ def _count(alternative: Alternative, counts: Mapping[str, int]) -> int:
 
 
 def _capped(number: int) -> int:
+    """Return a number of structures, at most ``MAX_COUNT + 1``."""
     return min(number, MAX_COUNT + 1)
 
 

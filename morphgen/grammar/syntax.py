@@ -101,6 +101,7 @@ class Alternative:
 
     items: tuple[Item, ...]
     weight: Expression | None = None
+    """Relative probability of the alternative; None for 1."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class Include:
     """An include of another grammar's statements."""
 
     target: str
+    """Name or path of the grammar, as written."""
     location: SourceLocation
 
 
@@ -197,8 +199,8 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
 
     NAME = INT = QUANTITY = _word
 
-    def grammar(self, *given: Statement | None) -> list[Statement]:
-        statements = [statement for statement in given if statement is not None]
+    def grammar(self, *children: Statement | None) -> list[Statement]:
+        statements = [statement for statement in children if statement is not None]
         if len(statements) > MAX_STATEMENTS:
             raise GrammarError(
                 f"{self._origin}: {len(statements):,} statements; expected at most "
@@ -273,8 +275,8 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         return Expression("name", (), self._location(token), str(token))
 
     def call(self, name: Token, *operands: Expression | None) -> Expression:
-        given = tuple(operand for operand in operands if operand is not None)
-        return Expression("call", given, self._location(name), str(name))
+        arguments = tuple(operand for operand in operands if operand is not None)
+        return Expression("call", arguments, self._location(name), str(name))
 
     def unary(self, sign: Token, operand: Expression) -> Expression:
         return operand if sign == "+" else Expression("negative", (operand,), self._location(sign))

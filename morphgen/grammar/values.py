@@ -143,6 +143,7 @@ def distribution_of(expression: Expression, scope: Scope) -> tuple[Distribution,
 
 
 def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
+    """Return the value, which may be infinite or NaN, and the unit of an expression."""
     match expression.operator:
         case "number":
             return _quantity(expression)
@@ -164,6 +165,7 @@ def _evaluate(expression: Expression, scope: Scope) -> tuple[float, str]:
 
 
 def _quantity(expression: Expression) -> tuple[float, str]:
+    """Return a number with a unit in SI units."""
     if not expression.text:
         return expression.value, ""
     if expression.text not in UNITS:
@@ -198,19 +200,19 @@ def _arithmetic(
 
 
 def _require_arguments(distribution: Distribution, expression: Expression) -> None:
-    given, kind = distribution.arguments, distribution.kind
+    arguments, kind = distribution.arguments, distribution.kind
     signature = f"{kind}({DISTRIBUTIONS[kind]})"
     expected = {"choice": None, "normal": 4}.get(kind, 2)
-    if (expected is not None and len(given) != expected) or not given:
+    if (expected is not None and len(arguments) != expected) or not arguments:
         raise _error(expression, f"does not fit {signature}")
     low, high = distribution.bounds
-    if expected is not None and given[-2] > given[-1]:
+    if expected is not None and arguments[-2] > arguments[-1]:
         raise _error(expression, f"low is above high in {signature}", ": ")
     if not math.isfinite(high - low) or (low > 0 and not math.isfinite(high / low)):
         raise _error(expression, f"{low:g} and {high:g} are too far apart", ": ")
     if kind == "loguniform" and low <= 0:
         raise _error(expression, "low must be above zero", ": ")
-    if kind == "normal" and given[1] < 0:
+    if kind == "normal" and arguments[1] < 0:
         raise _error(expression, "the deviation is negative", ": ")
     if kind == "randint" and (low != int(low) or high != int(high)):
         raise _error(expression, "randint needs whole numbers", ": ")

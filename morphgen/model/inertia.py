@@ -158,6 +158,13 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
     return mesh
 
 
+def link_frame_mesh(shape: Shape) -> trimesh.Trimesh:
+    """Return a copy of a shape's triangles in the link frame; open meshes stay open."""
+    geometry = shape.geometry
+    mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
+    return mesh.copy().apply_transform(shape.T_link_shape.matrix)
+
+
 def bounding_box(shapes: Sequence[Shape]) -> Array:
     """Return the axis-aligned bounds of shapes in the link frame, shape (2, 3) [m].
 

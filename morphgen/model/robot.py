@@ -116,6 +116,11 @@ class Joint:
         """Whether the joint is neither fixed nor a mimic joint."""
         return self.kind != "fixed" and self.mimic is None
 
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the joint rotates without limits, whatever its kind in the source."""
+        return self.kind == "continuous" or (self.kind == "revolute" and self.limits is None)
+
     @cached_property
     def unit_axis(self) -> Vec3:
         """The axis, scaled to unit length.
