@@ -69,7 +69,7 @@ def sample(args: argparse.Namespace) -> None:
         report = make_set(config, args.n, work, lambda done: update(min(done, args.n)))
 
     def summary() -> str:
-        lines = [f"{folder}: {report.made} made, {report.kept} were there"]
+        lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]
         rejected = sorted(report.rejected.items(), key=lambda entry: -entry[1])
         lines += [f"  {times} draws rejected: {reason}" for reason, times in rejected]
         lines += [f"  {name} has the same body as {same}" for name, same in report.duplicates]

@@ -204,7 +204,7 @@ def build(args: argparse.Namespace) -> None:
             progress=update,
         )
     data = {"folder": str(report.folder), "made": report.num_written, "kept": report.num_kept}
-    lines = [f"{report.folder}: {report.num_written} robots made, {report.num_kept} were there"]
+    lines = [f"{report.folder}: {report.num_written} robots written, {report.num_kept} already existed"]
     if args.goals:
         write_goals(report.folder, goals, config)
         data["goals"] = len(goals)

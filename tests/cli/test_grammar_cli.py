@@ -40,10 +40,10 @@ def cubes(run):
 
 def test_sample_makes_a_set_and_says_how_many(run, tmp_path):
     code, out, err = run("sample", "cubes", "-n", 3, "--light")
-    assert (code, out, err) == (0, "robots/cubes: 3 made, 0 were there\n", "")
+    assert (code, out, err) == (0, "robots/cubes: 3 robots written, 0 already existed\n", "")
     assert len(list((tmp_path / "robots" / "cubes").glob("cubes-*"))) == 3
     code, out, _ = run("sample", "cubes", "-n", 4, "--light")
-    assert (code, out) == (0, "robots/cubes: 1 made, 3 were there\n")
+    assert (code, out) == (0, "robots/cubes: 1 robots written, 3 already existed\n")
 
 
 def test_sample_reads_a_grammar_file(run, mine):

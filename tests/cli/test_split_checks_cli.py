@@ -115,7 +115,7 @@ def test_a_build_says_where_it_is_and_verifies(run, write):
     code, out, err = run("split", "build", path, "--light")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
-        "data/mine/some: 4 robots made, 0 were there",
+        "data/mine/some: 4 robots written, 0 already existed",
         "verify it anywhere: morphgen split verify data/mine/some",
     ]
     first = tree(Path("data"))
@@ -253,7 +253,7 @@ def build_with_goals(run, path, out="data", *more):
 def test_a_build_ships_goals_that_verify_and_pass_the_audit(run, write, tmp_path):
     path = write(reaching())
     assert build_with_goals(run, path) == [
-        "data/mine/some: 4 robots made, 0 were there",
+        "data/mine/some: 4 robots written, 0 already existed",
         "4 goal sets, seed 0",
         "verify it anywhere: morphgen split verify data/mine/some",
     ]
