@@ -203,8 +203,9 @@ def build(args: argparse.Namespace) -> None:
             settings=BuildSettings(light=args.light, picture=args.picture),
             progress=update,
         )
-    data = {"folder": str(report.folder), "made": report.num_written, "kept": report.num_kept}
-    lines = [f"{report.folder}: {report.num_written} robots written, {report.num_kept} already existed"]
+    written, kept = report.num_written, report.num_kept
+    data = {"folder": str(report.folder), "made": written, "kept": kept}
+    lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
     if args.goals:
         write_goals(report.folder, goals, config)
         data["goals"] = len(goals)
