@@ -1,4 +1,4 @@
-"""``import morphgen`` is enough, and costs nothing until it is used."""
+"""``import morphgen`` gives the public API and loads packages only when used."""
 
 import doctest
 import subprocess
@@ -32,7 +32,7 @@ def test_parts_may_be_keywords_or_joined_by_dashes(request_text, words):
     assert (robot.name, robot.links, robot.joints) == (same.name, same.links, same.joints)
 
 
-def test_the_package_shows_what_is_public():
+def test_dir_lists_the_public_names():
     assert dir(morphgen) == sorted(morphgen.__all__)
     assert {"Robot", "MorphgenError", "__version__", "compose", "tasks"} <= set(dir(morphgen))
     assert all(getattr(morphgen, name) is not None for name in dir(morphgen))
@@ -50,19 +50,19 @@ def test_a_robot_prints_as_one_line():
 
 
 @pytest.mark.parametrize("name", ["compose", "sample", "read", "write"])
-def test_the_examples_of_the_documentation_work(name, tmp_path, monkeypatch):
+def test_documentation_examples_work(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder().find(getattr(morphgen, name), name, globs={})
     example.globs["morphgen"] = morphgen
     assert doctest.DocTestRunner().run(example).failed == 0
 
 
-def test_a_mistake_is_one_clear_error():
+def test_invalid_arguments_give_one_clear_error():
     with pytest.raises(MorphgenError, match="did you mean 'lwr'"):
         morphgen.compose("arm=lwrr")
 
 
-def test_importing_it_loads_no_heavy_package():
+def test_importing_morphgen_loads_no_heavy_package():
     heavy = {"numpy", "torch", "trimesh", "pybullet", "mujoco", "yourdfpy", "scipy"}
     code = f"import sys, morphgen; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""The house stands as designed: imports go down only, and help is quick."""
+"""Import order, module size and import cost of the packages."""
 
 import ast
 import os
@@ -84,7 +84,7 @@ def test_imports_go_down_only(path):
             assert package_of(module) in allowed, f"{name_of(path)} imports {module}"
 
 
-def test_no_modules_import_each_other():
+def test_imports_have_no_cycles():
     graph = {
         name: {module for module in imports(path) if module in NAMES and module != name}
         for name, path in NAMES.items()
@@ -97,7 +97,7 @@ def test_no_modules_import_each_other():
 
 
 @pytest.mark.parametrize("folder", ["morphgen", "viewer", "tasks", "rl", "benchmarks", "docs"])
-def test_nobody_imports_the_front_door(folder):
+def test_no_module_imports_the_top_level_package(folder):
     modules = (PACKAGE.parent / folder).rglob("*.py")
     outside = [
         path
@@ -108,7 +108,7 @@ def test_nobody_imports_the_front_door(folder):
     assert guilty == []
 
 
-def test_every_package_has_its_place():
+def test_every_package_has_a_layer():
     others = {"templates", "robots_real", "__main__"}  # data, and the way into the CLI
     assert {package_of(name) for name in NAMES} - {""} == set(PACKAGES) | others
 
@@ -128,7 +128,7 @@ def modules_after(statement):
 
 
 @pytest.mark.parametrize("statement", ["import morphgen", "import morphgen.cli"])
-def test_the_front_door_loads_nothing_heavy(statement):
+def test_top_level_import_loads_no_heavy_package(statement):
     loaded = modules_after(statement)
     assert "morphgen" in loaded
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "numpy", "scipy", "lxml", "yaml"})
@@ -144,7 +144,7 @@ def test_importing_the_checks_loads_no_simulator():
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "fcl", "igl", "lxml", "scipy"})
 
 
-def test_processes_of_pybullet_load_little_else():
+def test_pybullet_processes_load_few_packages():
     loaded = modules_after("import morphgen.tasks.sim.bullet_workers")
     assert "pybullet" in loaded
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "scipy", "lxml"} - {"pybullet"})
@@ -160,7 +160,7 @@ def test_processes_of_pybullet_load_little_else():
         "tasks.env_specs",
     ],
 )
-def test_splits_and_goals_wait_for_no_torch(module):
+def test_splits_and_goals_do_not_import_torch(module):
     assert "torch" not in modules_after(f"import morphgen.{module}")
 
 
@@ -199,7 +199,7 @@ def run_without_extras(folder, *words):
     ],
     ids=" ".join,
 )
-def test_the_core_needs_no_extra(words, tmp_path):
+def test_core_works_without_optional_extras(words, tmp_path):
     done = run_without_extras(tmp_path, *words)
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -213,7 +213,7 @@ def test_the_core_needs_no_extra(words, tmp_path):
         (("view",), "viewer"),
     ],
 )
-def test_a_missing_extra_is_one_line_that_says_how_to_install_it(words, extra, tmp_path):
+def test_missing_extra_error_says_how_to_install_it(words, extra, tmp_path):
     done = run_without_extras(tmp_path, *words)
     assert (done.returncode, done.stdout) == (2, "")
     assert f"pip install 'morphgen[{extra}]'" in done.stderr

@@ -1,4 +1,4 @@
-"""The pages say what the code does."""
+"""The documentation pages match the code."""
 
 import re
 from pathlib import Path
@@ -22,14 +22,14 @@ def codes_in_source():
     return found
 
 
-def test_every_code_of_a_finding_is_on_the_page():
+def test_every_finding_code_is_documented():
     page = (ROOT / "docs" / "checks.md").read_text(encoding="utf-8")
     codes = codes_in_source()
     assert len(codes) > 30
     assert {code for code in codes if f"`{code}`" not in page} == set()
 
 
-def test_the_readme_counts_the_parts_right():
+def test_readme_part_counts_are_correct():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     arms, ees = re.search(r"(\d+) arms and (\d+) end-effectors", text).groups()
     library = default_library()
@@ -42,14 +42,14 @@ def indented(text):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_between_pages_lead_somewhere(page):
+def test_links_between_pages_are_valid(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
         if not target.startswith("https://"):
             assert (page.parent / target).exists(), target
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_command_on_a_page_exists(page):
+def test_every_documented_command_exists(page):
     commands = build_parser()._subparsers._group_actions[0].choices
     text = page.read_text(encoding="utf-8")
     blocks = "\n".join([*re.findall(r"```\w*\n(.*?)```", text, re.DOTALL), indented(text)])
@@ -57,7 +57,7 @@ def test_every_command_on_a_page_exists(page):
         assert command in commands
 
 
-def test_the_readmes_example_runs(tmp_path, monkeypatch):
+def test_readme_example_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL

@@ -1,4 +1,4 @@
-"""Examples run, and a task that is outside of morphgen does all that its own tasks do."""
+"""The examples run; an external task supports everything that the built-in tasks do."""
 
 import importlib.util
 import sys
@@ -33,7 +33,7 @@ def follow(monkeypatch, tmp_path):
     spec.loader.exec_module(module)
 
 
-def test_a_task_outside_of_the_package_trains_plays_and_is_shown(follow, tmp_path, capsys):
+def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys):
     assert len(CUSTOM_TASK.read_text(encoding="utf-8").splitlines()) < 150
     few = ("--steps", "512", "--envs", "4", "--set", "minibatches=4", "--no-tensorboard")
     robot, sim = "planar-cube", ("--sim", "mujoco")

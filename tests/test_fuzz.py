@@ -1,6 +1,6 @@
-"""Whatever a file holds: no traceback, no hang, no more than a gigabyte, and one line if refused.
+"""Arbitrary file contents cause no traceback, no hang and no memory use above one gigabyte.
 
-The examples are the same in every run.
+Rejected files give a one-line message. The generated examples are the same in every run.
 """
 
 from pathlib import Path

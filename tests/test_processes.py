@@ -1,4 +1,4 @@
-"""Work in several processes is the same as in one."""
+"""Results of parallel work equal those of serial work."""
 
 import os
 from functools import partial
@@ -24,19 +24,19 @@ def test_results_come_in_order(jobs, n):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_of_the_work_is_raised(jobs):
+def test_worker_error_is_raised(jobs):
     results = parallel_map(fail, range(40), jobs)
     assert [next(results) for _ in range(2 * CHUNK_SIZE)] == list(range(2 * CHUNK_SIZE))
     with pytest.raises(BenchmarkError, match="20 is wrong"):
         list(results)
 
 
-def test_a_process_that_dies_is_reported():
+def test_dead_process_is_reported():
     with pytest.raises(MorphgenError, match=r"a worker died.*finished results are kept: run again"):
         list(parallel_map(die, range(20), 2))
 
 
 @pytest.mark.parametrize("jobs", [0, -1])
-def test_there_is_a_job_at_least(jobs):
+def test_number_of_jobs_is_at_least_one(jobs):
     with pytest.raises(MorphgenError, match=f"{jobs} jobs: expected 1 or more"):
         list(parallel_map(fail, [1], jobs))

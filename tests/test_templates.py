@@ -1,4 +1,4 @@
-"""Every template is sound over its whole range, and chains make the benchmark's categories."""
+"""Every template is valid over its whole range; chains match the benchmark's categories."""
 
 from collections.abc import Iterator, Mapping
 
@@ -23,7 +23,7 @@ Range = tuple[float, float]
 Step = tuple[str, Mapping[str, float | Range]]
 
 
-def test_there_are_templates_of_every_kind():
+def test_templates_of_every_kind_exist():
     assert {manifest.kind for manifest in TEMPLATES} == {"base", "arm", "ee", "segment", "body"}
 
 
@@ -49,13 +49,13 @@ RANGES = [pytest.param(manifest, id=manifest.name) for manifest in TEMPLATES]
 
 
 @pytest.mark.parametrize("manifest", RANGES)
-def test_a_template_is_sound_at_the_ends_of_its_ranges(manifest):
+def test_template_is_valid_at_the_ends_of_its_ranges(manifest):
     for values in extremes(manifest):
         assert troubles(load_part(manifest, values).fragment, tool_required=False) == [], values
 
 
 @pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
-def test_masses_of_a_template_follow_from_its_shapes(manifest):
+def test_template_masses_match_its_shapes(manifest):
     if manifest.name == "cartpole":
         pytest.skip("its pole has a mass of its own, see below")
     for link in load_part(manifest).fragment.links:
@@ -65,7 +65,7 @@ def test_masses_of_a_template_follow_from_its_shapes(manifest):
 
 
 @pytest.mark.parametrize("values", [{}, {"length": 0.5, "mass": 1.5}, {"length": 1.5}])
-def test_the_pole_of_a_cartpole_has_the_inertia_of_its_shapes(values):
+def test_cartpole_pole_inertia_matches_its_shapes(values):
     pole = load_part(LIBRARY.manifest("cartpole"), values).fragment.link("pole")
     assert pole.inertial.mass == values.get("mass", 1)
     solid = inertial_from_density(
@@ -77,7 +77,7 @@ def test_the_pole_of_a_cartpole_has_the_inertia_of_its_shapes(values):
 
 @pytest.mark.parametrize("fingers", [2, 3, 4, 5])
 @pytest.mark.parametrize("gather", [0.0, 1.0])
-def test_fingers_of_a_hand_leave_room_for_each_other(fingers, gather):
+def test_hand_fingers_do_not_collide(fingers, gather):
     part = load_part(LIBRARY.manifest("hand"), {"fingers": fingers, "gather": gather})
     names = [link.name for link in part.fragment.links if link.name.endswith("proximal")]
     assert len(names) == fingers
@@ -88,7 +88,7 @@ def test_fingers_of_a_hand_leave_room_for_each_other(fingers, gather):
     assert cosines.max() == pytest.approx(np.cos(widest))
 
 
-def test_fingers_of_a_hand_curl_towards_the_tool():
+def test_hand_fingers_curl_towards_the_tool():
     body = load_part(LIBRARY.manifest("hand")).fragment
     open_hand, fist = forward_kinematics(body, [np.zeros(body.dof), np.full(body.dof, 0.5)])
     tips = [i for i, link in enumerate(body.links) if link.name.endswith("distal")]
@@ -221,7 +221,7 @@ def derivation(steps: list[Step], u: np.random.Generator | float) -> Derivation:
 
 
 @pytest.mark.parametrize("name", CATEGORIES)
-def test_a_category_has_the_links_and_joints_of_the_benchmark_and_is_sound(name):
+def test_category_matches_the_benchmark_and_is_valid(name):
     steps, counts = CATEGORIES[name]
     rng = np.random.default_rng(0)
     for u in (0.0, 0.5, 1.0, rng, rng, rng):
@@ -232,7 +232,7 @@ def test_a_category_has_the_links_and_joints_of_the_benchmark_and_is_sound(name)
 
 @pytest.mark.parametrize("name", CATEGORIES)
 @pytest.mark.parametrize("u", [0.0, 1.0])
-def test_joints_can_hold_twice_what_hangs_on_them(name, u):
+def test_joint_efforts_are_at_least_twice_the_gravity_load(name, u):
     robot = join(derivation(CATEGORIES[name][0], u), LIBRARY, "robot")
     load = gravity_load(robot, random_configurations(robot, 200, np.random.default_rng(0)))
     effort = np.array([robot.joints[k].effort for k in robot.independent_joints])

@@ -1,4 +1,4 @@
-"""Every test of the command line runs in a folder of its own."""
+"""Each command-line test runs in its own temporary folder."""
 
 from dataclasses import replace
 

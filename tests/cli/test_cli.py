@@ -1,4 +1,4 @@
-"""What every command writes and prints, the same bytes each time."""
+"""Output and files of the basic commands; repeated commands write identical bytes."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ from morphgen.grammar.library import LIBRARY_VARIABLE
 COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
 
 
-def test_compose_writes_a_bundle_and_says_what_it_is(run, tmp_path):
+def test_compose_writes_a_bundle_and_prints_its_summary(run, tmp_path):
     code, out, err = run("compose", "base=gantry", "ee=plane", "--out", "robots")
     assert (code, err) == (0, "")
     first, *files = out.splitlines()
@@ -50,7 +50,7 @@ def test_compose_prints_the_card_as_json_and_nothing_else():
     assert data["card"] == json.loads(Path("robots/gantry-plane/card.json").read_text())
 
 
-def test_list_prints_a_row_a_part(run):
+def test_list_prints_one_row_per_part(run):
     code, out, err = run("list", "bases")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines()[2:]]
@@ -79,7 +79,7 @@ def test_show_prints_the_frames_of_a_bundle_as_json(run, tmp_path):
     assert {joint["name"]: joint["mimic"] for joint in data["joints"]}["right"] == "left"
 
 
-def test_check_is_silent_about_a_sound_bundle(run, tmp_path):
+def test_check_reports_no_findings_for_a_valid_bundle(run, tmp_path):
     folder = write_bundle(valid_robot(), tmp_path / "sound", picture=False)
     assert run("check", folder, "--strict") == (0, f"{folder}: 0 error, 0 warning, 0 info\n", "")
 
@@ -92,12 +92,12 @@ def test_check_is_silent_about_a_sound_bundle(run, tmp_path):
         ({"damping": 0.1}, (0, 0)),
     ],
 )
-def test_check_fails_for_errors_and_if_strict_for_warnings(run, robot_urdf, change, codes):
+def test_check_exits_1_for_errors_and_with_strict_for_warnings(run, robot_urdf, change, codes):
     path = robot_urdf(with_joint(valid_robot(), "elbow", **change))
     assert (run("check", path)[0], run("check", path, "--strict")[0]) == codes
 
 
-def test_check_says_what_is_wrong_where_and_how_to_mend_it(run, robot_urdf):
+def test_check_prints_code_location_and_fix_of_a_finding(run, robot_urdf):
     path = robot_urdf(with_joint(valid_robot(), "elbow", limits=(1.0, -1.0)))
     _, out, _ = run("check", path)
     _, finding, remedy = out.splitlines()
@@ -132,7 +132,7 @@ def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
     assert "axis-not-unit" in run("check", path)[1]
 
 
-def test_import_makes_a_bundle_of_any_urdf(run, robot_urdf, tmp_path):
+def test_import_converts_a_urdf_to_a_bundle(run, robot_urdf, tmp_path):
     path = robot_urdf(arm())
     code, out, err = run(
         "import", path, "--root-link", "upper", "--tool", "slider", "--out", "robots"
@@ -147,7 +147,7 @@ def test_import_makes_a_bundle_of_any_urdf(run, robot_urdf, tmp_path):
     assert json.loads(out)["card"]["source"] == "some_robot.urdf"
 
 
-def test_import_passes_arguments_to_xacro_and_tells_its_repairs(run, tmp_path):
+def test_import_passes_arguments_to_xacro_and_prints_repairs(run, tmp_path):
     path = tmp_path / "pincer.xacro"
     path.write_text(PINCER.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 2 0"/>'))
     words = ("import", path, "--arg", "length=0.4", "--no-picture", "--out", "o")
@@ -192,7 +192,7 @@ def test_conform_prints_json_and_nothing_else(tmp_path):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself(capsys, command):
+def test_every_command_has_help(capsys, command):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
     assert stop.value.code == 0
@@ -207,7 +207,7 @@ def test_help_names_every_command(capsys):
     assert all(f"    {command} " in listed for command in COMMANDS)
 
 
-def test_no_command_is_no_success(run):
+def test_without_a_command_usage_is_printed_and_exit_code_is_2(run):
     code, out, _ = run()
     assert code == 2
     assert out.startswith("usage: morphgen")
@@ -217,7 +217,7 @@ def test_version(run):
     assert run("--version") == (0, "morphgen 0.1.0\n", "")
 
 
-def test_ones_own_library_is_used(run, tmp_path, monkeypatch):
+def test_user_library_is_used(run, tmp_path, monkeypatch):
     write_part(tmp_path / "own")
     words = ("compose", "base=gantry", "ee=pincer", "ee.length=30cm", "--no-picture", "--out", "o")
     assert run(*words, "--library", "own", "--name", "a")[0] == 0
@@ -244,14 +244,14 @@ def test_two_processes_write_the_same_bytes(tmp_path):
     assert {path.name for path in folder.iterdir()} == {*names.split()}
 
 
-def test_a_reader_that_leaves_early_is_no_error():
+def test_closed_stdout_causes_no_error_message():
     process = start("--version", PYTHONUNBUFFERED="")
     process.stdout.close()
     assert process.wait() == 1
     assert process.stderr.read() == ""
 
 
-def test_an_unforeseen_fault_is_not_hidden(monkeypatch):
+def test_internal_errors_keep_their_traceback(monkeypatch):
     """Only what a user can cause is one line; a fault of the program keeps its traceback."""
 
     def fail(*_):

@@ -1,4 +1,4 @@
-"""``morphgen fit``: what it prints, what it writes, and what it refuses."""
+"""``morphgen fit``: output, written files and rejected input."""
 
 import json
 from dataclasses import replace
@@ -104,7 +104,7 @@ def assert_same_inertials(made, source):
         )
 
 
-def test_a_mesh_gives_a_table_and_the_primitive(run, box, tmp_path):
+def test_mesh_fit_prints_a_table_and_the_primitive(run, box, tmp_path):
     before = tree(tmp_path)
     code, out, err = run("fit", box)
     assert (code, err) == (0, "")
@@ -118,7 +118,7 @@ def test_a_mesh_gives_a_table_and_the_primitive(run, box, tmp_path):
     assert tree(tmp_path) == before
 
 
-def test_a_mesh_as_json_is_data_in_metres(run, box):
+def test_mesh_fit_as_json_is_in_metres(run, box):
     code, out, err = run("fit", box, "--json", "--seed", "3")
     assert (code, err) == (0, "")
     data = json.loads(out)
@@ -135,7 +135,7 @@ def test_a_mesh_as_json_is_data_in_metres(run, box):
 
 
 @pytest.mark.slow
-def test_more_primitives_are_fitted_where_one_does_not_do(run, angle):
+def test_more_primitives_are_fitted_until_the_iou_is_reached(run, angle):
     code, out, err = run("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json")
     assert (code, err) == (0, "")
     data = json.loads(out)
@@ -147,7 +147,7 @@ def test_more_primitives_are_fitted_where_one_does_not_do(run, angle):
     assert len(json.loads(out)["primitives"]) == 1
 
 
-def test_primitives_that_enclose_hold_every_corner(run, angle):
+def test_enclosing_primitives_cover_the_whole_mesh(run, angle):
     code, out, err = run("fit", angle, "--enclose", "--json")
     assert (code, err) == (0, "")
     data = json.loads(out)
@@ -157,7 +157,7 @@ def test_primitives_that_enclose_hold_every_corner(run, angle):
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "STL"])
-def test_every_format_of_meshes_is_read(run, tmp_path, suffix):
+def test_every_mesh_format_is_read(run, tmp_path, suffix):
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / f"link.{suffix}")
     code, out, err = run("fit", f"link.{suffix}", "--json", "--enclose")
     assert (code, err) == (0, "")
@@ -165,7 +165,7 @@ def test_every_format_of_meshes_is_read(run, tmp_path, suffix):
     np.testing.assert_allclose(sorted(found["box"]), (0.1, 0.2, 0.3), atol=1e-5)
 
 
-def test_a_part_of_primitives_keeps_them(run):
+def test_part_made_of_primitives_keeps_them(run):
     code, out, err = run("fit", "plane")
     assert (code, err) == (0, "")
     _, _, plate, mean = out.splitlines()
@@ -180,14 +180,14 @@ def test_a_part_of_primitives_keeps_them(run):
     assert data["findings"] == []
 
 
-def test_a_part_s_bundle_may_have_the_name_of_the_part(run, tmp_path):
+def test_bundle_may_have_the_name_of_its_part(run, tmp_path):
     code, out, err = run("fit", "plane", "--out", "plane", "--no-picture")
     assert (code, err) == (0, "")
     assert out.splitlines()[-1] == "plane"
     assert run("check", "plane")[0] == 0
 
 
-def test_a_users_part_is_found_in_the_library_that_is_named(run, tmp_path):
+def test_user_part_is_found_in_the_given_library(run, tmp_path):
     write_part(tmp_path / "mine")
     code, out, err = run("fit", "pincer", "--library", "mine", "--json")
     assert (code, err) == (0, "")
@@ -196,7 +196,7 @@ def test_a_users_part_is_found_in_the_library_that_is_named(run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_real_part_is_written_without_collision_meshes(run, tmp_path):
+def test_fitted_part_has_no_collision_meshes(run, tmp_path):
     """The Fetch's gripper: a palm and two fingers that are each other's copies."""
     words = ("fit", "fetch_gripper", "--out", "made/gripper", "--no-picture", "--json")
     code, out, err = run(*words, "--configurations", "50")
@@ -251,7 +251,7 @@ def test_a_bundle_is_fitted_link_by_link(run, meshed, tmp_path):
 
 
 @pytest.mark.slow
-def test_visuals_are_replaced_where_asked_and_keep_their_colour(run, meshed, tmp_path):
+def test_visual_option_replaces_visuals_and_keeps_their_colour(run, meshed, tmp_path):
     words = ("fit", meshed, "--visual", "--out", "made", "--no-picture", "--configurations", "1")
     assert run(*words)[0] == 0
     assert meshes_of(tmp_path / "made", "visual") == []
@@ -279,7 +279,7 @@ def urdf_of(folder, *files):
     return "robot.urdf"
 
 
-def test_the_same_words_write_the_same_bytes(run, box, tmp_path):
+def test_repeated_fit_writes_the_same_bytes(run, box, tmp_path):
     urdf = urdf_of(tmp_path, box)
     words = ("--no-picture", "--configurations", "1")
     assert run("fit", urdf, "--out", "a/robot", *words)[0] == 0
@@ -287,7 +287,7 @@ def test_the_same_words_write_the_same_bytes(run, box, tmp_path):
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
-def test_a_bundle_that_is_there_is_replaced(run, tmp_path):
+def test_existing_bundle_is_replaced(run, tmp_path):
     words = ("--out", "made", "--no-picture", "--configurations", "1")
     assert run("fit", "plane", *words)[0] == 0
     assert run("fit", "cylinder", *words)[0] == 0
@@ -296,7 +296,7 @@ def test_a_bundle_that_is_there_is_replaced(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
-def test_a_picture_is_drawn_unless_it_is_unwanted(run, tmp_path):
+def test_picture_is_written_by_default(run, tmp_path):
     assert run("fit", "plane", "--out", "made", "--configurations", "1")[0] == 0
     assert (tmp_path / "made" / "preview.png").is_file()
 
@@ -313,7 +313,7 @@ def flat(path):
 
 
 @pytest.mark.parametrize("output", [(), ("--json",)])
-def test_a_link_that_is_flat_is_told_and_the_others_are_fitted(run, box, tmp_path, output):
+def test_flat_link_is_reported_and_the_others_are_fitted(run, box, tmp_path, output):
     urdf = urdf_of(tmp_path, box, flat(tmp_path / "leaf.obj"))
     code, out, err = run("fit", urdf, *output)
     assert (code, err) == (0, "")
@@ -341,12 +341,12 @@ MESHES = {
 
 
 @pytest.mark.parametrize("name", list(MESHES))
-def test_a_mesh_that_is_none_is_refused_by_name(refused, tmp_path, name):
+def test_invalid_mesh_is_rejected_with_its_file_name(refused, tmp_path, name):
     (tmp_path / name).write_bytes(MESHES[name])
     assert name in refused("fit", name)
 
 
-def test_a_binary_stl_of_nans_is_refused_by_name(refused, tmp_path):
+def test_binary_stl_with_nan_is_rejected_with_its_file_name(refused, tmp_path):
     mesh = trimesh.creation.box((1, 1, 1))
     data = bytearray(mesh.export(file_type="stl"))
     data[84 + 12 : 84 + 16] = np.float32(np.nan).tobytes()
@@ -384,24 +384,24 @@ def test_a_binary_stl_of_nans_is_refused_by_name(refused, tmp_path):
         ("plane --out made/.hidden", "name '.hidden': use letters"),
     ],
 )
-def test_a_wrong_request_is_refused(refused, words, message):
+def test_invalid_arguments_are_rejected(refused, words, message):
     assert message in refused("fit", *words.split())
 
 
-def test_a_folder_of_a_parts_name_does_not_hide_the_part(run, tmp_path):
+def test_folder_named_like_a_part_does_not_hide_the_part(run, tmp_path):
     (tmp_path / "plane").mkdir()
     code, out, _ = run("fit", "plane", "--json")
     assert (code, [link["link"] for link in json.loads(out)["links"]]) == (0, ["plate"])
 
 
-def test_a_mesh_is_not_written_as_a_robot(refused, box):
+def test_mesh_fit_does_not_accept_out(refused, box):
     message = refused("fit", box, "--out", "made")
     assert "link.stl is a mesh" in message
     assert "--out" in message
 
 
 @pytest.mark.parametrize("source", ["plane", "robot"])
-def test_a_folder_that_is_no_bundle_is_never_replaced_nor_anything_fitted(
+def test_folder_that_is_not_a_bundle_is_rejected_before_fitting(
     refused, robot_urdf, tmp_path, source
 ):
     (tmp_path / "made").mkdir()
@@ -412,23 +412,23 @@ def test_a_folder_that_is_no_bundle_is_never_replaced_nor_anything_fitted(
 
 
 @pytest.mark.parametrize("named", ["source", "source/", "./source", "source/robot.urdf"])
-def test_a_bundle_is_not_replaced_by_its_own_fit(refused, meshed, named):
+def test_bundle_is_not_overwritten_by_its_own_fit(refused, meshed, named):
     assert "is the robot itself" in refused("fit", named, "--out", "source", "--no-picture")
 
 
-def test_a_robot_without_shapes_is_refused(refused, tmp_path):
+def test_robot_without_shapes_is_rejected(refused, tmp_path):
     (tmp_path / "bare.urdf").write_text('<robot name="r"><link name="a"/></robot>')
     assert "bare.urdf: no link has a shape" in refused("fit", "bare.urdf")
 
 
-def test_a_robot_with_a_mesh_that_is_none_is_refused_by_name(refused, tmp_path):
+def test_robot_with_an_invalid_mesh_is_rejected_with_the_file_name(refused, tmp_path):
     (tmp_path / "empty.stl").write_bytes(b"")
     shape = '<visual><geometry><mesh filename="empty.stl"/></geometry></visual>'
     (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="a">{shape}</link></robot>')
     assert "empty.stl" in refused("fit", "r.urdf", "--out", "made")
 
 
-def test_an_error_is_json_for_who_asks_for_it(run, tmp_path):
+def test_errors_are_printed_as_json_with_the_json_option(run, tmp_path):
     (tmp_path / "flat.obj").write_bytes(MESHES["flat.obj"])
     code, out, err = run("fit", "flat.obj", "--json")
     assert code == 2
@@ -437,7 +437,7 @@ def test_an_error_is_json_for_who_asks_for_it(run, tmp_path):
 
 
 @pytest.mark.parametrize("step", ["urdf_text", "card_text"])
-def test_an_interrupted_fit_leaves_no_half_bundle(run, tmp_path, monkeypatch, step):
+def test_interrupted_fit_leaves_no_partial_bundle(run, tmp_path, monkeypatch, step):
     def interrupt(*_):
         raise KeyboardInterrupt
 

@@ -1,4 +1,4 @@
-"""``morphgen goals``: what it prints, what fails, and what it refuses."""
+"""``morphgen goals``: output, failures and rejected input."""
 
 import json
 import signal
@@ -37,7 +37,7 @@ def cells(line):
     return [cell for cell in line.split("  ") if cell]
 
 
-def test_a_row_a_robot_says_what_its_goals_are(run, path, cache):
+def test_table_has_one_row_per_goal_set(run, path, cache):
     code, out, err = run("goals", path)
     assert (code, err) == (0, "")
     head, _, *rows, last = out.splitlines()
@@ -60,13 +60,13 @@ def test_a_row_a_robot_says_what_its_goals_are(run, path, cache):
     assert len(list((cache / "goals-4").iterdir())) == 3
 
 
-def test_certificates_are_asked_for(run, path):
+def test_certify_option_adds_certificates(run, path):
     code, out, _ = run("goals", path, "--certify")
     assert code == 0
     assert [line.split()[-1] for line in out.splitlines()[2:-1]] == ["yes"] * 3
 
 
-def test_goals_are_json_alone(run, path):
+def test_json_option_prints_only_json(run, path):
     code, out, err = run("goals", path, "--json", "--seed", 3, "--certify")
     assert (code, err) == (0, "")
     data = json.loads(out)
@@ -80,7 +80,7 @@ def test_goals_are_json_alone(run, path):
     ] * 3
 
 
-def test_a_robot_that_fails_does_not_stop_the_others(run, tmp_path, monkeypatch):
+def test_robot_without_enough_goals_does_not_stop_the_others(run, tmp_path, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 1)
     fine = [member(words, task="reach") for words in (TRAIN[0], TRAIN[1])]
     few = member("arm=arm3 ee=claw", task="reach")
@@ -98,7 +98,7 @@ def test_a_robot_that_fails_does_not_stop_the_others(run, tmp_path, monkeypatch)
     assert [(one["robot"], one["side"]) for one in data["failures"]] == [("arm3-claw", "train")]
 
 
-def test_a_goal_that_is_not_proven_fails(run, path, monkeypatch):
+def test_unproven_goals_give_exit_code_1(run, path, monkeypatch):
     lines = [
         "goal 3: its configuration is in collision",
         "goal 4: its configuration is in collision",
@@ -114,7 +114,7 @@ def test_a_goal_that_is_not_proven_fails(run, path, monkeypatch):
     assert (data["passed"], data["sets"][0]["unproven"]) == (False, lines)
 
 
-def test_one_robot_is_given_by_words_a_name_or_a_folder(run, tmp_path):
+def test_robot_can_be_given_as_parts_name_or_folder(run, tmp_path):
     run("compose", "base=gantry", "ee=plane", "--no-picture", "--geometry", "primitive")
     keys = set()
     for words in (("base=gantry", "ee=plane"), ("gantry-plane",), ("robots/gantry-plane",)):
@@ -128,21 +128,21 @@ def test_one_robot_is_given_by_words_a_name_or_a_folder(run, tmp_path):
     assert len(keys) == 1
 
 
-def test_one_robot_can_push_among_obstacles(run):
+def test_single_robot_gets_push_goals_with_obstacles(run):
     code, out, _ = run("goals", "gantry-plane", "--task", "push", "--obstacles", "--certify")
     assert code == 0
     assert out.splitlines()[2].split()[1:3] == ["push", "100"]
     assert out.splitlines()[2].split()[-2:] == ["3", "yes"]
 
 
-def test_a_built_split_is_a_split(run, tmp_path):
+def test_split_folder_is_accepted_as_split(run, tmp_path):
     folder = build_split(
         some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True)
     ).folder
     assert run("goals", folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")
 
 
-def test_an_interruption_is_said_in_a_line_and_keeps_what_is_made(tmp_path):
+def test_interrupt_prints_one_line_and_keeps_completed_sets(tmp_path):
     many = [member(f"base=gantry ee=plane ee.size={60 + i}mm", f"robot-{i}") for i in range(40)]
     (tmp_path / "many.yaml").write_text(split_text(split(many, some().test)))
     process = start("goals", "many.yaml", XDG_CACHE_HOME=str(tmp_path / "cache"))
@@ -176,6 +176,6 @@ def files(folder):
         ("folder", "folder is no built split: it has no build.json"),
     ],
 )
-def test_what_it_cannot_do_is_refused_in_a_line(refused, path, tmp_path, argv, message):
+def test_invalid_arguments_are_rejected_in_one_line(refused, path, tmp_path, argv, message):
     (tmp_path / "folder").mkdir()
     assert message in refused("goals", *argv.split())

@@ -38,7 +38,7 @@ def cubes(run):
     return Path("set")
 
 
-def test_sample_makes_a_set_and_says_how_many(run, tmp_path):
+def test_sample_creates_a_set_and_prints_its_size(run, tmp_path):
     code, out, err = run("sample", "cubes", "-n", 3, "--light")
     assert (code, out, err) == (0, "robots/cubes: 3 robots written, 0 already existed\n", "")
     assert len(list((tmp_path / "robots" / "cubes").glob("cubes-*"))) == 3
@@ -54,7 +54,7 @@ def test_sample_reads_a_grammar_file(run, mine):
     ]
 
 
-def test_robots_of_a_light_set_and_the_whole_set_are_robots_for_every_command(run, cubes):
+def test_light_set_and_its_robots_are_accepted_by_other_commands(run, cubes):
     for robot in (cubes / "cubes-000001", cubes / "cubes-000001" / "robot.urdf"):
         assert run("show", robot)[1].startswith("cubes-000001: ")
     code, out, _ = run("check", cubes)
@@ -62,7 +62,7 @@ def test_robots_of_a_light_set_and_the_whole_set_are_robots_for_every_command(ru
     assert out.count(": 0 error, 0 warning") == len(list(cubes.glob("cubes-*")))
 
 
-def test_sample_writes_bundles_with_a_picture_unless_told_otherwise(run):
+def test_sample_writes_pictures_unless_no_picture_is_given(run):
     assert run("sample", "cubes", "-n", 1, "--out", "a")[0] == 0
     assert run("sample", "cubes", "-n", 1, "--out", "b", "--no-picture")[0] == 0
     assert Path("a/cubes-000000/preview.png").is_file()
@@ -70,13 +70,13 @@ def test_sample_writes_bundles_with_a_picture_unless_told_otherwise(run):
     assert read_bundle(Path("a/cubes-000000")).dof == 2
 
 
-def test_sample_counts_the_draws_that_it_rejected(run):
+def test_sample_prints_the_number_of_rejected_draws(run):
     code, out, _ = run("sample", "cubes", "-n", 5, "--light", "--where", "mass < 0.5")
     assert code == 0
     assert out.splitlines()[1].endswith(" draws rejected: where (mass < 0.5)")
 
 
-def test_sample_tells_robots_that_are_the_same(run):
+def test_sample_reports_duplicate_robots(run):
     Path("one.grammar").write_text("robot -> cubes\n")
     code, out, _ = run("sample", "one.grammar", "-n", 2, "--light")
     assert code == 0
@@ -96,12 +96,12 @@ def test_sample_prints_its_report_as_json_and_nothing_else():
     }
 
 
-def test_sample_is_the_same_with_two_jobs(run, cubes):
+def test_sample_does_not_depend_on_the_number_of_jobs(run, cubes):
     assert run("sample", "cubes", "-n", 4, "--light", "--jobs", 2, "--out", "two")[0] == 0
     assert tree(cubes) == tree(Path("two"))
 
 
-def test_several_conditions_all_hold(run):
+def test_all_where_conditions_hold(run):
     words = ("--where", "mass > 0.1", "--where", "mass < 0.9")
     assert run("sample", "cubes", "-n", 5, "--light", *words)[0] == 0
     masses = [record["mass"] for record in records("robots/cubes")]
@@ -133,7 +133,7 @@ def test_several_conditions_all_hold(run):
         ),
     ],
 )
-def test_a_mistake_is_refused_in_one_line(refused, words, message):
+def test_invalid_arguments_are_rejected_in_one_line(refused, words, message):
     assert message in refused(*words.split())
 
 
@@ -146,18 +146,18 @@ def test_a_mistake_is_refused_in_one_line(refused, words, message):
         ("include robot", "my.grammar:1:9: unknown grammar 'robot'"),
     ],
 )
-def test_a_faulty_grammar_is_refused_before_anything_is_drawn(refused, text, message):
+def test_invalid_grammar_is_rejected_before_sampling(refused, text, message):
     Path("my.grammar").write_text(text)
     assert message in refused("sample", "my.grammar")
 
 
-def test_a_set_made_otherwise_is_refused(refused, cubes):
+def test_existing_set_with_another_seed_is_rejected(refused, cubes):
     assert "set holds another set: its seed is 0, not 1" in refused(
         "sample", "cubes", "--light", "--seed", 1, "--out", cubes
     )
 
 
-def test_ray_without_ray_is_refused(refused, monkeypatch):
+def test_ray_option_without_the_package_is_rejected(refused, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     assert "--ray needs the package ray: pip install 'morphgen[ray]'" in refused(
         "sample", "cubes", "--ray"
@@ -172,7 +172,7 @@ def test_grammar_list_names_the_categories(run):
         assert line.split(maxsplit=1) == [row["name"], row["robots"]]
 
 
-def test_grammar_check_says_sound_or_what_is_wrong(run, mine):
+def test_grammar_check_prints_sound_or_the_faults(run, mine):
     assert run("grammar", "check", mine) == (0, "mine: sound\n", "")
     assert json.loads(run("grammar", "check", mine, "--json")[1]) == []
     mine.write_text("robot -> cubes\nx -> cubes\nlet r = 1\n")
@@ -186,7 +186,7 @@ def test_grammar_check_says_sound_or_what_is_wrong(run, mine):
     assert (code, len(json.loads(out))) == (1, 2)
 
 
-def test_grammar_count_says_how_many_and_what_is_drawn(run, mine):
+def test_grammar_count_prints_structures_and_random_values(run, mine):
     code, out, _ = run("grammar", "count", mine)
     assert (code, out.splitlines()) == (
         0,
@@ -204,7 +204,7 @@ def test_grammar_count_says_how_many_and_what_is_drawn(run, mine):
     }
 
 
-def test_a_huge_number_of_structures_is_counted_at_once(run, mine):
+def test_huge_number_of_structures_is_counted_quickly(run, mine):
     mine.write_text(
         "robot -> slides a0\n"
         + "".join(f"a{i} -> a{i + 1} a{i + 1}\n" for i in range(64))
@@ -216,7 +216,7 @@ def test_a_huge_number_of_structures_is_counted_at_once(run, mine):
     assert (found["structures"], found["finite"]) == (None, True)
 
 
-def test_a_negative_limit_is_refused(run, mine):
+def test_negative_limit_is_rejected(run, mine):
     code, _, err = run("grammar", "enumerate", mine, "--limit", -1)
     assert code == 2
     assert err.startswith("morphgen: argument --limit: -1: expected a whole number, 0 or more;")
@@ -253,7 +253,7 @@ def test_grammar_print_is_a_grammar_without_includes(run, mine):
     assert run("grammar", "print", mine)[1] == out
 
 
-def test_derive_prints_a_line_a_part(run, cubes):
+def test_derive_prints_one_line_per_part(run, cubes):
     code, out, _ = run("derive", cubes / "cubes-000001")
     assert (code, out.count("\n"), out.startswith("cubes=cubes(size=")) == (0, 1, True)
     text = json.loads(run("derive", cubes / "cubes-000001", "--json")[1])
@@ -262,7 +262,7 @@ def test_derive_prints_a_line_a_part(run, cubes):
 
 @pytest.mark.parametrize("light", [True, False])
 @pytest.mark.parametrize("category", ["chain", "panda_variations"])
-def test_derive_replays_to_the_same_bytes(run, light, category):
+def test_derive_reproduces_the_same_bytes(run, light, category):
     words = ("--light",) if light else ("--no-picture",)
     assert run("sample", category, "-n", 2, "--out", "set", *words)[0] == 0
     folder = Path("set") / f"{category}-000001"
@@ -274,7 +274,7 @@ def test_derive_replays_to_the_same_bytes(run, light, category):
     assert (code, json.loads(out)) == (1, {"same": False})
 
 
-def test_derive_tells_what_differs(run, cubes):
+def test_derive_reports_differences(run, cubes):
     a, b = cubes / "cubes-000000", cubes / "cubes-000001"
     assert run("derive", a, "--diff", a) == (0, "the same\n", "")
     code, out, _ = run("derive", a, "--diff", b)
@@ -283,7 +283,7 @@ def test_derive_tells_what_differs(run, cubes):
     assert json.loads(run("derive", a, "--diff", b, "--json")[1]) == out.splitlines()
 
 
-def test_mutate_writes_neighbours_and_says_what_changed(run, cubes):
+def test_mutate_writes_neighbours_and_prints_their_changes(run, cubes):
     words = ("mutate", cubes / "cubes-000002", "-n", 2, "--seed", 1, "--no-picture")
     code, out, _ = run(*words)
     assert code == 0
@@ -298,7 +298,7 @@ def test_mutate_writes_neighbours_and_says_what_changed(run, cubes):
     ]
 
 
-def test_mutate_refuses_what_is_not_in_the_index(refused, cubes):
+def test_mutate_rejects_robots_missing_from_the_index(refused, cubes):
     assert "'cubes-000009' is not in the index of" in refused("mutate", cubes / "cubes-000009")
 
 
@@ -318,7 +318,7 @@ def test_compose_follows_a_grammar_file(run, mine):
 
 
 @pytest.mark.parametrize("by_environment", [True, False])
-def test_parts_and_grammars_of_a_users_folder(run, monkeypatch, by_environment):
+def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch, by_environment):
     folder = Path("library")
     write_part(folder)
     (folder / "held.grammar").write_text("robot -> fixed ur5 pincer(length=uniform(0.15, 0.3))\n")
@@ -333,7 +333,7 @@ def test_parts_and_grammars_of_a_users_folder(run, monkeypatch, by_environment):
     assert run("derive", "robots/held/held-000001", "--replay", *words)[0] == 0
 
 
-def test_a_template_that_decides_by_a_number_can_be_sampled(run):
+def test_template_with_a_numeric_condition_can_be_sampled(run):
     wide = 'size="${0.02 if length > 0.2 else 0.03} 0.02'
     xacro = PINCER.replace('size="0.02 0.02', wide)
     assert wide in xacro

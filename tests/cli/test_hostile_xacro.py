@@ -1,4 +1,4 @@
-"""A description from a stranger runs no code, reads nothing else, and ends."""
+"""Untrusted xacro files run no code, read no other folders, and stay within limits."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def link(expression):
     return f"<link name={quoteattr('${' + expression + '}')}/>"
 
 
-def test_the_call_that_ran_a_command_does_not(refused, hostile):
+def test_known_command_execution_exploit_is_rejected(refused, hostile):
     path = hostile(link(CALL))
     for words in (
         ("show", path),
@@ -84,7 +84,7 @@ def test_the_call_that_ran_a_command_does_not(refused, hostile):
         ("open('/etc/passwd')", "name 'open' is not defined"),
     ],
 )
-def test_an_expression_off_the_list_is_named(refused_at, expression, construct):
+def test_disallowed_expressions_are_named_in_the_error(refused_at, expression, construct):
     assert construct in refused_at(link(expression))
 
 
@@ -106,17 +106,17 @@ def test_an_expression_off_the_list_is_named(refused_at, expression, construct):
         '<xacro:arg name="a" default="lambda: 0"/><link name="${$(arg a)}"/>',
     ],
 )
-def test_every_place_of_an_expression_goes_by_the_list(refused, hostile, body):
+def test_allow_list_applies_wherever_expressions_occur(refused, hostile, body):
     message = refused("show", hostile(body))
     assert "Lambda 'lambda: 0' is not allowed" in message or "invalid expression" in message
 
 
-def test_units_in_yaml_go_by_the_list(refused_at, hostile):
+def test_allow_list_applies_to_yaml_units(refused_at, hostile):
     (hostile("").parent / "units.yaml").write_text("a: !degrees (lambda:0)()\n")
     assert "Lambda 'lambda:0' is not allowed" in refused_at(link("xacro.load_yaml('units.yaml')"))
 
 
-def test_tags_of_yaml_make_nothing(refused_at, hostile):
+def test_yaml_tags_construct_no_objects(refused_at, hostile):
     text = "a: !!python/object/apply:os.system ['touch pwned']\n"
     (hostile("").parent / "tags.yaml").write_text(text)
     assert "tags.yaml:1:4: invalid YAML" in refused_at(link("xacro.load_yaml('tags.yaml')"))
@@ -125,7 +125,7 @@ def test_tags_of_yaml_make_nothing(refused_at, hostile):
 @pytest.mark.parametrize(
     "name", ["../secret.yaml", "{home}/secret.yaml", "link.yaml", "up/secret.yaml"]
 )
-def test_yaml_comes_from_the_own_folder_only(refused_at, hostile, tmp_path, name):
+def test_yaml_is_read_only_from_the_file_folder(refused_at, hostile, tmp_path, name):
     folder = hostile("").parent
     (folder / "link.yaml").symlink_to(tmp_path / "home" / "secret.yaml")
     (folder / "up").symlink_to(tmp_path / "home")
@@ -147,7 +147,7 @@ def test_yaml_comes_from_the_own_folder_only(refused_at, hostile, tmp_path, name
         "$(find home)/secret.xml",
     ],
 )
-def test_includes_come_from_the_own_folder_only(refused_at, hostile, tmp_path, name):
+def test_includes_are_read_only_from_the_file_folder(refused_at, hostile, tmp_path, name):
     (hostile("").parent / "link.xml").symlink_to(tmp_path / "home" / "secret.xml")
     name = name.format(home=tmp_path / "home")
     for more in ("", ' optional="true"'):
@@ -155,7 +155,7 @@ def test_includes_come_from_the_own_folder_only(refused_at, hostile, tmp_path, n
         assert "the folder of the description" in message
 
 
-def test_a_root_lets_files_come_from_elsewhere(run, hostile, tmp_path):
+def test_root_option_allows_files_of_another_folder(run, hostile, tmp_path):
     home = tmp_path / "home"
     (home / "ok.xml").write_text('<robot><link name="included"/></robot>')
     (home / "ok.yaml").write_text("name: loaded\n")
@@ -171,7 +171,7 @@ def test_a_root_lets_files_come_from_elsewhere(run, hostile, tmp_path):
     assert run("show", path, "--root", home / "nowhere")[0] == 2
 
 
-def test_meshes_of_a_root_are_found(run, tmp_path):
+def test_meshes_in_a_root_folder_are_found(run, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     (tmp_path / "data" / "meshes").mkdir(parents=True)
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "data" / "meshes" / "a.stl")
@@ -188,7 +188,7 @@ def test_meshes_of_a_root_are_found(run, tmp_path):
     assert (tmp_path / "robots" / "x" / "meshes").is_dir()
 
 
-def test_devices_and_pipes_are_not_read(refused_at, hostile):
+def test_device_files_and_pipes_are_not_read(refused_at, hostile):
     folder = hostile("").parent
     os.mkfifo(folder / "pipe")
     for body in ('<xacro:include filename="pipe"/>', link("xacro.load_yaml('pipe')")):
@@ -219,7 +219,7 @@ def aliases(depth):
         ("a: !!set {b, c}", "invalid YAML"),
     ],
 )
-def test_yaml_cannot_swell(refused_at, hostile, content, reason):
+def test_yaml_alias_expansion_is_limited(refused_at, hostile, content, reason):
     (hostile("").parent / "bomb.yaml").write_text(content)
     assert reason in refused_at(link("xacro.load_yaml('bomb.yaml')"))
 
@@ -235,7 +235,7 @@ def test_yaml_cannot_swell(refused_at, hostile, content, reason):
         "'%1000000000d' % 1",
     ],
 )
-def test_a_large_expression_is_refused(refused_at, expression):
+def test_large_expressions_are_rejected(refused_at, expression):
     message = refused_at(f"\n{link(expression)}", line=3)
     assert f"when evaluating expression '{expression}'" in message
 
@@ -264,7 +264,7 @@ PROPERTIES = "".join(
         ('<xacro:include filename="robot.urdf.xacro"/>', "endless"),
     ],
 )
-def test_a_document_cannot_swell(refused, hostile, body, reason):
+def test_expanded_document_size_is_limited(refused, hostile, body, reason):
     assert reason in refused("show", hostile(body))
 
 
@@ -273,20 +273,20 @@ ENDLESS = f"<xacro:macro name='m' params=\"a:={'a' * 60}'\"/>"
 
 
 @pytest.mark.parametrize("limit", ["CPU_LIMIT", "WALL_LIMIT"])
-def test_what_no_bound_foresees_is_ended(refused, hostile, monkeypatch, limit):
+def test_expansion_is_stopped_at_the_time_limit(refused, hostile, monkeypatch, limit):
     monkeypatch.setattr(xacro_process, limit, 2)
     path = hostile(ENDLESS)
     what = {"CPU_LIMIT": "2 s of CPU time", "WALL_LIMIT": "2 s"}[limit]
     assert f"{path}: its expansion takes more than {what}\n" in refused("show", path)
 
 
-def test_memory_that_no_bound_foresees_is_refused(refused, hostile, monkeypatch):
+def test_expansion_is_stopped_at_the_memory_limit(refused, hostile, monkeypatch):
     monkeypatch.setattr(xacro_process, "MEMORY_LIMIT", 150 << 20)
     path = hostile("<a/>" * 500_000)
     assert "needs more than 150 MiB of memory" in refused("show", path)
 
 
-def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatch):
+def test_limits_apply_to_user_library_parts(refused, tmp_path, monkeypatch):
     monkeypatch.setattr(xacro_process, "CPU_LIMIT", 2)
     library = tmp_path / "library"
     library.mkdir()
@@ -305,7 +305,7 @@ def test_parts_of_ones_own_library_are_bounded_too(refused, tmp_path, monkeypatc
         assert reason in refused("compose", "arm=ur5", "ee=trap", "--library", library)
 
 
-def test_the_child_writes_no_file(tmp_path):
+def test_child_process_writes_no_files(tmp_path):
     code = "from morphgen.formats.xacro_process import limit_process; limit_process(9, 2**30); "
     write = "file = open('written', 'w'); file.write('a'); file.close()"
     done = subprocess.run(
@@ -315,7 +315,7 @@ def test_the_child_writes_no_file(tmp_path):
     assert (tmp_path / "written").read_bytes() == b""
 
 
-def test_the_child_loads_nothing_heavy():
+def test_child_process_imports_no_heavy_packages():
     code = (
         "import morphgen.formats.xacro, morphgen.formats.xacro_compile, sys, json;"
         "print(json.dumps(list(sys.modules)))"

@@ -1,4 +1,4 @@
-"""Ctrl-C while workers start is one line, and leaves neither a process nor half a file."""
+"""Ctrl-C while workers start prints one line and leaves no process and no partial file."""
 
 import os
 import signal
@@ -33,11 +33,11 @@ PATIENCE = 120.0
 @pytest.mark.slow
 @pytest.mark.parametrize("later", [0.0, 0.3])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_ctrl_c_while_workers_start_is_one_line(tmp_path, name, later):
+def test_ctrl_c_while_workers_start_prints_one_line(tmp_path, name, later):
     check(tmp_path, name, later)
 
 
-def test_ctrl_c_as_the_first_worker_starts_is_one_line(tmp_path):
+def test_ctrl_c_as_the_first_worker_starts_prints_one_line(tmp_path):
     check(tmp_path, "sample", 0.0)
 
 

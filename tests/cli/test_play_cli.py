@@ -1,4 +1,4 @@
-"""``morphgen play``: what it prints, the film that it leaves, and what it refuses."""
+"""``morphgen play``: output, video file and rejected input."""
 
 import re
 
@@ -28,7 +28,7 @@ def told(out):
     return [LINE.fullmatch(line).groups() for line in out.splitlines() if "episode" in line]
 
 
-def test_inverse_kinematics_reaches(run, tmp_path):
+def test_ik_policy_reaches_the_goal(run, tmp_path):
     code, out, err = run("play", "reach", "arm3-stick", "--policy", "ik", "--sim", "mujoco")
     assert (code, err) == (0, "")
     ((number, result, distance, place, score, seconds),) = told(out)
@@ -39,7 +39,7 @@ def test_inverse_kinematics_reaches(run, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_script_pushes_in_less_than_the_time_and_is_filmed(run, tmp_path):
+def test_scripted_policy_pushes_before_the_time_limit_and_is_recorded(run, tmp_path):
     words = ("play", "push", "prims", "--policy", "scripted", "--sim", "mujoco")
     code, out, err = run(*words, "--out", "push.mp4")
     assert (code, err) == (0, "")
@@ -54,7 +54,7 @@ def test_the_script_pushes_in_less_than_the_time_and_is_filmed(run, tmp_path):
     assert 0 <= frames / fps - float(seconds) <= 0.08
 
 
-def test_episodes_differ_and_are_the_same_again(run):
+def test_episodes_differ_and_are_reproducible(run):
     words = ("play", "reach", "arm3-stick", "--sim", "mujoco", "--episodes", "2", "--obstacles")
     outs = [run(*words, "--seed", seed, "--kind", "discrete")[1] for seed in (1, 1, 2)]
     assert outs[0] == outs[1] != outs[2]
@@ -62,7 +62,7 @@ def test_episodes_differ_and_are_the_same_again(run):
     assert first[2:] != second[2:]
 
 
-def test_zero_does_nothing(run):
+def test_zero_policy_does_not_move(run):
     code, out, _ = run("play", "push", "prims", "--policy", "zero", "--sim", "mujoco")
     assert code == 0
     ((_, result, distance, _, score, seconds),) = told(out)
@@ -89,12 +89,12 @@ def test_zero_does_nothing(run):
         (("push", "arm=ur5", "ee=plain"), "did you mean 'plane'?"),
     ],
 )
-def test_what_cannot_be_played_is_refused(refused, words, says):
+def test_invalid_arguments_are_rejected(refused, words, says):
     assert says in refused("play", *words)
 
 
 @pytest.mark.parametrize(
     "words", [("lift", "prims"), ("push", "prims", "--policy", "magic"), ("push",)]
 )
-def test_invalid_choices_are_refused(words, refused):
+def test_invalid_choices_are_rejected(words, refused):
     assert "see morphgen play --help" in refused("play", *words)

@@ -1,4 +1,4 @@
-"""What is said of runs and evaluations: bars for eyes, lines for files, what went wrong in both."""
+"""Progress output: bars on a terminal, lines in a file, failures in both."""
 
 import sys
 from contextlib import closing
@@ -32,7 +32,7 @@ def show(request, monkeypatch):
     display.close()
 
 
-def test_episodes_cut_short_are_told_at_once_and_only_then(show, capsys):
+def test_diverged_episodes_are_reported_when_they_occur(show, capsys):
     show(replace(REPORT, update=99, transitions=99 * 32), 100)
     assert "diverged" not in capsys.readouterr().err
     show(replace(REPORT, update=99, transitions=99 * 32, unstable=2), 100)
@@ -40,7 +40,7 @@ def test_episodes_cut_short_are_told_at_once_and_only_then(show, capsys):
     assert told in capsys.readouterr().err
 
 
-def test_what_takes_minutes_says_how_far_it_is_once_in_each(capsys, monkeypatch):
+def test_progress_is_printed_once_per_minute(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with closing(TrainingProgress()) as display:
@@ -55,7 +55,7 @@ def test_what_takes_minutes_says_how_far_it_is_once_in_each(capsys, monkeypatch)
     )
 
 
-def test_on_a_terminal_it_is_a_bar_that_goes_away(capsys, monkeypatch):
+def test_terminal_progress_bar_is_removed_at_the_end(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with closing(TrainingProgress()) as display:
         tell = display.evaluation("train")

@@ -1,4 +1,4 @@
-"""What is wrong is refused in one line, and nothing half-written is left."""
+"""Invalid input is rejected with a one-line message, and no partial files are left."""
 
 import argparse
 import json
@@ -49,18 +49,18 @@ BOMB = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "lol"}">' for i in
         ("base=gantry ee=plane --library nowhere", "nowhere does not exist"),
     ],
 )
-def test_a_wrong_request_is_refused(refused, words, message):
+def test_invalid_arguments_are_rejected(refused, words, message):
     assert message in refused("compose", *words.split(), "--out", "out")
 
 
 @pytest.mark.parametrize("name", ["../x", "", "a/b", ".", "..", ".hidden", "-x", "a b", "n" * 300])
-def test_a_name_that_is_no_plain_folder_is_refused(refused, robot_urdf, name):
+def test_names_that_are_not_plain_folder_names_are_rejected(refused, robot_urdf, name):
     naming = ("--no-picture", "--out", "out", f"--name={name}")
     assert f"name {name!r}: use letters" in refused("compose", "base=gantry", "ee=plane", *naming)
     assert f"name {name!r}: use letters" in refused("import", robot_urdf(arm()), *naming)
 
 
-def test_a_files_own_name_cannot_lead_out_of_the_folder(refused, robot_urdf):
+def test_robot_name_in_a_file_cannot_leave_the_output_folder(refused, robot_urdf):
     path = robot_urdf(replace(arm(), name=".."))
     assert "name '..': use letters" in refused("check", path, "--fix", "out")
     assert "name '..': use letters" in refused("import", path, "--out", "out", "--as-is")
@@ -95,7 +95,7 @@ def test_a_files_own_name_cannot_lead_out_of_the_folder(refused, robot_urdf):
     ],
     ids=["broken", "empty", "bomb", "dtd", "climbing", "absolute", "mesh", "package", "sdf"],
 )
-def test_a_broken_description_is_refused(refused, urdf, xml, message):
+def test_broken_urdf_is_rejected(refused, urdf, xml, message):
     started = time.process_time()  # of this process: other load does not count
     path = urdf(xml)
     assert message in refused("import", path, "--out", "out")
@@ -104,7 +104,7 @@ def test_a_broken_description_is_refused(refused, urdf, xml, message):
 
 
 @pytest.mark.parametrize("xml", ["<robot", f'<!DOCTYPE r [{BOMB}]><robot name="r">&e11;</robot>'])
-def test_check_refuses_what_is_no_xml(refused, urdf, xml):
+def test_check_rejects_files_that_are_not_xml(refused, urdf, xml):
     assert "broken.urdf" in refused("check", urdf(xml))
 
 
@@ -124,11 +124,11 @@ def test_check_refuses_what_is_no_xml(refused, urdf, xml):
         ("conform . --seed -1", "argument --seed: -1: expected a whole number, 0 or more"),
     ],
 )
-def test_what_is_not_there_is_named(refused, argv, message):
+def test_missing_files_are_named(refused, argv, message):
     assert message in refused(*argv.split())
 
 
-def test_links_that_a_file_does_not_have_name_the_nearest(refused, robot_urdf):
+def test_unknown_link_names_suggest_the_nearest(refused, robot_urdf):
     path = robot_urdf(arm())
     assert "did you mean 'slider'" in refused("import", path, "--tool", "slidr")
     assert "did you mean 'base'" in refused("import", path, "--root-link", "bas")
@@ -148,13 +148,13 @@ def test_links_that_a_file_does_not_have_name_the_nearest(refused, robot_urdf):
         '{"format": 1, "home": {"j": "x"}, "ignore_pairs": []}',
     ],
 )
-def test_a_bundle_with_a_broken_card_is_refused(refused, tmp_path, card):
+def test_bundle_with_a_broken_card_is_rejected(refused, tmp_path, card):
     folder = write_bundle(replace(arm(), frames=()), tmp_path / "arm", picture=False)
     (folder / "card.json").write_text(card)
     assert "card" in refused("show", folder)
 
 
-def test_an_error_is_json_for_who_asks_for_it(run):
+def test_errors_are_printed_as_json_with_the_json_option(run):
     code, out, err = run("compose", "arm=ur55", "--json")
     assert code == 2
     data = json.loads(out)
@@ -162,26 +162,26 @@ def test_an_error_is_json_for_who_asks_for_it(run):
     assert err == f"morphgen: {data['message']}\n"
 
 
-def test_a_missing_data_package_says_how_to_install_it(refused, tmp_path):
+def test_missing_data_package_error_says_how_to_install_it(refused, tmp_path):
     source = {"package": "no-such-data", "file": "x.urdf"}
     write_part(tmp_path, source=source, file=None, density=None, parameters=None)
     message = refused("compose", "base=gantry", "ee=pincer", "--library", ".")
     assert "'x.urdf' is part of 'no-such-data', not installed: pip install no-such-data" in message
 
 
-def test_a_broken_manifest_is_named_by_line_and_column(refused, tmp_path):
+def test_broken_manifest_error_has_line_and_column(refused, tmp_path):
     (tmp_path / "stump.yaml").write_text("name: stump\nkind: [\n")
     assert "stump.yaml:3:1: invalid YAML" in refused("compose", "ee=stump", "--library", ".")
 
 
-def test_an_output_folder_that_cannot_be_written_is_named(refused, tmp_path):
+def test_unwritable_output_folder_is_named(refused, tmp_path):
     (tmp_path / "file").write_text("a plain file")
     words = ("compose", "base=gantry", "ee=plane", "--no-picture")
     assert "cannot write to file/deep" in refused(*words, "--out", "file/deep")
     assert "cannot write to file" in refused(*words, "--out", "file")
 
 
-def test_a_folder_that_is_no_bundle_is_never_replaced(refused, tmp_path):
+def test_folder_that_is_not_a_bundle_is_never_replaced(refused, tmp_path):
     (tmp_path / "out" / "gantry-plane").mkdir(parents=True)
     (tmp_path / "out" / "gantry-plane" / "thesis.txt").write_text("years of work")
     words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
@@ -193,7 +193,7 @@ def interrupt(*_):
 
 
 @pytest.mark.parametrize("step", ["urdf_text", "mjcf_text", "card_text", "render"])
-def test_an_interrupted_run_leaves_no_half_bundle(run, tmp_path, monkeypatch, step):
+def test_interrupted_run_leaves_no_partial_bundle(run, tmp_path, monkeypatch, step):
     (tmp_path / "out").mkdir()
     monkeypatch.setattr(bundle, step, interrupt)
     code, out, err = run("compose", "base=gantry", "ee=plane", "--out", "out")
@@ -202,7 +202,7 @@ def test_an_interrupted_run_leaves_no_half_bundle(run, tmp_path, monkeypatch, st
     assert tree(tmp_path / "out") == {}
 
 
-def test_ctrl_c_while_the_commands_are_imported_is_one_line(run, monkeypatch):
+def test_ctrl_c_during_imports_prints_one_line(run, monkeypatch):
     monkeypatch.setattr(cli, "build_parser", interrupt)
     assert run("list") == (130, "", "morphgen: interrupted; nothing half-written is left\n")
 
@@ -223,24 +223,24 @@ def test_ctrl_c_while_the_commands_are_imported_is_one_line(run, monkeypatch):
         ("compose foo=bar", "foo=bar: unknown key 'foo'; expected base, arm, ee, a limb such as"),
     ],
 )
-def test_a_misspelt_word_names_the_nearest_valid_one(refused, argv, message):
+def test_misspelt_words_suggest_the_nearest_valid_one(refused, argv, message):
     assert message in refused(*argv.split())
 
 
 @pytest.mark.parametrize(
     ("text", "value"), [("2e6", 2_000_000), ("7", 7), (str(2**60 + 1), 2**60 + 1)]
 )
-def test_a_whole_number_is_read_exactly(text, value):
+def test_whole_numbers_are_read_exactly(text, value):
     assert whole_number(0)(text) == value
 
 
 @pytest.mark.parametrize("text", ["1.5", "nan", "inf", "1e999", "x", "", "-1"])
-def test_what_is_not_a_whole_number_is_refused(text):
+def test_invalid_whole_numbers_are_rejected(text):
     with pytest.raises(argparse.ArgumentTypeError, match="expected a whole number, 0 or more"):
         whole_number(0)(text)
 
 
-def test_ctrl_c_that_a_package_makes_another_error_of_is_ctrl_c(run, monkeypatch):
+def test_ctrl_c_converted_by_a_package_is_treated_as_ctrl_c(run, monkeypatch):
     def swallow(*_):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -258,7 +258,7 @@ def test_ctrl_c_that_a_package_makes_another_error_of_is_ctrl_c(run, monkeypatch
 
 
 @pytest.mark.parametrize("move", [1, 2])
-def test_an_interrupted_replacement_leaves_the_old_bundle(run, tmp_path, monkeypatch, move):
+def test_interrupted_replacement_keeps_the_old_bundle(run, tmp_path, monkeypatch, move):
     words = ("compose", "--no-picture", "--out", "out", "--name", "g", "base=gantry", "ee=plane")
     assert run(*words)[0] == 0
     before = tree(tmp_path / "out")
@@ -275,7 +275,7 @@ def test_an_interrupted_replacement_leaves_the_old_bundle(run, tmp_path, monkeyp
     assert tree(tmp_path / "out") == before
 
 
-def test_an_interrupted_process_leaves_neither_half_a_bundle_nor_a_temporary_folder(tmp_path):
+def test_interrupted_process_leaves_no_partial_bundle_or_temporary_folder(tmp_path):
     out = tmp_path / "out"
     process = start("compose", "arm=kinova_gen3", "ee=robotiq_2f85", "--out", out)
     deadline = time.monotonic() + 60

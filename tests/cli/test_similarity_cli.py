@@ -1,4 +1,4 @@
-"""``morphgen similarity``: what it prints, what it writes, and what it refuses."""
+"""``morphgen similarity``: output, written files and rejected input."""
 
 import csv
 import json
@@ -44,7 +44,7 @@ def test_the_measures_are_those_of_the_room():
     assert (*MEASURES, "all") == command.MEASURES
 
 
-def test_a_folder_of_bundles_gives_a_matrix_a_measure(run, bundles, tmp_path):
+def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
     before = tree(tmp_path)
     code, out, err = run(*("similarity", *ARGUMENTS))
     assert (code, err) == (0, "")
@@ -79,14 +79,14 @@ def test_json_holds_the_matrices(run, bundles):
         np.testing.assert_allclose(about["matrix"], similarity_matrix(made, name), atol=1e-6)
 
 
-def test_the_tree_is_the_measure_if_none_is_named(run, bundles):
+def test_tree_is_the_default_measure(run, bundles):
     _, out, _ = run("similarity", "robots", "--json")
     assert list(json.loads(out)["measures"]) == ["tree"]
     _, out, _ = run("similarity", "robots", "--measure", "cosine", "--json")
     assert list(json.loads(out)["measures"]) == ["cosine"]
 
 
-def test_paths_can_be_mixed_and_are_taken_once(run, bundles, light_set):
+def test_paths_can_be_mixed_and_duplicates_are_dropped(run, bundles, light_set):
     lwr = Path("robots/lwr-plane")
     paths = (lwr, lwr / "robot.urdf", light_set / "cubes-000001", light_set)
     code, out, _ = run("similarity", *paths, "robots", "--json")
@@ -96,7 +96,7 @@ def test_paths_can_be_mixed_and_are_taken_once(run, bundles, light_set):
     assert names[0] == "robots/lwr-plane"  # two robots are called lwr-plane
 
 
-def test_robots_of_a_light_set_are_composed_anew(run, light_set):
+def test_robots_of_a_light_set_are_composed(run, light_set):
     code, out, _ = run("similarity", light_set, "--measure", "cosine", "--json")
     assert code == 0
     found = json.loads(out)
@@ -108,7 +108,7 @@ def test_robots_of_a_light_set_are_composed_anew(run, light_set):
     )
 
 
-def test_beyond_twenty_robots_each_has_its_nearest(run):
+def test_more_than_twenty_robots_list_the_nearest_of_each(run):
     run("sample", "stick", "-n", "21", "--light", "--out", "set", "--json")
     code, out, _ = run("similarity", "set", "--measure", "workspace")
     assert code == 0
@@ -130,7 +130,7 @@ def test_beyond_twenty_robots_each_has_its_nearest(run):
     assert statistics.startswith("210 pairs: ")
 
 
-def test_the_csv_has_a_line_a_pair(run, bundles):
+def test_csv_has_one_line_per_pair(run, bundles):
     code, out, _ = run("similarity", *ARGUMENTS, "--csv", "pairs.csv", "--json")
     assert code == 0
     assert json.loads(out)["files"] == ["pairs.csv"]
@@ -146,7 +146,7 @@ def test_the_csv_has_a_line_a_pair(run, bundles):
         assert [float(row[name]) for row in rows] == values.tolist()
 
 
-def test_pictures_are_written_the_same_every_time(run, bundles, tmp_path):
+def test_pictures_are_reproducible(run, bundles, tmp_path):
     pictures = ("--heatmap", "heat.png", "--map", "map.png")
     code, out, _ = run("similarity", *ARGUMENTS, *pictures)
     assert code == 0
@@ -158,12 +158,12 @@ def test_pictures_are_written_the_same_every_time(run, bundles, tmp_path):
     assert tree(tmp_path) == first
 
 
-def test_one_robot_is_none_to_compare(refused, bundles):
+def test_single_robot_is_rejected(refused, bundles):
     assert "robots/arm is one robot; name others" in refused("similarity", "robots/arm")
     assert "is one robot" in refused("similarity", "robots/arm", "robots/arm")
 
 
-def test_a_robot_without_a_tool_is_refused_with_its_path(refused, robot_urdf, bundles):
+def test_robot_without_a_tool_is_rejected_with_its_path(refused, robot_urdf, bundles):
     path = robot_urdf(replace(arm(), frames=()))
     error = refused("similarity", path, "robots")
     assert f"{path}: robot 'arm' has no frame 'tool'" in error
@@ -179,7 +179,7 @@ def test_a_robot_without_a_tool_is_refused_with_its_path(refused, robot_urdf, bu
         (("robots/notes.txt",), "notes.txt"),
     ],
 )
-def test_what_is_no_robot_is_refused(paths, reason, refused, bundles, tmp_path):
+def test_paths_that_are_not_robots_are_rejected(paths, reason, refused, bundles, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "set.json").write_text("{}")
@@ -195,9 +195,9 @@ def test_what_is_no_robot_is_refused(paths, reason, refused, bundles, tmp_path):
         (("--csv", "robots"), "--csv robots: it is a folder"),
     ],
 )
-def test_what_cannot_be_written_is_refused_first(arguments, reason, refused, bundles):
+def test_unwritable_output_is_rejected_before_computing(arguments, reason, refused, bundles):
     assert reason in refused("similarity", "robots", *arguments)
 
 
-def test_an_unknown_measure_is_refused(refused, bundles):
+def test_unknown_measure_is_rejected(refused, bundles):
     assert "invalid choice: 'cosin'" in refused("similarity", "robots", "--measure", "cosin")

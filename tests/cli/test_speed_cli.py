@@ -1,4 +1,4 @@
-"""``morphgen speed``: what it prints, and what it refuses."""
+"""``morphgen speed``: output and rejected input."""
 
 import json
 
@@ -13,7 +13,7 @@ def own_cache(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
-def test_it_prints_rates_and_shares(sim, capsys):
+def test_speed_prints_rates_and_shares(sim, capsys):
     words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]
     assert main([*words, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -26,7 +26,7 @@ def test_it_prints_rates_and_shares(sim, capsys):
     assert "physics steps per second" in text
 
 
-def test_bodies_of_many_links_are_measured_too(capsys):
+def test_robots_above_the_default_max_links_can_be_measured(capsys):
     words = ["speed", "reach", "chain", "beads=7", "--envs", "1", "--seconds", "0.05"]
     assert main([*words, "--sim", "mujoco"]) == 0
     assert "reach, chain" in capsys.readouterr().out
@@ -47,6 +47,6 @@ def test_bodies_of_many_links_are_measured_too(capsys):
         (["reach", "ur55-plane"], "'ur55' is not a part"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(words, named, capsys):
+def test_invalid_arguments_are_rejected(words, named, capsys):
     assert main(["speed", *words]) == 2
     assert named in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""``morphgen split audit``, ``build``, ``verify`` and ``stats``: what they print and refuse."""
+"""``morphgen split audit``, ``build``, ``verify`` and ``stats``: output and rejected input."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ def leaky():
     return combined(test=[*TEST, twin, near, "base=planar ee=sphere"])
 
 
-def test_a_sound_split_passes_the_audit(run, write):
+def test_valid_split_passes_the_audit(run, write):
     code, out, err = run("split", "audit", write(combined()))
     assert (code, err) == (0, "")
     header, _, row, verdict = out.splitlines()
@@ -43,7 +43,7 @@ def test_a_sound_split_passes_the_audit(run, write):
     assert verdict == "mine/some: passed: 0 error, 0 warning, 0 accepted"
 
 
-def test_a_leaky_split_fails_and_says_why(run, write):
+def test_leaky_split_fails_the_audit_with_reasons(run, write):
     code, out, err = run("split", "audit", write(leaky()))
     assert (code, err) == (1, "")
     lines = out.splitlines()
@@ -57,7 +57,7 @@ def test_a_leaky_split_fails_and_says_why(run, write):
     assert lines[-1] == "mine/some: FAILED: 5 error, 0 warning, 0 accepted"
 
 
-def test_what_is_near_can_be_said(run, write):
+def test_near_option_sets_the_audit_thresholds(run, write):
     path = write(split([*TRAIN, member(f"{TEST[0]} ee.size=0.2", "large")], TEST))
     assert "body-near" not in run("split", "audit", path)[1]
     assert "error body-near (1)" in run("split", "audit", path, "--near", "0.05,0.99")[1]
@@ -72,14 +72,14 @@ def test_accepted_findings_are_listed_and_do_not_fail(run, write):
     assert out.splitlines()[-1] == "mine/some: passed: 0 error, 0 warning, 1 accepted"
 
 
-def test_warnings_fail_if_asked_to(run, write):
+def test_strict_option_makes_warnings_fail(run, write):
     path = write(combined(accepted={"hull": "nobody knows"}))
     code, out, _ = run("split", "audit", path)
     assert (code, "warning accepted-unused (1)" in out) == (0, True)
     assert run("split", "audit", path, "--strict")[0] == 1
 
 
-def test_many_findings_are_cut_short(run, write):
+def test_long_lists_of_findings_are_shortened(run, write):
     many = [replace(member(TRAIN[0], f"robot-{i}"), robot_hash=f"{i:032d}") for i in range(14)]
     _, out, _ = run("split", "audit", write(combined(train=[*TRAIN, *many])))
     lines = out.splitlines()
@@ -87,7 +87,7 @@ def test_many_findings_are_cut_short(run, write):
     assert lines[i + 11] == "  and 4 more (--json lists all)"
 
 
-def test_an_audit_is_json_alone(run, write):
+def test_audit_json_option_prints_only_json(run, write):
     code, out, err = run("split", "audit", write(leaky()), "--json")
     assert (code, err) == (1, "")
     data = json.loads(out)
@@ -110,7 +110,7 @@ def test_a_missing_part_fails_the_audit_and_is_named(run, write):
     assert "fix: name the folder of your parts with --library" in out
 
 
-def test_a_build_says_where_it_is_and_verifies(run, write):
+def test_build_prints_its_folder_and_passes_verify(run, write):
     path = write(combined())
     code, out, err = run("split", "build", path, "--light")
     assert (code, err) == (0, "")
@@ -129,7 +129,7 @@ def test_a_build_says_where_it_is_and_verifies(run, write):
         assert out == f"mine/some, id {split_id(combined())}: all 4 robots are the same\n"
 
 
-def test_what_differs_is_printed_by_robot(run, write):
+def test_verify_prints_differences_per_robot(run, write):
     run("split", "build", write(combined()), "--out", "out")
     folder = Path("out/mine/some/robots/planar-cube")
     (folder / "robot.xml").write_text("<mujoco/>")
@@ -145,7 +145,7 @@ def test_what_differs_is_printed_by_robot(run, write):
     assert [each["where"] for each in data["differences"]] == ["planar-cube"]
 
 
-def test_stats_put_the_papers_figures_beside_ours(run):
+def test_stats_shows_the_figures_of_the_paper(run):
     code, out, err = run("split", "stats", "composition/ee-task", "extrapolation/primitives/reach")
     assert (code, err) == (0, "")
     _, _, task, primitives, _, _, source = out.splitlines()
@@ -162,7 +162,7 @@ def test_stats_put_the_papers_figures_beside_ours(run):
     assert "arXiv 2505.14986" in source
 
 
-def test_splits_of_the_same_robots_share_a_row(run, write):
+def test_stats_merges_splits_with_the_same_robots(run, write):
     path = write(combined(name="mine/some/push"))
     reach = combined(name="mine/some/reach")
     sides = [tuple(replace(m, task="reach") for m in side) for side in (reach.train, reach.test)]
@@ -211,7 +211,7 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
         ("stats nowhere", "nowhere: no such file, and no split of this name"),
     ],
 )
-def test_what_they_cannot_do_is_refused_in_a_line(run, write, tmp_path, argv, message):
+def test_invalid_arguments_are_rejected_in_one_line(run, write, tmp_path, argv, message):
     write(combined())
     wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
     write(combined(train=[wrong]), "wrong.yaml")
@@ -250,7 +250,7 @@ def build_with_goals(run, path, out="data", *more):
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_a_build_ships_goals_that_verify_and_pass_the_audit(run, write, tmp_path):
+def test_build_with_goals_passes_verify_and_audit(run, write, tmp_path):
     path = write(reaching())
     assert build_with_goals(run, path) == [
         "data/mine/some: 4 robots written, 0 already existed",
@@ -275,7 +275,7 @@ def test_a_build_ships_goals_that_verify_and_pass_the_audit(run, write, tmp_path
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_the_seed_of_goals_is_said_shipped_and_audited(run, write):
+def test_goal_seed_is_printed_stored_and_audited(run, write):
     lines = build_with_goals(run, write(reaching()), "data", "--goal-seed", "7")
     assert lines[1] == "4 goal sets, seed 7"
     assert {one.seed for one in read_goals("data/mine/some", "train").values()} == {7}
@@ -287,7 +287,7 @@ def test_the_seed_of_goals_is_said_shipped_and_audited(run, write):
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_goals_are_audited_only_if_they_are_there_or_asked_for(run, write):
+def test_goals_are_audited_only_if_stored_or_requested(run, write):
     accepted = {"body-shared": "new goals", "combination-seen": "it is known"}
     path = write(known(accepted=accepted))
     assert run("split", "audit", path)[0] == 0
@@ -314,7 +314,7 @@ def test_accepted_findings_about_goals_do_not_fail(run, write):
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_a_robot_without_goals_stops_the_build_before_it_begins(run, write, monkeypatch):
+def test_robot_without_goals_is_rejected_before_building(run, write, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 1)
     few = [member(f"arm=arm3 ee={ee}", task="reach") for ee in ("claw", "plane")]
     path = write(replace(reaching(), train=(*reaching().train[:2], *few)))
@@ -326,7 +326,7 @@ def test_a_robot_without_goals_stops_the_build_before_it_begins(run, write, monk
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_a_build_without_goals_does_not_leave_those_of_another(run, write):
+def test_build_without_goals_does_not_reuse_a_folder_with_goals(run, write):
     path = write(reaching())
     build_with_goals(run, path)
     before = tree(Path("data"))
@@ -351,7 +351,7 @@ def test_a_build_without_goals_does_not_leave_those_of_another(run, write):
         ("audit folder", "folder is no built split: it has no build.json"),
     ],
 )
-def test_goals_that_cannot_be_are_refused_in_a_line(refused, write, tmp_path, argv, message):
+def test_invalid_goal_options_are_rejected_in_one_line(refused, write, tmp_path, argv, message):
     write(reaching())
     (tmp_path / "folder").mkdir()
     assert message in refused("split", *argv.split())

@@ -1,4 +1,4 @@
-"""``morphgen split list``, ``show`` and ``new``: what they print, write and refuse."""
+"""``morphgen split list``, ``show`` and ``new``: output, written files and rejected input."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,7 @@ TRAPS = {
 }
 
 
-def test_list_has_a_row_a_split(run):
+def test_list_has_one_row_per_split(run):
     code, out, err = run("split", "list")
     assert (code, err) == (0, "")
     header, _, *rows = out.splitlines()
@@ -41,7 +41,7 @@ def test_list_has_a_row_a_split(run):
     assert (facts["train"], facts["test"], facts["regime"]) == (4, 1, "composition")
 
 
-def test_show_prints_a_row_a_robot(run):
+def test_show_prints_one_row_per_robot(run):
     code, out, err = run("split", "show", "composition/ee-arm/reach")
     split = read_split("composition/ee-arm/reach")
     assert (code, err) == (0, "")
@@ -67,7 +67,7 @@ def test_show_prints_json(run):
     assert data["statistics"] == split.statistics
 
 
-def test_new_says_what_it_made_and_what_is_next(run, tmp_path):
+def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
     code, out, err = run(*INTERPOLATION, "--seed", 4)
     name = "interpolation-cubes-reach-seed4"
     assert (code, err) == (0, "")
@@ -99,7 +99,7 @@ def test_new_says_what_it_made_and_what_is_next(run, tmp_path):
         ),
     ],
 )
-def test_every_regime_is_made_by_name(run, argv, name, counts):
+def test_every_regime_can_be_created(run, argv, name, counts):
     data = json.loads(run(*argv, "--json")[1])
     split = read_split(f"{name}.yaml")
     assert data == [
@@ -114,7 +114,7 @@ def test_every_regime_is_made_by_name(run, argv, name, counts):
     assert (len(split.train), len(split.test)) == counts
 
 
-def test_several_sizes_make_a_file_each(run):
+def test_several_train_sizes_write_one_file_each(run):
     code, out, _ = run(*INTERPOLATION[:-1], "1,2,4", "--name", "my/cubes", "--out", "splits")
     assert code == 0
     paths = [Path(f"splits/my/cubes-train{n}.yaml") for n in (1, 2, 4)]
@@ -128,14 +128,14 @@ def test_several_sizes_make_a_file_each(run):
 
 
 @pytest.mark.slow
-def test_the_same_order_gives_the_same_bytes_with_any_number_of_jobs(run, tmp_path):
+def test_split_files_do_not_depend_on_the_number_of_jobs(run, tmp_path):
     assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml")[0] == 0
     before = tree(tmp_path)
     assert run(*INTERPOLATION[:-1], "9", "--out", "a.yaml", "--jobs", 2)[0] == 0
     assert tree(tmp_path) == before
 
 
-def test_figures_are_added_when_asked_for(run):
+def test_statistics_option_adds_statistics(run):
     run(*INTERPOLATION, "--out", "a.yaml", "--statistics")
     run(*INTERPOLATION, "--out", "b.yaml")
     a, b = read_split("a.yaml"), read_split("b.yaml")
@@ -143,7 +143,7 @@ def test_figures_are_added_when_asked_for(run):
     assert (b.statistics, split_id(b)) == ({}, split_id(a))
 
 
-def test_robots_that_are_trained_twice_are_told(run):
+def test_duplicate_train_robots_are_reported(run):
     Path("two.grammar").write_text(
         "robot -> gantry ee\nee -> @weight(30) plane(size=0.1) | plane(size=0.2)\n"
     )
@@ -154,7 +154,7 @@ def test_robots_that_are_trained_twice_are_told(run):
     assert f"  {repeated} train robots have the body and task of an earlier one\n" in out
 
 
-def test_parts_and_grammars_of_the_users_library_are_found(run, monkeypatch):
+def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch):
     Path("lib").mkdir()
     Path("lib/mine.grammar").write_text("robot -> gantry plane(size=uniform(0.1, 0.3))\n")
     words = ("split", "new", "interpolation", "--grammar", "mine", "--train", 2)
@@ -166,7 +166,7 @@ def test_parts_and_grammars_of_the_users_library_are_found(run, monkeypatch):
     assert list(data["made"]["grammar"]) == ["mine"]
 
 
-def test_another_split_is_never_replaced(run, refused):
+def test_existing_split_file_is_never_replaced(run, refused):
     assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
     message = refused(*INTERPOLATION, "--out", "a.yaml", "--seed", 1)
     assert "a.yaml exists with another content; choose another --name or --out" in message
@@ -174,7 +174,7 @@ def test_another_split_is_never_replaced(run, refused):
     assert "b-train2.yaml exists" in refused(*INTERPOLATION[:-1], "1,2", "--out", "b.yaml")
 
 
-def test_an_interrupted_run_leaves_nothing(run, tmp_path, monkeypatch):
+def test_interrupted_run_leaves_no_files(run, tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -213,14 +213,14 @@ def test_an_interrupted_run_leaves_nothing(run, tmp_path, monkeypatch):
         (("split", "show", "x.yaml"), "x.yaml: no such file"),
     ],
 )
-def test_what_cannot_be_made_is_refused(refused, tmp_path, argv, message):
+def test_invalid_arguments_are_rejected(refused, tmp_path, argv, message):
     (tmp_path / "file").write_text("a plain file")
     (tmp_path / "broken.grammar").write_text("robot -> gantry plnae\n")
     assert message in refused(*argv)
 
 
 @pytest.mark.parametrize("trap", TRAPS)
-def test_a_broken_file_is_refused_by_its_line(run, refused, trap):
+def test_broken_split_file_is_rejected_with_its_line(run, refused, trap):
     old, new, message = TRAPS[trap]
     assert run(*COMPOSITION, "--out", "a.yaml")[0] == 0
     text = Path("a.yaml").read_text()
@@ -231,6 +231,6 @@ def test_a_broken_file_is_refused_by_its_line(run, refused, trap):
     assert message in told
 
 
-def test_what_is_missing_is_asked_for(refused):
+def test_missing_arguments_are_named(refused):
     for argv in (("split",), ("split", "new"), ("split", "new", "interpolation")):
         assert "the following arguments are required" in refused(*argv)

@@ -1,4 +1,4 @@
-"""``morphgen tokens``: what it prints, what it writes, and what it refuses."""
+"""``morphgen tokens``: output, written files and rejected input."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,7 @@ def bundle(tmp_path):
     return write_bundle(arm(), tmp_path / "arm", picture=False).relative_to(tmp_path)
 
 
-def test_it_prints_what_the_tokens_say_link_by_link(run, bundle):
+def test_tokens_are_printed_link_by_link(run, bundle):
     code, out, err = run("tokens", bundle)
     assert (code, err) == (0, "")
     cylinder, twice = "cylinder r 0.02, length", "0.04 | prismatic | 0 1 0"
@@ -48,7 +48,7 @@ def test_it_prints_what_the_tokens_say_link_by_link(run, bundle):
     assert out.splitlines()[-1] == "arm: (6, 48), indices over 22"
 
 
-def test_it_takes_a_urdf_and_words(run, robot_urdf):
+def test_robot_can_be_given_as_urdf_or_parts(run, robot_urdf):
     code, out, _ = run("tokens", robot_urdf(arm()))
     assert (code, len(rows_of(out))) == (0, 6)
     assert {row[3] for row in rows_of(out)} == {""}
@@ -61,11 +61,11 @@ def test_it_takes_a_urdf_and_words(run, robot_urdf):
     assert {*drawn} == {"cylinder", "sphere"}
 
 
-def test_options_may_stand_between_words(run):
+def test_options_may_stand_between_parts(run):
     assert run("tokens", WORDS[0], "--max-links", 7, WORDS[1])[0] == 0
 
 
-def test_it_prints_the_fields(run, bundle):
+def test_layout_option_prints_the_fields(run, bundle):
     code, out, err = run("tokens", "--layout")
     assert (code, err) == (0, "")
     lines = out.splitlines()[2:]
@@ -77,7 +77,7 @@ def test_it_prints_the_fields(run, bundle):
     assert sum(field["size"] for field in json.loads(data)) == 48
 
 
-def test_it_prints_json_alone(run):
+def test_json_option_prints_only_json(run):
     code, out, err = run("tokens", *WORDS, "--json", "--max-links", 10)
     assert (code, err) == (0, "")
     data = json.loads(out)
@@ -89,7 +89,7 @@ def test_it_prints_json_alone(run):
     assert [field["name"] for field in data["layout"]] == [field.name for field in LAYOUT]
 
 
-def test_it_writes_a_file_the_same_bytes_each_time(run, bundle, tmp_path):
+def test_written_file_is_reproducible(run, bundle, tmp_path):
     before = set(tree(tmp_path))
     code, out, err = run("tokens", bundle, "--out", "arm.npz")
     assert (code, err) == (0, "")
@@ -127,12 +127,12 @@ def test_it_writes_a_file_the_same_bytes_each_time(run, bundle, tmp_path):
         ("./folder.npz", "folder.npz holds no robot"),
     ],
 )
-def test_what_it_cannot_do_is_refused(refused, tmp_path, argv, message):
+def test_invalid_arguments_are_rejected(refused, tmp_path, argv, message):
     (tmp_path / "folder.npz").mkdir()
     assert message in refused("tokens", *argv.split())
 
 
-def test_an_interrupted_run_leaves_the_old_file(run, bundle, tmp_path, monkeypatch):
+def test_interrupted_run_keeps_the_old_file(run, bundle, tmp_path, monkeypatch):
     Path("arm.npz").write_text("old")
     before = tree(tmp_path)
 

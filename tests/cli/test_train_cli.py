@@ -39,7 +39,7 @@ def split_yaml(tmp_path):
     return "split.yaml"
 
 
-def test_one_body_is_trained_resumed_evaluated_and_played(run, tmp_path):
+def test_single_robot_is_trained_resumed_evaluated_and_played(run, tmp_path):
     code, out, err = run(*RUN, "--steps", "128", "--seed", "3")
     folder = tmp_path / "runs" / "planar-cube-reach" / "me-mlp" / "seed3"
     assert (code, out) == (0, f"{folder.relative_to(tmp_path) / CHECKPOINT}\n")
@@ -73,7 +73,7 @@ def test_one_body_is_trained_resumed_evaluated_and_played(run, tmp_path):
     assert out.startswith("episode 1: ")
 
 
-def test_a_robot_of_many_links_is_trained_without_an_option(run, tmp_path):
+def test_max_links_defaults_to_the_size_of_the_robot(run, tmp_path):
     words = ("train", "chain", "beads=7", "task=reach", "--agent", "me-mlp", *SMALL)
     words += ("--steps", "32")
     code, out, err = run(*words, "--out", "run", "--max-links", "23")
@@ -92,7 +92,7 @@ def test_a_robot_of_many_links_is_trained_without_an_option(run, tmp_path):
         assert out.startswith("episode 1: ")
 
 
-def test_a_policy_that_sees_its_tool_is_scored_and_played_where_it_is_shown(run):
+def test_policy_with_tool_position_is_evaluated_and_played(run):
     words = (*RUN, "--steps", "32", "--no-tensorboard", "--out", "run")
     assert run(*words, "--tool-position")[0] == 0
     assert read_checkpoint(Path("run"))[1]["layout"]["tool"]
@@ -104,7 +104,7 @@ def test_a_policy_that_sees_its_tool_is_scored_and_played_where_it_is_shown(run)
     assert (code, out[:11]) == (0, "episode 1: ")
 
 
-def test_the_policy_that_is_played_is_the_one_that_was_trained(run):
+def test_play_uses_the_given_checkpoint(run):
     outs = []
     for seed in (0, 1):
         run(*RUN, "--steps", "64", "--out", f"run{seed}", "--seed", seed, "--no-discrete")
@@ -113,7 +113,7 @@ def test_the_policy_that_is_played_is_the_one_that_was_trained(run):
     assert outs[0] == outs[1] != outs[2] == outs[3]
 
 
-def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml):
+def test_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml):
     code, _, _ = run(
         "train", split_yaml, "--agent", "me-mlp", *SMALL, "--steps", "64", "--out", "a"
     )
@@ -140,7 +140,7 @@ def test_a_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_ya
     assert "pass --resume" in err
 
 
-def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_yaml):
+def test_training_uses_the_goals_stored_with_a_split(run, split_yaml):
     build = ("split", "build", split_yaml, "--out", "built", "--goals", "--goal-seed", "5")
     assert run(*build)[0] == 0
     (index,) = Path("built").rglob("goals/index.json")
@@ -161,7 +161,7 @@ def test_goals_that_ship_with_a_split_are_those_that_are_trained_on(run, split_y
 
 
 @pytest.mark.slow
-def test_training_may_have_more_goals_than_evaluations(run):
+def test_train_goals_option_does_not_change_evaluation_goals(run):
     """Which have the same, whatever the training had."""
     found = []
     for name, more in (("a", ()), ("b", ("--train-goals", "150"))):
@@ -186,7 +186,7 @@ def test_training_may_have_more_goals_than_evaluations(run):
     assert not Path("c").exists()
 
 
-def test_every_switch_is_a_flag(run, tmp_path):
+def test_every_training_switch_has_an_option(run, tmp_path):
     off = ("--no-symlog", "--no-slow-critic", "--no-discrete", "--no-curriculum")
     on = ("--task-reweighting", "--fixed-deviation", "--mask-morphology", "--tool-position")
     flags = (*off, *on, "--no-tensorboard")
@@ -209,12 +209,12 @@ def test_every_switch_is_a_flag(run, tmp_path):
     assert not Path("bins").exists()
 
 
-def test_actions_are_discrete_for_reach_alone(run, tmp_path):
+def test_default_actions_are_discrete_only_for_reach(run, tmp_path):
     run("train", "prims", "task=push", "--agent", "me-mlp", *SMALL, "--steps", "32", "--out", "p")
     assert not read_config(tmp_path / "p").policy.discrete
 
 
-def test_references_are_evaluated_beside(run, split_yaml):
+def test_baselines_can_be_evaluated(run, split_yaml):
     code, out, _ = run("eval", "ik", "--split", split_yaml, "--sim", "mujoco", "--episodes", "1")
     assert code == 0
     assert "ik: MT reach " in out
@@ -222,7 +222,7 @@ def test_references_are_evaluated_beside(run, split_yaml):
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_a_run_that_goes_on(run, tmp_path, cache):
+def test_interrupted_training_can_be_resumed(run, tmp_path, cache):
     words = (*RUN, "--steps", 32 * 300, "--no-tensorboard")
     process = start(*words, "--out", "cut", XDG_CACHE_HOME=str(cache))
     try:
@@ -242,7 +242,7 @@ def test_ctrl_c_leaves_a_run_that_goes_on(run, tmp_path, cache):
     assert sorted(tree(tmp_path / "cut")) == [CHECKPOINT, "config.json", METRICS]
 
 
-def test_a_run_cut_short_equals_one_that_was_not(run, tmp_path):
+def test_resumed_run_equals_an_uninterrupted_run(run, tmp_path):
     words = (*RUN, "--steps", "96", "--no-tensorboard")
     for out in ("whole", "cut"):
         assert run(*words, "--out", out)[0] == 0
@@ -252,7 +252,7 @@ def test_a_run_cut_short_equals_one_that_was_not(run, tmp_path):
     assert len(read_metrics(tmp_path / "cut")) == 3
 
 
-def test_tables_of_runs_on_a_gpu_are_written_without_one(run, split_yaml, tmp_path):
+def test_study_report_of_gpu_runs_needs_no_gpu(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0", *SMALL)
     code, out, _ = run(*words, "--device", "cuda", "--report")
     assert code == 0
@@ -260,7 +260,7 @@ def test_tables_of_runs_on_a_gpu_are_written_without_one(run, split_yaml, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_study_is_a_table(run, split_yaml, tmp_path):
+def test_study_prints_a_table(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp,me-mlp-discrete", "--seeds", "0..1", *SMALL)
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
     code, out, _ = run(*words, "--report")
@@ -292,7 +292,7 @@ def test_a_study_is_a_table(run, split_yaml, tmp_path):
     assert "scores.json: of another evaluation" in err
 
 
-def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tmp_path):
+def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0..1", *SMALL)
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
     broken = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed0" / CHECKPOINT
@@ -364,11 +364,11 @@ def test_a_cell_that_fails_is_told_and_the_exit_code_says_so(run, split_yaml, tm
         (("study", "interpolation/arm3/reach", "--steps", "10"), "an update takes"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(refused, words, says):
+def test_invalid_arguments_are_rejected_in_one_line(refused, words, says):
     assert says in refused(*words)
 
 
-def test_folders_and_checkpoints_that_are_others_are_refused(run, refused, tmp_path):
+def test_foreign_folders_and_checkpoints_are_rejected(run, refused, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     assert "not the folder of a run" in refused(*RUN, "--steps", "32", "--out", "mine")
@@ -387,5 +387,5 @@ def test_folders_and_checkpoints_that_are_others_are_refused(run, refused, tmp_p
 
 
 @pytest.mark.parametrize("words", [("--steps", "1.5"), ("--steps", "inf"), ("--steps", "many")])
-def test_steps_are_whole_numbers(words, refused):
+def test_steps_option_must_be_a_whole_number(words, refused):
     assert "argument --steps" in refused(*RUN, *words)

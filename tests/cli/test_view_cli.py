@@ -1,4 +1,4 @@
-"""``morphgen view`` serves, warns and refuses."""
+"""``morphgen view``: serving, warnings and rejected input."""
 
 import re
 import signal
@@ -22,7 +22,7 @@ def address(process):
     raise AssertionError(process.stderr.read())
 
 
-def test_a_bundle_is_served_until_interrupted(tmp_path):
+def test_bundle_is_served_until_interrupted(tmp_path):
     write_bundle(arm(), tmp_path / "arm", picture=False)
     viewing = start("view", tmp_path / "arm", "--port", "8931")
     page = urllib.request.urlopen(address(viewing), timeout=60)
@@ -41,7 +41,7 @@ def test_a_bundle_is_served_until_interrupted(tmp_path):
         pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
     ],
 )
-def test_however_it_ends_no_upload_is_left(tmp_path, monkeypatch, end):
+def test_uploads_are_deleted_on_every_signal(tmp_path, monkeypatch, end):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     viewing = start("view", "--port", "8933")
     port = int(re.search(r":(\d+)", address(viewing))[1])
@@ -56,7 +56,7 @@ def test_however_it_ends_no_upload_is_left(tmp_path, monkeypatch, end):
     assert list(tmp_path.glob("morphgen-uploads-*")) == []
 
 
-def test_it_serves_the_sites_that_are_allowed(tmp_path):
+def test_allowed_origins_are_served(tmp_path):
     site = "https://hub.example.com"
     viewing = start("view", "--port", "8934", "--allow-origin", site)
     port = int(re.search(r":(\d+)", address(viewing))[1])
@@ -70,7 +70,7 @@ def test_it_serves_the_sites_that_are_allowed(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="no IPv6 here")
-def test_it_serves_at_ipv6(tmp_path):
+def test_ipv6_address_is_served(tmp_path):
     viewing = start("view", "--port", "8935", "--host", "::1")
     where = address(viewing)
     port = int(where.rpartition(":")[2])
@@ -82,7 +82,7 @@ def test_it_serves_at_ipv6(tmp_path):
 
 
 @pytest.mark.slow
-def test_another_host_is_warned_of(tmp_path):
+def test_non_local_host_prints_a_warning(tmp_path):
     viewing = start("view", "--host", "0.0.0.0", "--port", "8932")
     address(viewing)
     viewing.send_signal(signal.SIGINT)
@@ -95,7 +95,7 @@ def test_another_host_is_warned_of(tmp_path):
     ("name", "why"),
     [("some.npz", "is not an episode of morphgen view"), ("some.pt", "is not a checkpoint")],
 )
-def test_a_file_that_cannot_be_played_is_refused(refused, tmp_path, name, why):
+def test_invalid_episode_and_checkpoint_files_are_rejected(refused, tmp_path, name, why):
     (tmp_path / name).write_text("something else")
     assert why in refused("view", tmp_path / name)
 
@@ -113,5 +113,5 @@ def test_a_file_that_cannot_be_played_is_refused(refused, tmp_path, name, why):
         (["--allow-origin", "http://box/page"], "without a path"),
     ],
 )
-def test_what_cannot_be_served_is_refused(refused, words, why):
+def test_invalid_arguments_are_rejected(refused, words, why):
     assert why in refused("view", *words)

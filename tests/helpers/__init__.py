@@ -1,1 +1,1 @@
-"""What tests share: robots, scenes, runs and clients, built in code."""
+"""Shared test helpers: robots, scenes, runs and clients, built in code."""

@@ -1,4 +1,4 @@
-"""Run the command line in another process, and see what it leaves on disk."""
+"""Run the command line in another process and inspect the files it leaves."""
 
 import os
 import signal

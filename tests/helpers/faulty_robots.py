@@ -1,4 +1,4 @@
-"""Robots with one fault each, by the code of its finding."""
+"""Robots with exactly one fault each, keyed by finding code."""
 
 import math
 from collections.abc import Callable

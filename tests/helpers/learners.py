@@ -1,4 +1,4 @@
-"""Small learners on a line, and what there is to compare of them."""
+"""Small learners on a one-dimensional task, and comparisons of their weights."""
 
 import io
 from dataclasses import asdict, replace

@@ -1,4 +1,4 @@
-"""The smallest batch to learn from: a point on a line, with the observations of real bodies."""
+"""The smallest batch to learn from: a point on a line with full robot observations."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Parts that tests write into folders of their own."""
+"""Parts that tests write to their own folders."""
 
 from pathlib import Path
 

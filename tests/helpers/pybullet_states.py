@@ -1,4 +1,4 @@
-"""What tests of PyBullet's simulation share: starts, walks, and a look inside."""
+"""Helpers for PyBullet tests: start states, random walks and contact queries."""
 
 import numpy as np
 import pybullet

@@ -1,4 +1,4 @@
-"""The smallest runs there are: two sliding bodies to train on, one to test on, in MuJoCo."""
+"""The smallest training runs: two sliding robots to train on and one to test on, in MuJoCo."""
 
 from dataclasses import replace
 

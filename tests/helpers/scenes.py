@@ -1,4 +1,4 @@
-"""Little scenes that the tests of every simulator share."""
+"""Small scenes shared by the simulator tests."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Tokens of the arm, and their fields by name."""
+"""Tokens of the test arm, with fields accessed by name."""
 
 from dataclasses import replace
 

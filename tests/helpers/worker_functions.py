@@ -1,4 +1,4 @@
-"""Work for several processes, which import it from here."""
+"""Importable functions for worker processes."""
 
 import os
 import time

@@ -1,4 +1,4 @@
-"""What tests of tasks share."""
+"""Fixtures shared by the task tests."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Actions become targets, and states become rewards."""
+"""Conversion of actions to joint targets, and reward terms."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_bins_are_symmetric_and_hold_zero():
     assert BINS[5] == 0
 
 
-def test_continuous_actions_are_clipped_and_discrete_ones_looked_up():
+def test_continuous_actions_are_clipped_and_discrete_actions_index_bins():
     shares = decode_actions(torch.tensor([[2.0, -0.5]]), "continuous", (1, 2), CPU)
     assert shares.tolist() == [[1.0, -0.5]]
     shares = decode_actions(torch.tensor([[0, 5, 10]]), "discrete", (1, 3), CPU)
@@ -48,12 +48,12 @@ def test_continuous_actions_are_clipped_and_discrete_ones_looked_up():
         (torch.tensor([[0.0, 1.0]]), "discrete", "integers from 0"),
     ],
 )
-def test_what_is_no_action_is_refused(actions, kind, words):
+def test_invalid_actions_are_rejected(actions, kind, words):
     with pytest.raises(TaskError, match=words):
         decode_actions(actions, kind, (1, 2), CPU)
 
 
-def test_targets_move_by_the_step_of_each_joint_from_the_targets_before(robot_tables):
+def test_targets_move_from_the_previous_targets_by_each_joints_step(robot_tables):
     body = torch.tensor([0, 1, 1])
     mask = robot_tables.action_mask(fingers=True)[body]
     before = robot_tables.home[body]
@@ -76,7 +76,7 @@ def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
     assert torch.equal(targets[0, ~moved], robot_tables.home[1, ~moved])
 
 
-def test_terms_of_reach():
+def test_reach_reward_terms():
     config = ReachConfig()
     distance = torch.tensor([0.029, 0.031])
     violation = limit_violation(
@@ -92,7 +92,7 @@ def test_terms_of_reach():
     assert score.tolist() == pytest.approx([200.0, -50 * 0.031**2])
 
 
-def test_terms_of_push():
+def test_push_reward_terms():
     success = torch.tensor([True, False])
     terms = push_terms(
         PushConfig(),
@@ -106,7 +106,7 @@ def test_terms_of_push():
     assert terms["approach"].tolist() == pytest.approx([-0.05, -0.1])
 
 
-def test_the_line_moves_over_the_first_half_of_training_and_then_stays():
+def test_curriculum_line_moves_during_the_first_half_of_training():
     line = torch.tensor([0.2, 0.1])
     places = [curriculum_line(PushConfig(), line, p / 100)[0].item() for p in range(101)]
     assert places[0] == pytest.approx(0.02)

@@ -1,4 +1,4 @@
-"""Reach over a batch of bodies: episodes, what ends them, and that the same seed gives the same."""
+"""Batches of reach environments: episodes, terminations and reproducibility."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def run(batch, controller, steps):
     return [batch.step(controller.act(batch)) for _ in range(steps)]
 
 
-def test_observations_have_the_shapes_they_claim(made):
+def test_observations_have_the_declared_shapes(made):
     channels = ObservationConfig(velocity=True, previous_action=True, tool=True, points=50)
     batch = made(obstacles=True, observe=channels)
     seen = batch.reset()
@@ -86,7 +86,7 @@ def test_observations_have_the_shapes_they_claim(made):
     assert all(value.isfinite().all() for value in seen.values())
 
 
-def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
+def test_reach_episode_has_one_goal_and_ends_only_by_time(made):
     batch = made(config=replace(CONFIG, max_episode_steps=5))
     batch.reset()
     goal = batch.field("goal").clone()
@@ -102,7 +102,7 @@ def test_an_episode_has_one_goal_and_ends_by_time_alone(made):
     assert (batch.episode_step == 0).all()
 
 
-def test_the_final_observation_is_before_the_next_start(made):
+def test_final_observation_precedes_the_reset(made):
     batch = made(config=replace(CONFIG, max_episode_steps=3))
     batch.reset()
     for _ in range(3):
@@ -113,7 +113,7 @@ def test_the_final_observation_is_before_the_next_start(made):
     assert not torch.equal(step.observation["tokens"], step.final_observation["tokens"])
 
 
-def test_a_start_is_never_the_goals_own_configuration(made):
+def test_start_is_never_the_goal_configuration(made):
     batch = made(40, robots=(0,))
     for _ in range(3):
         batch.reset()
@@ -123,7 +123,7 @@ def test_a_start_is_never_the_goals_own_configuration(made):
         assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
 
 
-def test_doing_nothing_moves_nothing(made):
+def test_zero_actions_move_no_joint(made):
     batch = made()
     batch.reset()
     before = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, batch.q)
@@ -134,7 +134,7 @@ def test_doing_nothing_moves_nothing(made):
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
+def test_ik_reaches_the_goal_and_random_actions_do_not(made, kind):
     steps = run(made(12, robots=(0,), kind=kind), InverseKinematics(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() >= 0.9
     assert steps[-1].score[steps[-1].success].unique().tolist() == [CONFIG.score_near]
@@ -142,19 +142,19 @@ def test_inverse_kinematics_arrives_and_chance_does_not(made, kind):
     assert steps[-1].success.float().mean() <= 0.2
 
 
-def test_inverse_kinematics_goes_around_what_is_in_the_way(made):
+def test_ik_avoids_obstacles(made):
     batch = made(12, robots=(1, 1, 2))
     steps = run(batch, InverseKinematics(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() >= 0.9
 
 
-def test_the_reward_is_the_sum_of_its_terms(made):
+def test_reward_is_the_sum_of_its_terms(made):
     for step in run(made(obstacles=True), Random(3), 20):
         assert torch.allclose(step.reward, sum(step.terms.values()))
         assert step.reward.isfinite().all()
 
 
-def test_an_environment_is_the_same_in_whichever_batch(made):
+def test_environment_does_not_depend_on_its_batch(made):
     whole = made(4, seed=7)
     part = made(2, seed=7, first=2)
     actions = torch.rand(
@@ -169,7 +169,7 @@ def test_an_environment_is_the_same_in_whichever_batch(made):
 
 
 @pytest.mark.parametrize("others", [(), (1,), (1, 2), (0, 0, 0, 0, 0, 0, 0)])
-def test_no_bit_of_a_reward_depends_on_the_rest_of_the_batch(made, others):
+def test_rewards_are_bit_identical_in_any_batch(made, others):
     alone, beside = (made(1 + len(more), robots=(0, *more), seed=7) for more in ((), others))
     actions = torch.rand(
         30, 1, alone.robot_tables.max_links, generator=torch.Generator().manual_seed(0)
@@ -182,7 +182,7 @@ def test_no_bit_of_a_reward_depends_on_the_rest_of_the_batch(made, others):
             assert torch.equal(term, b.terms[name][:1]), name
 
 
-def test_a_point_cloud_changes_no_episode(made):
+def test_point_cloud_observations_do_not_change_episodes(made):
     with_points, without = (
         made(obstacles=True, seed=2, observe=ObservationConfig(points=points)) for points in (5, 0)
     )
@@ -193,25 +193,25 @@ def test_a_point_cloud_changes_no_episode(made):
         assert torch.equal(with_points.targets, without.targets)
 
 
-def test_what_would_leave_robots_out_is_refused():
+def test_batches_smaller_than_the_robot_list_are_rejected():
     with pytest.raises(TaskError, match="2 environments for 3 robots"):
         make_batch("reach", list(WORDS), 2)
     with pytest.raises(TaskError, match=r"expected a list, \['prims'\]"):
         make_batch("reach", "prims", 2)
 
 
-def test_a_negative_seed_is_refused(made):
+def test_negative_seed_is_rejected(made):
     with pytest.raises(TaskError, match="seed -1"):
         made(seed=-1)
 
 
-def test_shares_become_the_nearest_bins_towards_zero():
+def test_actions_are_rounded_to_the_nearest_bin_towards_zero():
     shares = torch.tensor([[0.0, 1.0, -1.0, 0.3, -0.3, 0.01]])
     found = [BINS[i] for i in encode_actions(shares, "discrete")[0].tolist()]
     assert found == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
 
 
-def test_a_batch_goes_on_from_its_state(made):
+def test_batch_continues_from_a_saved_state(made):
     one, other = made(seed=3), made(seed=3)
     one.reset()
     other.reset()
@@ -227,7 +227,7 @@ def test_a_batch_goes_on_from_its_state(made):
         made(2).load_state_dict(state)
 
 
-def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
+def test_returned_tensors_are_copies(made):
     """Whoever keeps it finds it as it was, and whoever writes into it changes no batch."""
     options = {
         "obstacles": True,
@@ -270,7 +270,7 @@ def test_what_is_seen_of_a_batch_belongs_to_the_caller(made):
         assert all(torch.equal(kept[name], before[name]) for name in kept)
 
 
-def test_first_episodes_may_be_spread_over_time(made):
+def test_spread_reset_staggers_the_first_episodes(made):
     batch = made(60, robots=(0,), seed=1)
     batch.reset(spread=True)
     passed = batch.episode_step.clone()
@@ -284,7 +284,7 @@ def test_first_episodes_may_be_spread_over_time(made):
     assert torch.equal(over, passed == passed.max())
 
 
-def test_velocities_and_actions_are_those_of_the_links(made):
+def test_observed_velocities_and_actions_match_the_links(made):
     batch = made(observe=ObservationConfig(velocity=True, previous_action=True))
     assert batch.reset()["velocity"].abs().max() == 0
     action = torch.ones(batch.action_mask.shape)
@@ -296,7 +296,7 @@ def test_velocities_and_actions_are_those_of_the_links(made):
     assert (seen["velocity"].abs().amax(dim=1) > 0.01).all()
 
 
-def test_the_tool_is_where_the_joints_bring_it(made):
+def test_observed_tool_position_matches_forward_kinematics(made):
     batch = made(observe=ObservationConfig(tool=True))
     batch.reset()
     for _ in range(5):
@@ -308,7 +308,7 @@ def test_the_tool_is_where_the_joints_bring_it(made):
         assert np.linalg.norm(expected - each.goals.poses[0, :3]) > 0.01
 
 
-def test_the_tool_is_at_the_goal_where_the_witness_is(made):
+def test_goal_configuration_puts_the_tool_at_the_goal(made):
     batch = made(observe=ObservationConfig(tool=True))
     batch.reset()
     envs = torch.arange(3)
@@ -320,7 +320,7 @@ def test_the_tool_is_at_the_goal_where_the_witness_is(made):
     )
 
 
-def test_points_are_on_the_obstacles(made):
+def test_point_cloud_lies_on_the_obstacles(made):
     batch = made(obstacles=True, observe=ObservationConfig(points=80))
     seen = batch.reset()
     for env in range(3):

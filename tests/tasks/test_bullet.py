@@ -1,4 +1,4 @@
-"""One process of PyBullet: padding, no memory of the past, errors, and its end."""
+"""PyBullet in one process: padding, resets, errors and closing."""
 
 import gc
 
@@ -14,7 +14,7 @@ from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation
 
 
-def test_tensors_are_padded_and_stay_the_same(simulate):
+def test_state_tensors_are_padded_and_reused(simulate):
     simulation = simulate(*mixed_scenes())
     q = reset(simulation)
     before = simulation.q
@@ -31,7 +31,7 @@ def test_tensors_are_padded_and_stay_the_same(simulate):
     assert simulation.block_pose[1, 3] == pytest.approx(1, abs=1e-6)
 
 
-def test_padding_of_targets_may_be_anything(simulate):
+def test_padding_of_targets_is_ignored(simulate):
     simulation = simulate(*mixed_scenes())
     q = reset(simulation)
     q[1, 5:] = torch.nan
@@ -50,7 +50,7 @@ def touching_starts(scene, seed):
 
 
 @pytest.mark.parametrize("scene", [push_scene, reach_scene, real_arm_scene])
-def test_a_reset_leaves_no_trace_of_the_past(simulate, scene):
+def test_reset_removes_all_earlier_state(simulate, scene):
     """Random pasts near a touching start; without new broad-phase entries some show."""
     rng = np.random.default_rng(3)
     used = simulate(scene())
@@ -67,7 +67,7 @@ def test_a_reset_leaves_no_trace_of_the_past(simulate, scene):
         assert torch.equal(found, expected), seed
 
 
-def test_the_touching_starts_touch(simulate):
+def test_touching_starts_are_in_contact(simulate):
     """Without contacts the test above would show little."""
     simulation = simulate(push_scene())
     q, pose = touching_starts(push_scene(), 0)
@@ -77,7 +77,7 @@ def test_the_touching_starts_touch(simulate):
     assert frozenset((loaded.robot, loaded.block)) in bodies
 
 
-def test_an_environment_gives_the_same_bits_alone_and_among_many(simulate):
+def test_environment_is_bit_identical_alone_and_in_a_batch(simulate):
     scenes = [scene for _ in range(17) for scene in mixed_scenes()][:50]
     many = simulate(*scenes)
     together = wander(many, reset(many), 30)
@@ -94,7 +94,7 @@ def test_an_environment_gives_the_same_bits_alone_and_among_many(simulate):
             assert torch.equal(alone.block_pose[0], together[step, env, 18:25])
 
 
-def test_resetting_some_leaves_the_others_alone(simulate):
+def test_partial_reset_does_not_change_other_environments(simulate):
     scenes = mixed_scenes()
     a, b = simulate(*scenes), simulate(*scenes)
     q = reset(a)
@@ -109,7 +109,7 @@ def test_resetting_some_leaves_the_others_alone(simulate):
     assert not torch.equal(state(a)[1], state(b)[1])
 
 
-def test_a_reset_reports_the_state(simulate):
+def test_reset_reports_the_state(simulate):
     simulation = simulate(*mixed_scenes())
     q = reset(simulation)
     assert torch.equal(simulation.q, q)
@@ -118,7 +118,7 @@ def test_a_reset_reports_the_state(simulate):
     assert torch.allclose(simulation.block_pose, pose, atol=1e-6)
 
 
-def test_a_robot_is_written_once(simulate, monkeypatch):
+def test_robot_file_is_written_once(simulate, monkeypatch):
     written = []
     original = bullet.write_bundle
 
@@ -131,7 +131,7 @@ def test_a_robot_is_written_once(simulate, monkeypatch):
     assert len(written) == 3
 
 
-def test_an_unstable_environment_is_named_and_can_be_reset(simulate):
+def test_diverged_environment_is_reported_and_can_be_reset(simulate):
     simulation = simulate(*mixed_scenes())
     q = reset(simulation)
     simulation.step(q)
@@ -148,7 +148,7 @@ def test_an_unstable_environment_is_named_and_can_be_reset(simulate):
     assert torch.equal(simulation.q[2, :6], fresh.q[0])
 
 
-def test_wrong_arguments_are_refused_before_anything_moves(simulate):
+def test_invalid_arguments_are_rejected_before_stepping(simulate):
     simulation = simulate(*mixed_scenes())
     q = reset(simulation)
     before = state(simulation)
@@ -165,7 +165,7 @@ def test_wrong_arguments_are_refused_before_anything_moves(simulate):
     assert torch.equal(state(simulation), before)
 
 
-def test_the_limit_of_clients_is_named(monkeypatch):
+def test_client_limit_error_names_the_limit(monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda *_: -1)
     with pytest.raises(SimulationError, match="no client left: a process has 1024"):
         BulletSimulation([push_scene()])
@@ -182,7 +182,7 @@ def test_closing_frees_the_clients(simulate):
         simulation.step(torch.zeros(1, 5))
 
 
-def test_a_forgotten_simulation_frees_its_clients():
+def test_garbage_collected_simulation_frees_its_clients():
     simulation = BulletSimulation([push_scene()])
     client = client_of(simulation).id
     del simulation

@@ -1,4 +1,4 @@
-"""Contacts in PyBullet: blocks, friction, obstacles, links with each other."""
+"""Contacts in PyBullet: blocks, friction, obstacles and self-contact."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def test_blocks_fall_and_come_to_rest(simulate):
 
 @pytest.mark.parametrize("friction", [0.3, 0.6])
 @pytest.mark.parametrize("degrees", [0, 30, 45])
-def test_friction_is_coulombs_with_the_blocks_coefficient(simulate, friction, degrees):
+def test_friction_follows_coulombs_law(simulate, friction, degrees):
     simulation = simulate(block_scene(friction, height=0.025))
     q = reset(simulation)
     simulation.step(q)
@@ -54,14 +54,14 @@ def test_friction_is_coulombs_with_the_blocks_coefficient(simulate, friction, de
     np.testing.assert_allclose(moved, expected, atol=0.05 * np.linalg.norm(expected))
 
 
-def test_robots_have_the_stated_friction(simulate):
+def test_robots_have_the_specified_friction(simulate):
     loaded = client_of(simulate(push_scene()))
     for link in (-1, *loaded.driven):
         info = pybullet.getDynamicsInfo(loaded.robot, link, physicsClientId=loaded.id)
         assert info[1] == FRICTION
 
 
-def test_a_block_without_mass_stays_where_it_is_put(simulate):
+def test_block_without_mass_is_static(simulate):
     scene = block_scene(mass=0.0)
     simulation = simulate(scene)
     pose = torch.tensor([[0.1, 0.2, 0.7, 1.0, 0.0, 0.0, 0.0]])
@@ -79,7 +79,7 @@ def push(simulation, steps=60):
         simulation.step(q)
 
 
-def test_the_gantry_pushes_the_block(simulate):
+def test_gantry_pushes_the_block(simulate):
     simulation = simulate(push_scene())
     push(simulation)
     plate = float(simulation.q[0, 1]) + 0.005
@@ -87,7 +87,7 @@ def test_the_gantry_pushes_the_block(simulate):
     assert float(simulation.block_pose[0, 1]) > 0.2
 
 
-def test_without_contacts_the_plate_passes_through(simulate):
+def test_plate_passes_through_the_block_without_contacts(simulate):
     simulation = simulate(push_scene(), contacts=Contacts(scene=False))
     push(simulation)
     assert float(simulation.q[0, 1]) > 0.2
@@ -103,7 +103,7 @@ def test_obstacles_stop_the_robot(simulate):
     assert float(simulation.q[0, 1]) == pytest.approx(0.05 - half_plate, abs=0.01)
 
 
-def test_what_is_held_does_not_touch_what_stands(simulate):
+def test_fixed_base_touches_blocks_but_not_static_objects(simulate):
     """The foot of the arm stands in the ground and in a box, and on a block."""
     box = Block((0.1, 0.1, 0.05), Pose((0.0, 0.0, -0.01)))
     scene = Scene(robot("arm=ur5 ee=plane"), obstacles=(box,))
@@ -135,7 +135,7 @@ def overlapping():
     return replace(body, joints=tuple(joints))
 
 
-def test_links_touch_each_other_unless_ignored(simulate):
+def test_links_collide_unless_their_pair_is_ignored(simulate):
     body = overlapping()
     touched = self_contact(simulate, body)
     assert touched

@@ -1,4 +1,4 @@
-"""Joints in PyBullet: where links are, the law of the motors, and their limits."""
+"""Joints in PyBullet: forward kinematics, motor law and limits."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])
-def test_links_are_where_the_kinematics_put_them(simulate, request_):
+def test_link_poses_match_forward_kinematics(simulate, request_):
     T = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.2, 0.4, -0.7))
     body = robot(request_)
     simulation = simulate(Scene(body, T), contacts=Contacts(False, False))
@@ -46,7 +46,7 @@ def test_links_are_where_the_kinematics_put_them(simulate, request_):
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=arm3 ee=claw", "prims"])
-def test_motors_follow_the_critically_damped_law(simulate, request_):
+def test_motors_are_critically_damped(simulate, request_):
     body = robot(request_)
     free = replace(body, joints=tuple(replace(j, effort=None, velocity=None) for j in body.joints))
     simulation = simulate(Scene(free, ground=None), contacts=Contacts(False, False))
@@ -64,7 +64,7 @@ def test_motors_follow_the_critically_damped_law(simulate, request_):
 
 
 @pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
-def test_robots_carry_their_own_weight(simulate, scene):
+def test_motors_hold_the_robot_against_gravity(simulate, scene):
     simulation = simulate(scene())
     q = reset(simulation)
     for _ in range(300):
@@ -100,7 +100,7 @@ def test_velocity_is_limited(simulate):
 
 
 @pytest.mark.parametrize("pushes", [False, True])
-def test_joints_come_back_to_their_limits(simulate, pushes):
+def test_joints_return_to_their_limits(simulate, pushes):
     """Whatever pushes them past; with and without a block the solver is another."""
     body = arm()
     block = Block((0.1, 0.1, 0.1), Pose((3.0, 0.0, 0.05)), 1.0) if pushes else None
@@ -123,7 +123,7 @@ def test_joints_come_back_to_their_limits(simulate, pushes):
     assert float(simulation.q[0, 0]) == pytest.approx(2.0, abs=1e-3)
 
 
-def test_nothing_throws_a_joint(simulate):
+def test_strong_contacts_do_not_exceed_joint_speed_limits(simulate):
     """An arm that presses itself and the ground as hard as it can."""
     body = robot("arm=ur5 ee=plane")
     simulation = simulate(*[Scene(body)] * 8)

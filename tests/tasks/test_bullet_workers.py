@@ -1,4 +1,4 @@
-"""PyBullet in several processes: the same bits, and nothing left behind however it ends."""
+"""PyBullet in several processes: identical results and cleanup after every kind of exit."""
 
 import gc
 import os
@@ -83,7 +83,7 @@ def leftovers(scratch, pid):
     return [*scratch.glob("morphgen-*"), *Path("/dev/shm").glob(f"*{pid}*")]
 
 
-def test_workers_give_the_bits_of_one_process(workers):
+def test_workers_are_bit_identical_to_one_process(workers):
     alone = BulletSimulation(workers.scenes)
     generator = torch.Generator().manual_seed(0)
     envs, q, pose = starts(alone)
@@ -100,7 +100,7 @@ def test_workers_give_the_bits_of_one_process(workers):
     alone.close()
 
 
-def test_wrong_arguments_leave_the_workers_at_work(workers):
+def test_invalid_arguments_do_not_stop_the_workers(workers):
     envs, q, pose = starts(workers)
     workers.reset(envs, q, pose)
     with pytest.raises(ValueError, match=r"environment 0 .*targets"):
@@ -112,7 +112,7 @@ def test_wrong_arguments_leave_the_workers_at_work(workers):
 
 
 @pytest.mark.parametrize("heavy", [{0}, {1}, {0, 1}], ids=["here", "in a worker", "both"])
-def test_what_is_unstable_is_named_wherever_it_is_and_the_others_step(heavy):
+def test_diverged_environments_are_reported_and_the_others_step(heavy):
     """The weight of such a block is not finite."""
     scenes = [push_scene() for _ in range(4)]
     for env in heavy:
@@ -132,7 +132,7 @@ def test_what_is_unstable_is_named_wherever_it_is_and_the_others_step(heavy):
         assert torch.isfinite(state(simulation)).all()
 
 
-def test_a_robot_that_cannot_be_loaded_is_named_here(monkeypatch, scratch):
+def test_robot_that_cannot_be_loaded_is_named_in_the_parent(monkeypatch, scratch):
     original = bullet.export_robots
 
     def lost(scenes, folder):
@@ -144,7 +144,7 @@ def test_a_robot_that_cannot_be_loaded_is_named_here(monkeypatch, scratch):
     assert leftovers(scratch, os.getpid()) == []
 
 
-def test_a_killed_worker_is_reported_at_once_and_all_is_freed(scratch):
+def test_killed_worker_is_reported_and_everything_is_freed(scratch):
     simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     envs, q, pose = starts(simulation)
     simulation.reset(envs, q, pose)
@@ -160,7 +160,7 @@ def test_a_killed_worker_is_reported_at_once_and_all_is_freed(scratch):
     simulation.close()
 
 
-def test_a_worker_killed_in_the_middle_of_a_step_is_reported():
+def test_worker_killed_during_a_step_is_reported():
     scenes = [push_scene() for _ in range(8)]
     simulation = BulletSimulation(scenes, processes=2)
     envs, q, pose = starts(simulation)
@@ -181,7 +181,7 @@ def test_a_worker_killed_in_the_middle_of_a_step_is_reported():
     killer.wait()
 
 
-def test_nothing_is_left_after_closing(scratch):
+def test_close_removes_processes_and_files(scratch):
     simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     running = pids(simulation)
     kept = simulation.q
@@ -194,7 +194,7 @@ def test_nothing_is_left_after_closing(scratch):
         simulation.reset(*starts(simulation))
 
 
-def test_a_forgotten_simulation_ends_its_workers(scratch):
+def test_garbage_collected_simulation_ends_its_workers(scratch):
     simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
     running = pids(simulation)
     del simulation
@@ -244,7 +244,7 @@ while True:
 """
 
 
-def test_an_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
+def test_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
     process, running = script(tmp_path, "raise RuntimeError('on purpose')")
     _, errors = process.communicate(timeout=20)
     assert "on purpose" in errors
@@ -277,7 +277,7 @@ def test_workers_end_when_the_parent_is_killed(tmp_path, scratch):
     assert list(Path("/dev/shm").glob(f"*{process.pid}*")) == []
 
 
-def test_the_work_is_shared_evenly():
+def test_environments_are_distributed_evenly():
     scenes = [scene for scene in mixed_scenes() for _ in range(10)]
     shares = divide(scenes, 3)
     assert sorted(env for share in shares for env in share) == list(range(30))
@@ -287,6 +287,6 @@ def test_the_work_is_shared_evenly():
 
 
 @pytest.mark.parametrize(("scenes", "processes"), [([], 2), ([1], 0)])
-def test_processes_need_something_to_do(scenes, processes):
+def test_zero_scenes_or_processes_are_rejected(scenes, processes):
     with pytest.raises(ValueError, match="both must be at least 1"):
         BulletSimulation(scenes, processes=processes)

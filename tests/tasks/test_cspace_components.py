@@ -1,4 +1,4 @@
-"""Links that part what a robot can get to, and goals that are on the larger side."""
+"""Connected components of free configuration space, and goals in the largest one."""
 
 import math
 import re
@@ -45,7 +45,7 @@ def hinged(kind, *walls):
     return replace(body, joints=(turning, sliding), home=(0.0, 0.9))
 
 
-def test_a_wall_across_parts_what_is_behind_it():
+def test_wall_splits_the_joint_range():
     body = walled(ACROSS)
     (found,) = cspace_components(body)
     assert found.pairs == (("ball", "base"),)
@@ -58,11 +58,11 @@ def test_a_wall_across_parts_what_is_behind_it():
 
 
 @pytest.mark.parametrize("walls", [(), GAP])
-def test_what_can_be_gone_round_parts_nothing(walls):
+def test_passable_obstacle_does_not_split_the_range(walls):
     assert cspace_components(walled(*walls)) == ()
 
 
-def test_a_joint_without_end_goes_on_at_the_other():
+def test_continuous_joint_wraps_around():
     """A wall on one side is no barrier to what goes round, two are; limits make one enough."""
     left, right = ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0))
     assert cspace_components(hinged("continuous", left)) == ()
@@ -73,7 +73,7 @@ def test_a_joint_without_end_goes_on_at_the_other():
     assert not in_other_component(found, np.array([0.5, 0.9])).any()
 
 
-def test_whole_turns_part_nothing():
+def test_ranges_of_full_turns_are_not_split():
     """A wall in the way of a hinge that turns twice: where it is counts, not how often round."""
     body = hinged("revolute", ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0)))
     found = cspace_components(body)
@@ -83,11 +83,11 @@ def test_whole_turns_part_nothing():
 
 
 @pytest.mark.parametrize("words", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "prims"])
-def test_robots_as_they_are_have_none(words):
+def test_library_robots_have_one_component(words):
     assert cspace_components(robot(words)) == ()
 
 
-def test_goals_are_on_the_larger_side(tmp_path):
+def test_goals_are_in_the_larger_component(tmp_path):
     body = walled(ACROSS)
     both, _ = FreeSpace(Scene(body)).sample(40, np.random.default_rng(0))
     assert 5 < (both[:, 0] > 0.5).sum() < 35
@@ -99,7 +99,7 @@ def test_goals_are_on_the_larger_side(tmp_path):
     assert certify_goals(goals, body, Scene(body)) == []
 
 
-def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
+def test_too_few_goals_error_counts_the_unreachable_ones():
     space = FreeSpace(Scene(walled(ACROSS)))
     with pytest.raises(BenchmarkError) as caught:
         space.sample(1, np.random.default_rng(0), lambda q: False)
@@ -110,7 +110,7 @@ def test_a_robot_with_too_few_is_told_how_many_are_cut_off():
     assert int(said[1]) == space.free(q).sum() > 100
 
 
-def test_a_certificate_notices_what_is_beyond(tmp_path):
+def test_certificate_detects_goals_in_another_component(tmp_path):
     goals = draw_goals(
         ball(0.2), ReachConfig(num_goals=12), obstacles=False, seed=0, cache=tmp_path
     )
@@ -122,7 +122,7 @@ def test_a_certificate_notices_what_is_beyond(tmp_path):
     assert [line for line in lines if "touch" in line] == [f"goal {i}: {said}" for i in there]
 
 
-def test_joints_that_do_not_move_the_tool_part_nothing():
+def test_joints_that_do_not_move_the_tool_are_not_split():
     body = walled(ACROSS)
     (frame,) = body.frames
     assert cspace_components(replace(body, frames=(replace(frame, link="cart"),))) == ()

@@ -1,4 +1,4 @@
-"""Which configurations are free, against spheres worked out by hand and against MuJoCo's plane."""
+"""Collision-free configurations, compared with hand-computed spheres and MuJoCo's plane."""
 
 from dataclasses import replace
 
@@ -42,17 +42,17 @@ def free(scene, *q):
     return FreeSpace(scene).free([[value] for value in q]).tolist()
 
 
-def test_links_may_touch_the_ground_and_not_go_into_it():
+def test_links_may_touch_but_not_penetrate_the_ground():
     lowest = -0.5 + 0.1
     assert free(Scene(aside()), 0.0, lowest - SHALLOW, lowest - DEEP) == [True, True, False]
     assert free(Scene(aside(), ground=None), lowest - DEEP) == [True]
 
 
-def test_the_ground_is_solid_however_deep_a_link_is():
+def test_links_deep_below_the_ground_are_in_collision():
     assert free(Scene(aside(), Pose((0.0, 0.0, -3.0))), 0.0) == [False]
 
 
-def test_the_root_and_what_is_fixed_to_it_may_be_in_the_ground():
+def test_root_and_links_fixed_to_it_may_be_in_the_ground():
     foot = Link("foot", collisions=(Shape(Sphere(0.2)),))
     fixed = Joint("to_foot", "fixed", "plate", "foot", Pose((0.0, 0.5, 0.0)))
     robot = aside()
@@ -60,7 +60,7 @@ def test_the_root_and_what_is_fixed_to_it_may_be_in_the_ground():
     assert free(Scene(robot), 0.0) == [True]
 
 
-def test_links_may_not_go_into_each_other_unless_they_are_neighbours_or_their_pair_is_ignored():
+def test_links_collide_unless_adjacent_or_their_pair_is_ignored():
     touching = -0.5 + 0.05 + 0.1
     q = (touching - SHALLOW, touching - DEEP)
     above = Pose((0.0, 0.0, 0.3))
@@ -75,13 +75,13 @@ def test_links_may_not_go_into_each_other_unless_they_are_neighbours_or_their_pa
         assert FreeSpace(Scene(body, above)).free([[0.0, z] for z in q]).tolist() == expected
 
 
-def test_links_may_not_go_into_obstacles():
+def test_links_collide_with_obstacles():
     scene = Scene(aside(), obstacles=(replace(SLAB, pose=Pose((0.5, 0.0, 1.0))),))
     touching = 1.0 - 0.1 - 0.1 - 0.5
     assert free(scene, touching + SHALLOW, touching + DEEP) == [True, False]
 
 
-def test_obstacles_are_hit_by_name_and_may_touch_each_other_and_the_ground():
+def test_obstacle_hits_are_named_and_obstacles_may_overlap():
     near, far = SLAB, replace(SLAB, pose=Pose((0.5, 0.0, 0.35)))
     sunk = Block((1.0, 1.0, 1.0), Pose((5.0, 0.0, 0.0)))
     space = FreeSpace(Scene(aside(), obstacles=(near, sunk, far)))
@@ -95,13 +95,13 @@ def test_obstacles_are_hit_by_name_and_may_touch_each_other_and_the_ground():
     assert space.free([[0.5]]).all()
 
 
-def test_an_obstacle_in_the_base_leaves_nothing_free():
+def test_obstacle_in_the_base_leaves_no_free_configuration():
     """The base stands still, and simulators do not test what does; so this has to."""
     inside = Block((0.05, 0.05, 0.05))
     assert free(Scene(aside(), obstacles=(inside,)), 0.0, 0.5) == [False, False]
 
 
-def test_the_point_of_a_tool_is_in_no_obstacle_though_no_link_is():
+def test_tool_point_inside_an_obstacle_is_in_collision():
     fingertip = Frame("tool", "ball", Pose((0.0, 0.0, 0.3)))
     robot = replace(aside(), frames=(fingertip,))
     thin = Block((0.1, 0.1, 0.1), Pose((0.5, 0.0, 0.9)))
@@ -111,19 +111,19 @@ def test_the_point_of_a_tool_is_in_no_obstacle_though_no_link_is():
     assert free(Scene(below, obstacles=(thin,)), -0.25) == [True]
 
 
-def test_the_robot_is_where_the_scene_puts_it():
+def test_robot_base_pose_of_the_scene_is_used():
     """Upside down the slide goes down."""
     assert free(Scene(aside(), HALF_TURN), 0.0, 0.5, -0.5) == [True, False, True]
     assert free(Scene(aside(), Pose((0.0, 0.0, 1.0))), 0.5, -0.5) == [True, True]
 
 
-def test_what_can_be_pushed_is_no_obstacle():
+def test_pushable_block_is_not_an_obstacle():
     block = replace(SLAB, mass=0.1)
     assert free(Scene(aside(), block=block), 0.0) == [True]
     assert free(Scene(aside(), obstacles=(block,)), 0.0) == [False]
 
 
-def test_a_robot_may_use_any_names():
+def test_any_link_names_are_accepted():
     links = tuple(
         replace(link, name=name)
         for link, name in zip(aside().links, ("world", "ground"), strict=True)
@@ -143,7 +143,7 @@ def test_configurations_have_the_shape_of_the_robot():
 
 @pytest.mark.filterwarnings("ignore:Attach conflict")
 @pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
-def test_mujoco_with_a_plane_and_geoms_of_its_own_agrees(scene):
+def test_results_agree_with_mujoco_plane_contacts(scene):
     """A model built another way: what is written as MJCF, in a world with a true plane."""
     scene = scene()
     robot = scene.robot
@@ -186,7 +186,7 @@ def plane_hits(scene, q):
         yield bool((data.contact.dist[counts] < -PENETRATION).any())
 
 
-def test_draws_are_free_uniform_and_the_first_of_more():
+def test_samples_are_free_uniform_and_a_prefix_of_larger_samples():
     space = FreeSpace(Scene(aside()))
     q, tried = space.sample(400, np.random.default_rng(0))
     assert q.shape == (400, 1)
@@ -198,7 +198,7 @@ def test_draws_are_free_uniform_and_the_first_of_more():
     assert fewer < tried
 
 
-def test_a_drawn_count_is_that_of_all_that_were_tested(monkeypatch):
+def test_sample_returns_the_number_of_tested_configurations(monkeypatch):
     monkeypatch.setattr(module, "_CHUNK", 7)
     space = FreeSpace(Scene(aside()))
     q, tried = space.sample(50, np.random.default_rng(0))
@@ -209,7 +209,7 @@ def test_a_drawn_count_is_that_of_all_that_were_tested(monkeypatch):
     assert (all_drawn[verdicts] == q).all()
 
 
-def test_a_robot_that_is_never_free_is_named_with_what_collides(monkeypatch):
+def test_robot_without_free_configuration_is_named_with_its_collisions(monkeypatch):
     monkeypatch.setattr(module, "TRIES", 20)
     with pytest.raises(BenchmarkError) as caught:
         FreeSpace(Scene(aside(), Pose((0.0, 0.0, -3.0)))).sample(10, np.random.default_rng(0))
@@ -229,7 +229,7 @@ def pushed(robot=None, **changes):
     return FreeSpace(Scene(robot or aside(), block=block, **changes))
 
 
-def test_the_block_is_an_obstacle_where_it_is_said_to_be():
+def test_block_is_an_obstacle_at_the_given_pose():
     """The ball of 0.1 m is 0.5 m beside the plate, and its centre 0.5 m above the ground."""
     space = pushed()
     above = 0.5 + 0.1 + 0.1
@@ -240,7 +240,7 @@ def test_the_block_is_an_obstacle_where_it_is_said_to_be():
     assert space.free([[0.3], [0.0]], [block_at(0.5, above)] * 2).tolist() == [False, True]
 
 
-def test_the_block_may_be_turned_any_way():
+def test_block_may_have_any_orientation():
     diagonal = 0.1 * np.sqrt(2)
     space = pushed()
 
@@ -253,7 +253,7 @@ def test_the_block_may_be_turned_any_way():
     assert space.free([[0.0]] * 2, aside_of).tolist() == [True, False]
 
 
-def test_the_block_may_stand_on_the_ground_but_not_in_what_stands_still():
+def test_block_may_rest_on_the_ground_but_not_in_static_objects():
     blocks = [block_at(2.0, 0.1), block_at(2.0, 0.0), block_at(0.0, 0.1), block_at(1.5, 0.1)]
     wall = Block((0.2, 0.2, 0.2), Pose((1.6, 0.0, 0.1)))
     space = pushed(obstacles=(wall,))
@@ -262,14 +262,14 @@ def test_the_block_may_stand_on_the_ground_but_not_in_what_stands_still():
     assert space.block_is_clear(blocks).tolist() == expected
 
 
-def test_room_is_left_by_what_moves():
+def test_block_clearance_ignores_moving_links():
     space = pushed()
     in_ball, in_plate = block_at(0.5, 0.5), block_at(0.1, 0.1)
     assert not space.free([[0.0]], [in_ball])[0]
     assert space.block_is_clear([in_ball, in_plate]).tolist() == [True, False]
 
 
-def test_the_point_of_a_tool_is_not_in_the_block():
+def test_tool_point_inside_the_block_is_in_collision():
     fingertip = Frame("tool", "ball", Pose((0.0, 0.0, 0.3)))
     space = pushed(replace(aside(), frames=(fingertip,)))
     assert space.free([[0.0]] * 2, [block_at(0.5, z) for z in (0.85, 0.95)]).tolist() == [
@@ -278,7 +278,7 @@ def test_the_point_of_a_tool_is_not_in_the_block():
     ]
 
 
-def test_blocks_have_their_shape_and_a_scene_with_one():
+def test_block_poses_with_a_wrong_shape_or_scene_are_rejected():
     with pytest.raises(ValueError, match=r"blocks have shape \(7,\); 1 configurations need"):
         pushed().free([[0.0]], block_at(0.5, 0.5))
     with pytest.raises(ValueError, match=r"a scene with a block"):
@@ -288,7 +288,7 @@ def test_blocks_have_their_shape_and_a_scene_with_one():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_is_not_finite_is_not_free_but_an_error(value):
+def test_non_finite_input_is_rejected(value):
     scene = push_scene()
     space, home = FreeSpace(scene), np.array([scene.robot.home])
     block = np.array([[0.0, 0.0, 0.075, 1.0, 0.0, 0.0, 0.0]])

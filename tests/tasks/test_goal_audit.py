@@ -1,4 +1,4 @@
-"""The audit finds goals that leak, and sets that are not those of the split's robots."""
+"""The audit reports leaking goals and goal sets that do not belong to the split's robots."""
 
 import re
 from dataclasses import replace
@@ -62,16 +62,16 @@ def moved(array, row, column, by):
     return array
 
 
-def test_sound_sets_have_no_findings(sets):
+def test_valid_sets_have_no_findings(sets):
     assert found(some(), sets) == []
 
 
-def test_a_shipped_split_has_no_findings(cache):
+def test_built_in_split_has_no_findings(cache):
     which = read_split("extrapolation/primitives/reach")
     assert found(which, made(which, cache)) == []
 
 
-def test_a_cache_that_ignores_the_seed_is_found(sets, cache):
+def test_cache_that_ignores_the_seed_is_reported(sets, cache):
     """The set of another seed under the key of this one is proven, and not the one."""
     other = made(some(), cache, replace(RECIPE, seed=1))
     for at in (REACH, PUSH):
@@ -81,7 +81,7 @@ def test_a_cache_that_ignores_the_seed_is_found(sets, cache):
         assert told[0].why == "its goals are not those that seed 0 gives"
 
 
-def test_sets_of_another_seed_are_found(cache):
+def test_sets_of_another_seed_are_reported(cache):
     other = made(some(), cache, replace(RECIPE, seed=1))
     told = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
     assert [each.code for each in told] == ["goals-seed"] * 3
@@ -102,7 +102,7 @@ def test_sets_of_another_seed_are_found(cache):
         ),
     ],
 )
-def test_sets_with_other_constants_are_found(sets, cache, recipe):
+def test_sets_with_other_constants_are_reported(sets, cache, recipe):
     other = made(some(), cache, recipe)
     wrong = [at for at, one in other.sets.items() if one.goals.key != sets.sets[at].goals.key]
     told = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
@@ -110,14 +110,14 @@ def test_sets_with_other_constants_are_found(sets, cache, recipe):
     assert len(wrong) >= 2
 
 
-def test_a_set_without_the_obstacles_of_its_member_is_found(cache):
+def test_set_without_the_obstacles_of_its_member_is_reported(cache):
     bare = replace(some().test[0], obstacles=False)
     other = made(replace(some(), test=(bare,)), cache)
     (why,) = whys(some(), other)
     assert why == "its set is for reach, not reach with obstacles"
 
 
-def test_a_set_of_another_body_is_found(sets):
+def test_set_of_another_robot_is_reported(sets):
     body = "0" * 32
     told = audit_goals(some(), changed(sets, REACH, {"key": "1" * 64}, robot_hash=body), LIBRARY)
     assert [(each.code, each.where) for each in told] == [
@@ -126,7 +126,7 @@ def test_a_set_of_another_body_is_found(sets):
     assert told[0].why.startswith(f"its set is of body {body}, not of ")
 
 
-def test_sets_that_were_swapped_are_found(cache):
+def test_swapped_sets_are_reported(cache):
     which = split([member(TRAIN[0], task="reach"), member(TRAIN[1], task="reach")], [TEST[0]])
     sets = made(which, cache)
     a, b = (("train", name) for name in ("gantry-plane", "planar-cube"))
@@ -141,7 +141,7 @@ def test_sets_that_were_swapped_are_found(cache):
     assert {each.code for each in told} == {"goals-body", "goals-unproven", "goals-missing"}
 
 
-def test_goals_out_of_reach_are_found(sets):
+def test_goals_out_of_reach_are_reported(sets):
     goals = sets.sets[REACH].goals
     told = audit_goals(
         some(), changed(sets, REACH, {"poses": moved(goals.poses, [3, 5], 0, 0.01)}), LIBRARY
@@ -151,7 +151,7 @@ def test_goals_out_of_reach_are_found(sets):
     assert told[1].why.endswith("(and 1 more)")
 
 
-def test_goals_in_collision_are_found(sets):
+def test_goals_in_collision_are_reported(sets):
     box = sets.sets[LAST].goals.obstacles[0]
     at = tuple(sets.sets[LAST].goals.poses[0, :3].tolist())
     inside = (replace(box, pose=replace(box.pose, position=at)),)
@@ -172,7 +172,7 @@ def test_goals_in_collision_are_found(sets):
         ("q", 0, np.nan, "not all numbers are finite"),
     ],
 )
-def test_pushes_that_cannot_be_proven_are_found(sets, field, column, by, why):
+def test_unproven_pushes_are_reported(sets, field, column, by, why):
     array = getattr(sets.sets[PUSH].goals, field)
     wrong = changed(sets, PUSH, {field: moved(array, 2, column, by)})
     told = [each for each in audit_goals(some(), wrong, LIBRARY) if each.code == "goals-unproven"]
@@ -180,7 +180,7 @@ def test_pushes_that_cannot_be_proven_are_found(sets, field, column, by, why):
     assert told[0].why.startswith(why)
 
 
-def test_a_block_in_an_obstacle_is_found(cache):
+def test_block_in_an_obstacle_is_reported(cache):
     which = split([member(TRAIN[0], obstacles=True)], [member(TRAIN[2])])
     sets = made(which, cache)
     goals = sets.sets[REACH].goals
@@ -192,7 +192,7 @@ def test_a_block_in_an_obstacle_is_found(cache):
     assert re.match(r"start \d: the block is in an obstacle or the base", unproven)
 
 
-def test_a_member_without_a_set_and_a_set_without_a_member_are_found(sets):
+def test_missing_and_surplus_sets_are_reported(sets):
     other = {**sets.sets, ("test", "stranger"): sets.sets[LAST]}
     del other[REACH]
     assert found(some(), replace(sets, sets=other)) == [
@@ -201,7 +201,7 @@ def test_a_member_without_a_set_and_a_set_without_a_member_are_found(sets):
     ]
 
 
-def test_a_robot_that_has_no_goals_is_told_why(sets):
+def test_finding_explains_why_a_robot_has_no_goals(sets):
     broken = replace(some().train[0], derivation="base=planar[top: ee=cubw]")
     which = replace(some(), train=(broken, some().train[1]))
     told = audit_goals(which, sets, LIBRARY)
@@ -216,7 +216,7 @@ def twins(task, obstacles=False):
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
-def test_the_same_body_on_both_sides_shares_its_goals(cache, task):
+def test_same_robot_on_both_sides_shares_its_goals(cache, task):
     count = 12 if task == "reach" else 4
     told = audit_goals(twins(task), made(twins(task), cache), LIBRARY)
     assert [(each.code, each.severity, each.where) for each in told] == [
@@ -225,14 +225,14 @@ def test_the_same_body_on_both_sides_shares_its_goals(cache, task):
     assert told[0].why == f"train robot gantry-plane has {count} of its {count} goals"
 
 
-def test_the_same_body_at_another_task_shares_nothing(cache):
+def test_same_robot_with_another_task_shares_no_goals(cache):
     train = [member(TRAIN[0], task="reach")]
     which = split(train, [member(TRAIN[0], "twin")])
     assert found(which, made(which, cache)) == []
     assert found(twins("reach", True), made(twins("reach", True), cache)) == []
 
 
-def test_one_goal_of_the_same_body_is_a_leak_if_it_is_near(cache):
+def test_single_nearby_goal_of_the_same_robot_is_a_leak(cache):
     which = twins("reach", obstacles=True)
     sets = made(which, cache)
     goal = sets.sets[REACH].goals.poses[7]
@@ -258,7 +258,7 @@ def test_one_goal_of_the_same_body_is_a_leak_if_it_is_near(cache):
     assert told(1.1 * NEAR) == told(0.0, np.radians(1.1)) == []
 
 
-def test_a_goal_that_other_bodies_share_is_no_leak_but_most_of_a_set_is(cache):
+def test_most_goals_shared_with_another_robot_are_a_leak_but_one_is_not(cache):
     which = split([member(TRAIN[0], task="reach")], [member(TRAIN[2], "other", task="reach")])
     sets = made(which, cache)
     theirs = sets.sets[REACH].goals
@@ -274,14 +274,14 @@ def test_a_goal_that_other_bodies_share_is_no_leak_but_most_of_a_set_is(cache):
     assert shared(7, "q") == ["train robot gantry-plane has 7 of its 12 configurations"]
 
 
-def test_the_worst_of_several_is_named(cache):
+def test_worst_of_several_leaks_is_named(cache):
     train = [member(TRAIN[0], name, task="reach") for name in ("a", "b")]
     which = split(train, [member(TRAIN[0], "twin", task="reach")])
     assert whys(which, made(which, cache)) == ["train robot a (and 1 more) has 12 of its 12 goals"]
 
 
 @pytest.mark.parametrize(("at", "fields"), [(REACH, ["poses", "q"]), (PUSH, ["blocks", "q"])])
-def test_goals_that_a_set_has_twice_are_a_warning(sets, at, fields):
+def test_duplicate_goals_in_a_set_are_a_warning(sets, at, fields):
     goals = sets.sets[at].goals
     arrays = {name: getattr(goals, name).copy() for name in fields}
     for array in arrays.values():
@@ -292,7 +292,7 @@ def test_goals_that_a_set_has_twice_are_a_warning(sets, at, fields):
     assert twice.why == "goals 0 and 1 of its set are the same (and 2 more pairs)"
 
 
-def test_a_block_at_the_same_place_is_another_start_with_another_configuration(sets):
+def test_push_starts_with_equal_blocks_differ_by_configuration(sets):
     blocks = sets.sets[PUSH].goals.blocks.copy()
     blocks[1] = blocks[0]
     told = found(some(), changed(sets, PUSH, {"blocks": blocks}))
@@ -300,7 +300,7 @@ def test_a_block_at_the_same_place_is_another_start_with_another_configuration(s
     assert ("goals-changed", "train robot gantry-cylinder") in told
 
 
-def test_what_a_split_accepts_does_not_fail(cache):
+def test_accepted_findings_do_not_fail(cache):
     reasons = {"body-shared": "new goals of a known body", "goals-shared": "on purpose"}
     which = replace(twins("reach"), accepted=reasons, regime="interpolation")
     done = audit(which, LIBRARY)
@@ -312,7 +312,7 @@ def test_what_a_split_accepts_does_not_fail(cache):
     assert not with_goal_findings(audit(strict, LIBRARY), strict, findings).passed()
 
 
-def test_an_accepted_finding_about_goals_is_unused_only_if_somebody_looked(sets):
+def test_unused_accepted_goal_findings_are_reported_only_after_a_goal_audit(sets):
     which = replace(some(), accepted={"goals-shared": "on purpose"}, regime="interpolation")
     done = audit(which, LIBRARY)
     unused = "accepted goals-shared"

@@ -1,4 +1,4 @@
-"""Goal sets, and the faults of the released code that they must not have."""
+"""Goal sets, and tests against the goal-set faults of the original released code."""
 
 import os
 import re
@@ -62,7 +62,7 @@ def files(folder):
 
 @pytest.mark.parametrize("words", WORDS)
 @pytest.mark.parametrize("boxes", [False, True])
-def test_every_goal_is_proven_by_its_witness(words, boxes, cache):
+def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
     body = robot(words)
     found = made(body, cache, obstacles=boxes, ground=0.0)
     assert found.q.shape == (12, body.dof)
@@ -74,7 +74,7 @@ def test_every_goal_is_proven_by_its_witness(words, boxes, cache):
     assert len(np.unique(found.q, axis=0)) == 12
 
 
-def test_goals_are_above_the_ground_wherever_it_is(body, cache):
+def test_goals_are_above_the_ground_at_any_height(body, cache):
     here, there = (made(body, cache, ground=ground) for ground in (0.0, LIFTED))
     assert there.poses[:, :3] == pytest.approx(frame_pose(body, there.q)[:, :3, 3])
     assert certify_goals(there, body, scene_of(body, there)) == []
@@ -97,7 +97,7 @@ def test_goals_are_never_inside_an_obstacle(words, cache):
 
 @pytest.mark.parametrize("ground", [0.0, -0.4])
 @pytest.mark.parametrize("words", WORDS)
-def test_obstacles_are_in_the_workspace_and_leave_the_robot_at_home(words, ground, cache):
+def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground, cache):
     body = robot(words)
     found = made(body, cache, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6))
     space = FreeSpace(scene_of(body, found, ground))
@@ -111,7 +111,7 @@ def test_obstacles_are_in_the_workspace_and_leave_the_robot_at_home(words, groun
     assert space.free(q).mean() > KEPT - 0.15
 
 
-def test_obstacles_that_leave_too_little_are_passed_over(body, monkeypatch):
+def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
     def left(share):
         monkeypatch.setattr(obstacles, "KEPT", share)
         boxes = draw_obstacles(body, 8, (0.5, 0.7), np.random.default_rng(0), ground=LIFTED)
@@ -122,14 +122,14 @@ def test_obstacles_that_leave_too_little_are_passed_over(body, monkeypatch):
     assert left(0.7) > 0.6
 
 
-def test_no_room_for_obstacles_is_an_error_not_fewer(body, cache):
+def test_missing_room_for_obstacles_is_an_error(body, cache):
     config = replace(CONFIG, obstacles=2, obstacle_size=(3.0, 4.0))
     with pytest.raises(BenchmarkError, match=r"'arm': of 32 boxes .* only 0 .* fewer or smaller"):
         made(body, cache, obstacles=True, config=config)
     assert not cache.exists()
 
 
-def test_obstacles_without_a_number_are_refused(body, cache):
+def test_obstacle_count_is_required(body, cache):
     config = replace(CONFIG, obstacles=0)
     with pytest.raises(BenchmarkError, match="0 obstacles of size"):
         made(body, cache, obstacles=True, config=config)
@@ -137,12 +137,12 @@ def test_obstacles_without_a_number_are_refused(body, cache):
 
 
 @pytest.mark.parametrize("size", [(0.0, 0.1), (0.2, 0.1), (0.1, np.inf)])
-def test_invalid_sizes_of_obstacles_are_refused(body, size):
+def test_invalid_obstacle_sizes_are_rejected(body, size):
     with pytest.raises(BenchmarkError, match="1 obstacles of size"):
         draw_obstacles(body, 1, size, np.random.default_rng(0))
 
 
-def test_the_cache_knows_the_seed(body, cache):
+def test_cache_key_depends_on_the_seed(body, cache):
     first, second = made(body, cache, seed=0), made(body, cache, seed=1)
     assert not np.isin(first.q, second.q).any()
     assert (made(body, cache, seed=1).q == second.q).all()
@@ -165,7 +165,7 @@ def changes(body):
     }
 
 
-def test_the_cache_knows_all_that_matters_and_nothing_else(body, cache):
+def test_cache_key_depends_on_exactly_the_relevant_inputs(body, cache):
     keys = [
         made(**{"body": body, "cache": cache, **change}).key for change in changes(body).values()
     ]
@@ -179,7 +179,7 @@ def test_the_cache_knows_all_that_matters_and_nothing_else(body, cache):
     assert len(files(cache)) == count
 
 
-def test_a_stored_set_is_the_one_that_was_made(body, cache, monkeypatch):
+def test_stored_set_equals_the_sampled_set(body, cache, monkeypatch):
     fresh = made(body, cache, obstacles=True)
 
     def forbidden(*_):
@@ -193,7 +193,7 @@ def test_a_stored_set_is_the_one_that_was_made(body, cache, monkeypatch):
     assert (stored.poses == fresh.poses).all()
 
 
-def test_every_run_gives_the_same_bytes(body, tmp_path):
+def test_goal_sets_are_byte_identical_across_processes(body, tmp_path):
     made(body, tmp_path / "here", obstacles=True)
     code = (
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
@@ -212,13 +212,13 @@ def test_every_run_gives_the_same_bytes(body, tmp_path):
     assert len(files(tmp_path / "here")) == 1
 
 
-def test_fewer_goals_are_the_first_of_more(body, cache):
+def test_smaller_goal_sets_are_prefixes_of_larger_ones(body, cache):
     few = made(body, cache)
     more = made(body, cache, config=replace(CONFIG, num_goals=30))
     assert (more.q[:12] == few.q).all()
 
 
-def test_a_failed_sample_does_not_truncate_the_set(cache):
+def test_failed_samples_do_not_truncate_the_set(cache):
     """Three of four configurations of this arm collide, and every set is full."""
     body = robot("arm=ur5 ee=plane")
     found = made(body, cache, ground=0.0)
@@ -226,7 +226,7 @@ def test_a_failed_sample_does_not_truncate_the_set(cache):
     assert len(found.q) == 12
 
 
-def test_a_robot_without_enough_goals_is_refused_with_its_acceptance_rate(body, cache, monkeypatch):
+def test_too_few_goals_error_has_the_acceptance_rate(body, cache, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 20)
     with pytest.raises(BenchmarkError) as caught:
         made(body, cache, ground=5.0)
@@ -237,7 +237,7 @@ def test_a_robot_without_enough_goals_is_refused_with_its_acceptance_rate(body, 
     assert not cache.exists()
 
 
-def test_a_tool_that_does_not_move_is_refused(body, cache):
+def test_fixed_tool_is_rejected(body, cache):
     fixed = replace(body, frames=(replace(body.frame("tool"), link="base"),))
     with pytest.raises(BenchmarkError, match="no joint moves its tool"):
         made(fixed, cache)
@@ -245,7 +245,7 @@ def test_a_tool_that_does_not_move_is_refused(body, cache):
         made(replace(body, frames=()), cache)
 
 
-def test_a_negative_seed_is_refused(body, cache):
+def test_negative_seed_is_rejected(body, cache):
     with pytest.raises(BenchmarkError, match="12 goals with seed -1"):
         made(body, cache, seed=-1)
 
@@ -265,13 +265,13 @@ def test_a_negative_seed_is_refused(body, cache):
         ({"obstacle_size": (0.1, np.inf)}, "expected finite numbers"),
     ],
 )
-def test_invalid_constants_are_refused(changes, text):
+def test_invalid_constants_are_rejected(changes, text):
     with pytest.raises(TaskError, match=re.escape(text)):
         replace(CONFIG, **changes)
 
 
 @pytest.mark.parametrize("keep", [0, 100, -200])
-def test_a_broken_file_is_named(body, cache, keep):
+def test_broken_file_is_named(body, cache, keep):
     made(body, cache)
     (path,) = cache.iterdir()
     path.write_bytes(path.read_bytes()[:keep])
@@ -279,7 +279,7 @@ def test_a_broken_file_is_named(body, cache, keep):
         made(body, cache)
 
 
-def test_a_changed_byte_is_noticed(body, cache):
+def test_changed_byte_is_detected(body, cache):
     found = made(body, cache)
     (path,) = cache.iterdir()
     data = path.read_bytes()
@@ -290,27 +290,27 @@ def test_a_changed_byte_is_noticed(body, cache):
         made(body, cache)
 
 
-def test_a_file_under_another_name_is_noticed(body, cache):
+def test_renamed_file_is_detected(body, cache):
     first, second = made(body, cache), made(body, cache, seed=1)
     (cache / f"{first.key}.npz").replace(cache / f"{second.key}.npz")
     with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
         made(body, cache, seed=1)
 
 
-def test_a_cache_that_cannot_be_written_is_a_warning(body, tmp_path):
+def test_unwritable_cache_is_a_warning(body, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(UserWarning, match="cannot store a ReachGoalSet"):
         found = made(body, tmp_path / "file" / "goals")
     assert len(found.q) == 12
 
 
-def test_the_users_cache_is_the_default(body, tmp_path, monkeypatch):
+def test_user_cache_is_the_default(body, tmp_path, monkeypatch):
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / name)
     found = made(body, None)
     assert (tmp_path / "morphgen" / "goals-4" / f"{found.key}.npz").is_file()
 
 
-def test_a_certificate_names_every_fault(body, cache):
+def test_certificate_names_every_fault(body, cache):
     found = made(body, cache, obstacles=True)
     scene = scene_of(body, found)
 
@@ -333,7 +333,7 @@ def test_a_certificate_names_every_fault(body, cache):
     assert "not goals of robot 'arm'" in faults(poses=found.poses[1:])[0]
 
 
-def test_a_certificate_notices_a_collision(body, cache):
+def test_certificate_detects_a_collision(body, cache):
     found = made(body, cache)
     around = Shape(Box((2.0, 2.0, 2.0)))
     walled = body.with_links([Link("base", body.link("base").inertial, (), (around,))])

@@ -1,4 +1,4 @@
-"""Links that stay level: which they are, and that simulators leave them alone."""
+"""Links whose height and tilt never change, and their ground contacts in the simulators."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ ARM = "arm=arm3 ee=claw"
     ("request_", "roll", "count"),
     [(ARM, 0.0, 2), (ARM, 0.1, 1), ("arm=ur5 ee=plane", 0.0, None), ("planar_arm", 0.0, None)],
 )
-def test_links_are_level_whose_height_and_tilt_no_joint_changes(request_, roll, count):
+def test_level_links_have_constant_height_and_tilt(request_, roll, count):
     body, T_world_root = robot(request_), Pose.from_xyz_rpy(rpy=(roll, 0.0, 0.0))
     drawn = np.random.default_rng(0).uniform(*joint_limits(body).T, (9, body.dof))
     T_world_link = T_world_root.matrix @ np.array([forward_kinematics(body, q) for q in drawn])
@@ -32,7 +32,7 @@ def test_links_are_level_whose_height_and_tilt_no_joint_changes(request_, roll, 
 
 
 @pytest.mark.parametrize("simulation", [MujocoSimulation, BulletSimulation])
-def test_a_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
+def test_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
     """The disc of arm3 stands on the ground, to which no joint brings it nearer."""
     body = robot(ARM)
     block = Block((0.1, 0.1, 0.1), Pose((0.0, -0.7, 0.05)), mass=0.1)
@@ -58,7 +58,7 @@ def test_a_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
 
 
 @pytest.mark.parametrize("simulation", [MujocoSimulation, BulletSimulation])
-def test_what_is_on_a_turntable_still_meets_obstacles(simulation):
+def test_links_on_a_turntable_collide_with_obstacles(simulation):
     """The arm, stretched out level, is stopped by a post."""
     body = robot("arm=arm3 ee=claw arm.length=0.3")
     q = torch.tensor([body.home], dtype=torch.float32)

@@ -1,4 +1,4 @@
-"""One robot in plain Gymnasium: spaces, seeds, ends, pictures, and both checkers."""
+"""Single-robot Gymnasium environments: spaces, seeds, terminations, rendering and checkers."""
 
 import subprocess
 import sys
@@ -101,7 +101,7 @@ def test_both_checkers_pass(make, name, options):
         "import morphgen.tasks, gymnasium, morphgen.tasks.gym_env",
     ],
 )
-def test_the_ids_are_known_once_gymnasium_and_the_tasks_are_imported(imports):
+def test_ids_are_registered_after_importing_gymnasium_and_tasks(imports):
     code = (
         f"{imports}\n"
         "assert gymnasium.spec('morphgen/Reach-v0').entry_point\n"
@@ -111,7 +111,7 @@ def test_the_ids_are_known_once_gymnasium_and_the_tasks_are_imported(imports):
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
-def test_an_id_with_its_module_is_known_in_any_order_of_imports():
+def test_ids_with_a_module_prefix_work_in_any_import_order():
     code = (
         "import morphgen.tasks, gymnasium\n"
         "env_id = 'morphgen.tasks.gym_env:morphgen/Reach-v0'\n"
@@ -121,7 +121,7 @@ def test_an_id_with_its_module_is_known_in_any_order_of_imports():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_importing_the_tasks_loads_nothing():
+def test_importing_tasks_loads_no_heavy_packages():
     code = (
         "import sys; import morphgen.tasks\n"
         "assert not {'gymnasium', 'numpy', 'torch'} & set(sys.modules), 'loaded'\n"
@@ -129,7 +129,7 @@ def test_importing_the_tasks_loads_nothing():
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
-def test_reach_observes_what_one_robot_needs(make):
+def test_reach_observation_keys_and_shapes(make):
     env = make("morphgen/Reach-v0")
     links = len(env.unwrapped.env_spec.robot.links)
     shapes = {name: space.shape for name, space in env.observation_space.items()}
@@ -137,7 +137,7 @@ def test_reach_observes_what_one_robot_needs(make):
     assert env.action_space.shape == (len(env.unwrapped.action_joints),)
 
 
-def test_push_observes_block_line_and_obstacles(make):
+def test_push_observation_has_block_line_and_obstacles(make):
     channels = ObservationConfig(velocity=True, previous_action=True, points=12)
     env = make("morphgen/Push-v0", "prims", obstacles=True, observe=channels, kind="discrete")
     links, joints = len(env.unwrapped.env_spec.robot.links), len(env.unwrapped.action_joints)
@@ -153,7 +153,7 @@ def test_push_observes_block_line_and_obstacles(make):
     assert env.action_space.nvec.tolist() == [len(BINS)] * joints
 
 
-def test_an_action_moves_its_own_joint(make):
+def test_action_moves_its_own_joint(make):
     env = make("morphgen/Reach-v0", observe=ObservationConfig(previous_action=True)).unwrapped
     for k, name in enumerate(env.action_joints):
         env.reset(seed=0)
@@ -168,7 +168,7 @@ def test_an_action_moves_its_own_joint(make):
 
 
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
-def test_a_seed_gives_its_episodes(make, sim):
+def test_seed_determines_the_episodes(make, sim):
     env, other = make("morphgen/Reach-v0", sim=sim), make("morphgen/Reach-v0", sim=sim)
     env.reset(seed=5)
     first = run(env, 3 * STEPS)
@@ -180,7 +180,7 @@ def test_a_seed_gives_its_episodes(make, sim):
     assert np.array_equal(run(other, 3 * STEPS), first)
 
 
-def test_without_a_seed_episodes_go_on_and_begin_anywhere(make):
+def test_unseeded_resets_continue_the_random_sequence(make):
     env = make("morphgen/Reach-v0")
     goals = [tuple(env.reset(seed=1)[0]["goal"])]
     goals += [tuple(env.reset()[0]["goal"]) for _ in range(7)]
@@ -191,7 +191,7 @@ def test_without_a_seed_episodes_go_on_and_begin_anywhere(make):
     assert len(starts) > 1
 
 
-def test_asking_for_the_generator_makes_the_first_episode_no_less_random(make):
+def test_first_unseeded_episode_is_random_after_reading_np_random(make):
     starts = set()
     for _ in range(6):
         env = make("morphgen/Reach-v0")
@@ -200,7 +200,7 @@ def test_asking_for_the_generator_makes_the_first_episode_no_less_random(make):
     assert len(starts) > 1
 
 
-def test_a_robot_of_many_links_needs_more_numbers_for_them(make):
+def test_robot_above_the_default_max_links_needs_the_option(make):
     body = morphgen.compose("chain beads=7", geometry="primitive")
     with pytest.raises(MorphgenError, match="max_links 25 or more"):
         make("morphgen/Reach-v0", robot=body, max_links=24)
@@ -210,7 +210,7 @@ def test_a_robot_of_many_links_needs_more_numbers_for_them(make):
         assert seen["tokens"][:, 0] * (numbered - 1) == pytest.approx(range(links))
 
 
-def test_the_episodes_are_those_of_a_batch(make, cache):
+def test_episodes_equal_those_of_a_batch(make, cache):
     env = make("morphgen/Reach-v0")
     batch = make_batch(
         "reach", ["arm3-stick"], 1, sim="mujoco", seed=7, configs=(REACH,), cache=cache
@@ -233,7 +233,7 @@ def test_the_episodes_are_those_of_a_batch(make, cache):
     batch.close()
 
 
-def test_an_episode_ends_by_itself_and_is_seen_to_its_end(make):
+def test_last_observation_of_an_episode_is_returned(make):
     env = make("morphgen/Push-v0", "prims", observe=ObservationConfig(velocity=True)).unwrapped
     env.reset(seed=0)
     for k in range(STEPS):
@@ -246,7 +246,7 @@ def test_an_episode_ends_by_itself_and_is_seen_to_its_end(make):
         env.step(np.ones(5, dtype=np.float32))
 
 
-def test_info_says_how_contacts_are_set(make):
+def test_info_describes_the_contact_settings(make):
     env = make("morphgen/Reach-v0", contacts=Contacts(self_collision=False))
     assert env.reset(seed=0)[1] == {"self_collision": False}
     assert env.step(env.action_space.sample())[4]["self_collision"] is False
@@ -255,7 +255,7 @@ def test_info_says_how_contacts_are_set(make):
 @pytest.mark.parametrize(
     ("name", "robot"), [("morphgen/Reach-v0", "arm3-stick"), ("morphgen/Push-v0", "prims")]
 )
-def test_the_last_moment_of_an_episode_can_be_seen(make, name, robot):
+def test_last_state_of_an_episode_can_be_rendered(make, name, robot):
     """The batch has begun the next one by then, elsewhere."""
     env = make(name, robot, render_mode="rgb_array", size=(160, 120)).unwrapped
     env.reset(seed=3)
@@ -270,14 +270,14 @@ def test_the_last_moment_of_an_episode_can_be_seen(make, name, robot):
     assert still < moved / 5
 
 
-def test_without_a_render_mode_nothing_is_drawn(make):
+def test_no_render_mode_returns_no_frame(make):
     env = make("morphgen/Reach-v0")
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert env.unwrapped.render() is None
 
 
-def test_a_closed_environment_says_so(make):
+def test_closed_environment_raises_a_clear_error(make):
     env = make("morphgen/Reach-v0", render_mode="rgb_array").unwrapped
     env.reset(seed=0)
     env.render()
@@ -296,7 +296,7 @@ def test_a_closed_environment_says_so(make):
         (np.full(5, np.nan, dtype=np.float32), "not finite"),
     ],
 )
-def test_an_action_that_is_none_is_refused(make, action, says):
+def test_invalid_actions_are_rejected(make, action, says):
     env = make("morphgen/Reach-v0").unwrapped
     env.reset(seed=0)
     with pytest.raises(TaskError, match=says):
@@ -315,7 +315,7 @@ def test_an_action_that_is_none_is_refused(make, action, says):
         ("push", {"config": REACH}, TaskError, "ReachConfig is not the config of push"),
     ],
 )
-def test_wrong_options_are_refused(task, options, error, says, cache):
+def test_invalid_options_are_rejected(task, options, error, says, cache):
     config = REACH if task == "reach" else PUSH
     given = {"robot": "arm3-stick", "config": config, "cache": cache} | options
     with pytest.raises(error, match=says):

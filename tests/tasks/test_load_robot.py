@@ -1,4 +1,4 @@
-"""A robot goes by many names, and a wrong one is told what was meant."""
+"""Ways to name a robot, and error messages for unknown names."""
 
 from pathlib import Path
 
@@ -25,19 +25,19 @@ from morphgen.tasks.env_specs import load_robot
         ("arm=arm3 ee=stick ee.length=0.3", "arm=arm3 ee=stick ee.length=0.3"),
     ],
 )
-def test_names_are_words_of_compose(given, words):
+def test_names_are_compose_arguments(given, words):
     expected = morphgen.compose(words, geometry="primitive")
     assert load_robot(given).name == expected.name
     assert robot_hash(load_robot(given)) == robot_hash(expected)
 
 
-def test_a_robot_is_itself_but_for_its_collision_shapes():
+def test_loaded_robot_differs_only_in_collision_shapes():
     robot = morphgen.compose("arm=ur5 ee=plane")
     assert load_robot(robot, geometry="mesh") is robot
     assert robot_hash(load_robot(robot)) == robot_hash(load_robot("arm=ur5 ee=plane"))
 
 
-def test_collision_shapes_are_primitives_unless_meshes_are_asked_for():
+def test_collision_shapes_are_primitives_by_default():
     def has_meshes(robot):
         shapes = (shape for link in robot.links for shape in link.collisions)
         return any(isinstance(shape.geometry, Mesh) for shape in shapes)
@@ -46,7 +46,7 @@ def test_collision_shapes_are_primitives_unless_meshes_are_asked_for():
     assert has_meshes(load_robot("ur5-plane", geometry="mesh"))
 
 
-def test_files_are_read(tmp_path, monkeypatch):
+def test_robot_files_are_read(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = morphgen.write(arm(), "bundles", picture=False)
     Path("own.urdf").write_text(urdf_text(arm(), str))
@@ -58,7 +58,7 @@ def test_files_are_read(tmp_path, monkeypatch):
     assert load_robot("lr=3/own.urdf").dof == arm().dof
 
 
-def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
+def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("prims").mkdir()
     assert load_robot("prims").name == "prims"
@@ -79,7 +79,7 @@ def test_a_folder_that_is_no_bundle_does_not_hide_a_grammar(tmp_path, monkeypatc
         (" ", CompositionError, "no robot is named"),
     ],
 )
-def test_a_wrong_name_says_what_is_near(given, error, says):
+def test_unknown_name_suggests_the_nearest(given, error, says):
     with pytest.raises(error) as caught:
         load_robot(given)
     assert says in str(caught.value)

@@ -1,4 +1,4 @@
-"""How hard motors may pull."""
+"""Force limits of the joint motors."""
 
 from dataclasses import replace
 
@@ -28,14 +28,14 @@ def limits(body, error, velocity=0.0, effort=PLENTY):
     return motors.limits((errors, errors), (velocities, velocities))
 
 
-def test_a_held_slide_pulls_as_its_stiffness_says():
+def test_blocked_slide_force_equals_stiffness_times_error():
     (along, up) = limits(finger(2.0), 0.01)
     spring = (1 + SLACK) * GAIN * BANDWIDTH**2 * 0.01
     assert along == pytest.approx(spring * 2.2)
     assert up == pytest.approx(spring * 2.0)
 
 
-def test_joints_of_an_arm_pull_each_other():
+def test_joint_forces_of_an_arm_are_coupled():
     body = robot("arm=ur5 ee=plane")
     error = np.linspace(0.01, -0.02, body.dof)
     inertia = np.abs(mass_matrix(body, body.home))
@@ -44,7 +44,7 @@ def test_joints_of_an_arm_pull_each_other():
     np.testing.assert_allclose(limits(body, error), wanted, rtol=1e-12)
 
 
-def test_a_finger_follows_its_leader():
+def test_mimic_finger_follows_its_leader():
     body = arm()
     error = np.zeros(5)
     error[body.movable_joints.index(body.joint_index["left"])] = 0.01
@@ -52,23 +52,23 @@ def test_a_finger_follows_its_leader():
     assert left == right > 0
 
 
-def test_at_rest_nothing_pulls_and_no_more_than_the_effort_ever():
+def test_force_is_zero_at_rest_and_never_exceeds_the_effort():
     assert (limits(finger(), 0.0) == 0).all()
     assert (limits(finger(), 0.05, effort=3.0) == 3).all()
 
 
-def test_a_motor_that_lags_as_much_as_its_speed_says_has_slack_alone():
+def test_force_at_the_expected_lag_is_only_the_slack():
     speed = 0.3
     (along, _) = limits(finger(2.0), 2 * speed / BANDWIDTH, speed)
     assert along == pytest.approx(SLACK * GAIN * 2.2 * 4 * BANDWIDTH * speed)
 
 
-def test_what_is_far_behind_pulls_no_harder_than_its_speed_limit_needs():
+def test_position_error_is_limited_by_the_speed_limit():
     fast = 2.0
     assert (limits(finger(), 50.0) == limits(finger(), LAG * fast)).all()
 
 
-def test_a_robot_has_the_same_bits_alone_and_among_others():
+def test_forces_are_bit_identical_alone_and_in_a_batch():
     bodies = [finger(), robot("arm=ur5 ee=plane"), arm()]
     rows = [len(body.movable_joints) for body in bodies]
     error = np.random.default_rng(0).normal(size=sum(rows))
@@ -80,7 +80,7 @@ def test_a_robot_has_the_same_bits_alone_and_among_others():
         assert (alone == every[end - n : end]).all()
 
 
-def test_joints_without_a_speed_limit_have_the_benchmarks():
+def test_joints_without_a_speed_limit_use_the_default():
     body = arm()
     joints = {joint.name: joint for joint in body.joints}
     assert speed_limit(joints["elbow"]) == 2.0

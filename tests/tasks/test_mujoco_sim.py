@@ -1,4 +1,4 @@
-"""MuJoCo behind the protocol: the law of control, contacts, forgetting, the same bits."""
+"""MuJoCo simulation: control law, contacts, resets and reproducibility."""
 
 import math
 from dataclasses import replace
@@ -61,7 +61,7 @@ def block_scene(block, **rest):
     return Scene(robot("prims"), Pose((5.0, 0.0, 0.0)), block=block, **rest)
 
 
-def test_the_first_state_is_home():
+def test_initial_state_is_home():
     sim = MujocoSimulation(mixed_scenes())
     assert sim.q.dtype == sim.block_pose.dtype == torch.float32
     joints = max(scene.robot.dof for scene in sim.scenes)
@@ -74,7 +74,7 @@ def test_the_first_state_is_home():
 
 
 @pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
-def test_home_is_held(scene):
+def test_home_position_is_held(scene):
     sim = MujocoSimulation([scene()])
     start = sim.q.clone()
     held(sim, 300)
@@ -82,7 +82,7 @@ def test_home_is_held(scene):
     assert sim.qd.abs().max() < 1e-4
 
 
-def test_joints_follow_the_law():
+def test_joints_follow_the_control_law():
     sim = MujocoSimulation([real_arm_scene()], NOTHING_TOUCHES)
     home = sim.q[0].double().numpy()
     target = home + np.array([0.05, -0.04, 0.05, 0.03, -0.05, 0.05])
@@ -96,7 +96,7 @@ def test_joints_follow_the_law():
     assert sim.q[0].numpy() == pytest.approx(target, abs=1e-4)
 
 
-def test_effort_limits_what_a_joint_lifts():
+def test_effort_limit_bounds_the_lifted_load():
     strong = real_arm_scene().robot
     joints = tuple(replace(j, effort=5.0) if j.effort else j for j in strong.joints)
     sim = MujocoSimulation(
@@ -111,7 +111,7 @@ def test_effort_limits_what_a_joint_lifts():
     assert 0 < moved[1] < 0.05
 
 
-def test_a_far_target_is_approached_no_faster_than_the_joint_may():
+def test_far_target_is_approached_within_the_speed_limit():
     body = robot("prims")
     sim = MujocoSimulation([Scene(body)], NOTHING_TOUCHES)
     target, fastest = sim.q.clone(), 0.0
@@ -122,7 +122,7 @@ def test_a_far_target_is_approached_no_faster_than_the_joint_may():
     assert 0.9 < fastest / body.joints[body.independent_joints[0]].velocity < 1.35
 
 
-def test_mimic_joints_follow_and_root_poses_and_orders_are_kept():
+def test_mimic_joints_root_poses_and_joint_order_are_kept():
     body = arm()
     body = replace(body, ignore_pairs=adjacent_pairs(body))
     at = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.1, 0.2, 0.3))
@@ -137,7 +137,7 @@ def test_mimic_joints_follow_and_root_poses_and_orders_are_kept():
     assert model.body("base").dofnum == 0
 
 
-def test_a_model_has_a_body_for_each_rigid_part():
+def test_model_has_one_body_per_rigid_group():
     scene = real_arm_scene()
     parts = merge_rigid_links(scene.robot).links
     assert len(parts) < len(scene.robot.links)
@@ -145,7 +145,7 @@ def test_a_model_has_a_body_for_each_rigid_part():
     assert world.model.nbody == 1 + len(parts)
 
 
-def test_a_root_named_world_is_a_link_like_any_other():
+def test_root_link_may_be_named_world():
     plain = reach_scene().robot
     first = plain.root.name
 
@@ -166,7 +166,7 @@ def test_a_root_named_world_is_a_link_like_any_other():
     assert same_bits(outputs(sims[0]), outputs(sims[1]))
 
 
-def test_what_was_before_a_reset_leaves_no_bit():
+def test_reset_removes_all_earlier_state():
     scenes = mixed_scenes()
     fresh, used = MujocoSimulation(scenes), MujocoSimulation(scenes)
     home = fresh.q.clone(), fresh.block_pose.clone()
@@ -180,7 +180,7 @@ def test_what_was_before_a_reset_leaves_no_bit():
         assert same_bits(outputs(used, i), outputs(fresh, i))
 
 
-def test_a_reset_of_one_moves_no_other():
+def test_partial_reset_does_not_change_other_environments():
     one, other = (MujocoSimulation(mixed_scenes()) for _ in range(2))
     home = one.q.clone(), one.block_pose.clone()
     for sim in (one, other):
@@ -194,7 +194,7 @@ def test_a_reset_of_one_moves_no_other():
     assert same_bits(outputs(one, 2), outputs(other, 2))
 
 
-def test_bits_depend_neither_on_the_batch_nor_on_threads():
+def test_results_are_bit_identical_for_any_batch_and_thread_count():
     alone = [MujocoSimulation([scene]) for scene in mixed_scenes()]
     batches = [MujocoSimulation(mixed_scenes() * 17, threads=threads) for threads in (1, 2, 3)]
     for sim in (*alone, *batches):
@@ -205,7 +205,7 @@ def test_bits_depend_neither_on_the_batch_nor_on_threads():
         batch.close()
 
 
-def test_a_block_falls_freely_and_comes_to_rest():
+def test_block_falls_freely_and_comes_to_rest():
     edge = 0.1
     sim = MujocoSimulation([block_scene(Block((edge,) * 3, Pose((0, 0, 1.0)), 0.1))])
     held(sim, 10)
@@ -218,7 +218,7 @@ def test_a_block_falls_freely_and_comes_to_rest():
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.6])
-def test_friction_is_the_blocks(friction):
+def test_friction_is_that_of_the_block(friction):
     """On a slope that is a tenth steeper than friction holds, or flatter."""
     travelled = []
     for share in (0.9, 1.1):
@@ -249,7 +249,7 @@ def test_spin_is_in_the_world_frame():
     assert spins[1] == pytest.approx(spins[0], abs=0.02)
 
 
-def test_a_block_without_mass_stays_where_it_is_put():
+def test_block_without_mass_is_static():
     block = Block((0.1,) * 3, Pose((0.0, 0.0, 0.5)))
     sim = MujocoSimulation([block_scene(block)])
     pose = torch.tensor([[0.1, 0.2, 0.7, 0.0, 1.0, 0.0, 0.0]])
@@ -262,7 +262,7 @@ def test_a_block_without_mass_stays_where_it_is_put():
 @pytest.mark.parametrize(
     ("contacts", "lowest"), [(Contacts(), -0.02), (Contacts(scene=False), -10.0)]
 )
-def test_links_touch_the_ground_if_asked(contacts, lowest):
+def test_ground_contacts_are_optional(contacts, lowest):
     sim = MujocoSimulation([Scene(robot("prims"), Pose((0, 0, -0.5)))], contacts)
     q = sim.q.clone()
     depth = sim.scenes[0].robot.joint_index["gantry_z"]
@@ -274,7 +274,7 @@ def test_links_touch_the_ground_if_asked(contacts, lowest):
     assert (reached < 0.21) == (lowest < -1)
 
 
-def test_links_touch_each_other_if_asked_and_not_ignored():
+def test_self_contacts_are_optional_and_respect_ignored_pairs():
     body = robot("arm=panda ee=panda_hand")
     q = np.clip(np.array([0, 1.2, 0, -3.0, 0, 0.2, 0.8, 0.0]), *joint_limits(body).T)
     counts = []
@@ -289,7 +289,7 @@ def test_links_touch_each_other_if_asked_and_not_ignored():
     assert counts[1] == 0
 
 
-def test_what_explodes_is_named_and_can_be_reset(tmp_path, monkeypatch):
+def test_diverged_environment_is_reported_and_can_be_reset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sim = MujocoSimulation(mixed_scenes(), threads=2)
     home = sim.q.clone(), sim.block_pose.clone()
@@ -313,7 +313,7 @@ def test_what_explodes_is_named_and_can_be_reset(tmp_path, monkeypatch):
     [(10_750, "its contacts do not fit into MuJoCo's memory"), (14_000, "stack overflow")],
     ids=["contacts", "stack"],
 )
-def test_contacts_without_room_are_of_one_environment_alone(monkeypatch, memory, words):
+def test_contact_overflow_affects_only_its_environment(monkeypatch, memory, words):
     compiled = mujoco_model._robot_spec
 
     def cramped(*args):
@@ -338,7 +338,7 @@ def test_contacts_without_room_are_of_one_environment_alone(monkeypatch, memory,
     assert same_bits(outputs(sim, 1), outputs(alone))
 
 
-def test_targets_that_are_not_finite_move_nothing():
+def test_non_finite_targets_are_rejected_before_stepping():
     sim = MujocoSimulation(mixed_scenes())
     before = [outputs(sim, i) for i in range(3)]
     targets = sim.q.clone()
@@ -348,7 +348,7 @@ def test_targets_that_are_not_finite_move_nothing():
     assert all(same_bits(outputs(sim, i), before[i]) for i in range(3))
 
 
-def test_what_mujoco_refuses_is_one_line():
+def test_mujoco_errors_become_one_line():
     scene = block_scene(Block((0.1, 0.0, 0.1), mass=0.1))
     with pytest.raises(
         SimulationError, match=r"environment 1, robot 'prims.*MuJoCo refuses"
@@ -368,19 +368,19 @@ def test_what_mujoco_refuses_is_one_line():
         ([-1], (1, 5), torch.zeros(1, 7), "there are 1"),
     ],
 )
-def test_resets_that_mean_nothing_are_refused(envs, q, pose, words):
+def test_invalid_resets_are_rejected(envs, q, pose, words):
     sim = MujocoSimulation([push_scene()])
     with pytest.raises(ValueError, match=words):
         sim.reset(torch.tensor(envs), torch.zeros(q), pose)
 
 
-def test_targets_have_one_shape():
+def test_targets_with_a_wrong_shape_are_rejected():
     sim = MujocoSimulation([push_scene()] * 2)
     with pytest.raises(ValueError, match=r"\(5,\), not \(2, 5\)"):
         sim.step(torch.zeros(5))
 
 
-def test_closed_is_closed():
+def test_closed_simulation_raises_a_clear_error():
     sim = MujocoSimulation([reach_scene()], threads=2)
     sim.close()
     sim.close()
@@ -388,7 +388,7 @@ def test_closed_is_closed():
         sim.step(sim.q)
 
 
-def test_equal_scenes_share_a_model():
+def test_equal_scenes_share_one_model():
     scenes = [push_scene(), push_scene(), push_scene(mass=0.2), reach_scene()]
     moved = replace(scenes[0], block=replace(scenes[0].block, pose=Pose((0.3, 0, 0.1))))
     sim = MujocoSimulation([*scenes, moved])
@@ -413,7 +413,7 @@ def test_full_speed_back_and_forth_is_stable(request_):
         assert sim.qd.abs().max() < 40
 
 
-def test_movable_joints_are_where_the_robot_says():
+def test_movable_joint_order_matches_the_robot():
     scene = reach_scene()
     sim = MujocoSimulation([scene])
     q = torch.from_numpy(

@@ -1,4 +1,4 @@
-"""One robot, one set of shapes, one key, one set of goals and one score, whatever names it."""
+"""One robot has the same shapes, key, goals and score however it is named."""
 
 from dataclasses import replace
 
@@ -97,19 +97,19 @@ def test_tokens_are_the_same(batches, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_score_is_the_same(scores, name):
+def test_scores_are_the_same(scores, name):
     assert scores[name] == scores["words"]
     assert len(set(scores[name])) > STEPS / 2
 
 
-def test_what_is_only_seen_does_not_count():
+def test_visuals_do_not_change_the_simulation_hash():
     robot = load_robot("arm=ur5 ee=stick")
     bare = robot.with_links([replace(link, visuals=()) for link in robot.links])
     assert robot_hash(bare, visuals=False) == robot_hash(robot, visuals=False)
     assert robot_hash(bare) != robot_hash(robot)
 
 
-def test_what_it_is_made_of_stays():
+def test_loading_a_robot_twice_changes_nothing():
     once = load_robot("arm=ur5 ee=stick")
     twice = load_robot(once)
     assert [link.collisions for link in twice.links] == [link.collisions for link in once.links]

@@ -1,4 +1,4 @@
-"""Push sets: blocks that robots of every kind can get behind and across the line."""
+"""Push goal sets: block positions that every kind of robot can push across the line."""
 
 from dataclasses import fields, replace
 
@@ -45,7 +45,7 @@ def space_of(words, found):
 
 @pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
 @pytest.mark.parametrize("boxes", [False, True])
-def test_every_block_can_be_pushed_across(words, boxes, cache):
+def test_every_block_can_be_pushed_across_the_line(words, boxes, cache):
     found = made(words, cache, obstacles=boxes)
     body, space = robot(words), space_of(words, found)
     edge, x, y = found.block.size[0], *found.blocks[:, :2].T
@@ -73,7 +73,7 @@ def test_every_block_can_be_pushed_across(words, boxes, cache):
 
 
 @pytest.mark.parametrize("words", ARMS)
-def test_arms_have_a_block_in_proportion_to_their_effective_reach(words, cache):
+def test_arm_block_distance_scales_with_effective_reach(words, cache):
     found, work = made(words, cache), workspace(robot(words))
     edge = found.block.size[0]
     reach = np.sqrt(work.reach**2 - (work.shoulder[2] - edge / 2) ** 2)
@@ -84,14 +84,14 @@ def test_arms_have_a_block_in_proportion_to_their_effective_reach(words, cache):
 
 
 @pytest.mark.parametrize("words", FREE)
-def test_free_bodies_have_it_in_metres_before_them(words, cache):
+def test_mobile_bases_have_the_block_at_a_fixed_distance(words, cache):
     found = made(words, cache)
     assert 0.15 <= found.block.size[0] <= 0.2
     assert (np.abs(found.blocks[:, 0]) <= 0.2).all()
     assert found.scale == 1
 
 
-def test_bodies_that_reach_less_have_all_of_it_smaller(cache):
+def test_short_robots_have_a_scaled_down_push_region(cache):
     """A rod of 0.15 m and its ball of 0.03 m, that swings on a slide."""
     found = made(SHORT, cache)
     assert found.scale == pytest.approx(0.18 / np.sqrt(2) / 0.4, rel=0.2)
@@ -99,7 +99,7 @@ def test_bodies_that_reach_less_have_all_of_it_smaller(cache):
     assert found.line == pytest.approx(0.2 * found.scale)
 
 
-def test_effective_reach_is_that_of_a_right_triangle():
+def test_effective_reach_follows_the_right_triangle():
     reach, height, share = 1.0, 0.4, 0.2
     e = effective_reach(reach, height, share)
     assert np.hypot(e, height - share * e / 2) == pytest.approx(reach)
@@ -108,7 +108,7 @@ def test_effective_reach_is_that_of_a_right_triangle():
     assert effective_reach(1.0, 1.5, 0.2) == 0
 
 
-def test_the_ground_may_be_lower(cache):
+def test_ground_may_be_below_the_base(cache):
     words = "arm=panda ee=panda_hand"
     found = made(words, cache, ground=-0.05)
     assert found.ground == -0.05
@@ -116,7 +116,7 @@ def test_the_ground_may_be_lower(cache):
     assert found.key != made(words, cache).key
 
 
-def test_the_block_is_as_the_config_has_it(cache):
+def test_block_matches_the_config(cache):
     config = replace(CONFIG, block_mass=0.3, friction=0.6, line=0.1, start=-0.1, start_depth=0.0)
     found = made("prims", cache, config=config)
     assert (found.block.mass, found.block.friction, found.line) == (0.3, 0.6, 0.1)
@@ -125,21 +125,21 @@ def test_the_block_is_as_the_config_has_it(cache):
     assert found.block.pose == Pose((x, y, z), tuple(turn))
 
 
-def test_blocks_are_turned_and_placed_at_random(cache):
+def test_block_positions_and_orientations_are_random(cache):
     found = made("prims", cache, config=replace(CONFIG, num_goals=60))
     assert np.histogram(found.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
     yaw = 2 * np.arctan2(found.blocks[:, 6], found.blocks[:, 3])
     assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
 
 
-def test_fewer_starts_are_the_first_of_more(cache):
+def test_smaller_sets_are_prefixes_of_larger_ones(cache):
     few = made("arm=ur5 ee=plane", cache)
     more = made("arm=ur5 ee=plane", cache, config=replace(CONFIG, num_goals=40))
     for name in ("q", "blocks", "behind", "across"):
         assert (getattr(more, name)[:5] == getattr(few, name)).all()
 
 
-def test_what_is_stored_is_what_was_made(cache, monkeypatch):
+def test_stored_set_equals_the_sampled_set(cache, monkeypatch):
     fresh = made("prims", cache, obstacles=True)
 
     def forbidden(*_):
@@ -152,7 +152,7 @@ def test_what_is_stored_is_what_was_made(cache, monkeypatch):
         assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path):
+def test_same_seed_gives_the_same_bytes(tmp_path):
     for folder in ("here", "there"):
         made("prims", tmp_path / folder, obstacles=True)
     files = [list((tmp_path / folder).iterdir()) for folder in ("here", "there")]
@@ -160,7 +160,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     assert files[0][0].read_bytes() == files[1][0].read_bytes()
 
 
-def test_the_key_knows_all_that_matters_and_nothing_else(cache):
+def test_cache_key_depends_on_exactly_the_relevant_inputs(cache):
     base = {"config": CONFIG}
     changes = [
         base,
@@ -180,7 +180,7 @@ def test_the_key_knows_all_that_matters_and_nothing_else(cache):
     assert (found.key, found.robot) == (keys[0], "other")
 
 
-def test_a_robot_that_cannot_push_is_refused_with_the_reason(cache):
+def test_robot_that_cannot_push_is_rejected_with_the_reason(cache):
     with pytest.raises(
         TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
     ):
@@ -197,7 +197,7 @@ def test_a_robot_that_cannot_push_is_refused_with_the_reason(cache):
     assert not cache.exists()
 
 
-def test_obstacles_that_always_stand_in_the_way_are_an_error(cache, monkeypatch):
+def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
     def wall(*_, **__):
         return (Block((9.0, 0.1, 0.1)),)
 
@@ -214,14 +214,14 @@ def test_obstacles_that_always_stand_in_the_way_are_an_error(cache, monkeypatch)
         ({"start": 0.3}, "is to cross 0.2: sizes must be positive, and the start"),
     ],
 )
-def test_numbers_that_mean_nothing_are_refused(changes, text, cache):
+def test_invalid_constants_are_rejected(changes, text, cache):
     with pytest.raises((TaskError, BenchmarkError), match=text):
         made("prims", cache, config=replace(CONFIG, **changes))
     with pytest.raises(BenchmarkError, match="with seed -1"):
         made("prims", cache, seed=-1)
 
 
-def test_a_broken_or_misnamed_file_is_named(cache):
+def test_broken_or_renamed_file_is_named(cache):
     first, second = made("prims", cache), made("prims", cache, seed=1)
     paths = [cache / f"{each.key}.npz" for each in (first, second)]
     paths[1].write_bytes(paths[0].read_bytes())
@@ -232,7 +232,7 @@ def test_a_broken_or_misnamed_file_is_named(cache):
         made("prims", cache)
 
 
-def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path):
+def test_unwritable_cache_is_a_warning(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(UserWarning, match="cannot store a PushStartSet"):
         found = made("prims", tmp_path / "file" / "pushes")

@@ -1,7 +1,7 @@
-"""Faults of AnyBody's released code that concern tasks, each with the test that we do not have it.
+"""Tests that faults of AnyBody's released task code do not occur here.
 
-Others are tested where they would be: goal sets in ``test_goals`` and ``test_split_goals``, the
-slow critic, the deviation of actions and the learning rate in ``tests/rl``.
+Related tests are elsewhere: goal sets in ``test_goals`` and ``test_split_goals``; the target
+critic, the action standard deviation and the learning rate in ``tests/rl``.
 """
 
 from contextlib import closing
@@ -101,7 +101,7 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
-def test_obstacles_of_an_episode_never_hold_its_goal_or_start(robot, task, cache):
+def test_obstacles_never_contain_the_goal_or_start(robot, task, cache):
     """Their goals could lie inside the obstacle that was there at the time."""
     config = FEW if task == "reach" else replace(PushConfig(), num_goals=6, max_episode_steps=40)
     setting = draw_spec(robot, config, obstacles=True, seed=0, cache=cache)
@@ -115,7 +115,7 @@ def test_obstacles_of_an_episode_never_hold_its_goal_or_start(robot, task, cache
                 assert space.free(batch.groups["reach"].goal_configuration.numpy()).all()
 
 
-def test_one_goal_holds_for_the_whole_episode(robot, cache):
+def test_goal_is_constant_during_an_episode(robot, cache):
     """Theirs was drawn again inside the episode."""
     setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
     with closing(batch_from_specs([setting], 3, sim="mujoco")) as batch:
@@ -129,7 +129,7 @@ def test_one_goal_holds_for_the_whole_episode(robot, cache):
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
-def test_episodes_follow_their_seed(robot, task, cache):
+def test_seed_determines_the_episodes(robot, task, cache):
     """Generators of theirs had none."""
     config = FEW if task == "reach" else replace(PushConfig(), num_goals=6)
     setting = draw_spec(robot, config, obstacles=False, seed=0, cache=cache)

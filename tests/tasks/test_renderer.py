@@ -1,4 +1,4 @@
-"""Pictures show what there is, from a camera that has all of it in view, and films are whole."""
+"""Rendered frames, the automatic camera and video files."""
 
 import resource
 from dataclasses import replace
@@ -84,7 +84,7 @@ def changed(a, b):
     return np.abs(a.astype(int) - b).max(axis=2) > 8
 
 
-def test_a_frame_is_of_its_size_and_its_bytes_are_always_the_same(on, reach):
+def test_frames_have_the_requested_size_and_are_reproducible(on, reach):
     drawing = on(reach)
     frame = drawing.frame(at_goal(reach, 1))
     assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
@@ -94,13 +94,13 @@ def test_a_frame_is_of_its_size_and_its_bytes_are_always_the_same(on, reach):
     assert all(np.array_equal(frame, each) for each in again)
 
 
-def test_the_robot_is_where_its_joints_are(on, reach):
+def test_robot_is_drawn_at_its_joint_positions(on, reach):
     drawing = on(reach)
     a, b = (drawing.frame(RenderState(q)) for q in reach.goals.q[:2])
     assert 50 < changed(a, b).sum() < a.size / 6
 
 
-def test_the_goal_is_green_and_only_where_it_is_asked_for(on, reach):
+def test_goal_is_green_and_drawn_only_on_request(on, reach):
     drawing = on(reach)
     without = drawing.frame(RenderState(reach.goals.q[0]))
     shown = [drawing.frame(at_goal(reach, i)) for i in (1, 2)]
@@ -111,7 +111,7 @@ def test_the_goal_is_green_and_only_where_it_is_asked_for(on, reach):
     assert green > max(red, blue)
 
 
-def test_the_block_is_drawn_where_it_is_and_the_line_on_the_ground(on, push):
+def test_block_and_ground_line_are_drawn_at_their_positions(on, push):
     drawing = on(push)
     start, line, q = push.goals.blocks[0], push.goals.line, push.goals.q[0]
     x = push.goals.blocks[:, 0]
@@ -137,7 +137,7 @@ def test_obstacles_are_drawn(on, reach):
 
 
 @pytest.mark.parametrize("name", ["reach", "push"])
-def test_all_that_matters_is_in_view_and_fills_it(name, request):
+def test_camera_frames_the_whole_scene(name, request):
     """Points are projected here anew, by the position and axes of the camera."""
     points = Renderer.of_spec(request.getfixturevalue(name))._model.points
     camera = renderer._camera(points, 4 / 3)
@@ -157,7 +157,7 @@ def test_all_that_matters_is_in_view_and_fills_it(name, request):
     assert most == pytest.approx(renderer._MARGIN, abs=1e-6)
 
 
-def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(plain):
+def test_robot_without_visuals_is_drawn_with_its_collision_shapes(plain):
     robot = arm()
     bare = replace(robot, links=tuple(replace(link, visuals=()) for link in robot.links))
     still = plain(Scene(bare, ground=None))
@@ -165,7 +165,7 @@ def test_a_robot_without_visuals_is_drawn_by_its_collision_shapes(plain):
     assert changed(a, b).sum() > 50
 
 
-def test_a_scene_without_anything_else_can_be_drawn(plain):
+def test_scene_with_only_a_robot_can_be_drawn(plain):
     block = Block((0.2, 0.2, 0.2), Pose((0.2, -0.5, 0.1)), 0.1)
     drawn = plain(Scene(arm(), block=block))
     with_block = drawn.frame(RenderState(arm().home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
@@ -181,7 +181,7 @@ def test_two_renderers_do_not_disturb_each_other(on, reach, push):
     assert np.array_equal(one.frame(RenderState(reach.goals.q[0])), first)
 
 
-def test_a_closed_renderer_says_so(on, reach):
+def test_closed_renderer_raises_a_clear_error(on, reach):
     drawing = on(reach)
     drawing.close()
     drawing.close()
@@ -189,7 +189,7 @@ def test_a_closed_renderer_says_so(on, reach):
         drawing.frame(RenderState(reach.goals.q[0]))
 
 
-def test_a_moment_is_an_environment_of_a_batch(cache):
+def test_snapshot_is_one_environment_of_a_batch(cache):
     batch = make_batch(
         ["reach", "push"],
         ["arm3-stick", "prims"],
@@ -214,7 +214,7 @@ FRAMES = [np.full((48, 64, 3), value, dtype=np.uint8) for value in range(0, 250,
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_a_film_has_its_frames_its_speed_and_the_same_bytes(tmp_path, suffix):
+def test_video_has_all_frames_the_frame_rate_and_reproducible_bytes(tmp_path, suffix):
     for name in ("a", "b"):
         write_video(iter(FRAMES), tmp_path / f"{name}{suffix}", fps=25)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"a{suffix}", f"b{suffix}"]
@@ -229,7 +229,7 @@ def test_a_film_has_its_frames_its_speed_and_the_same_bytes(tmp_path, suffix):
     assert facts.get("fps", 1000 / facts.get("duration", 1)) == 25
 
 
-def test_a_film_is_there_whole_or_not_at_all(tmp_path):
+def test_failed_recording_leaves_no_partial_video(tmp_path):
     path = tmp_path / "film.mp4"
     path.write_bytes(b"old")
 
@@ -251,7 +251,7 @@ def test_a_film_is_there_whole_or_not_at_all(tmp_path):
         ("no/film.mp4", "there is no folder"),
     ],
 )
-def test_where_no_film_can_be_written_is_said_at_once(tmp_path, name, says):
+def test_unwritable_video_path_is_rejected_at_once(tmp_path, name, says):
     with pytest.raises(FormatError, match=says):
         require_video_path(tmp_path / name)
     with pytest.raises(FormatError, match=says):
@@ -272,7 +272,7 @@ def full_disk():
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
-def test_a_film_that_the_disk_has_no_room_for_is_an_error(tmp_path, full_disk, name):
+def test_full_disk_while_recording_is_an_error(tmp_path, full_disk, name):
     with pytest.raises(FormatError, match=rf"cannot write .*{name}: (ffmpeg .* full, or|File too)"):
         write_video(NOISE, tmp_path / name, fps=25)
     assert list(tmp_path.iterdir()) == []
@@ -287,7 +287,7 @@ def test_a_film_that_the_disk_has_no_room_for_is_an_error(tmp_path, full_disk, n
         (None, "No such file or directory"),
     ],
 )
-def test_a_film_of_a_failing_or_missing_ffmpeg_is_an_error(tmp_path, monkeypatch, script, says):
+def test_failing_or_missing_ffmpeg_is_an_error(tmp_path, monkeypatch, script, says):
     program = tmp_path / "ffmpeg"
     if script:
         program.write_text(f"#!/bin/sh\n{script}\n")

@@ -1,4 +1,4 @@
-"""Fewer bodies, the same motion and contacts."""
+"""Merging rigidly connected links keeps motion and contacts."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand", "chain"])
-def test_fewer_bodies_move_alike(request_):
+def test_merged_links_move_like_separate_ones(request_):
     body = robot(request_)
     merged = merge_rigid_links(body)
     rng = np.random.default_rng(0)
@@ -28,7 +28,7 @@ def test_fewer_bodies_move_alike(request_):
     assert merged.home == body.home
 
 
-def test_links_that_ignore_others_are_not_joined():
+def test_links_with_different_ignored_pairs_are_not_merged():
     """A fixed finger that may touch what its palm may not stays a body of its own."""
     body = arm()
     fixed = replace(body.joints[3], kind="fixed", limits=None)
@@ -41,7 +41,7 @@ def test_links_that_ignore_others_are_not_joined():
     assert joined.mass == pytest.approx(body.mass)
 
 
-def test_neighbours_are_ignored_whoever_reads_the_robot():
+def test_adjacent_links_are_ignored_without_ignore_pairs():
     made = load_robot("arm3-stick")
     bare = replace(made, ignore_pairs=())
     assert set(untested_pairs(bare)) <= set(untested_pairs(made)) == set(made.ignore_pairs)

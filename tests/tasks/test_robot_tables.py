@@ -1,4 +1,4 @@
-"""The robots of a batch as padded tensors."""
+"""Padded tensors of the robots of a batch."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def configurations(robots, robot_tables, n=20):
     return body, q
 
 
-def test_the_position_codes_are_those_of_the_tokens(robots, robot_tables):
+def test_position_codes_match_the_tokens(robots, robot_tables):
     body, q = configurations(robots, robot_tables, n=4)
     found = LinkTokens(robot_tables, body)(q.float())
     for i, robot in enumerate(robots):
@@ -53,7 +53,7 @@ def test_the_position_codes_are_those_of_the_tokens(robots, robot_tables):
         assert (together[:, n:] == 0).all()
 
 
-def test_masks_and_steps_follow_the_joints(robots, robot_tables):
+def test_masks_and_step_sizes_match_the_joints(robots, robot_tables):
     for i, robot in enumerate(robots):
         n = len(robot.links)
         assert robot_tables.link_mask[i].tolist() == [True] * n + [False] * (
@@ -71,7 +71,7 @@ def test_masks_and_steps_follow_the_joints(robots, robot_tables):
         assert (robot_tables.max_step[i, robot.dof :] == 0).all()
 
 
-def test_fingers_act_in_push_and_not_in_reach(robots, robot_tables):
+def test_fingers_are_actuated_in_push_but_not_in_reach(robots, robot_tables):
     panda = 1
     reach, push = (robot_tables.action_mask(fingers=fingers)[panda] for fingers in (False, True))
     names = [link.name for link in robots[panda].links]
@@ -81,7 +81,7 @@ def test_fingers_act_in_push_and_not_in_reach(robots, robot_tables):
     assert all("finger" in name for name in fingers)
 
 
-def test_a_mimic_joint_follows_its_leader():
+def test_mimic_joint_follows_its_leader():
     links = tuple(Link(n, collisions=(Shape(Box((0.1, 0.1, 0.1))),)) for n in ("a", "b", "c"))
     joints = (
         Joint("lead", "revolute", "a", "b", axis=(0, 0, 1), limits=(-1.0, 1.0)),
@@ -107,11 +107,11 @@ def test_a_mimic_joint_follows_its_leader():
         (Robot("r", (Link("a"),), frames=(Frame("tool", "a"),)), RobotError, "no joint moves"),
     ],
 )
-def test_what_cannot_act_is_refused(robot, error, words):
+def test_robots_without_a_tool_or_moving_joint_are_rejected(robot, error, words):
     with pytest.raises(error, match=words):
         build_robot_tables([robot])
 
 
-def test_an_empty_batch_is_refused():
+def test_empty_batch_is_rejected():
     with pytest.raises(BenchmarkError, match="no robots"):
         build_robot_tables([])

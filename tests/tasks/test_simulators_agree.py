@@ -1,4 +1,4 @@
-"""The same targets in PyBullet and in MuJoCo lead to the same places."""
+"""The same joint targets lead to the same states in PyBullet and MuJoCo."""
 
 from dataclasses import replace
 
@@ -87,7 +87,7 @@ def positions(simulation, scene, targets, contacts):
 
 
 @pytest.mark.parametrize("words", [*FAST, *SLOW])
-def test_tools_go_the_same_way_in_free_space(words):
+def test_tool_paths_agree_in_free_space(words):
     body = robot(words)
     for seed in range(3):
         targets = smooth_walk(body, seed)
@@ -105,7 +105,7 @@ def test_tools_go_the_same_way_in_free_space(words):
     ("edge", "mass", "turn"),
     [(0.15, 0.1, (0, 0, 0.4)), (0.15, 0.1, (0.2, 0.1, 0.0)), (0.06, 0.5, (0.0, 0.3, 1.0))],
 )
-def test_a_dropped_block_comes_to_rest_alike(edge, mass, turn):
+def test_dropped_blocks_come_to_rest_at_the_same_pose(edge, mass, turn):
     start = Pose.from_xyz_rpy((0.3, -0.4, edge + 0.05), turn)
     scene = Scene(robot("prims"), Pose((5, 0, 0)), Block((edge,) * 3, start, mass))
     ends = []
@@ -125,7 +125,7 @@ def test_a_dropped_block_comes_to_rest_alike(edge, mass, turn):
 
 @pytest.mark.parametrize("friction", [0.5, 1.0])
 @pytest.mark.parametrize("aside", [0.0, 0.03])
-def test_a_block_is_pushed_alike(friction, aside):
+def test_pushed_blocks_move_the_same_distance(friction, aside):
     """By the gantry's plate, upright behind it and off the ground, at 0.2 m/s."""
     scene = replace(push_scene(friction=friction), obstacles=())
     ends = []

@@ -1,4 +1,4 @@
-"""What ``measure`` says of where time goes, with a clock that ticks when it is read."""
+"""``measure_speed`` time shares, measured with a fake clock."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -22,7 +22,7 @@ def robot():
 
 
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
-def test_shares_sum_up_and_the_simulators_own_step_is_told_apart(robot, sim, tmp_path):
+def test_shares_sum_to_one_and_separate_the_native_step(robot, sim, tmp_path):
     ticks, (module, step) = count(), SIMULATORS[sim].native_step
     with closing(
         make_batch("reach", [robot], 3, sim=sim, configs=(CONFIG,), cache=tmp_path)
@@ -40,7 +40,7 @@ def test_shares_sum_up_and_the_simulators_own_step_is_told_apart(robot, sim, tmp
     assert found.substeps_per_second == 4 * found.steps_per_second > 0
 
 
-def test_without_it_all_within_the_simulation_is_one(robot, tmp_path):
+def test_simulator_time_is_one_share_without_the_native_step(robot, tmp_path):
     ticks = count()
     with closing(
         make_batch("reach", [robot], 2, sim="mujoco", configs=(CONFIG,), cache=tmp_path)

@@ -1,4 +1,4 @@
-"""Goal sets of splits: made once, shipped with a built split, and read back as they were."""
+"""Goal sets of splits: sampling, storage with a built split, and loading."""
 
 import io
 import json
@@ -81,7 +81,7 @@ def test_single_and_multi_embodiment_have_the_same_goals(tmp_path):
     assert (among.goals.poses == single[1].goals.poses).all()
 
 
-def test_goals_follow_the_seed_that_the_cache_must_not_ignore(cache):
+def test_goals_depend_on_the_seed_despite_the_cache(cache):
     first, second = (made(reaching(), cache, replace(RECIPE, seed=seed)) for seed in (0, 1))
     for a, b in zip(first, second, strict=True):
         assert (a.goals.seed, b.goals.seed) == (0, 1)
@@ -89,7 +89,7 @@ def test_goals_follow_the_seed_that_the_cache_must_not_ignore(cache):
     assert GoalConfig().seed == 0
 
 
-def test_every_member_has_its_own_set_train_first(cache):
+def test_every_member_has_a_set_in_train_test_order(cache):
     found = made(mixed(), cache, certified=True)
     assert [(one.side, one.robot, one.task) for one in found] == [
         ("train", "gantry-plane", "reach"),
@@ -103,7 +103,7 @@ def test_every_member_has_its_own_set_train_first(cache):
     assert [one.certificate_errors for one in made(mixed(), cache)] == [None] * 3
 
 
-def test_a_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
+def test_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 1)
     words = ("arm=arm3 ee=claw", TRAIN[1], TRAIN[0])
     few, part, fine = (member(each, task="reach") for each in words)
@@ -117,7 +117,7 @@ def test_a_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
     assert fine == ""
 
 
-def test_a_set_that_cannot_be_certified_says_so(cache, monkeypatch):
+def test_uncertified_set_reports_its_faults(cache, monkeypatch):
     line = "goal 3: its configuration is in collision"
     monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
     found = made(reaching(), cache, certified=True)
@@ -126,7 +126,7 @@ def test_a_set_that_cannot_be_certified_says_so(cache, monkeypatch):
     }
 
 
-def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
+def test_interrupted_run_reuses_completed_sets(cache, monkeypatch):
     def interrupt(done, total):
         assert total == 4
         if done == 2:
@@ -141,7 +141,7 @@ def test_an_interrupted_run_goes_on_where_it_was(cache, monkeypatch):
 
 
 @pytest.mark.slow
-def test_processes_make_the_same_sets(tmp_path):
+def test_sets_do_not_depend_on_the_number_of_processes(tmp_path):
     sizes = [f"base=gantry ee=cube ee.size={size}mm" for size in range(60, 68)]
     which = split(
         [member(words, f"cube-{i}", task="reach") for i, words in enumerate(sizes)],
@@ -153,7 +153,7 @@ def test_processes_make_the_same_sets(tmp_path):
     assert all(one.certificate_errors == () for one in there)
 
 
-def test_one_robot_has_the_set_that_it_has_in_a_split(cache):
+def test_single_robot_has_the_same_set_as_in_a_split(cache):
     body = robot("base=gantry ee=plane")
     alone = sample_robot_goals(body, "reach", RECIPE, obstacles=False, cache=cache)
     among = made(reaching(), cache)[0]
@@ -174,7 +174,7 @@ def built(folder, which):
     return build_split(which, folder, LIBRARY, settings=BuildSettings(light=True)).folder
 
 
-def test_what_ships_is_read_back_as_it_was(home, cache):
+def test_stored_sets_are_read_back_unchanged(home, cache):
     found = made(mixed(), cache)
     assert write_goals(home, found, RECIPE) == home / "goals"
     read = read_split_goals(home)
@@ -195,7 +195,7 @@ def test_what_ships_is_read_back_as_it_was(home, cache):
             assert type(was) is type(is_), each.name
 
 
-def test_two_builds_are_equal_byte_for_byte(home, tmp_path):
+def test_builds_are_byte_identical(home, tmp_path):
     other = built(tmp_path / "there", mixed())
     for i, folder in enumerate((home, other)):
         write_goals(folder, made(mixed(), tmp_path / f"cache{i}"), RECIPE)
@@ -210,13 +210,13 @@ def test_two_builds_are_equal_byte_for_byte(home, tmp_path):
     ]
 
 
-def test_a_file_carries_no_time(cache):
+def test_files_contain_no_timestamp(cache):
     content = set_npz(made(reaching(), cache)[0].goals)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
-def test_a_batch_takes_the_sets_that_are_shipped_and_refuses_others(home, cache, monkeypatch):
+def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):
     which = mixed()
     write_goals(home, made(which, cache), RECIPE)
     monkeypatch.setattr(TASKS["push"], "sample", forbidden)
@@ -237,7 +237,7 @@ def test_a_batch_takes_the_sets_that_are_shipped_and_refuses_others(home, cache,
             make_split_batch(which, "train", 2, **{**options, **wrong})
 
 
-def test_the_index_says_what_the_sets_are(home, cache):
+def test_index_describes_the_sets(home, cache):
     found = made(mixed(), cache)
     write_goals(home, found, RECIPE)
     index = json.loads((home / "goals" / "index.json").read_text())
@@ -253,7 +253,7 @@ def test_the_index_says_what_the_sets_are(home, cache):
         assert (home / "goals" / record["file"]).is_file()
 
 
-def test_the_sums_of_a_build_are_those_of_its_goals_too(home, cache):
+def test_checksums_of_a_build_cover_its_goals(home, cache):
     write_goals(home, made(mixed(), cache), RECIPE)
     assert verify(home, LIBRARY).differences == ()
     path = home / "goals" / "train" / "gantry-cylinder.npz"
@@ -263,7 +263,7 @@ def test_the_sums_of_a_build_are_those_of_its_goals_too(home, cache):
     assert "is not what SHA256SUMS was written for" in why
 
 
-def test_an_interruption_leaves_a_build_that_is_not_finished(home, cache, monkeypatch):
+def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
     found = made(mixed(), cache)
 
     def interrupted(*_):
@@ -282,7 +282,7 @@ def test_an_interruption_leaves_a_build_that_is_not_finished(home, cache, monkey
     assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []
 
 
-def test_a_member_without_a_set_is_refused_and_nothing_is_written(home, cache):
+def test_missing_set_is_rejected_before_writing(home, cache):
     found = made(mixed(), cache)
     before = tree(home)
     without = [replace(one, goals=None, error="too few") for one in found[:2]] + found[2:]
@@ -293,7 +293,7 @@ def test_a_member_without_a_set_is_refused_and_nothing_is_written(home, cache):
     assert tree(home) == before
 
 
-def test_only_a_finished_build_takes_goals(tmp_path, cache):
+def test_goals_are_added_only_to_finished_builds(tmp_path, cache):
     found = made(mixed(), cache)
     (tmp_path / "other").mkdir()
     with pytest.raises(MorphgenError, match="SHA256SUMS: no such file"):
@@ -301,7 +301,7 @@ def test_only_a_finished_build_takes_goals(tmp_path, cache):
     assert tree(tmp_path / "other") == {}
 
 
-def test_a_build_without_goals_says_how_to_get_them(home):
+def test_build_without_goals_error_says_how_to_add_them(home):
     with pytest.raises(BenchmarkError, match=r"index\.json: no such file; morphgen split build --"):
         read_goals(home, "train")
 
@@ -323,7 +323,7 @@ def test_a_build_without_goals_says_how_to_get_them(home):
         ),
     ],
 )
-def test_a_broken_index_is_named(home, cache, old, new, message):
+def test_broken_index_is_named(home, cache, old, new, message):
     write_goals(home, made(mixed(), cache), RECIPE)
     path = home / "goals" / "index.json"
     text = path.read_text()
@@ -335,7 +335,7 @@ def test_a_broken_index_is_named(home, cache, old, new, message):
     assert str(home / "goals") in str(caught.value)
 
 
-def test_a_broken_file_is_named(cache, tmp_path):
+def test_broken_file_is_named(cache, tmp_path):
     whole = made(reaching(), cache)[0].goals
     content = set_npz(whole)
     path = tmp_path / "some.npz"
@@ -349,7 +349,7 @@ def test_a_broken_file_is_named(cache, tmp_path):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["q", "poses"])
-def test_numbers_that_are_not_finite_are_refused(cache, tmp_path, name, value):
+def test_non_finite_numbers_are_rejected(cache, tmp_path, name, value):
     whole = made(reaching(), cache)[0].goals
     values = getattr(whole, name).copy()
     values[1, 2] = value
@@ -360,7 +360,7 @@ def test_numbers_that_are_not_finite_are_refused(cache, tmp_path, name, value):
         goals_from_npz(content, "reach", tmp_path / "s.npz")
 
 
-def test_sets_travel_between_processes(cache):
+def test_sets_can_be_pickled(cache):
     one = made(mixed(), cache)[1]
     assert one.goals is not None
     assert same(pickle.loads(pickle.dumps(one)).goals, one.goals)

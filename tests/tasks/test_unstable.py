@@ -1,4 +1,4 @@
-"""A simulation that explodes ends one episode, whatever the simulator, and nothing else."""
+"""A diverged simulation ends only its own episode, in every simulator."""
 
 import math
 
@@ -68,7 +68,7 @@ def numbers(step):
 
 
 @pytest.mark.parametrize("lost", [[0], [1], [0, 1, 2, 3]], ids=["reach", "push", "all"])
-def test_it_is_put_back_its_episode_ends_and_the_others_go_on(made, lost):
+def test_diverged_environment_is_reset_and_the_others_continue(made, lost):
     batch, whole = made(), made()
     batch.reset()
     whole.reset()
@@ -100,7 +100,7 @@ def test_it_is_put_back_its_episode_ends_and_the_others_go_on(made, lost):
         assert torch.equal(each[kept], numbers(other)[name][kept]), name
 
 
-def test_the_episode_that_follows_is_the_one_that_would_have(made):
+def test_episode_after_divergence_is_unchanged(made):
     batch, whole = made(), made()
     batch.reset()
     whole.reset()
@@ -113,7 +113,7 @@ def test_the_episode_that_follows_is_the_one_that_would_have(made):
     assert torch.equal(batch.targets[0], whole.targets[0])
 
 
-def test_episodes_say_so(made):
+def test_episodes_report_divergence(made):
     class Breaks(Random):
         acted = 0
 
@@ -131,7 +131,7 @@ def test_episodes_say_so(made):
     assert len(others) == 2 * ENVS - 2
 
 
-def test_an_episode_that_diverges_is_never_a_success(made):
+def test_diverged_episode_is_never_a_success(made):
     """Not even where the tool is at the goal, or the block across the line."""
     batch = made()
 
@@ -180,7 +180,7 @@ def test_an_episode_that_diverges_is_never_a_success(made):
 
 @pytest.mark.parametrize("made", ["mujoco"], indirect=True)
 @pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
-def test_contacts_that_do_not_fit_end_one_episode(made, warning):
+def test_contact_overflow_ends_one_episode(made, warning):
     batch, whole = made(), made()
     batch.reset()
     whole.reset()

@@ -1,4 +1,4 @@
-"""A batch for loops of Gymnasium's vector environments and for stable-baselines3."""
+"""Vector environments for Gymnasium loops and stable-baselines3."""
 
 import sys
 import warnings
@@ -51,7 +51,7 @@ def batch_from_specs(cache):
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_spaces_hold_what_is_seen_and_done(batch_from_specs, kind):
+def test_spaces_contain_observations_and_actions(batch_from_specs, kind):
     batch = batch_from_specs(kind=kind)
     envs = TaskVector(batch)
     links = batch.robot_tables.max_links
@@ -69,14 +69,14 @@ def test_spaces_hold_what_is_seen_and_done(batch_from_specs, kind):
         seen, *_ = envs.step(envs.action_space.sample())
 
 
-def test_what_is_empty_is_not_observed(cache):
+def test_empty_observation_entries_are_omitted(cache):
     batch = make_batch("reach", ROBOTS[:1], 2, sim="mujoco", configs=(REACH,), cache=cache)
     with closing(TaskVector(batch)) as envs:
         assert "obstacles" in batch.observe()
         assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
 
 
-def test_steps_are_those_of_the_batch(batch_from_specs):
+def test_steps_equal_those_of_the_batch(batch_from_specs):
     batch, envs = batch_from_specs(seed=3), TaskVector(batch_from_specs(seed=99))
     expected, (seen, _) = batch.reset(), envs.reset(seed=3)
     rng = np.random.default_rng(0)
@@ -96,7 +96,7 @@ def test_steps_are_those_of_the_batch(batch_from_specs):
             assert np.array_equal(infos["terms"][name], term.numpy())
 
 
-def test_where_an_episode_ends_the_next_begins_and_the_last_is_told(batch_from_specs):
+def test_autoreset_returns_the_final_observation(batch_from_specs):
     envs = TaskVector(batch_from_specs())
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     envs.reset(seed=0)
@@ -120,7 +120,7 @@ def test_where_an_episode_ends_the_next_begins_and_the_last_is_told(batch_from_s
                 assert not np.array_equal(final["tokens"], seen["tokens"][env])
 
 
-def test_nothing_that_is_returned_changes_later(batch_from_specs):
+def test_returned_arrays_are_copies(batch_from_specs):
     envs = TaskVector(batch_from_specs())
     kept = []
     seen, _ = envs.reset(seed=0)
@@ -133,7 +133,7 @@ def test_nothing_that_is_returned_changes_later(batch_from_specs):
     assert not any(np.shares_memory(first[name], second[name]) for name in first)
 
 
-def test_a_loop_as_of_cleanrl_runs(batch_from_specs):
+def test_cleanrl_style_loop_runs(batch_from_specs):
     """Statistics of episodes, values of final observations, everything in preallocated rows."""
     envs = RecordEpisodeStatistics(TaskVector(batch_from_specs()))
     envs.reset(seed=1)
@@ -154,7 +154,7 @@ def test_a_loop_as_of_cleanrl_runs(batch_from_specs):
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_ppo_of_stable_baselines3_learns(batch_from_specs, kind):
+def test_stable_baselines3_ppo_learns(batch_from_specs, kind):
     envs = VecMonitor(sb3_vector(batch_from_specs(kind=kind)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -172,7 +172,7 @@ def test_ppo_of_stable_baselines3_learns(batch_from_specs, kind):
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer)
 
 
-def test_stable_baselines3_is_told_how_episodes_ended(batch_from_specs):
+def test_stable_baselines3_infos_distinguish_truncation(batch_from_specs):
     envs = sb3_vector(batch_from_specs())
     envs.seed(3)
     first = envs.reset()["goal"]
@@ -189,7 +189,7 @@ def test_stable_baselines3_is_told_how_episodes_ended(batch_from_specs):
             assert set(info["terminal_observation"]) == set(seen)
 
 
-def test_stable_baselines3_asks_for_attributes(batch_from_specs):
+def test_stable_baselines3_can_read_attributes(batch_from_specs):
     envs = sb3_vector(batch_from_specs())
     assert envs.get_attr("num_envs", [0, 2]) == [4, 4]
     assert envs.env_is_wrapped(gym.Wrapper) == [False] * 4
@@ -201,7 +201,7 @@ def test_stable_baselines3_asks_for_attributes(batch_from_specs):
         envs.set_attr("label", "y", indices=0)
 
 
-def test_without_stable_baselines3_the_error_says_what_to_install(batch_from_specs, monkeypatch):
+def test_missing_stable_baselines3_error_says_what_to_install(batch_from_specs, monkeypatch):
     monkeypatch.delitem(sys.modules, "morphgen.tasks.sb3", raising=False)
     for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:
         monkeypatch.delitem(sys.modules, name)
@@ -216,7 +216,7 @@ def test_without_stable_baselines3_the_error_says_what_to_install(batch_from_spe
         import_module("morphgen.tasks.sb3")
 
 
-def test_gymnasium_makes_vectors_of_several_robots(cache):
+def test_gymnasium_makes_vector_envs_of_several_robots(cache):
     options = {
         "robots": ["prims", "arm3-stick"],
         "sim": "mujoco",
@@ -242,7 +242,7 @@ def test_goal_sampling_reports_its_progress(cache):
     assert calls == [(0, 2), (1, 2), (2, 2)]
 
 
-def test_spaces_have_the_bounds_that_tasks_declare():
+def test_spaces_have_the_bounds_declared_by_the_task():
     values = {"speed": np.zeros((3, 2), np.float32), "goal": np.zeros((3, 7), np.float32)}
     fields = (ObservationField("speed", 2, "speed_mask", low=0.0, high=5.0),)
     space = observation_space(values, fields)

@@ -1,4 +1,4 @@
-"""A viewer on small robots, and a browser without a screen to look at it."""
+"""Fixtures: a viewer with small robots and a headless browser."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Pages of other sites cannot use the viewer, by whatever name they ask it."""
+"""Pages of other sites cannot use the viewer, whatever host name or origin they send."""
 
 import http.client
 import re
@@ -40,7 +40,7 @@ def asked(gate, host, origin=None, path="/"):
         ("::", "[fe80::1]:8080", "http://[fe80::1]:8080"),
     ],
 )
-def test_own_names_and_allowed_sites_are_answered(bound, host, origin):
+def test_own_host_names_and_allowed_origins_are_accepted(bound, host, origin):
     assert asked(access_policy(bound, [HUB]), host, origin) == ""
 
 
@@ -69,11 +69,11 @@ def test_own_names_and_allowed_sites_are_answered(bound, host, origin):
         ("0.0.0.0", "192.168.1.5:8080", "http://evil.example"),
     ],
 )
-def test_other_names_and_sites_are_refused(bound, host, origin):
+def test_other_host_names_and_origins_are_rejected(bound, host, origin):
     assert asked(access_policy(bound), host, origin)
 
 
-def test_two_hosts_or_origins_are_refused():
+def test_duplicate_host_or_origin_headers_are_rejected():
     for key in ("Host", "Origin"):
         headers = Headers([("Host", "localhost"), ("Origin", "http://localhost")])
         headers[key] = headers[key]
@@ -90,7 +90,7 @@ def test_two_hosts_or_origins_are_refused():
         "playbackPath=a.viser",
     ],
 )
-def test_an_address_cannot_show_another_server(query):
+def test_url_cannot_connect_to_another_server(query):
     assert "another server" in asked(AccessPolicy(), "localhost:8080", path=f"/?{query}")
     assert (
         asked(AccessPolicy(), "localhost:8080", path="/?websocket=ws://localhost:8080/proxy") == ""
@@ -100,13 +100,13 @@ def test_an_address_cannot_show_another_server(query):
 @pytest.mark.parametrize(
     "origin", ["null", "*", "evil.example", "http://", "http://a/b", "ftp://a", "http://u@a", ""]
 )
-def test_a_malformed_origin_is_rejected(origin):
+def test_malformed_origin_is_rejected(origin):
     with pytest.raises(MorphgenError, match=re.escape(f"--allow-origin {origin!r}: expected")):
         access_policy("127.0.0.1", [origin])
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:{port}"])
-def test_a_foreign_page_gets_no_websocket(viewer, origin):
+def test_foreign_origin_gets_no_websocket(viewer, origin):
     port = viewer().port
     with pytest.raises(InvalidStatus) as refused:
         PlainClient(port, origin=origin.format(port=port))
@@ -114,7 +114,7 @@ def test_a_foreign_page_gets_no_websocket(viewer, origin):
     assert b"may not use this viewer" in refused.value.response.body
 
 
-def test_a_foreign_host_name_gets_no_websocket(viewer):
+def test_foreign_host_name_gets_no_websocket(viewer):
     port = viewer().port
     host = f"evil.example:{port}"
     with pytest.raises(InvalidStatus) as refused:
@@ -123,7 +123,7 @@ def test_a_foreign_host_name_gets_no_websocket(viewer):
 
 
 @pytest.mark.parametrize("origin", [None, "http://127.0.0.1:{port}", HUB])
-def test_own_pages_and_allowed_sites_get_a_websocket(viewer, origin):
+def test_own_pages_and_allowed_origins_get_a_websocket(viewer, origin):
     on = viewer(origins=[HUB])
     with PlainClient(on.port, origin=origin and origin.format(port=on.port)) as client:
         client.shows("Categories")
@@ -139,7 +139,7 @@ def fetched(port, path="/", **headers):
     return answer, answer.read()
 
 
-def test_pages_are_served_to_its_own_names_only(viewer, capfd):
+def test_pages_are_served_only_to_own_host_names(viewer, capfd):
     port = viewer().port
     answer, page = fetched(port, Host=f"localhost:{port}")
     assert (answer.status, b"<html" in page) == (200, True)
@@ -171,7 +171,7 @@ def test_invalid_requests_leave_no_traceback(viewer, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_the_server_of_a_recording_refuses_everyone():
+def test_recording_server_rejects_all_clients():
     server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))
     try:
         with pytest.raises(InvalidStatus):

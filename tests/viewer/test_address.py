@@ -1,4 +1,4 @@
-"""Addresses are read as they are written."""
+"""Viewer URLs are parsed and formatted consistently."""
 
 import pytest
 from hypothesis import given
@@ -16,23 +16,23 @@ TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
     st.lists(TEXTS, min_size=1, max_size=4),
     st.dictionaries(KEYS.filter(lambda key: key not in PAGES), TEXTS.filter(bool)),
 )
-def test_a_written_address_is_read(page, subjects, state):
+def test_formatted_url_is_parsed_back(page, subjects, state):
     address = Address(page, tuple(subjects), state)
     assert parse_address(address.query) == address
 
 
 @given(st.lists(TEXTS, max_size=3), st.dictionaries(st.just("seed"), TEXTS.filter(bool)))
-def test_robots_of_a_rollout_are_read_in_order(robots, state):
+def test_robots_of_a_rollout_url_keep_their_order(robots, state):
     address = Address("play", ("reach",), state, tuple(robots))
     assert parse_address(address.query) == address
 
 
-def test_a_uri_stays_readable():
+def test_robot_uri_stays_readable():
     address = Address("robot", ("words:arm=ur5 ee=plane",), {"q": "0.1,-2"})
     assert address.query == "?robot=words:arm=ur5%20ee=plane&q=0.1,-2"
 
 
-def test_no_query_is_the_first_page():
+def test_empty_query_is_the_first_page():
     assert parse_address("") is None
     assert parse_address("?") is None
 
@@ -45,16 +45,16 @@ def test_no_query_is_the_first_page():
         ("?play=reach&robot=a&split=b", "two pages: split and play"),
     ],
 )
-def test_an_invalid_address_is_rejected(query, why):
+def test_invalid_url_is_rejected(query, why):
     with pytest.raises(AddressError, match=why):
         parse_address(query)
 
 
-def test_state_at_its_default_is_left_out():
+def test_default_state_is_omitted():
     address = Address("gallery", ("robots",), {"n": "2", "sort": "name"})
     assert address.with_state(n="", sort="-mass").query == "?gallery=robots&sort=-mass"
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_every_page_of_the_table_can_be_loaded(page):
+def test_every_registered_page_can_be_loaded(page):
     assert callable(load_page(page))

@@ -1,4 +1,4 @@
-"""Every command that a page shows is one that morphgen knows."""
+"""Every command shown on a page is a valid morphgen command."""
 
 import html
 import re
@@ -36,7 +36,7 @@ def commands(client):
         ("?compose=chain&seed=3&number=2", "morphgen sample chain -n 3 --seed 3"),
     ],
 )
-def test_the_commands_of_a_page_are_morphgens(viewer, folder, query, expected):
+def test_commands_of_a_page_are_valid(viewer, folder, query, expected):
     write_bundle(arm(), folder / "robots" / "it's me", picture=False)
     (folder / "my").mkdir(exist_ok=True)
     (folder / "my" / "own.grammar").write_text("include chain\n")

@@ -33,14 +33,14 @@ def robot_of(words):
     return compose(derivation, LIBRARY, name)
 
 
-def test_roles_count_joints_on_the_path_to_the_tool():
+def test_joint_roles_count_joints_on_the_path_to_the_tool():
     assert joint_roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
     panda = robot_of("arm=panda ee=panda_hand")
     assert joint_roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
     assert all_roles([arm(), panda]) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
 
 
-def test_a_role_moves_every_robot_by_the_same_share():
+def test_joint_role_moves_every_robot_by_the_same_fraction():
     for robot in (arm(), robot_of("arm=panda ee=panda_hand")):
         home = np.array(robot.home)
         assert with_roles(robot, home, {}) == pytest.approx(home)
@@ -63,7 +63,7 @@ def test_token_differences_are_relative_to_the_first_robot():
     assert other[2].all()
 
 
-def test_the_picture_of_tokens_is_the_same_every_time():
+def test_token_picture_is_reproducible():
     tables = [np.linspace(-1, 1, 96).reshape(2, 48), np.zeros((3, 48))]
     links = [["a", "b"], ["a", "$x$", "c"]]
     first = tokens_png(["one", "two_$y"], links, tables)
@@ -73,7 +73,7 @@ def test_the_picture_of_tokens_is_the_same_every_time():
     assert height > 200
 
 
-def test_robots_are_like_themselves():
+def test_robot_compared_with_itself_is_identical():
     robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
     found = compare_robots(robots, LIBRARY.folders)
     assert found.values["cosine"].diagonal() == pytest.approx([1, 1])
@@ -114,7 +114,7 @@ def test_figures_link_to_robots_and_escape_names():
     assert "b and &lt;a&gt;: 0.300" in heatmap
 
 
-def test_points_in_one_place_are_drawn():
+def test_coincident_points_are_drawn():
     text = map_svg(np.zeros((3, 2)), list("abc"), ["train"] * 3, list("abc"))
     assert text.count("<circle") == 3
     assert "nan" not in text

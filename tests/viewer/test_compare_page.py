@@ -1,4 +1,4 @@
-"""Robots stand side by side in a browser."""
+"""The compare page in a browser."""
 
 import re
 
@@ -42,6 +42,6 @@ def test_primitives_are_coloured_by_their_iou(see, viewer, picture):
     assert not node(on, "/robot0/3/visual0").visible
 
 
-def test_too_many_robots_are_refused(see):
+def test_too_many_robots_are_rejected(see):
     page = see("?" + "&".join(["compare=robots/some-arm"] * 5))
     page.get_by_text("5 robots to compare: expected 2 to 4").wait_for()

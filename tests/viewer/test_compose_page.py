@@ -1,4 +1,4 @@
-"""Robots are composed in a browser."""
+"""The compose page in a browser."""
 
 import re
 
@@ -15,7 +15,7 @@ def choose(page, label, option, nth=0):
     page.get_by_role("option", name=option, exact=True).click()
 
 
-def test_parts_are_chosen_and_turned_into_words(see, picture):
+def test_chosen_parts_become_compose_arguments(see, picture):
     page = see("?compose=arm=arm3 ee=plane")
     page.get_by_text(re.compile("5 DoF|6 DoF")).first.wait_for()
     slider = page.get_by_text("length (m)", exact=True)
@@ -27,7 +27,7 @@ def test_parts_are_chosen_and_turned_into_words(see, picture):
     assert page.failures == []
 
 
-def test_parts_that_do_not_fit_say_why_and_the_robot_stays(see):
+def test_parts_that_do_not_fit_show_an_error_and_keep_the_robot(see):
     page = see("?compose=base=gantry ee=stick")
     page.get_by_text("DoF").first.wait_for()
     choose(page, "ee", "(none)", nth=1)
@@ -35,7 +35,7 @@ def test_parts_that_do_not_fit_say_why_and_the_robot_stays(see):
     assert page.get_by_text("gantry-stick").is_visible()
 
 
-def test_a_robot_is_written(see, folder):
+def test_robot_is_written_to_a_bundle(see, folder):
     page = see("?compose=base=planar ee=cube")
     page.get_by_text("DoF").first.wait_for()
     page.get_by_role("tab", name="Get").click()
@@ -47,7 +47,7 @@ def test_a_robot_is_written(see, folder):
     assert (folder / "robots" / "by-hand" / "preview.png").is_file()
 
 
-def test_a_grammar_is_edited_drawn_and_stepped_through(see, picture):
+def test_grammar_is_edited_sampled_and_stepped_through(see, picture):
     page = see("?compose=planar_arm")
     page.get_by_text("Derivation").first.wait_for()
     page.get_by_role("button", name="next").click()
@@ -66,7 +66,7 @@ def test_a_grammar_is_edited_drawn_and_stepped_through(see, picture):
     assert page.failures == []
 
 
-def test_an_edited_grammar_is_kept_in_the_address(see):
+def test_edited_grammar_is_kept_in_the_url(see):
     page = see("?compose=planar_arm")
     page.get_by_text("Derivation").first.wait_for()
     text = page.locator("textarea").first
@@ -83,6 +83,6 @@ def test_an_edited_grammar_is_kept_in_the_address(see):
     page.wait_for_url(re.compile(r"compose=planar_arm$"))
 
 
-def test_a_drawn_robot_has_an_address(see):
+def test_sampled_robot_has_a_url(see):
     page = see("?compose=chain&seed=3&number=2")
     page.get_by_text("chain-000002").wait_for()

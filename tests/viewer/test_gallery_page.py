@@ -1,4 +1,4 @@
-"""Galleries in a browser."""
+"""The gallery pages in a browser."""
 
 import re
 
@@ -16,7 +16,7 @@ def wait_for_names(page, wanted):
         page.locator(".card .name", has_text=name).wait_for()
 
 
-def test_a_set_is_shown_and_a_click_opens_a_robot(see):
+def test_click_in_a_gallery_opens_the_robot(see):
     page = see("?gallery=robots/prims")
     page.locator(".card").first.wait_for()
     assert names(page) == [f"prims-{i:06d}" for i in range(24)]
@@ -27,7 +27,7 @@ def test_a_set_is_shown_and_a_click_opens_a_robot(see):
 
 
 @pytest.mark.slow
-def test_rows_are_searched_and_the_address_says_so(see, control):
+def test_search_filters_rows_and_updates_the_url(see, control):
     page = see("?gallery=robots/prims")
     page.locator(".card").first.wait_for()
     control.input(page, "Search").fill("00000")
@@ -39,7 +39,7 @@ def test_rows_are_searched_and_the_address_says_so(see, control):
 
 
 @pytest.mark.slow
-def test_pages_are_turned(see):
+def test_gallery_pages_can_be_changed(see):
     page = see("?gallery=robots/prims&sort=-name")
     page.locator(".card").first.wait_for()
     assert names(page)[0] == "prims-000029"
@@ -50,7 +50,7 @@ def test_pages_are_turned(see):
 
 
 @pytest.mark.slow
-def test_thumbnails_are_drawn_by_workers_and_a_broken_robot_says_so(see):
+def test_thumbnails_are_rendered_by_workers_and_broken_robots_show_an_error(see):
     page = see("?gallery=robots")
     page.locator(".card").first.wait_for()
     page.wait_for_selector(".card:has-text('some-arm') img")
@@ -60,7 +60,7 @@ def test_thumbnails_are_drawn_by_workers_and_a_broken_robot_says_so(see):
 
 
 @pytest.mark.slow
-def test_a_dead_worker_is_reported_once_and_thumbnails_are_still_drawn(see, viewer):
+def test_dead_worker_is_reported_once_and_thumbnails_are_still_rendered(see, viewer):
     on = viewer()
     page = see("?gallery=robots/prims", on=on)
     page.locator(".card img").first.wait_for()
@@ -92,7 +92,7 @@ def test_the_library_links_to_everything(see):
         ("?split=extrapolation/arm/reach", "no such file"),
     ],
 )
-def test_an_address_that_leads_nowhere_says_why(see, query, message):
+def test_unknown_url_shows_an_error(see, query, message):
     page = see(query)
     page.get_by_text(re.compile(re.escape(message))).first.wait_for()
     page.get_by_role("link", name="Library").click()
@@ -100,7 +100,7 @@ def test_an_address_that_leads_nowhere_says_why(see, query, message):
 
 
 @pytest.mark.slow
-def test_a_split_is_made_of_what_passes_the_filter(see, control, folder):
+def test_split_is_created_from_filtered_robots(see, control, folder):
     page = see("?gallery=robots/prims&search=00000")
     page.get_by_text("10 of 30 robots").wait_for()
     page.get_by_text("New split").click()

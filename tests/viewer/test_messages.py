@@ -1,4 +1,4 @@
-"""Messages that no page of the viewer sends change nothing, and leave no traceback."""
+"""Invalid websocket messages change nothing and leave no traceback."""
 
 import msgspec
 import pytest
@@ -28,7 +28,7 @@ from morphgen.viewer.messages import message_fault
     ],
     ids=lambda message: repr(message)[:50],
 )
-def test_a_malformed_message_closes_its_connection_only(viewer, capfd, message):
+def test_malformed_message_closes_only_its_connection(viewer, capfd, message):
     on = viewer()
     with PlainClient(on.port) as client, PlainClient(on.port) as other:
         client.shows("Categories")
@@ -45,7 +45,7 @@ def test_a_text_message_closes_its_connection(viewer):
         assert client.until_closed() == (1008, "expected a binary message")
 
 
-def test_messages_of_a_page_are_taken():
+def test_valid_messages_are_accepted():
     assert message_fault(msgspec.msgpack.encode(CAMERA)) == ""
 
 
@@ -60,7 +60,7 @@ def test_messages_of_a_page_are_taken():
         ("UploadButton", "Look at a URDF or a zipped bundle", "x", "takes no value"),
     ],
 )
-def test_a_value_that_a_control_cannot_have_is_rejected(viewer, capfd, kind, label, value, why):
+def test_invalid_control_values_are_rejected(viewer, capfd, kind, label, value, why):
     with PlainClient(viewer().port) as client:
         client.change(client.control(kind, label), value)
         client.shows("That did not work")
@@ -71,7 +71,7 @@ def test_a_value_that_a_control_cannot_have_is_rejected(viewer, capfd, kind, lab
 @pytest.mark.parametrize(
     "updates", [{}, {"update_cb": []}, {"value": "x", "sync_cb": None}, {"_impl": 1}]
 )
-def test_nothing_but_a_controls_value_is_changed(viewer, capfd, updates):
+def test_messages_can_change_only_control_values(viewer, capfd, updates):
     with PlainClient(viewer().port) as client:
         search = client.control("Text", "Search")
         client.send({"type": "GuiUpdateMessage", "uuid": search, "updates": updates})
@@ -81,7 +81,7 @@ def test_nothing_but_a_controls_value_is_changed(viewer, capfd, updates):
     assert capfd.readouterr().err == ""
 
 
-def test_a_slider_takes_numbers_only_and_in_its_range(viewer, capfd):
+def test_slider_accepts_only_numbers_in_its_range(viewer, capfd):
     with PlainClient(viewer().port, "?robot=robots/some-arm") as client:
         shoulder = client.control("Slider", "shoulder")
         for value in (float("nan"), float("inf"), "far", None, True, [1]):

@@ -1,4 +1,4 @@
-"""No address, and no text that a browser sends, makes a page tell of files outside its folders."""
+"""No URL or text from a browser reveals files outside the served folders."""
 
 import re
 from types import SimpleNamespace
@@ -62,7 +62,7 @@ def secret(tmp_path):
         "?compose=./../elsewhere/a.grammar",
     ],
 )
-def test_an_address_reveals_nothing_outside_the_folders(viewer, capfd, secret, query):
+def test_url_reveals_nothing_outside_the_folders(viewer, capfd, secret, query):
     with PlainClient(viewer().port, query.replace("{}", str(secret))) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
         assert re.search("outside of the folders|no such file", client.text)
@@ -96,7 +96,7 @@ def test_an_address_reveals_nothing_outside_the_folders(viewer, capfd, secret, q
     ],
     ids=lambda each: each[:30],
 )
-def test_an_invalid_address_is_answered_in_a_sentence(viewer, capfd, query, why):
+def test_invalid_url_shows_an_error_message(viewer, capfd, query, why):
     with PlainClient(viewer().port, query) as client:
         client.until(lambda: NOTHING in client.text or "tag error" in client.text)
         shown = client.text.replace("&#x27;", "'")
@@ -111,14 +111,14 @@ def test_an_invalid_number_counts_as_zero(viewer, capfd, query):
     assert capfd.readouterr().err == ""
 
 
-def test_a_grammar_of_the_folder_includes_none_from_outside(viewer, folder, secret):
+def test_grammar_file_cannot_include_outside_files(viewer, folder, secret):
     (folder / "mine.grammar").write_text(f'include "{secret}/a.grammar"\nrobot -> ur5\n')
     with PlainClient(viewer().port, "?compose=mine.grammar") as client:
         client.shows("leads outside of")
         assert WORD not in client.text
 
 
-def test_a_grammars_text_includes_nothing(viewer, secret):
+def test_grammar_text_cannot_include_files(viewer, secret):
     with PlainClient(viewer().port, "?compose=arm3") as client:
         text = client.control("Text", "text")
         client.change(text, f'include "{secret}/a.grammar"\nrobot -> ur5\n')
@@ -126,7 +126,7 @@ def test_a_grammars_text_includes_nothing(viewer, secret):
         assert WORD not in client.text
 
 
-def test_a_checkpoint_names_no_robot_from_outside(viewer, folder, secret, monkeypatch):
+def test_checkpoint_cannot_name_an_outside_robot(viewer, folder, secret, monkeypatch):
     (folder / "runs").mkdir(exist_ok=True)
     (folder / "runs" / "some.pt").touch()
     for name in (f"{secret}/a.urdf", f"{secret}/a.grammar", f"{secret}"):
@@ -138,7 +138,7 @@ def test_a_checkpoint_names_no_robot_from_outside(viewer, folder, secret, monkey
             assert WORD not in client.text
 
 
-def test_an_episode_names_no_robot_from_outside(viewer, folder, secret):
+def test_episode_cannot_name_an_outside_robot(viewer, folder, secret):
     about = {"format": 1, "task": "reach", "bodies": [{"place": f"{secret}/a.urdf"}]}
     arrays = {f"0/{name}": np.zeros(1) for name in ("q", "score", "distance", "success", "goal")}
     np.savez(folder / "mine.npz", about=np.array(str(about).replace("'", '"')), **arrays)
@@ -147,7 +147,7 @@ def test_an_episode_names_no_robot_from_outside(viewer, folder, secret):
         assert WORD not in client.text
 
 
-def test_a_card_names_no_file_outside(viewer, folder, secret):
+def test_card_cannot_name_an_outside_file(viewer, folder, secret):
     bundle = write_bundle(arm(), folder / "robots" / "nosy", picture=False)
     card = (bundle / "card.json").read_text()
     (bundle / "card.json").write_text(card.replace('"robot.xml":', f'"{secret}/a.urdf":'))

@@ -1,4 +1,4 @@
-"""Texts are packed into addresses and unpacked again; invalid ones are rejected."""
+"""Packing of texts into URLs, and rejection of invalid packed texts."""
 
 import base64
 import random
@@ -21,7 +21,7 @@ from morphgen.viewer.address import (
 
 
 @given(st.text(max_size=300))
-def test_a_text_comes_back_from_an_address(text):
+def test_text_is_restored_from_a_url(text):
     address = Address("compose", ("chain",), {"text": pack_text(text)})
     assert "%" not in address.query
     assert unpack_text(parse_address(address.query).state["text"]) == text

@@ -1,4 +1,4 @@
-"""The compose panel says in words what its controls show."""
+"""Conversion between the controls of the compose panel and compose arguments."""
 
 import pytest
 
@@ -21,7 +21,7 @@ LIBRARY = default_library()
 WORDS = "base=pedestal left.arm=ur5 left.ee=plane right.ee=stick left.ee.size=0.1 base.height=0.7"
 
 
-def test_words_come_back():
+def test_compose_arguments_survive_a_round_trip():
     choice = parse_choice(WORDS.split(), LIBRARY)
     again = parse_choice(choice.words.split(), LIBRARY)
     assert again == choice
@@ -29,7 +29,7 @@ def test_words_come_back():
 
 
 @pytest.mark.parametrize("bad", ["arm", "arm=ur5 ee.size=1", "arm=ur5 arm.size=1", "arm=ur6"])
-def test_invalid_words_are_rejected(bad):
+def test_invalid_compose_arguments_are_rejected(bad):
     with pytest.raises(MorphgenError):
         parse_choice(bad.split(), LIBRARY)
 
@@ -54,7 +54,7 @@ def test_parts_offer_slots_and_each_can_be_filled(words, slots):
         parse_words(filled.words.split(), LIBRARY)
 
 
-def test_options_begin_with_nothing():
+def test_slot_options_begin_with_none():
     assert part_options("left.arm", LIBRARY)[0] == NO_PART
     assert "none" not in part_options("ee", LIBRARY)
 
@@ -78,7 +78,7 @@ TEMPLATES = [
 
 
 @pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
-def test_every_part_takes_both_ends_of_every_control(manifest):
+def test_every_part_accepts_both_ends_of_every_control(manifest):
     name = manifest.name
     slot = manifest.kind
     words = f"{slot}={name}" + (" ee=stick" if slot == "base" else "")
@@ -89,7 +89,7 @@ def test_every_part_takes_both_ends_of_every_control(manifest):
             parse_words(text.split(), LIBRARY)
 
 
-def test_another_part_takes_its_parameters_with_it():
+def test_changing_a_part_resets_its_parameters():
     choice = parse_choice(WORDS.split(), LIBRARY)
     other = with_part(choice, "left.ee", "stick", LIBRARY)
     assert "left.ee.size" not in other.values
@@ -97,7 +97,7 @@ def test_another_part_takes_its_parameters_with_it():
     assert "left.arm" not in with_part(choice, "left.arm", NO_PART, LIBRARY).parts
 
 
-def test_another_base_keeps_the_limbs_that_it_has_ports_for():
+def test_changing_the_base_keeps_limbs_with_matching_ports():
     choice = parse_choice(["base=pedestal", "arm=ur5", "left.arm=ur5", "left.ee=stick"], LIBRARY)
     gantry = with_part(choice, "base", "gantry", LIBRARY)
     assert gantry.words == "base=gantry arm=ur5"
@@ -105,14 +105,14 @@ def test_another_base_keeps_the_limbs_that_it_has_ports_for():
     assert planar.parts == {**choice.parts, "base": "planar"}
 
 
-def test_default_values_are_left_out():
+def test_default_values_are_omitted():
     choice = parse_choice(["arm=arm3", "arm.length=0.2"], LIBRARY)
     control = next(c for c in controls_of("arm", LIBRARY.manifest("arm3")) if c.key == "arm.length")
     assert with_value(choice, control, control.default).words == "base=fixed arm=arm3"
     assert with_value(choice, control, 0.4).words == "base=fixed arm=arm3 arm.length=0.4"
 
 
-def test_a_derivation_grows_part_by_part():
+def test_derivation_is_built_part_by_part():
     derivation, name = parse_words(WORDS.split(), LIBRARY)
     whole = list(derivation.walk())
     for n in range(1, len(whole) + 1):

@@ -1,4 +1,4 @@
-"""Robots do their tasks in a browser."""
+"""The play page in a browser."""
 
 import re
 import threading
@@ -46,7 +46,7 @@ def download(page, button):
     return found.value
 
 
-def test_a_robot_reaches_and_is_scrubbed_and_stepped(see, viewer, picture):
+def test_reach_episode_can_be_scrubbed_and_stepped(see, viewer, picture):
     on = viewer()
     page = see(f"?play=reach&robot={CUBE}&policy=ik&seed=3", on=on)
     wait_for_end(page)
@@ -62,7 +62,7 @@ def test_a_robot_reaches_and_is_scrubbed_and_stepped(see, viewer, picture):
     assert page.failures == []
 
 
-def test_the_address_is_shown_and_new_episodes_have_other_seeds(see, viewer):
+def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page = see(f"?play=reach&robot={CUBE}&policy=random")
     page.wait_for_url(re.compile(r"policy=random&seed=0"))
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()
@@ -75,7 +75,7 @@ def test_the_address_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page.get_by_text("success", exact=True).wait_for()
 
 
-def test_an_episode_is_saved_opened_and_made_into_a_scene_and_a_film(
+def test_episode_is_saved_opened_and_exported_as_scene_and_video(
     see, viewer, folder, picture, tmp_path
 ):
     on = viewer()
@@ -112,7 +112,7 @@ def test_robots_are_replaced_added_and_removed(see, viewer, picture):
     page.wait_for_url(re.compile(r"play=reach&robot=robots/prims/prims-000002&policy"))
 
 
-def test_a_robot_that_cannot_do_the_task_says_why(see, viewer):
+def test_robot_that_cannot_do_the_task_shows_the_reason(see, viewer):
     page = see(f"?play=push&robot={CUBE}")
     page.get_by_text(re.compile("robot 'planar-cube' can hardly push")).wait_for()
     choose(page, "task", "reach")
@@ -133,11 +133,11 @@ def test_a_robot_that_cannot_do_the_task_says_why(see, viewer):
         ("?play=nothing.npz", "no such file"),
     ],
 )
-def test_an_invalid_rollout_says_why(see, query, why):
+def test_invalid_rollout_shows_the_reason(see, query, why):
     see(query).get_by_text(re.compile(re.escape(why))).first.wait_for()
 
 
-def test_a_checkpoint_starts_with_the_robot_it_was_trained_on(see, viewer, folder, tmp_path):
+def test_checkpoint_starts_with_its_training_robot(see, viewer, folder, tmp_path):
     train(folder / "runs" / "small", small_config(small_source()), execution=QUIET)
     on = viewer("runs/small")
     page = see(on=on)
@@ -148,7 +148,7 @@ def test_a_checkpoint_starts_with_the_robot_it_was_trained_on(see, viewer, folde
     page.get_by_text(re.compile("the checkpoint is for other observations: obstacles 0")).wait_for()
 
 
-def test_a_player_ends_when_its_browser_leaves_the_page(see, viewer, capfd):
+def test_player_ends_when_its_browser_leaves_the_page(see, viewer, capfd):
     on = viewer()
     page = see(f"?play=reach&robot={CUBE}&policy=random", on=on)
     page.get_by_text(re.compile(r"simulated: [1-9]")).wait_for()

@@ -1,4 +1,4 @@
-"""A player simulates, shows steps and takes commands on a thread of its own."""
+"""The player simulates, displays steps and handles commands in its own thread."""
 
 import threading
 import time
@@ -107,7 +107,7 @@ def test_playback_is_paused_stepped_and_scrubbed(player, display):
     display.wait_for(lambda: display.steps[-2:] == [0, "stopped"])
 
 
-def test_slow_steps_are_shown_as_they_come(player, display):
+def test_slow_steps_are_shown_as_they_arrive(player, display):
     source = Counting(steps=8, pause=0.1)
     player.set_speed(4.0)
     player.load(lambda: source)

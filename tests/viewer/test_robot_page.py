@@ -1,4 +1,4 @@
-"""The page of a robot in a browser."""
+"""The robot page in a browser."""
 
 import io
 import os
@@ -53,7 +53,7 @@ def node(viewer, name):
 
 
 @pytest.mark.slow
-def test_a_slider_moves_the_robot_and_the_address(see, viewer, folder):
+def test_slider_moves_the_robot_and_updates_the_url(see, viewer, folder):
     on = viewer()
     page = see(ARM, on=on)
     wait_for_page(page)
@@ -71,7 +71,7 @@ def test_a_slider_moves_the_robot_and_the_address(see, viewer, folder):
 
 
 @pytest.mark.slow
-def test_an_address_brings_a_configuration_and_layers_back(see, viewer, picture):
+def test_url_restores_configuration_and_layers(see, viewer, picture):
     on = viewer()
     page = see(f"{ARM}&q=0.3,-0.4,0.02,0.01&show=collision,frames,joint axes,inertia", on=on)
     wait_for_page(page)
@@ -88,7 +88,7 @@ def test_an_address_brings_a_configuration_and_layers_back(see, viewer, picture)
 
 
 @pytest.mark.slow
-def test_collisions_are_red_while_they_last(see, viewer):
+def test_colliding_links_are_red(see, viewer):
     on = viewer()
     q = [0.0, -1.0, 2.6, 2.5, 0.0, 0.0]
     page = see(
@@ -172,7 +172,7 @@ def test_a_broken_robot_shows_its_findings(see, picture):
 
 
 @pytest.mark.slow
-def test_a_changed_file_is_seen_after_a_reload(see, viewer, folder, tmp_path):
+def test_changed_file_is_shown_after_a_reload(see, viewer, folder, tmp_path):
     bundle = write_bundle(arm(), folder / "robots" / "changing", picture=False)
     page = see("?robot=robots/changing")
     wait_for_page(page)
@@ -202,7 +202,7 @@ def test_two_browsers_do_not_disturb_each_other(see, viewer):
 
 
 @pytest.mark.slow
-def test_a_browser_that_leaves_while_its_page_is_built_harms_nobody(see, viewer, capfd):
+def test_browser_closed_during_page_setup_does_not_affect_others(see, viewer, capfd):
     on = viewer()
     for _ in range(3):
         page = see("?robot=words:arm=panda ee=panda_hand&show=visual,workspace,primitives", on=on)
@@ -215,7 +215,7 @@ def test_a_browser_that_leaves_while_its_page_is_built_harms_nobody(see, viewer,
 
 
 @pytest.mark.slow
-def test_a_browser_that_is_killed_leaves_nothing(see, viewer, browser_command, tmp_path, capfd):
+def test_killed_browser_leaves_no_resources(see, viewer, browser_command, tmp_path, capfd):
     on = viewer()
     query = "?robot=words:arm=panda%20ee=panda_hand&show=visual,workspace,primitives"
     own = ("--headless", f"--user-data-dir={tmp_path}", f"http://127.0.0.1:{on.port}/{query}")
@@ -250,7 +250,7 @@ def test_a_browser_that_is_killed_leaves_nothing(see, viewer, browser_command, t
     ],
     ids=["no-urdf", "climbs-out", "large"],
 )
-def test_a_bad_upload_says_why(see, tmp_path, name, content, message):
+def test_invalid_upload_shows_the_reason(see, tmp_path, name, content, message):
     page = see("?library=")
     button = page.get_by_role("button", name="Look at a URDF")
     button.wait_for()

@@ -1,4 +1,4 @@
-"""Rows of galleries are filtered, sorted and select_page."""
+"""Filtering, sorting and paging of gallery rows."""
 
 import pytest
 
@@ -58,7 +58,7 @@ def test_filters(condition, left):
         ("-findings", "abc"),
     ],
 )
-def test_sorting_puts_the_unknown_last(key, order):
+def test_sorting_puts_unknown_values_last(key, order):
     assert names(sort_rows(ROWS, key)) == list(order)
 
 
@@ -81,7 +81,7 @@ def test_pages(number, size, expected):
     assert select_page(range(7), number, size) == expected
 
 
-def test_no_rows_make_one_empty_page():
+def test_zero_rows_give_one_empty_page():
     assert select_page([], 3, 24) == ([], 1, 1)
 
 
@@ -91,7 +91,7 @@ def test_ranges_and_choices_of_facts():
     assert fact_choices([*ROWS, Row("d", "d")], "category") == ["arms", "hands"]
 
 
-def test_known_facts_are_in_a_line():
+def test_known_facts_are_joined_in_one_line():
     row = Row("d", "d", dof=3, reach=0.5, mass=1.25, findings=())
     assert facts_line(row) == "3 DoF · 0.50 m · 1.25 kg"
     assert facts_line(Row("d", "d")) == ""

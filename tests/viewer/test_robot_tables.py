@@ -1,4 +1,4 @@
-"""Texts, tables and configurations of a robot's page."""
+"""Texts, tables and joint configurations of the robot page."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def test_joints_are_grouped_by_their_part():
     ]
 
 
-def test_a_hint_names_kind_and_limits():
+def test_slider_hint_names_joint_type_and_limits():
     assert joint_hint(arm().joints[0]) == (
         "shoulder: revolute, -2 to 2 rad, at most 50 N m, 2 rad/s"
     )
@@ -48,7 +48,7 @@ def test_a_hint_names_kind_and_limits():
 @pytest.mark.parametrize(
     ("low", "high", "step"), [(-3.14, 3.14, 0.01), (0, 0.04, 0.0001), (0, 0, 0.001), (-1, 1, 0.01)]
 )
-def test_steps_are_round_and_small(low, high, step):
+def test_slider_steps_are_round_and_small(low, high, step):
     assert slider_step(low, high) == pytest.approx(step)
 
 
@@ -74,7 +74,7 @@ def test_collisions_are_listed_deepest_first():
     assert text.index("c in d: 20.0 mm") < text.index("a in b: 1.0 mm")
 
 
-def test_configurations_come_back_from_addresses():
+def test_configurations_are_restored_from_urls():
     robot = arm()
     q = np.array([0.1234, -1.5, 0.02, 0.04])
     assert parse_joints(format_joints(q), robot) == pytest.approx(q)
@@ -96,13 +96,13 @@ def test_the_ellipsoid_has_the_inertia_of_the_link():
     assert inertia_ellipsoid(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
 
 
-def test_bounds_hold_the_foot_and_the_tip():
+def test_bounds_contain_base_and_tip():
     low, high = robot_bounds(arm(), np.zeros(4))
     assert low[2] == pytest.approx(-0.02)
     assert high[2] > 0.8
 
 
-def test_a_free_configuration_is_free():
+def test_random_free_configuration_is_collision_free():
     from morphgen.checks.self_collision import SelfCollisionChecker
 
     robot = arm()

@@ -1,4 +1,4 @@
-"""Robots are found at their files, and nowhere else."""
+"""Robot URIs resolve only to files inside the served folders."""
 
 import tempfile
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_robots_are_read(files, uri, name):
     "uri",
     ["../x", "/etc/passwd", "upload:../../etc/passwd", "robots/../../x", "upload:/etc/hostname"],
 )
-def test_nothing_outside_is_read(files, uri):
+def test_files_outside_are_not_read(files, uri):
     with pytest.raises(UriError, match="outside of the folders"):
         read_robot_uri(uri, files)
 
@@ -105,7 +105,7 @@ def test_nothing_outside_is_read(files, uri):
         ("words:arm", "'arm' is not a part"),
     ],
 )
-def test_invalid_uris_say_why(files, uri, why):
+def test_invalid_uris_give_the_reason(files, uri, why):
     with pytest.raises(MorphgenError, match=why):
         read_robot_uri(uri, files)
 
@@ -134,7 +134,7 @@ def test_the_content_hash_changes_with_the_file(files):
         ("a\0b\nc", "a\\x00b\\nc"),
     ],
 )
-def test_errors_name_no_folder_of_the_machine(text, expected):
+def test_errors_contain_no_absolute_paths(text, expected):
     root, temporary = Path("/home/me/work"), tempfile.gettempdir()
     files = FileAccess((), (root,), Path(temporary) / "morphgen-uploads-1")
     given = text.format(uploads=files.uploads, root=root, temporary=temporary)
@@ -147,7 +147,7 @@ def _derivation(files):
     return resolve_derivation("words:base=planar ee=cube", files)
 
 
-def test_a_bundle_takes_the_librarys_meshes_only_if_it_is_the_same(files, tmp_path):
+def test_bundle_uses_library_meshes_only_if_the_robot_is_unchanged(files, tmp_path):
     made = read_robot_uri("words:arm=ur5 ee=plane", files)
     bundle = write_bundle(made, tmp_path / "robots" / "ur5", picture=False)
     read = read_robot_uri("robots/ur5", files)

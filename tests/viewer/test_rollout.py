@@ -1,4 +1,4 @@
-"""Rollouts equal those of ``morphgen play``, and episodes come back from their files."""
+"""Rollouts equal those of ``morphgen play``; episodes are saved and loaded."""
 
 import json
 from dataclasses import replace
@@ -59,7 +59,7 @@ def episode(files, cache):
     return rollout.episode
 
 
-def test_an_episode_equals_that_of_morphgen_play(episode):
+def test_episode_equals_that_of_morphgen_play(episode):
     env = TaskEnv("reach", "planar-cube", sim="mujoco")
     results = []
     list(play(env, make_controller("ik", env, 3), 1, 3, results.append))
@@ -72,14 +72,14 @@ def test_an_episode_equals_that_of_morphgen_play(episode):
     assert track.success[-1] == result.success
 
 
-def test_a_score_counts_the_steps_so_far(episode):
+def test_score_counts_the_steps_so_far(episode):
     track = episode.tracks[0]
     assert score_until(track, "reach", 0) is None
     assert score_until(track, "reach", 2) == pytest.approx(sum(track.score[:2]) / 2)
     assert score_until(track, "push", 2) == track.score[1]
 
 
-def test_an_episode_comes_back_from_its_file(episode, files, root):
+def test_episode_is_restored_from_its_file(episode, files, root):
     content = episode_bytes(episode)
     assert content == episode_bytes(episode)
     (root / "episode.npz").write_bytes(content)
@@ -106,7 +106,7 @@ def test_a_viewer_can_be_started_for_an_episode(episode, files, root, monkeypatc
     assert start_address(("episode.npz",), files) == Address("play", ("episode.npz",))
 
 
-def test_an_episode_of_the_first_format_has_its_goal_and_its_line(episode, files, root):
+def test_episode_of_format_version_1_has_goal_and_line(episode, files, root):
     for extra, marker in ((None, "goal"), (0.2, "line")):
         path = root / "first.npz"
         path.write_bytes(episode_bytes(episode))
@@ -188,7 +188,7 @@ def test_an_episode_of_a_changed_robot_is_rejected(files, root, cache):
         read_episode(root / "two.npz", files)
 
 
-def test_a_robot_that_fails_does_not_stop_the_others(files, cache):
+def test_failed_robot_does_not_stop_the_others(files, cache):
     rollout = Rollout(RolloutConfig("reach", ("robots/none", "robots/one"), "zero"), files)
     assert list(rollout.faults) == ["robots/none"]
     assert "no such file" in rollout.faults["robots/none"]
@@ -224,11 +224,11 @@ def test_an_invalid_rollout_is_rejected(files, cache, config, why):
         Rollout(config, files)
 
 
-def test_the_name_of_a_checkpoint_is_that_of_runs():
+def test_checkpoint_name_matches_that_of_training_runs():
     assert CHECKPOINT == runs.CHECKPOINT
 
 
-def test_a_rollout_comes_back_from_its_address():
+def test_rollout_is_restored_from_its_url():
     for simulator in simulators():
         config = RolloutConfig("push", ("robots/one", CUBE), "random", 7, True, simulator)
         assert parse_rollout(rollout_address(config), []) == config
@@ -238,7 +238,7 @@ def test_a_rollout_comes_back_from_its_address():
     assert default.robots == ("robots/one",)
 
 
-def test_a_snapshot_does_not_grow(episode):
+def test_snapshot_is_independent_of_the_episode(episode):
     kept = snapshot(episode)
     for track in kept.tracks:
         track.q.append(track.q[-1])
@@ -268,7 +268,7 @@ def test_a_recording_has_all_shown_steps(episode):
     assert {"SetPositionMessage", "SetOrientationMessage", "MeshMessage"} <= kinds
 
 
-def test_the_camera_of_a_video_sees_the_whole_episode(episode):
+def test_video_camera_frames_the_whole_episode(episode):
     track = episode.tracks[0]
     points = make_renderer(track, (64, 48))._model.points
     low, high = points.min(axis=0), points.max(axis=0)

@@ -1,4 +1,4 @@
-"""A split in a browser."""
+"""The split page in a browser."""
 
 import re
 
@@ -17,7 +17,7 @@ SPLIT = "extrapolation/primitives/reach"
 
 
 @pytest.mark.slow
-def test_both_sides_the_map_and_the_audit(see, picture):
+def test_split_page_shows_both_sides_the_map_and_the_audit(see, picture):
     page = see(f"?split={SPLIT}")
     page.get_by_text("train (10)").wait_for()
     page.get_by_text("test (2)").wait_for()
@@ -44,7 +44,7 @@ def test_both_sides_the_map_and_the_audit(see, picture):
 
 
 @pytest.mark.slow
-def test_a_new_split_is_saved_of_what_is_shown(see, folder):
+def test_new_split_is_saved_from_the_shown_robots(see, folder):
     page = see(f"?split={SPLIT}&search=0000")
     page.get_by_text("train (10)").wait_for()
     search = page.get_by_text("Search", exact=True)
@@ -73,7 +73,7 @@ def test_robots_of_a_set_become_members(folder, monkeypatch):
     assert {member.task for member in split.train} == {"push"}
 
 
-def test_sides_are_inside_and_outside_of_the_filter():
+def test_filter_separates_train_and_test_robots():
     rows = [Row(name, name) for name in "abcdef"]
     train, test = choose_sides(rows, rows[2:5], 2, 3)
     assert [row.name for row in train] == ["c", "d"]
@@ -82,7 +82,7 @@ def test_sides_are_inside_and_outside_of_the_filter():
         choose_sides(rows, rows[2:5], 4, 1)
 
 
-def test_sides_must_not_be_empty_and_names_must_be_names(folder):
+def test_empty_sides_and_invalid_names_are_rejected(folder):
     files = FileAccess((), (folder.resolve(),), folder / "none")
     with pytest.raises(BenchmarkError, match="0 train and 0 test"):
         save_split("mine", "interpolation", [], [], files)

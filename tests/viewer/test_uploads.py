@@ -1,4 +1,4 @@
-"""Uploads are kept only if they are robots that store_upload to their folder."""
+"""Uploads are kept only if they are valid robots that stay inside their folder."""
 
 import html
 import io
@@ -44,13 +44,13 @@ def archive(files, how=zipfile.ZIP_STORED):
     return content.getvalue()
 
 
-def test_a_urdf_is_kept_and_read(access):
+def test_urdf_upload_is_kept_and_read(access):
     uri = store_upload("some.urdf", URDF, access)
     assert uri.startswith("upload:")
     assert read_robot_uri(uri, access).name == "r"
 
 
-def test_a_zipped_bundle_comes_back_as_it_left(access, tmp_path):
+def test_zipped_bundle_survives_a_round_trip(access, tmp_path):
     write_bundle(arm(), tmp_path / "arm", picture=False)
     files = bundle_files("arm", access)
     assert {"robot.urdf", "robot.xml", "card.json"} <= files.keys()
@@ -106,7 +106,7 @@ def test_large_uploads_are_rejected(access, monkeypatch):
     assert list(access.uploads.iterdir()) == []
 
 
-def test_a_zip_unpacks_to_no_more_than_it_says(access):
+def test_zip_cannot_unpack_to_more_than_its_declared_size(access):
     whole = archive({"a.urdf": URDF, "b.stl": b"0" * 5_000_000}, zipfile.ZIP_DEFLATED)
     small = (10).to_bytes(4, "little")
     with pytest.raises(UploadError, match="not a readable zip"):
@@ -182,7 +182,7 @@ def patched(whole, old, new):
     ],
     ids=lambda each: each[:40] if isinstance(each, str) else "",
 )  # fmt: skip
-def test_an_unsafe_zip_is_rejected_in_a_sentence(access, content, why):
+def test_unsafe_zip_is_rejected_with_a_message(access, content, why):
     with pytest.raises(UploadError, match=why) as refused:
         store_upload("a.zip", content, access)
     assert str(access.uploads) not in str(refused.value)
@@ -198,7 +198,7 @@ def test_an_invalid_file_name_is_rejected(access, name):
         store_upload(name, URDF, access)
 
 
-def test_a_mesh_is_not_taken_from_another_upload_or_the_folder_above(access):
+def test_meshes_are_not_read_from_other_uploads_or_parent_folders(access):
     box = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
     first = store_upload(
         "a.zip", archive({"p/m.stl": box, "a.urdf": MESHED % b"package://p/m.stl"}), access
@@ -236,7 +236,7 @@ def test_only_descriptions_meshes_and_cards_are_kept(access):
     assert kept == {"p/urdf/a.urdf", "p/meshes/m.STL", "p/package.xml", "p/robot.xml"}
 
 
-def test_no_xacro_is_read_below_the_uploads(access):
+def test_xacro_uploads_are_not_read(access):
     folder = access.uploads / "1"
     folder.mkdir()
     (folder / "a.xacro").write_bytes(XACRO)
@@ -252,7 +252,7 @@ def test_the_number_of_uploads_is_limited(access, monkeypatch):
         store_upload("a.urdf", URDF, access)
 
 
-def test_a_full_disk_keeps_nothing(access, monkeypatch):
+def test_full_disk_leaves_no_files(access, monkeypatch):
     def full(self, data):
         raise OSError(28, "No space left on device", str(self))
 
@@ -264,7 +264,7 @@ def test_a_full_disk_keeps_nothing(access, monkeypatch):
 
 
 @pytest.mark.parametrize(("as_zip", "pairs"), [(False, ()), (True, (("upper", "right"),))])
-def test_a_robot_of_morphgen_keeps_its_tool_and_home(access, tmp_path, as_zip, pairs):
+def test_uploaded_bundle_keeps_tool_and_home(access, tmp_path, as_zip, pairs):
     robot = replace(arm(), ignore_pairs=(("upper", "right"),), provenance={"source": "x.urdf"})
     write_bundle(robot, tmp_path / "arm", picture=False)
     files = bundle_files("arm", access)
@@ -277,7 +277,7 @@ def test_a_robot_of_morphgen_keeps_its_tool_and_home(access, tmp_path, as_zip, p
     assert bool(back.provenance) == as_zip
 
 
-def test_a_link_called_tool_is_the_tool(access):
+def test_link_named_tool_is_the_tool_frame(access):
     text = b"""<robot name="r"><link name="a"/><link name="tool"/><joint name="j" type="fixed">
     <parent link="a"/><child link="tool"/></joint></robot>"""
     assert read_robot_uri(store_upload("a.urdf", text, access), access).frame("tool").link == "tool"
@@ -308,7 +308,7 @@ def test_uploads_come_through_a_websocket_and_are_read(viewer, tmp_path):
         ("../../a" + "b" * 10_000 + ".urdf", URDF, "invalid file name"),
     ],
 )
-def test_a_hostile_upload_is_rejected_in_a_sentence(viewer, capfd, name, content, why):
+def test_hostile_upload_is_rejected_with_a_message(viewer, capfd, name, content, why):
     on = viewer()
     with PlainClient(on.port) as client:
         client.upload(name, content)
@@ -318,7 +318,7 @@ def test_a_hostile_upload_is_rejected_in_a_sentence(viewer, capfd, name, content
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_upload_that_differs_from_its_announcement_is_dropped(viewer, capfd):
+def test_upload_that_differs_from_its_announcement_is_dropped(viewer, capfd):
     on = viewer()
     with PlainClient(on.port) as client:
         client.upload("a.urdf", b" " * 2000, size=1000)
@@ -336,7 +336,7 @@ def test_an_upload_that_differs_from_its_announcement_is_dropped(viewer, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_error_shows_no_temporary_path(viewer, capfd):
+def test_errors_show_no_temporary_path(viewer, capfd):
     broken = URDF.replace(b'<link name="a"/>', b'<link name="a"/><link name="b"/>')
     on = viewer()
     with PlainClient(on.port) as client:
@@ -354,7 +354,7 @@ def test_an_error_shows_no_temporary_path(viewer, capfd):
         assert tempfile.gettempdir() not in on.files.redact(text)
 
 
-def test_names_of_an_upload_are_text_on_the_page(viewer):
+def test_names_in_an_upload_are_escaped_on_the_page(viewer):
     name = "&lt;img src=x onerror=alert()&gt;"
     text = f"""<robot name="{name}"><link name="{name}"><visual name="{name}"><geometry>
     <sphere radius="0.1"/></geometry></visual></link><link name="tool"/><joint name="{name}"

@@ -1,4 +1,4 @@
-"""Workers that die are replaced."""
+"""Worker processes that die are replaced."""
 
 import os
 import time
@@ -16,7 +16,7 @@ def workers():
     made.close()
 
 
-def test_a_worker_that_dies_is_reported_once_and_replaced(workers):
+def test_dead_worker_is_reported_once_and_replaced(workers):
     value, first = workers.result(workers.submit(power, 2, 3))
     assert value == 9
     dying, waiting = workers.submit(die_later, 1.0), workers.submit(power, 2, 4)
@@ -28,7 +28,7 @@ def test_a_worker_that_dies_is_reported_once_and_replaced(workers):
     assert second not in (first, os.getpid())
 
 
-def test_closed_workers_end_their_processes():
+def test_closing_workers_ends_their_processes():
     workers = Workers(1)
     _, process = workers.result(workers.submit(power, 2, 3))
     workers.close()
