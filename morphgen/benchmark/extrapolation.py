@@ -35,6 +35,7 @@ class Bound:
     """
 
     is_upper: bool
+    """Whether the cosine must be below ``value``; above it otherwise."""
     value: float
 
     def __str__(self) -> str:
@@ -86,21 +87,21 @@ def extrapolation(
         A split for each size.
 
     Raises:
-        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of which
+        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of stream
             ``MAX_COMPOSED`` are composed, give too few test robots.
         SamplingError: If a grammar gives no valid robot.
     """
     require_size(request)
     _require_apart(train_grammars, test_grammars)
-    trained, tested = (
+    train_streams, test_streams = (
         [RobotStream.of(grammar, grammar.name, request) for grammar in grammars]
         for grammars in (train_grammars, test_grammars)
     )
     factory = RobotFactory(
         library.folders, with_features=similarity is not None, max_links=request.max_links
     )
-    turns = (divmod(i, len(trained)) for i in range(request.train[-1]))
-    recipes = [trained[which].recipe(number) for number, which in turns]
+    turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
+    recipes = [train_streams[stream].recipe(number) for number, stream in turns]
     train = make_robots(recipes, factory, jobs=jobs, progress=progress)
     names = {structure(robot.derivation, library): robot.name for robot in reversed(train)}
 
@@ -108,23 +109,23 @@ def extrapolation(
         twin = names.get(structure(derivation, library))
         return f"the structure of train robot {twin}" if twin else ""
 
-    bounded = _SimilarityBound(train, request.train[0], similarity)
+    reject_by_similarity = _SimilarityBound(train, request.train[0], similarity)
     search = TestRobotSearch(request, train, factory, progress)
     targets = ", ".join(grammar.name for grammar in test_grammars)
-    if not search.find(tested, reject_trained, bounded):
-        raise BenchmarkError(f"{targets}: {search.failure()}; {bounded.advice()}")
+    if not search.find(test_streams, reject_trained, reject_by_similarity):
+        raise BenchmarkError(f"{targets}: {search.failure()}; {reject_by_similarity.advice()}")
     sources = ", ".join(grammar.name for grammar in train_grammars)
     return assemble_drawn(
         request,
         "extrapolation",
         f"{{n}} robots of {sources}; test: {request.test} of {targets}",
         train,
-        search.found,
+        search.robots,
         {
             "train_categories": {grammar.name: grammar.digest for grammar in train_grammars},
             "test_categories": {grammar.name: grammar.digest for grammar in test_grammars},
             **({"similarity": str(similarity)} if similarity else {}),
-            "seeds": {stream.prefix: stream.seed for stream in (*trained, *tested)},
+            "seeds": {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)},
         },
     )
 
@@ -163,16 +164,17 @@ class _SimilarityBound:
 
 
 def _require_apart(train: Sequence[Grammar], test: Sequence[Grammar]) -> None:
-    for option, own, others in (
+    """Require that no grammar is named twice, on one side or on both."""
+    for option, grammars, excluded in (
         ("--train-category", train, ()),
         ("--test-category", test, train),
     ):
-        seen = {grammar.name for grammar in others}
-        for grammar in own:
-            if grammar.name in seen:
-                where = "on both sides" if others else "there twice"
+        names = {grammar.name for grammar in excluded}
+        for grammar in grammars:
+            if grammar.name in names:
+                where = "on both sides" if excluded else "there twice"
                 raise BenchmarkError(
                     f"{option} {grammar.name}: the category is {where}; a test category must not "
                     "be trained, and none be named twice"
                 )
-            seen.add(grammar.name)
+            names.add(grammar.name)

@@ -126,7 +126,8 @@ class TestRobotSearch:
         self._name_by_hash = {robot.hash: robot.name for robot in train}
         self._rejected: Counter[str] = Counter()
         self._num_composed = 0
-        self.found: list[Candidate] = []
+        self.robots: list[Candidate] = []
+        """Test robots so far."""
 
     def find(
         self,
@@ -137,7 +138,7 @@ class TestRobotSearch:
         """Take test robots from the streams in turn; return True when the request is met."""
         for number in itertools.count():
             for stream in streams:
-                if len(self.found) == self._request.test:
+                if len(self.robots) == self._request.test:
                     return True
                 if self._rejected.total() == MAX_DRAWS or self._num_composed == MAX_COMPOSED:
                     return False
@@ -167,16 +168,16 @@ class TestRobotSearch:
             self._num_composed += 1
             return reason
         self._name_by_hash[robot.hash] = robot.name
-        self.found.append(robot)
-        self._progress(self._num_train + len(self.found))
+        self.robots.append(robot)
+        self._progress(self._num_train + len(self.robots))
         return ""
 
     def failure(self) -> str:
         """Return how many robots were drawn and found, and the most common reason of rejection."""
         reason, count = self._rejected.most_common(1)[0]
-        drawn = self._rejected.total() + len(self.found)
+        drawn = self._rejected.total() + len(self.robots)
         return (
-            f"{len(self.found)} of {self._request.test} test robots found in {drawn} draws; "
+            f"{len(self.robots)} of {self._request.test} test robots found in {drawn} draws; "
             f"{count} had {reason}"
         )
 
@@ -233,7 +234,15 @@ def assemble_drawn(
     provenance: Mapping[str, object],
 ) -> tuple[Split, ...]:
     """Return the requested splits with a member for each robot and task; see ``assemble``."""
-    trained, tested = (members(side, request.tasks, request.obstacles) for side in (train, test))
+    train_members, test_members = (
+        members(side, request.tasks, request.obstacles) for side in (train, test)
+    )
     return assemble(
-        request, regime, summary, trained, tested, provenance, per_robot=len(request.tasks)
+        request,
+        regime,
+        summary,
+        train_members,
+        test_members,
+        provenance,
+        per_robot=len(request.tasks),
     )

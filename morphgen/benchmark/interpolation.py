@@ -56,14 +56,14 @@ def interpolation(
     require_size(request)
     if hull not in HULLS:
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
-    trained = RobotStream.of(grammar, grammar.name, request)
-    tested = RobotStream.of(grammar, f"{grammar.name}-test", request)
+    train_stream = RobotStream.of(grammar, grammar.name, request)
+    test_stream = RobotStream.of(grammar, f"{grammar.name}-test", request)
     factory = RobotFactory(library.folders, max_links=request.max_links)
-    recipes = [trained.recipe(i) for i in range(request.train[-1])]
+    recipes = [train_stream.recipe(i) for i in range(request.train[-1])]
     train = make_robots(recipes, factory, jobs=jobs, progress=progress)
     criterion = _StructureAndHull(train, request.train[0], hull, library)
     search = TestRobotSearch(request, train, factory, progress)
-    if not search.find([tested], criterion):
+    if not search.find([test_stream], criterion):
         raise BenchmarkError(f"{grammar.name}: {search.failure()}; {criterion.advice()}")
     where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
     return assemble_drawn(
@@ -71,11 +71,11 @@ def interpolation(
         "interpolation",
         f"{{n}} robots of {grammar.name}; test: {request.test} {where[hull]}",
         train,
-        search.found,
+        search.robots,
         {
             "grammar": {grammar.name: grammar.digest},
             "hull": hull,
-            "seeds": {stream.prefix: stream.seed for stream in (trained, tested)},
+            "seeds": {stream.prefix: stream.seed for stream in (train_stream, test_stream)},
         },
     )
 

@@ -166,8 +166,8 @@ def records_text(split: Split, known: Mapping[str, RobotData]) -> str:
 def token_tables(split: Split, known: Mapping[str, RobotData]) -> tuple[Array, NDArray[np.bool_]]:
     """Return tokens (n, max_links, 48) and mask (n, max_links) of all members."""
     tables = [known[member.robot_hash].tokens for _, member in sided_members(split)]
-    both = [pad_tokens(table, split.max_links) for table in tables]
-    return np.array([table for table, _ in both]), np.array([mask for _, mask in both])
+    padded = [pad_tokens(table, split.max_links) for table in tables]
+    return np.array([table for table, _ in padded]), np.array([mask for _, mask in padded])
 
 
 def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:

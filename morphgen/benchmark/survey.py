@@ -143,25 +143,33 @@ def survey_split(
     Raises:
         BenchmarkError: If ``jobs`` is below 1, or the split's provenance is malformed.
     """
-    trains, tests = _firsts(split.train), _firsts(split.test)
-    total = len(trains) + len(tests)
+    train_members, test_members = _firsts(split.train), _firsts(split.test)
+    total = len(train_members) + len(test_members)
     measurement = _Measurement(library.folders, split.max_links)
-    tested = list(parallel_map(measurement, tests, jobs, lambda done, _: progress(done, total)))
+    test_robots = list(
+        parallel_map(measurement, test_members, jobs, lambda done, _: progress(done, total))
+    )
     compare = _Comparison(
-        measurement, tuple(None if isinstance(robot, Fault) else robot.features for robot in tested)
+        measurement,
+        tuple(None if isinstance(robot, Fault) else robot.features for robot in test_robots),
     )
-    trained = list(
-        parallel_map(compare, trains, jobs, lambda done, _: progress(len(tests) + done, total))
+    train_robots = list(
+        parallel_map(
+            compare, train_members, jobs, lambda done, _: progress(len(test_members) + done, total)
+        )
     )
-    rows, columns = _first_indices(split.train, trains), _first_indices(split.test, tests)
-    shape = (len(trains), len(tests), len(MEASURES))
-    similarity = np.array([values for _, values in trained]).reshape(shape)
+    rows, columns = (
+        _first_indices(split.train, train_members),
+        _first_indices(split.test, test_members),
+    )
+    shape = (len(train_members), len(test_members), len(MEASURES))
+    similarity = np.array([values for _, values in train_robots]).reshape(shape)
     return SplitSurvey(
         split,
-        tuple(trained[row][0] for row in rows),
+        tuple(train_robots[row][0] for row in rows),
         tuple(
             robot if isinstance(robot, Fault) else robot.surveyed
-            for robot in (tested[column] for column in columns)
+            for robot in (test_robots[column] for column in columns)
         ),
         similarity[rows][:, columns],
     )

@@ -34,6 +34,7 @@ class ConformanceRow:
     """Result of one loader."""
 
     loader: str
+    """Name of the loader and its file."""
     passed: bool | None
     """Whether the loader agrees with morphgen; None if it is not installed."""
     joints: bool | None = None
@@ -108,7 +109,11 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
     expected = frame_pose(robot, q, frame)
     position_offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
     position_error = float(np.linalg.norm(position_offset, axis=1).max(initial=0.0))
-    rotation_error = _max_angle(reading.T_root_frame[:, :3, :3], expected[:, :3, :3])
+    # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2), from which
+    # small angles follow exactly.
+    R_difference = reading.T_root_frame[:, :3, :3] - expected[:, :3, :3]
+    sines = np.linalg.norm(R_difference, axis=(1, 2)) / np.sqrt(8.0)
+    rotation_error = float(2 * np.arcsin(np.clip(sines, 0.0, 1.0)).max(initial=0.0))
     expected_joints, joints = set(names), set(reading.joints)
     faults = []
     if missing := sorted(expected_joints - joints):
@@ -131,12 +136,3 @@ def _row(robot: Robot, folder: Path, loader: Loader, frame: str, q: Array) -> Co
         rotation_error=rotation_error,
         message="; ".join(faults),
     )
-
-
-def _max_angle(a: Array, b: Array) -> float:
-    """Return the largest angle between rotations (n, 3, 3) [rad], exact for small angles.
-
-    The Frobenius norm of the difference is sqrt(8) sin(angle / 2).
-    """
-    chord = np.linalg.norm(a - b, axis=(1, 2)) / np.sqrt(8.0)
-    return float(2 * np.arcsin(np.clip(chord, 0.0, 1.0)).max(initial=0.0))

@@ -137,9 +137,9 @@ def _are_primitives_near(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -
 
     objects_b = objects(b, T_a_b)
     return any(
-        fcl.distance(one, other, fcl.DistanceRequest(), fcl.DistanceResult()) <= MAX_GAP
-        for one in objects(a, np.eye(4))
-        for other in objects_b
+        fcl.distance(object_a, object_b, fcl.DistanceRequest(), fcl.DistanceResult()) <= MAX_GAP
+        for object_a in objects(a, np.eye(4))
+        for object_b in objects_b
     )
 
 
@@ -185,14 +185,22 @@ def _distance(a: _Triangles, b: _Triangles) -> float:
     """Return the exact distance between two sets of triangles [m]; 0 if they intersect."""
     import fcl
 
-    objects = []
-    for triangles in (a, b):
-        model = fcl.BVHModel()
-        model.beginModel(3 * len(triangles), len(triangles))
-        model.addSubModel(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
-        model.endModel()
-        objects.append(fcl.CollisionObject(model))
+    objects = (
+        triangle_collider(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+        for triangles in (a, b)
+    )
     return max(0.0, float(fcl.distance(*objects, fcl.DistanceRequest(), fcl.DistanceResult())))
+
+
+def triangle_collider(vertices: Array, faces: NDArray[np.int64]) -> fcl.CollisionObject:
+    """Return the collision object of triangles: vertices (n, 3) [m] and faces (m, 3)."""
+    import fcl
+
+    model = fcl.BVHModel()
+    model.beginModel(len(vertices), len(faces))
+    model.addSubModel(vertices, faces)
+    model.endModel()
+    return fcl.CollisionObject(model)
 
 
 def _encloses(solid: _Triangles, others: _Triangles) -> bool:

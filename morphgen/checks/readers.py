@@ -153,9 +153,9 @@ def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: 
         for name in address.keys() & q.keys():
             data.qpos[address[name]] = q[name][i]
         mujoco.mj_kinematics(model, data)
-        placed = data.site(sites[frame]) if frame in sites else data.body(bodies[frame])
-        poses[i, :3, 3] = placed.xpos
-        poses[i, :3, :3] = placed.xmat.reshape(3, 3)
+        frame_view = data.site(sites[frame]) if frame in sites else data.body(bodies[frame])
+        poses[i, :3, 3] = frame_view.xpos
+        poses[i, :3, :3] = frame_view.xmat.reshape(3, 3)
     return Reading(tuple(address), float(model.body_mass.sum()), poses)
 
 

@@ -63,18 +63,13 @@ def _repair_link(link: Link, *, moves: bool) -> Link:
         )
     if inertial is None or inertial.mass == 0 or inertia_fault(inertial) is None:
         return link
-    solid = unit_density_inertial(link)
-    if solid is None:
-        return replace(link, inertial=_ball(inertial))
-    inertia = inertial.mass / solid.mass * solid.matrix
-    return replace(link, inertial=Inertial.from_matrix(inertial.mass, inertial.com, inertia))
-
-
-def _ball(inertial: Inertial) -> Inertial:
-    """Return the mass properties of a ball with the same mass and the default density."""
-    mass = inertial.mass
-    radius = (3 * mass / (4 * math.pi * DEFAULT_DENSITY)) ** (1 / 3)
-    return Inertial.from_matrix(mass, inertial.com, 0.4 * mass * radius**2 * np.eye(3))
+    solid, mass = unit_density_inertial(link), inertial.mass
+    if solid is None:  # the inertia of a ball with the same mass and the default density
+        radius = (3 * mass / (4 * math.pi * DEFAULT_DENSITY)) ** (1 / 3)
+        inertia = 0.4 * mass * radius**2 * np.eye(3)
+    else:
+        inertia = mass / solid.mass * solid.matrix
+    return replace(link, inertial=Inertial.from_matrix(mass, inertial.com, inertia))
 
 
 def _repair_joint(joint: Joint, *, locked: bool) -> Joint:

@@ -52,7 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return _run(argv)
         except KeyboardInterrupt as interrupt:
-            return _interrupted(interrupt)
+            text = str(interrupt) or "nothing half-written is left"
+            print(f"morphgen: interrupted; {text}", file=sys.stderr)
+            return 130
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()
@@ -92,7 +94,11 @@ def _run(argv: Sequence[str] | None) -> int:
             if isinstance(error, MorphgenError):
                 return _refuse(error, str(error), args)
             if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
-                return _refuse(error, _how_to_install(error.name), args)
+                hint = f"pip install 'morphgen[{EXTRAS[error.name]}]'"
+                if error.name == "torch":
+                    hint += "; a small build without CUDA: https://pytorch.org/get-started/locally"
+                text = f"the package {error.name} is not installed: {hint}"
+                return _refuse(error, text, args)
             if isinstance(error, BrokenPipeError) or not isinstance(error, OSError):
                 raise
             return _refuse(error, f"{error.filename or 'output'}: {error.strerror}", args)
@@ -117,19 +123,6 @@ def _record_ctrl_c() -> Iterator[list[int]]:
         yield interrupts
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _how_to_install(package: str) -> str:
-    extra = f"pip install 'morphgen[{EXTRAS[package]}]'"
-    build = "; a small build without CUDA: https://pytorch.org/get-started/locally"
-    return f"the package {package} is not installed: {extra}{build if package == 'torch' else ''}"
-
-
-def _interrupted(interrupt: KeyboardInterrupt) -> int:
-    """Print in one line that the command was interrupted; return the exit code."""
-    text = str(interrupt) or "nothing half-written is left"
-    print(f"morphgen: interrupted; {text}", file=sys.stderr)
-    return 130
 
 
 def _refuse(error: Exception, text: str, args: Namespace) -> int:

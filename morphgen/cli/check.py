@@ -82,7 +82,7 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
         f"{label}: repaired {finding.code} at {finding.where}: {finding.repair}"
         for finding in repaired
     ]
-    counts = {name: sum(each.severity == name for each in findings) for name in SEVERITIES}
+    counts = {name: sum(finding.severity == name for finding in findings) for name in SEVERITIES}
     lines.append(f"{label}: {', '.join(f'{n} {name}' for name, n in counts.items())}")
     lines = [one_line(line) for line in lines]
     for finding in findings:

@@ -61,18 +61,18 @@ def repeated(name: str, help: str, **settings: object) -> Option:
     return Option((name,), {**settings, "help": f"{help}; may be repeated"})
 
 
-def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]:
     """Return a type for argparse: a whole number, also as ``2e6``.
 
     Args:
         least: The smallest valid number.
-        most: The largest valid number; None for no limit.
+        largest: The largest valid number; None for no limit.
     """
-    valid = f"{least} or more" if most is None else f"{least} to {most}"
+    valid = f"{least} or more" if largest is None else f"{least} to {largest}"
 
     def parse(text: str) -> int:
         number = _number(text)
-        if not (number % 1 == 0 and least <= number <= (math.inf if most is None else most)):
+        if not (number % 1 == 0 and least <= number <= (math.inf if largest is None else largest)):
             raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
         return int(number)
 
@@ -126,11 +126,11 @@ class Command:
         if self.commands:
             add_commands(parser, self.commands, required=True)
             return
-        for each in self.options:
-            alternatives = each if isinstance(each, tuple) else (each,)
-            group = parser.add_mutually_exclusive_group() if isinstance(each, tuple) else parser
-            for one in alternatives:
-                group.add_argument(*one.names, **one.settings)
+        for entry in self.options:
+            alternatives = entry if isinstance(entry, tuple) else (entry,)
+            group = parser.add_mutually_exclusive_group() if isinstance(entry, tuple) else parser
+            for argument in alternatives:
+                group.add_argument(*argument.names, **argument.settings)
         parser.set_defaults(run=self.run, parser=parser, **self.defaults)
 
     def _texts(self) -> dict[str, Any]:
@@ -178,8 +178,8 @@ def add_commands(
     parsers = parser.add_subparsers(
         metavar="COMMAND", dest="command", required=required, parser_class=Parser
     )
-    for each in commands:
-        each.add_to(parsers)
+    for entry in commands:
+        entry.add_to(parsers)
 
 
 def parse(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:

@@ -233,7 +233,7 @@ def _fit_links(target: Target, options: FitOptions, args: argparse.Namespace) ->
 def _fit_all_parts(args: argparse.Namespace) -> None:
     from morphgen.fitting.part_fits import parts_with_meshes, store_parts
 
-    given = {
+    options_without_effect = {
         "--out": args.out,
         "--root": args.root,
         "--enclose": args.enclose,
@@ -245,7 +245,7 @@ def _fit_all_parts(args: argparse.Namespace) -> None:
         "--seed": args.seed,
         "--json": args.json,
     }
-    if idle := [name for name, is_given in given.items() if is_given]:
+    if idle := [name for name, is_given in options_without_effect.items() if is_given]:
         raise MorphgenError(
             "--all stores one primitive and up to four for every part, always the same ones: it "
             f"takes no {' or '.join(idle)}"
@@ -256,9 +256,9 @@ def _fit_all_parts(args: argparse.Namespace) -> None:
 
 
 def _report_text(report: FitReport) -> str:
-    rows = [_row(each.link, each.fit, each.same_as) for each in report.links]
+    rows = [_row(row.link, row.fit, row.same_as) for row in report.links]
     if report.mean is not None:
-        seconds = sum(each.fit.seconds for each in report.links)
+        seconds = sum(row.fit.seconds for row in report.links)
         rows.append(("mean", "", "", *_quality_cells(report.mean), seconds))
     findings = [
         f"{finding.severity} {finding.code} at {finding.where}: {finding.why}"

@@ -54,12 +54,12 @@ def goals(args: argparse.Namespace) -> int:
                 f"{' '.join(args.words)}: name one split, or say --task for a robot"
             )
         split, _ = read_split_or_folder(args.words[0])
-        made = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
+        results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
     else:
-        made = [_robot_goals(args, GoalConfig(args.seed))]
-    passed = all(result.goals is not None and not result.certificate_errors for result in made)
-    data = _data(made, args.seed) | {"passed": passed}
-    opt.print_result(args, data, lambda: _text(made, args.seed))
+        results = [_robot_goals(args, GoalConfig(args.seed))]
+    passed = all(result.goals is not None and not result.certificate_errors for result in results)
+    data = _data(results, args.seed) | {"passed": passed}
+    opt.print_result(args, data, lambda: _text(results, args.seed))
     return int(not passed)
 
 
@@ -103,11 +103,11 @@ def read_split_or_folder(name: str) -> tuple[Split, Path | None]:
     return read_split(folder / SPLIT_FILE), folder
 
 
-def _text(made: Sequence[GoalResult], seed: int) -> str:
+def _text(results: Sequence[GoalResult], seed: int) -> str:
     from tabulate import tabulate
 
-    lines = [tabulate([_row(result) for result in made], HEADERS, disable_numparse=True)]
-    for result in made:
+    lines = [tabulate([_row(result) for result in results], HEADERS, disable_numparse=True)]
+    for result in results:
         robot = f"{result.side} robot {result.robot}" if result.side else f"robot {result.robot}"
         if result.goals is None:
             lines.append(f"{robot}: {result.error}")
@@ -118,8 +118,8 @@ def _text(made: Sequence[GoalResult], seed: int) -> str:
                 else ""
             )
             lines.append(f"{robot}: {result.certificate_errors[0]}{more}")
-    complete = sum(result.goals is not None for result in made)
-    return "\n".join([*lines, f"{complete} of {len(made)} goal sets are complete, seed {seed}"])
+    complete = sum(result.goals is not None for result in results)
+    return "\n".join([*lines, f"{complete} of {len(results)} goal sets are complete, seed {seed}"])
 
 
 def _row(result: GoalResult) -> tuple[str, ...]:
@@ -131,7 +131,7 @@ def _row(result: GoalResult) -> tuple[str, ...]:
     return (result.robot, result.side or "", result.task, count, rate, boxes, certified)
 
 
-def _data(made: Sequence[GoalResult], seed: int) -> dict[str, object]:
+def _data(results: Sequence[GoalResult], seed: int) -> dict[str, object]:
     from morphgen.tasks.split_goals import goal_record
 
     sets = [
@@ -142,12 +142,12 @@ def _data(made: Sequence[GoalResult], seed: int) -> dict[str, object]:
             else not result.certificate_errors,
             "unproven": list(result.certificate_errors or ()),
         }
-        for result in made
+        for result in results
         if result.goals
     ]
     failures = [
         {"robot": result.robot, "side": result.side, "task": result.task, "why": result.error}
-        for result in made
+        for result in results
         if result.goals is None
     ]
     return {"seed": seed, "sets": sets, "failures": failures}

@@ -37,9 +37,9 @@ def check(args: argparse.Namespace) -> int:
 
     library = opt.library_of(args)
     grammar = opt.load_grammar_named(args.grammar, library)
-    found = check_grammar(grammar, library)
-    opt.print_result(args, found, lambda: "\n".join(found) or f"{grammar.name}: sound")
-    return int(bool(found))
+    faults = check_grammar(grammar, library)
+    opt.print_result(args, faults, lambda: "\n".join(faults) or f"{grammar.name}: sound")
+    return int(bool(faults))
 
 
 @command(

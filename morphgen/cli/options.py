@@ -1,4 +1,4 @@
-"""Options that several commands share, and what commands make of them."""
+"""Options that several commands share, and functions that evaluate them."""
 
 from __future__ import annotations
 
@@ -151,8 +151,8 @@ def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> G
     from morphgen.grammar.grammar_file import find_grammar, load_grammar
 
     grammar = load_grammar(find_grammar(name, library.folders), library.folders)
-    if sound and (found := check_grammar(grammar, library)):
-        raise GrammarError(found[0] + (f" (and {len(found) - 1} more)" if found[1:] else ""))
+    if sound and (faults := check_grammar(grammar, library)):
+        raise GrammarError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
     return grammar
 
 

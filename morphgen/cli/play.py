@@ -150,8 +150,8 @@ def speed(args: argparse.Namespace) -> None:
         )
     with closing(batch), status(args, "measuring"):
         module, step = SIMULATORS[sim].native_step
-        own = [(import_module(module), step)] if args.workers == 1 else []
-        result = measure_speed(batch, args.seconds, own=own)
+        native_steps = [(import_module(module), step)] if args.workers == 1 else []
+        result = measure_speed(batch, args.seconds, own=native_steps)
 
     def text() -> str:
         shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]

@@ -143,22 +143,26 @@ def stats(args: argparse.Namespace) -> None:
 
     library = opt.library_of(args)
     groups = _by_robots([read_split(name) for name in args.splits or split_names()])
-    figures: dict[str, dict[str, Any]] = {}
+    statistics_by_title: dict[str, dict[str, Any]] = {}
     for title, splits in groups.items():
         with bar(args, title) as update:
-            figures[title] = statistics(splits[0], library, jobs=args.jobs, progress=update)
+            statistics_by_title[title] = statistics(
+                splits[0], library, jobs=args.jobs, progress=update
+            )
     data = [
         {
             "robots": title,
             "splits": [split.name for split in splits],
-            "ours": figures[title],
+            "ours": statistics_by_title[title],
             "paper": asdict(theirs) if (theirs := paper_row(title)) else None,
         }
         for title, splits in groups.items()
     ]
 
     def text() -> str:
-        rows = [_stats_row(title, ours, paper_row(title)) for title, ours in figures.items()]
+        rows = [
+            _stats_row(title, ours, paper_row(title)) for title, ours in statistics_by_title.items()
+        ]
         style = "github" if args.markdown else "simple"
         return (
             f"{tabulate(rows, 'keys', tablefmt=style, disable_numparse=True)}\n"
@@ -187,16 +191,18 @@ def _common_prefix(names: Sequence[str]) -> str:
     return "/".join(column[0] for column in same) or names[0]
 
 
-def _stats_row(title: str, ours: Mapping[str, Any], theirs: PaperRow | None) -> dict[str, str]:
-    train, cosine = ours["train"], ours["cosine"]
+def _stats_row(
+    title: str, statistics: Mapping[str, Any], paper_row: PaperRow | None
+) -> dict[str, str]:
+    train, cosine = statistics["train"], statistics["cosine"]
 
     def with_paper(value: str, key: str) -> str:
-        if theirs is None:
+        if paper_row is None:
             return value
-        paper = getattr(theirs, key)
+        paper = getattr(paper_row, key)
         return f"{value} ({'-' if paper is None else f'{paper:g}'})"
 
-    row = {"robots": title, "train": train["robots"], "test": ours["test"]["robots"]}
+    row = {"robots": title, "train": train["robots"], "test": statistics["test"]["robots"]}
     for key in ("links", "movable", "movable_to_tool"):
         row[key.replace("_", " ")] = with_paper(f"{train[key]:.4g}", key)
     row["cosine"] = with_paper(f"{cosine['mean']:.2f}", "cosine")

@@ -131,7 +131,7 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None) -> str:
     if goals:
         lines.append(f"{len(goals.sets)} goal sets were audited, seed {goals.config.seed}")
     counts = ", ".join(
-        f"{sum(each.severity == severity for each in result.findings)} {severity}"
+        f"{sum(finding.severity == severity for finding in result.findings)} {severity}"
         for severity in ("error", "warning")
     )
     verdict = "passed" if passed else "FAILED"
@@ -186,13 +186,13 @@ def build(args: argparse.Namespace) -> None:
         config = GoalConfig(args.goal_seed or 0)
         goals = make_goals(args, split, config)
         require_goal_sets(goals)
-    elif (home := split_folder_path(split, args.out)).is_dir():
+    elif (built_folder := split_folder_path(split, args.out)).is_dir():
         from morphgen.tasks.split_goals import GOALS, has_goals
 
-        if has_goals(home):
+        if has_goals(built_folder):
             raise BenchmarkError(
-                f"{home} was built with goals: say --goals, delete {home / GOALS}, or name another "
-                "folder"
+                f"{built_folder} was built with goals: say --goals, delete "
+                f"{built_folder / GOALS}, or name another folder"
             )
     with bar(args, "building") as update:
         report = build_split(

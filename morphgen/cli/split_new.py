@@ -28,15 +28,17 @@ def new_split(args: argparse.Namespace) -> None:
     from morphgen.benchmark.split_file import require_split_name
     from morphgen.benchmark.statistics import statistics
 
-    order = _order(args)
-    require_split_name(order.name)
+    request = _request(args)
+    require_split_name(request.name)
     library = opt.library_of(args)
-    total = order.train[-1] + order.test if order.train else None
+    total = request.train[-1] + request.test if request.train else None
     with bar(args, "sampling", total=total) as update:
-        splits: tuple[Split, ...] = args.generate(args, order, library, update)
+        splits: tuple[Split, ...] = args.generate(args, request, library, update)
     if args.statistics:
-        figures = [statistics(split, library, jobs=args.jobs) for split in splits]
-        splits = tuple(map(lambda split, each: replace(split, statistics=each), splits, figures))
+        splits = tuple(
+            replace(split, statistics=statistics(split, library, jobs=args.jobs))
+            for split in splits
+        )
     paths = _paths(args.out, splits)
     _write(splits, paths)
     data = [
@@ -88,24 +90,26 @@ def _regime_options(train: str, train_default: str = "") -> tuple[Option, ...]:
 
 
 def _interpolation(
-    args: argparse.Namespace, order: SplitRequest, library: Library, progress: Progress
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
 ) -> tuple[Split, ...]:
     from morphgen.benchmark.interpolation import interpolation
 
     grammar = opt.load_grammar_named(args.grammar, library, sound=True)
-    return interpolation(order, grammar, library, hull=args.hull, jobs=args.jobs, progress=progress)
+    return interpolation(
+        request, grammar, library, hull=args.hull, jobs=args.jobs, progress=progress
+    )
 
 
 def _composition(
-    args: argparse.Namespace, order: SplitRequest, library: Library, progress: Progress
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
 ) -> tuple[Split, ...]:
     from morphgen.benchmark.composition import composition
 
-    return composition(order, args.patterns, library, jobs=args.jobs, progress=progress)
+    return composition(request, args.patterns, library, jobs=args.jobs, progress=progress)
 
 
 def _extrapolation(
-    args: argparse.Namespace, order: SplitRequest, library: Library, progress: Progress
+    args: argparse.Namespace, request: SplitRequest, library: Library, progress: Progress
 ) -> tuple[Split, ...]:
     from morphgen.benchmark.extrapolation import extrapolation, parse_bound
 
@@ -115,11 +119,11 @@ def _extrapolation(
         for names in (args.train_category, args.test_category)
     )
     return extrapolation(
-        order, train, test, library, similarity=bound, jobs=args.jobs, progress=progress
+        request, train, test, library, similarity=bound, jobs=args.jobs, progress=progress
     )
 
 
-def _subject(args: argparse.Namespace) -> str:
+def _robots_word(args: argparse.Namespace) -> str:
     """Return a word or two about the robots of a split, for its name."""
     if args.generate is _interpolation:
         return Path(args.grammar).stem + ("" if args.hull == "any" else f"-{args.hull}")
@@ -130,7 +134,7 @@ def _subject(args: argparse.Namespace) -> str:
     return "-".join(keys) or "robots"
 
 
-def _order(args: argparse.Namespace) -> SplitRequest:
+def _request(args: argparse.Namespace) -> SplitRequest:
     from morphgen.benchmark.generate import SplitRequest
     from morphgen.benchmark.token_layout import MAX_LINKS
 
@@ -147,7 +151,7 @@ def _order(args: argparse.Namespace) -> SplitRequest:
             f"--train {args.train}: expected a whole number, or several such as 10,30,100"
         ) from error
     regime = args.generate.__name__.removeprefix("_")
-    words = [regime, _subject(args), *tasks, *(["obstacles"] if args.obstacles else [])]
+    words = [regime, _robots_word(args), *tasks, *(["obstacles"] if args.obstacles else [])]
     name = args.name or "-".join([*words, f"seed{args.seed}"])
     links = MAX_LINKS if args.max_links is None else args.max_links
     return SplitRequest(name, train, args.test, tuple(tasks), args.obstacles, args.seed, links)

@@ -250,9 +250,9 @@ def agent_spec(args: argparse.Namespace) -> AgentSpec:
     """
     from morphgen.rl.agent_spec import parse_agent
 
-    given = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
+    values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
     spec = parse_agent(args.agent)
-    switches = {name: value for name, value in given.items() if value is not None}
+    switches = {name: value for name, value in values.items() if value is not None}
     return replace(spec, switches={**spec.switches, **switches})
 
 

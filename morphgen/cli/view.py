@@ -6,7 +6,6 @@ import argparse
 import signal
 import sys
 import time
-from types import FrameType
 from typing import TYPE_CHECKING
 
 from morphgen.cli.command import command, option, repeated, whole_number
@@ -59,7 +58,7 @@ def view(args: argparse.Namespace) -> None:
     from morphgen.viewer.app import serve
 
     for name in STOP_SIGNALS:
-        signal.signal(name, _interrupt)
+        signal.signal(name, signal.default_int_handler)
     try:
         viewer = serve(args.words, args.host, args.port, args.library, args.allow_origin)
         _wait(args.host, viewer)
@@ -84,8 +83,3 @@ def _wait(host: str, viewer: Viewer) -> None:
         for signal_name in (signal.SIGINT, *STOP_SIGNALS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind
         viewer.stop()
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Stop as Ctrl-C does."""
-    raise KeyboardInterrupt

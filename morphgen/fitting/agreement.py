@@ -17,6 +17,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from morphgen.checks.home_pose import triangle_collider
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.model.geometry import Shape
 from morphgen.model.inertia import link_frame_mesh
@@ -105,11 +106,7 @@ def _mesh_collisions(robot: Robot, ignored: set[Pair], q: NDArray[np.float64]) -
 def _model(shapes: tuple[Shape, ...]) -> fcl.CollisionObject:
     """Return the triangles of a link's shapes as one collision object in the link frame."""
     whole = cast(trimesh.Trimesh, trimesh.util.concatenate([*map(link_frame_mesh, shapes)]))
-    model = fcl.BVHModel()
-    model.beginModel(len(whole.vertices), len(whole.faces))
-    model.addSubModel(np.asarray(whole.vertices), np.asarray(whole.faces))
-    model.endModel()
-    return fcl.CollisionObject(model)
+    return triangle_collider(np.asarray(whole.vertices), np.asarray(whole.faces))
 
 
 def _share(hits: int, misses: int) -> float:

@@ -211,6 +211,7 @@ def _parse_record(line: bytes) -> Record | None:
 
 
 def _record(sample: Sample) -> Record:
+    """Return a robot's line of the index."""
     robot = sample.robot
     return {
         "index": sample.index,
@@ -229,6 +230,7 @@ def _record(sample: Sample) -> Record:
 
 
 def _write_light(sample: Sample, folder: Path) -> None:
+    """Write the folder of a robot in a light set."""
     with replacing_folder(folder) as partial:
         (partial / URDF).write_text(light_urdf(sample.robot), encoding="utf-8")
         (partial / DERIVATION).write_text(f"{sample.derivation}\n", encoding="utf-8")

@@ -126,9 +126,9 @@ def frame_pose(robot: Robot, q: ArrayLike, frame: str = TOOL) -> Array:
     Raises:
         RobotError: If the frame is unknown.
     """
-    named = robot.frame(frame)
-    T_root_link = forward_kinematics(robot, q)[..., robot.link_index[named.link], :, :]
-    return np.asarray(T_root_link @ named.T_link_frame.matrix)
+    target = robot.frame(frame)
+    T_root_link = forward_kinematics(robot, q)[..., robot.link_index[target.link], :, :]
+    return np.asarray(T_root_link @ target.T_link_frame.matrix)
 
 
 def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
@@ -168,14 +168,16 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
     Raises:
         RobotError: If the frame is unknown.
     """
-    named = robot.frame(frame)
+    target = robot.frame(frame)
     T_root_link = forward_kinematics(robot, q)
-    T_root_frame = T_root_link[..., robot.link_index[named.link], :, :] @ named.T_link_frame.matrix
+    T_root_frame = (
+        T_root_link[..., robot.link_index[target.link], :, :] @ target.T_link_frame.matrix
+    )
     anchors, axes = joint_axes(robot, T_root_link)
     matrix, _ = robot.mimic_map
     row = {k: i for i, k in enumerate(robot.movable_joints)}
     jacobian = np.zeros((*T_root_frame.shape[:-2], 6, robot.dof))
-    for k in robot.joint_chain(named.link):
+    for k in robot.joint_chain(target.link):
         if k not in row:
             continue
         axis, by_leader = axes[..., k + 1, :], matrix[row[k]]
@@ -236,9 +238,9 @@ def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
     gains, offsets = robot.mimic_map
     row = {k: i for i, k in enumerate(robot.movable_joints)}
     points = np.zeros((3, q.shape[1]))
-    named = robot.frame(frame)
-    T_joint_point = named.T_link_frame
-    for k in reversed(robot.joint_chain(named.link)):
+    target = robot.frame(frame)
+    T_joint_point = target.T_link_frame
+    for k in reversed(robot.joint_chain(target.link)):
         joint = robot.joints[k]
         if joint.is_movable:
             gain, position = gains[row[k]], offsets[row[k]]
@@ -312,10 +314,10 @@ def _distance(robot: Robot, q: Array, frame: str) -> Array:
     sets.
     """
     positions = movable_positions(robot, q)
-    named = robot.frame(frame)
+    target = robot.frame(frame)
     column = {k: i for i, k in enumerate(robot.movable_joints)}
-    point = np.broadcast_to(np.array(named.T_link_frame.position), (*q.shape[:-1], 3))
-    for k in reversed(robot.joint_chain(named.link)):
+    point = np.broadcast_to(np.array(target.T_link_frame.position), (*q.shape[:-1], 3))
+    for k in reversed(robot.joint_chain(target.link)):
         joint = robot.joints[k]
         if joint.is_movable:
             point = _move_point(point, joint.kind, joint.unit_axis, positions[..., column[k], None])

@@ -172,15 +172,15 @@ def compile_chain(
     """
     rows, ends = [], []
     for robot in robots:
-        named = robot.frame(frame)
+        target = robot.frame(frame)
         T, row = np.eye(4), []
-        for k in robot.joint_chain(named.link):
+        for k in robot.joint_chain(target.link):
             T = T @ robot.joints[k].T_parent_joint.matrix
             if robot.joints[k].is_movable:
                 row.append((k, T))
                 T = np.eye(4)
         rows.append(row)
-        ends.append(T @ named.T_link_frame.matrix)
+        ends.append(T @ target.T_link_frame.matrix)
     depth = max(1, *map(len, rows))
     joints = _joint_tensors(robots, rows, depth, dtype, device, pad_front=True)
     return FrameChain(joints, torch.from_numpy(np.array(ends)).to(device, dtype))
