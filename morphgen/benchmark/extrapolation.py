@@ -87,7 +87,7 @@ def extrapolation(
         A split for each size.
 
     Raises:
-        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of stream
+        BenchmarkError: If a grammar is named twice, or ``MAX_DRAWS`` draws, of which
             ``MAX_COMPOSED`` are composed, give too few test robots.
         SamplingError: If a grammar gives no valid robot.
     """

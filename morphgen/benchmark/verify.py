@@ -79,7 +79,7 @@ def verify(
         progress: Receives the number of robots that are finished, and of all.
 
     Raises:
-        BenchmarkError: If the split does not exist or cannot be split_file.
+        BenchmarkError: If the split does not exist or cannot be read.
     """
     folder = Path(name_or_path)
     is_built = folder.is_dir()
