@@ -1,4 +1,4 @@
-"""An audit finds what a split gives away, and what it promises and does not keep."""
+"""Auditing a split: leaks between train and test, broken regime rules and unmet promises."""
 
 from dataclasses import replace
 
@@ -23,12 +23,12 @@ def found(made, **options):
     return [(each.code, each.where) for each in audit(made, LIBRARY, **options).findings]
 
 
-def test_a_sound_split_passes():
+def test_a_valid_split_passes():
     done = audit(combined(), LIBRARY)
     assert (done.findings, done.accepted, done.passed(strict=True)) == ((), (), True)
 
 
-def test_the_nearest_train_robot_is_told_by_every_measure():
+def test_the_nearest_train_robot_is_reported_for_every_measure():
     made = split([*TRAIN, "base=planar ee=cube ee.size=0.3"], [*TEST, "base=gantry ee=cube"])
     expected = {}
     robots = {m.name: compose_member(m, LIBRARY) for m in (*made.train, *made.test)}
@@ -43,7 +43,7 @@ def test_the_nearest_train_robot_is_told_by_every_measure():
     assert {(n.test, n.measure): (n.train, n.value) for n in neighbours} == expected
 
 
-def test_the_same_body_on_both_sides_is_a_leak_by_whatever_name():
+def test_the_same_robot_in_train_and_test_is_a_leak_under_any_name():
     twin = member(TRAIN[0], "somebody_else")
     done = audit(combined(test=[*TEST, twin]), LIBRARY)
     (leak,) = [each for each in done.findings if each.code == "body-shared"]
@@ -52,14 +52,14 @@ def test_the_same_body_on_both_sides_is_a_leak_by_whatever_name():
     assert not done.passed()
 
 
-def test_the_same_body_at_another_task_is_none():
+def test_the_same_robot_with_another_task_is_not_a_leak():
     made = combined(train=[*TRAIN, member(TEST[0], task="reach", name="planar-reach")])
     codes = {code for code, _ in found(made)}
     assert "combination-seen" in codes
     assert not codes & {"body-shared", "body-near"}
 
 
-def test_a_body_that_is_nearly_in_train_is_a_leak():
+def test_a_near_duplicate_of_a_train_robot_is_a_leak():
     near = split([member(f"{TEST[0]} ee.size=100.1mm", "near"), *TRAIN], TEST)
     done = audit(near, LIBRARY)
     (leak,) = [each for each in done.findings if each.code == "body-near"]
@@ -68,7 +68,7 @@ def test_a_body_that_is_nearly_in_train_is_a_leak():
     assert "body-near" not in {code for code, _ in found(near, near=NearThresholds(0.0, 1.0))}
 
 
-def test_nearness_needs_both_measures():
+def test_a_near_duplicate_needs_both_measures():
     made = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
     likeness = survey_split(made, LIBRARY)
     tree, alike = likeness.by_measure("tree")[0, 0], likeness.by_measure("cosine")[0, 0]
@@ -95,7 +95,7 @@ def jittered(node, amount, rng):
 
 
 @pytest.mark.parametrize("category", ["arm5", "chain", "planar_arm", "cubes", "stick"])
-def test_nearness_is_about_one_per_cent_of_size(category):
+def test_near_duplicates_differ_by_about_one_per_cent_in_size(category):
     sample = sample_robot(load_grammar(find_grammar(category)), LIBRARY, 0, seed=1)
     rng = np.random.default_rng(0)
     one = features(sample.robot, token_shapes(sample.robot))
@@ -112,12 +112,12 @@ def test_nearness_is_about_one_per_cent_of_size(category):
     assert not is_near(0.06)
 
 
-def test_a_name_may_not_stand_for_two_bodies():
+def test_a_name_shared_by_two_robots_is_a_finding():
     made = combined(test=[*TEST, member("base=planar ee=cylinder", "gantry-plane")])
     assert found(made) == [("name-shared", "test robot gantry-plane")]
 
 
-def test_a_part_that_is_not_there_is_told_with_the_nearest():
+def test_an_unknown_part_is_reported_with_the_nearest():
     wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
     done = audit(combined(train=[TRAIN[0], wrong, TRAIN[2], "base=planar ee=stick"]), LIBRARY)
     (missing,) = done.findings
@@ -135,26 +135,26 @@ def test_a_part_that_is_not_there_is_told_with_the_nearest():
         ("base=fixed[top: ee=cube]", "no joint moves its tool"),
     ],
 )
-def test_a_robot_that_cannot_be_composed_or_compared_is_told(derivation, why):
+def test_robots_that_cannot_be_composed_or_compared_are_reported(derivation, why):
     wrong = replace(member(TRAIN[1]), name="wrong", robot_hash="0" * 32, derivation=derivation)
     (broken,) = audit(combined(train=[*TRAIN, wrong]), LIBRARY).findings
     assert (broken.code, broken.where) == ("body-broken", "train robot wrong")
     assert why in broken.why
 
 
-def test_a_test_robot_that_cannot_be_composed_has_no_neighbours():
+def test_an_invalid_test_robot_has_no_neighbours():
     wrong = replace(member(TEST[0]), derivation="base=planar[top: ee=cubw]")
     done = audit(combined(test=[wrong]), LIBRARY)
     assert [each.code for each in done.findings] == ["part-missing"]
     assert done.neighbours == ()
 
 
-def test_a_split_without_a_sound_train_robot_can_be_audited():
+def test_a_split_without_valid_train_robots_can_be_audited():
     wrong = [replace(member(words), derivation="base=nothing") for words in TRAIN]
     assert {code for code, _ in found(combined(train=wrong))} == {"part-missing"}
 
 
-def test_a_body_that_is_another_today_is_told():
+def test_a_changed_robot_hash_is_reported():
     changed = replace(member(TRAIN[0]), robot_hash="0" * 32)
     done = audit(combined(train=[changed, *TRAIN[1:]]), LIBRARY)
     (finding,) = done.findings
@@ -164,7 +164,7 @@ def test_a_body_that_is_another_today_is_told():
     )
 
 
-def test_a_robot_that_is_there_twice_is_a_warning():
+def test_a_duplicate_robot_is_a_warning():
     done = audit(combined(train=[*TRAIN, member(TRAIN[0], "again")]), LIBRARY)
     (finding,) = done.findings
     assert (finding.code, finding.severity) == ("body-repeated", "warning")
@@ -173,7 +173,7 @@ def test_a_robot_that_is_there_twice_is_a_warning():
     assert not done.passed(strict=True)
 
 
-def test_the_rules_of_the_regimes_are_kept():
+def test_violations_of_regime_rules_are_reported():
     unseen = combined(test=["base=planar ee=sphere"])
     assert found(unseen) == [("part-unseen", "test robot planar-sphere")]
     large = member("base=planar ee=cube ee.size=0.3", "large-cube")
@@ -198,7 +198,7 @@ def _hash(derivation):
     return robot_hash(compose(parse_derivation(derivation), LIBRARY, "x"))
 
 
-def test_a_hull_that_was_promised_is_tested():
+def test_a_declared_hull_is_checked():
     train, tests = list(drawn("cubes", 4, 0)), list(drawn("cubes", 8, 1))
     sizes = [dict(parse_derivation(m.derivation).parameters)["size"] for m in (*train, *tests)]
     low, high = min(sizes[:4]), max(sizes[:4])
@@ -212,12 +212,12 @@ def test_a_hull_that_was_promised_is_tested():
         assert told == {f"test robot {m.name}" for m in wrong}
 
 
-def test_a_category_that_is_trained_is_no_extrapolation():
+def test_a_trained_category_is_not_extrapolation():
     made = split([*drawn("cubes", 2, 0)], [*drawn("cubes", 1, 1)], regime="extrapolation")
     assert {code for code, _ in found(made)} >= {"category-seen", "structure-seen"}
 
 
-def test_a_bound_on_likeness_that_was_promised_is_tested():
+def test_a_declared_similarity_bound_is_checked():
     likeness = survey_split(combined(), LIBRARY).by_measure("cosine").max()
     for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
         made = combined(provenance={"similarity": bound})
@@ -228,7 +228,7 @@ def test_a_bound_on_likeness_that_was_promised_is_tested():
         audit(combined(provenance={"similarity": "small"}), LIBRARY)
 
 
-def test_what_the_author_accepts_is_listed_with_the_reason_and_fails_nothing():
+def test_accepted_findings_are_listed_with_their_reason_and_do_not_fail_the_audit():
     accepted = {"part-unseen": "the sphere is new on purpose"}
     done = audit(combined(test=["base=planar ee=sphere"], accepted=accepted), LIBRARY)
     assert done.findings == ()
@@ -237,7 +237,7 @@ def test_what_the_author_accepts_is_listed_with_the_reason_and_fails_nothing():
     assert done.passed(strict=True)
 
 
-def test_accepting_one_thing_accepts_no_other():
+def test_accepting_one_finding_accepts_no_other():
     accepted = {"part-unseen": "on purpose"}
     tests = ["base=planar ee=sphere", member(TRAIN[0], "twin")]
     done = audit(combined(test=tests, accepted=accepted), LIBRARY)
@@ -245,7 +245,7 @@ def test_accepting_one_thing_accepts_no_other():
     assert not done.passed()
 
 
-def test_accepting_what_is_not_found_is_told():
+def test_accepting_an_absent_finding_is_a_warning():
     done = audit(combined(accepted={"body-naer": "a typo"}), LIBRARY)
     (finding,) = done.findings
     assert (finding.code, finding.severity) == ("accepted-unused", "warning")
@@ -253,7 +253,7 @@ def test_accepting_what_is_not_found_is_told():
     assert done.passed()
 
 
-def test_progress_is_told_and_processes_change_nothing():
+def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
     words = [f"base=planar ee=cube ee.size={50 + i}mm" for i in range(9)]
     made = combined(train=[*TRAIN, *(member(each, f"cube-{i}") for i, each in enumerate(words))])
     seen = []
@@ -262,7 +262,7 @@ def test_progress_is_told_and_processes_change_nothing():
     assert audit(made, LIBRARY, jobs=2) == one
 
 
-def test_a_derivation_that_two_members_share_is_composed_once():
+def test_a_derivation_shared_by_two_members_is_composed_once():
     made = combined(train=[*TRAIN, member(TRAIN[0], "reaching", task="reach")])
     seen = []
     survey_split(made, LIBRARY, progress=lambda done, total: seen.append(total))
@@ -272,7 +272,7 @@ def test_a_derivation_that_two_members_share_is_composed_once():
     np.testing.assert_array_equal(both.similarity[0], both.similarity[3])
 
 
-def test_an_audit_is_plain_data():
+def test_an_audit_converts_to_plain_data():
     data = audit(combined(accepted={"x": "y"}), LIBRARY).as_dict()
     assert data["split"] == "mine/some"
     assert [each["code"] for each in data["findings"]] == ["accepted-unused"]

@@ -53,7 +53,7 @@ def chunks(png):
 @pytest.mark.parametrize(
     "n", [1, MAX_WITH_VALUES, pytest.param(MAX_NAMED, marks=pytest.mark.slow), MAX_NAMED + 1]
 )
-def test_every_number_of_robots_can_be_drawn(n):
+def test_figures_can_be_drawn_for_any_number_of_robots(n):
     for png in drawings(n):
         assert pixels(png).std() > 5
         assert max(pixels(png).shape) < 2000
@@ -64,13 +64,13 @@ def test_pictures_are_reproducible(n):
     assert drawings(n) == drawings(n)
 
 
-def test_no_date_and_no_version_is_in_a_picture():
+def test_pictures_contain_no_date_and_no_version():
     for png in drawings(5):
         assert set(chunks(png)) == {"IHDR", "pHYs", "IDAT", "IEND"}
         assert matplotlib.__version__.encode() not in png
 
 
-def test_the_users_settings_change_no_picture():
+def test_matplotlib_settings_of_the_user_do_not_change_pictures():
     before = drawings(5)
     with matplotlib.rc_context({"font.size": 20, "axes.facecolor": "red", "savefig.dpi": 30}):
         assert drawings(5) == before
@@ -89,7 +89,7 @@ def test_bright_cells_mean_similar_robots_for_every_measure():
         assert different.sum() < 250
 
 
-def test_names_are_written_up_to_a_number_of_robots():
+def test_robots_of_a_matrix_are_labelled_up_to_a_limit():
     few = pixels(heatmap_png(["a" * 20] * 20, [panel(20)]))
     short = pixels(heatmap_png(["a"] * 20, [panel(20)]))
     assert few.shape[0] > short.shape[0] + 50
@@ -98,7 +98,7 @@ def test_names_are_written_up_to_a_number_of_robots():
     assert heatmap_png(["a" * 20] * many, [panel(many)]) == heatmap_png(["b"] * many, [panel(many)])
 
 
-def test_names_of_a_map_are_written_up_to_a_number_of_robots():
+def test_robots_of_a_map_are_labelled_up_to_a_limit():
     some = [f"robot{i}" for i in range(MAX_NAMED)]
     others = [f"other{i}" for i in range(MAX_NAMED)]
     assert map_png(some, [map_panel(MAX_NAMED)]) != map_png(others, [map_panel(MAX_NAMED)])

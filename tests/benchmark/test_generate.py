@@ -1,4 +1,4 @@
-"""New splits: the rules of each regime hold, seeds decide, and what cannot be is told."""
+"""Generating splits: the rules of each regime, seeds, nested sizes and error messages."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def require_sound(split):
     assert regime_findings(split, LIBRARY) == ()
 
 
-def test_robots_are_those_that_sample_draws():
+def test_robots_equal_those_of_sample():
     (split,) = interpolation(order(3), shipped("cubes"), LIBRARY)
     seeds = split.provenance["seeds"]
     drawn = morphgen.sample("cubes", 3, seed=seeds["cubes"])
@@ -69,7 +69,7 @@ def test_robots_are_those_that_sample_draws():
     require_sound(split)
 
 
-def test_the_seed_decides_and_the_number_of_robots_does_not():
+def test_robots_depend_on_the_seed_not_on_their_number():
     few, again, other = (
         interpolation(order(n, seed=seed), shipped("cubes"), LIBRARY)[0]
         for n, seed in ((2, 5), (6, 5), (2, 6))
@@ -81,7 +81,7 @@ def test_the_seed_decides_and_the_number_of_robots_does_not():
 
 
 @pytest.mark.parametrize("hull", ["inside", "outside"])
-def test_test_robots_of_every_size_keep_to_the_hull(hull):
+def test_test_robots_of_every_size_obey_the_hull_option(hull):
     splits = interpolation(order(6, 12, 24, test=3), shipped("arm3"), LIBRARY, hull=hull)
     assert [split.name for split in splits] == ["mine-train6", "mine-train12", "mine-train24"]
     for split in splits:
@@ -95,7 +95,7 @@ def test_test_robots_of_every_size_keep_to_the_hull(hull):
         assert split.provenance["nested"] == [6, 12, 24]
 
 
-def test_sizes_are_nested_around_the_same_test():
+def test_nested_sizes_share_the_test_robots():
     small, middle, large = interpolation(order(2, 3, 5, test=2), shipped("cubes"), LIBRARY)
     assert [len(split.train) for split in (small, middle, large)] == [2, 3, 5]
     assert small.train == middle.train[:2] == large.train[:2]
@@ -104,7 +104,7 @@ def test_sizes_are_nested_around_the_same_test():
     assert [split.provenance["train"] for split in (small, middle, large)] == [2, 3, 5]
 
 
-def test_a_grammar_of_several_structures_is_tested_by_those_that_are_trained():
+def test_interpolation_tests_only_trained_structures():
     (split,) = interpolation(order(2, test=6), shipped("prims"), LIBRARY)
     trained = {structure(d, LIBRARY) for d in derivations(split.train)}
     assert len(trained) <= 2
@@ -129,12 +129,12 @@ def test_every_robot_does_every_task():
 
 
 @pytest.mark.slow
-def test_several_processes_make_the_same():
+def test_the_number_of_processes_does_not_matter():
     one, two = (interpolation(order(10), shipped("cubes"), LIBRARY, jobs=n) for n in (1, 2))
     assert one == two
 
 
-def test_progress_is_told_up_to_the_end():
+def test_progress_reaches_the_total():
     told = []
     interpolation(order(3, test=2), shipped("cubes"), LIBRARY, progress=told.append)
     assert told == [1, 2, 3, 4, 5]
@@ -144,7 +144,7 @@ def test_progress_is_told_up_to_the_end():
     assert told == [1, 2, 3]
 
 
-def test_a_body_of_train_is_never_tested():
+def test_train_robots_are_never_test_robots():
     few = grammar("robot -> gantry plane(size=choice(0.1, 0.2, 0.3))")
     (split,) = interpolation(order(2), few, LIBRARY)
     bodies = {m.robot_hash for m in split.train}
@@ -153,7 +153,7 @@ def test_a_body_of_train_is_never_tested():
         interpolation(order(30), few, LIBRARY)
 
 
-def test_a_hull_that_nothing_is_in_is_told(monkeypatch):
+def test_an_empty_hull_is_an_error(monkeypatch):
     monkeypatch.setattr(generate, "MAX_DRAWS", 100)
     with pytest.raises(BenchmarkError) as caught:
         interpolation(order(3), shipped("arm3"), LIBRARY, hull="inside")
@@ -176,7 +176,7 @@ def grammars(*wanted):
     return [shipped(name) for name in wanted]
 
 
-def test_extrapolation_takes_categories_in_turn():
+def test_extrapolation_cycles_through_the_categories():
     few, many = extrapolation(
         order(4, 7, test=2), grammars(*CATEGORIES), grammars("chain", "cubes"), LIBRARY
     )
@@ -187,14 +187,14 @@ def test_extrapolation_takes_categories_in_turn():
     require_sound(many)
 
 
-def test_a_category_has_the_same_robots_whatever_stands_beside_it():
+def test_robots_of_a_category_do_not_depend_on_the_other_categories():
     (one,) = extrapolation(order(2), grammars("stick", "nlink"), grammars("cubes"), LIBRARY)
     (other,) = extrapolation(order(2), grammars("cubes", "stick"), grammars("chain"), LIBRARY)
     assert one.train[0] == other.train[1]
     assert one.test[0] == other.train[0]
 
 
-def test_a_structure_that_is_trained_is_not_tested():
+def test_extrapolation_never_tests_trained_structures():
     mine = grammar(
         "robot -> post links sphere(radius=0.02)",
         "links -> beam(length=uniform(0.1, 0.5)){2,7}",
@@ -238,7 +238,7 @@ def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
         assert split.provenance["similarity"] == f"{bound.strip()[0]}0.55"
 
 
-def test_a_robot_with_too_many_links_is_told_unless_all_have_room():
+def test_too_many_links_are_a_finding_unless_max_links_is_raised():
     wanted = order(2, test=6)
     with pytest.raises(
         BenchmarkError, match=r"robot 'chain-\d+' has 25 links, more than max_links 23"
@@ -258,13 +258,13 @@ def test_a_robot_with_too_many_links_is_told_unless_all_have_room():
 
 
 @pytest.mark.parametrize("given", ["many", 1, 2.5, True, None, [25]])
-def test_a_split_that_says_no_number_of_links_is_refused(given):
+def test_an_invalid_max_links_is_an_error(given):
     (made,) = extrapolation(order(1), grammars("stick"), grammars("cubes"), LIBRARY)
     with pytest.raises(BenchmarkError, match=r"made: max_links: .*; expected a whole number"):
         audit(replace(made, provenance={**made.provenance, "max_links": given}), LIBRARY)
 
 
-def test_a_bound_that_nothing_meets_is_told_with_the_nearest(monkeypatch):
+def test_an_unsatisfiable_bound_is_an_error_that_names_the_nearest_value(monkeypatch):
     monkeypatch.setattr(generate, "MAX_COMPOSED", 9)
     with pytest.raises(BenchmarkError) as caught:
         extrapolation(
@@ -276,7 +276,7 @@ def test_a_bound_that_nothing_meets_is_told_with_the_nearest(monkeypatch):
     assert text.endswith(": choose another bound, or other categories")
 
 
-def test_bounds_are_read():
+def test_bounds_are_parsed():
     assert [parse_bound(text) for text in ("<0.6", " > .25 ")] == [
         Bound(True, 0.6),
         Bound(False, 0.25),
@@ -284,7 +284,7 @@ def test_bounds_are_read():
 
 
 @pytest.mark.parametrize("text", ["0.6", "<", "<=0.6", "<6", "< nan", "", "<-1", "<0.6 0.7"])
-def test_what_is_no_bound_is_refused(text):
+def test_invalid_bounds_are_errors(text):
     with pytest.raises(BenchmarkError, match="expected '<' or '>' and a number from 0 to 1"):
         parse_bound(text)
 
@@ -297,7 +297,7 @@ def test_what_is_no_bound_is_refused(text):
         (("stick",), ("chain", "chain"), "--test-category chain: the category is"),
     ],
 )
-def test_a_category_is_named_once(train, test, message):
+def test_duplicate_categories_are_errors(train, test, message):
     with pytest.raises(BenchmarkError, match=message):
         extrapolation(order(4), grammars(*train), grammars(*test), LIBRARY)
 
@@ -319,20 +319,20 @@ def test_composition_holds_out_combinations_whose_parts_are_trained():
     require_sound(split)
 
 
-def test_without_a_size_all_is_trained_that_may_be():
+def test_without_a_size_all_admissible_robots_are_trained():
     (split,) = composition(order(test=2), FROM, LIBRARY)
     assert len(split.train) == 7
     assert split.provenance["from"] == FROM
 
 
-def test_nested_sizes_each_train_every_part_of_the_test_robots():
+def test_every_nested_size_trains_every_part_of_the_test_robots():
     splits = composition(order(3, 5, 7), FROM, LIBRARY)
     assert splits[0].train == splits[2].train[:3]
     assert splits[1].train == splits[2].train[:5]
     assert [regime_findings(split, LIBRARY) for split in splits] == [()] * 3
 
 
-def test_sizes_of_parts_are_choices_too_but_no_combinations():
+def test_parameters_of_parts_may_vary_but_do_not_define_combinations():
     sized = ["base=gantry ee={plane,cube} ee.size={5cm,10cm}", "arm=lwr ee={plane,cube}"]
     (split,) = composition(order(test=2), sized, LIBRARY)
     tested = {structure(d, LIBRARY) for d in derivations(split.test)}
@@ -342,7 +342,7 @@ def test_sizes_of_parts_are_choices_too_but_no_combinations():
     require_sound(split)
 
 
-def test_body_and_task_are_composed():
+def test_combinations_may_include_the_task():
     (split,) = composition(order(test=2, tasks=("reach", "push")), FROM, LIBRARY)
     for member in split.test:
         ee = parse_derivation(member.derivation).children[0][1].children[0][1].part
@@ -361,7 +361,7 @@ def test_grammars_and_limbs_can_be_combined():
     require_sound(split)
 
 
-def test_braces_are_written_out():
+def test_braces_are_expanded():
     assert expand("arm={ur5,lwr} ee=plane") == [("arm=ur5", "ee=plane"), ("arm=lwr", "ee=plane")]
     assert expand(" arm={ ur5 , lwr }  ") == [("arm=ur5",), ("arm=lwr",)]
     assert expand("ee.size={5,10}{cm,mm}") == [
@@ -385,7 +385,7 @@ def test_braces_are_written_out():
         (" ", "--from is empty"),
     ],
 )
-def test_braces_that_are_wrong_are_told(pattern, message):
+def test_invalid_braces_are_errors(pattern, message):
     with pytest.raises(BenchmarkError) as caught:
         expand(pattern)
     assert message in str(caught.value)
@@ -402,7 +402,7 @@ def test_braces_that_are_wrong_are_told(pattern, message):
         (order(), ["base={fixed,gantry}"], CompositionError, "nothing to compose"),
     ],
 )
-def test_what_cannot_be_composed_says_why(asked, patterns, error, message):
+def test_impossible_compositions_are_errors_with_the_reason(asked, patterns, error, message):
     with pytest.raises(error) as caught:
         composition(asked, patterns, LIBRARY)
     assert message in str(caught.value)
@@ -418,12 +418,12 @@ def test_what_cannot_be_composed_says_why(asked, patterns, error, message):
         ((3, 3), {}, "--train 3,3: expected sizes that grow, such as 10,30,100"),
     ],
 )
-def test_an_order_that_makes_no_sense_is_refused(sizes, changes, message):
+def test_invalid_orders_are_errors(sizes, changes, message):
     with pytest.raises(BenchmarkError, match=message):
         order(*sizes, **changes)
 
 
-def test_numbers_that_a_derivation_cannot_write_do_not_matter():
+def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
     """The base's default has 16 digits; the hash is that of the robot that the text gives."""
     body = RobotFactory(LIBRARY.folders)(ComposedRecipe(("base=planar", "ee=cube")))
     assert "travel_yaw=3.14159265359" in str(body.derivation)
@@ -434,7 +434,7 @@ def test_numbers_that_a_derivation_cannot_write_do_not_matter():
     assert again == drawn.derivation
 
 
-def test_a_robot_that_fails_its_checks_is_refused(monkeypatch):
+def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
     found = [Finding("overlap", "error", "link a", "too deep", "move it")]
     monkeypatch.setattr(robot_factory, "check", lambda robot: found)
     with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):

@@ -1,4 +1,4 @@
-"""The paper's scenarios: the files that come with morphgen are what their rows make."""
+"""The scenarios of the paper: the shipped files equal what their definitions generate."""
 
 import re
 
@@ -38,7 +38,7 @@ def versionless(text):
     return re.sub(r"(?m)^morphgen: .*\n", "", text)
 
 
-def test_all_fifteen_are_there():
+def test_there_are_fifteen_scenarios():
     assert split_names() == NAMES
 
 
@@ -46,7 +46,7 @@ def test_all_fifteen_are_there():
     "name",
     [pytest.param(s.name, marks=[] if s.name in QUICK else [pytest.mark.slow]) for s in SCENARIOS],
 )
-def test_the_files_are_what_is_made(name, tmp_path):
+def test_the_shipped_files_equal_the_generated_splits(name, tmp_path):
     paths = write_scenarios(tmp_path, [name])
     assert [path for path in paths if not path.is_file()] == []
     for path in paths:
@@ -56,7 +56,7 @@ def test_the_files_are_what_is_made(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_file_is_as_morphgen_writes_it(name):
+def test_the_shipped_files_round_trip(name):
     text = find_split(name).read_text(encoding="utf-8")
     split = read_split(name)
     assert versionless(split_text(split)) == versionless(text)
@@ -66,12 +66,12 @@ def test_a_file_is_as_morphgen_writes_it(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_regime_holds_but_for_what_is_accepted(name):
+def test_regime_findings_are_only_the_accepted_ones(name):
     split = read_split(name)
     assert {each.code for each in regime_findings(split, LIBRARY)} == set(split.accepted)
 
 
-def test_ee_task_composes_bodies_and_tasks():
+def test_ee_task_combines_robots_and_tasks():
     split = read_split("composition/ee-task")
     assert [(m.category, m.task) for m in split.train] == [("prims", "push")] * 3 + [
         ("composed", "reach")
@@ -100,26 +100,26 @@ def test_reach_and_push_share_their_robots(name):
         ("extrapolation/primitives/reach", 6.6, 4.6),
     ],
 )
-def test_robots_have_as_many_links_and_joints_as_the_papers(name, links, movable):
+def test_link_and_joint_counts_match_the_paper(name, links, movable):
     train = read_split(name).statistics["train"]
     assert (train["links"], train["movable"]) == (links, movable)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_every_robot_is_composed_to_its_hash_and_fits_into_the_tokens(name):
+def test_every_robot_has_its_recorded_hash_and_fits_into_the_tokens(name):
     split = read_split(name)
     for member in (*split.train, *split.test):
         assert len(compose_member(member, LIBRARY).links) <= MAX_LINKS
 
 
-def test_robots_of_a_file_are_composed_to_their_hashes():
+def test_robots_of_a_file_have_their_recorded_hashes():
     split = read_split("extrapolation/arms/push")
     named = {member.name: member for member in (*split.train, *split.test)}
     for name in ("ur5-stick", "lwr", "widowx", "arm5-000000"):
         assert compose_member(named[name], LIBRARY).name == name
 
 
-def test_an_unknown_scenario_names_the_nearest():
+def test_an_unknown_scenario_suggests_the_nearest():
     with pytest.raises(BenchmarkError, match="did you mean 'extrapolation/arms'"):
         scenario_splits("extrapolation/armz", LIBRARY)

@@ -1,4 +1,4 @@
-"""The hash of a body, the id of a split, and robots composed from members."""
+"""Robot hashes, split ids, and robots composed from split members."""
 
 import shutil
 from dataclasses import replace
@@ -106,11 +106,11 @@ def test_published_hashes_stay_what_they_are():
     ],
     ids=["name", "pairs", "provenance", "frame", "colour", "length of an axis"],
 )
-def test_what_does_not_make_the_body_does_not_count(changed):
+def test_nonphysical_properties_do_not_change_the_hash(changed):
     assert robot_hash(changed(arm())) == robot_hash(arm())
 
 
-def test_labels_do_not_count():
+def test_labels_do_not_change_the_hash():
     """The same parts under other symbols are the same body, so nobody trains on it unseen."""
     links = [replace(link, name=f"x_{link.name}") for link in arm().links]
     joints = [
@@ -162,11 +162,11 @@ def test_labels_do_not_count():
         lambda r: replace(r, frames=(replace(r.frames[0], T_link_frame=Pose((0, 0, 0.28))),)),
     ],
 )
-def test_what_makes_the_body_counts(changed):
+def test_physical_properties_change_the_hash(changed):
     assert robot_hash(changed(arm())) != robot_hash(arm())
 
 
-def test_a_hinge_without_limits_is_continuous():
+def test_a_revolute_joint_without_limits_hashes_as_continuous():
     free = with_joint(arm(), "elbow", limits=None)
     assert robot_hash(free) == robot_hash(with_joint(free, "elbow", kind="continuous"))
     assert robot_hash(free) == robot_hash(
@@ -174,7 +174,7 @@ def test_a_hinge_without_limits_is_continuous():
     )
 
 
-def test_a_mesh_counts_by_its_content(tmp_path):
+def test_a_mesh_is_hashed_by_its_content(tmp_path):
     path, copy, other = tmp_path / "a.stl", tmp_path / "b" / "c.stl", tmp_path / "d.stl"
     trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
     copy.parent.mkdir()
@@ -205,7 +205,7 @@ def test_a_mesh_counts_by_its_content(tmp_path):
 @pytest.mark.parametrize(
     "words", ["arm=ur5 ee=stick", "arm=lwr ee=panda_hand", "chain beads=4", "arm=widowx"]
 )
-def test_the_last_bits_do_not_count(words):
+def test_the_last_bits_of_numbers_do_not_change_the_hash(words):
     derivation, _ = parse_words(words.split(), LIBRARY)
     robot = compose(derivation, LIBRARY, "r")
     rng = np.random.default_rng(0)
@@ -215,7 +215,7 @@ def test_the_last_bits_do_not_count(words):
 
 
 @pytest.mark.parametrize("part", [1, 2, 3, 4, 5, 6, 8, 10])
-def test_sizes_that_people_write_are_far_from_where_rounding_changes(part):
+def test_round_sizes_are_far_from_the_rounding_boundaries_of_the_hash(part):
     """Also at the half, third and so on of the smallest step that counts."""
 
     def hashed(z):
@@ -226,27 +226,27 @@ def test_sizes_that_people_write_are_far_from_where_rounding_changes(part):
         assert hashed(z - 5e-10) == hashed(z) == hashed(z + 5e-10)
 
 
-def test_a_member_is_composed_under_its_name():
+def test_a_composed_member_has_its_name():
     robot = compose_member(member("arm=ur5 ee=plane", "mine"), LIBRARY)
     assert (robot.name, len(robot.links)) == ("mine", 10)
     assert robot.ignore_pairs
 
 
-def test_a_robot_of_another_body_is_refused():
+def test_a_robot_with_another_hash_is_an_error():
     changed = member("base=gantry ee=plane", robot_hash="0" * 32)
     own = member("base=gantry ee=plane").robot_hash
     with pytest.raises(BenchmarkError, match=f"'gantry-plane'.*{'0' * 32}.*{own}"):
         compose_member(changed, LIBRARY)
 
 
-def test_a_member_that_cannot_be_composed_says_why():
+def test_a_member_that_cannot_be_composed_is_an_error_with_the_reason():
     with pytest.raises(PartError, match="unknown part 'plnae'"):
         compose_member(member("base=gantry ee=plane", derivation="base=plnae"), LIBRARY)
     with pytest.raises(GrammarError, match=r"derivation of 'mine'.*invalid derivation"):
         compose_member(member("base=gantry ee=plane", "mine", derivation="base"), LIBRARY)
 
 
-def test_robots_are_composed_when_asked_for():
+def test_robots_are_composed_lazily():
     good, broken = (
         member("base=gantry ee=plane"),
         member("base=gantry ee=cube", robot_hash="0" * 32),
@@ -267,7 +267,7 @@ def split_of_two():
     return Split("s", "interpolation", "one", (a, b), (replace(b, name="r3"),), {"seed": 1})
 
 
-def test_the_id_is_of_regime_and_robots_alone():
+def test_the_id_depends_on_regime_and_robots_only():
     split = split_of_two()
     same = replace(
         split,

@@ -1,4 +1,4 @@
-"""The file of a split: found, written, read back, and told apart line by line."""
+"""Split files: lookup, reading, writing, tamper detection and errors with line numbers."""
 
 import string
 import time
@@ -54,7 +54,7 @@ def written(tmp_path):
     return path
 
 
-def test_what_is_written_is_read(written):
+def test_split_files_round_trip(written):
     assert read_split(written) == SPLIT
     assert read_split(str(written)) == SPLIT
     read = read_split_file(written)
@@ -67,7 +67,7 @@ def test_the_same_split_gives_the_same_bytes(written):
     assert split_text(read_split(written)) == split_text(SPLIT)
 
 
-def test_a_robot_has_a_line_of_its_own():
+def test_each_robot_has_one_line():
     text = split_text(SPLIT)
     for member in (*SPLIT.train, *SPLIT.test):
         (line,) = [line for line in text.splitlines() if member.name in line]
@@ -78,7 +78,7 @@ def test_a_robot_has_a_line_of_its_own():
     assert len(gone) == 2, "the robot's line and the id"
 
 
-def test_other_readers_of_yaml_see_the_same():
+def test_other_yaml_parsers_read_the_same_data():
     data = yaml.safe_load(split_text(SPLIT))
     assert data["id"] == split_id(SPLIT)
     assert data["train"][1]["body"] == SPLIT.train[1].robot_hash
@@ -86,7 +86,7 @@ def test_other_readers_of_yaml_see_the_same():
     assert data["made"] == SPLIT.provenance
 
 
-def test_what_is_empty_is_left_out():
+def test_empty_fields_are_omitted():
     bare = Split("s", "interpolation", "x", SPLIT.train, SPLIT.test)
     text = split_text(bare)
     assert not any(f"{key}:" in text for key in ("made", "accepted", "statistics", "reference"))
@@ -98,7 +98,7 @@ TEXTS = st.text(string.printable[:95] + "äß漢😀", min_size=1)
 
 
 @given(NAMES, NAMES | st.sampled_from(["no", "null", "y", "1e5", "0x1F", "12:30", "~"]), TEXTS)
-def test_any_text_comes_back_as_it_was(name, category, text):
+def test_arbitrary_text_round_trips(name, category, text):
     odd = replace(
         SPLIT,
         name=name,
@@ -110,7 +110,7 @@ def test_any_text_comes_back_as_it_was(name, category, text):
     assert parse_split(split_text(odd), Path("s.yaml")).split == odd
 
 
-def test_two_thousand_robots_are_read_and_written_at_once():
+def test_two_thousand_robots_are_read_and_written_quickly():
     many = tuple(robot(f"arm3-{i:06d}") for i in range(2000))
     started = time.process_time()
     text = split_text(replace(SPLIT, train=many))
@@ -119,7 +119,7 @@ def test_two_thousand_robots_are_read_and_written_at_once():
     assert len(text.splitlines()) < 2030
 
 
-def test_a_file_that_was_changed_is_refused_unless_asked_for(written):
+def test_a_changed_file_is_an_error_unless_allowed(written):
     text = written.read_text()
     written.write_text(text.replace("size=0.1,", "size=0.2,", 1))
     with pytest.raises(BenchmarkError) as caught:
@@ -167,7 +167,7 @@ def test_a_file_that_was_changed_is_refused_unless_asked_for(written):
         ("part-unseen: ", "part-unseen: 5 #", 0, "accepted part-unseen: expected text, not 5"),
     ],
 )
-def test_what_is_wrong_is_told_by_its_line(written, old, new, further, message):
+def test_errors_name_the_line(written, old, new, further, message):
     before, found, after = written.read_text().partition(old)
     assert found
     written.write_text(before + new + after)
@@ -190,7 +190,7 @@ def test_what_is_wrong_is_told_by_its_line(written, old, new, further, message):
         (b"format: 1\n? [a]\n: b\n", ":2: unknown key"),
     ],
 )
-def test_what_is_no_split_is_refused(tmp_path, content, message):
+def test_invalid_files_are_errors(tmp_path, content, message):
     path = tmp_path / "x.yaml"
     path.write_bytes(content)
     with pytest.raises(BenchmarkError) as caught:
@@ -217,28 +217,28 @@ def test_splits_are_found_by_name_or_path(written, tmp_path, monkeypatch):
         ("", ": no such file, and no split of this name"),
     ],
 )
-def test_a_split_that_is_not_there_names_the_nearest(name, message):
+def test_an_unknown_split_suggests_the_nearest(name, message):
     with pytest.raises(BenchmarkError, match=message.replace("?", r"\?")):
         find_split(name)
 
 
-def test_every_name_is_a_split_of_that_name():
+def test_every_listed_name_is_a_split_with_that_name():
     assert [read_split(name).name for name in split_names()] == split_names()
 
 
 @pytest.mark.parametrize("name", ["", "/x", "x/", "../x", "a b", ".x", "x//y", "x/../y"])
-def test_a_name_that_is_no_file_is_refused(name):
+def test_a_split_name_that_is_not_a_file_name_is_an_error(name):
     with pytest.raises(BenchmarkError, match="use letters, digits"):
         split_text(replace(SPLIT, name=name))
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a b", ".x", "n" * 201])
-def test_a_robots_name_that_is_no_folder_is_refused(name):
+def test_a_robot_name_that_is_not_a_folder_name_is_an_error(name):
     with pytest.raises(BenchmarkError, match="robot name"):
         split_text(replace(SPLIT, test=(robot(name),)))
 
 
-def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path, monkeypatch):
+def test_a_failed_write_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
     before = tree(tmp_path)
     with pytest.raises(BenchmarkError, match=r"cannot write .*file/x\.yaml: "):

@@ -1,4 +1,4 @@
-"""Statistics of splits, and those of the paper."""
+"""Statistics of splits, compared with the tables of the paper."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import reach
 
 
-def test_counts_are_means_over_the_robots_of_a_side():
+def test_link_and_joint_counts_are_means_over_train_or_test():
     found = statistics(split(["base=gantry ee=plane", "cubes"], ["chain beads=2"]), LIBRARY)
     assert (found["train"]["robots"], found["test"]["robots"]) == (2, 1)
     for key, gantry, cubes, chain in (
@@ -27,13 +27,13 @@ def test_counts_are_means_over_the_robots_of_a_side():
         assert found["test"][key] == chain
 
 
-def test_joints_beyond_the_tool_and_mimic_joints_count_as_movable_only():
+def test_joints_beyond_the_tool_and_mimic_joints_do_not_count_as_movable_to_tool():
     found = statistics(split(["arm=lwr ee=claw"], ["arm=lwr ee=plane"]), LIBRARY)
     assert (found["train"]["movable"], found["train"]["movable_to_tool"]) == (11, 7)
     assert (found["test"]["movable"], found["test"]["movable_to_tool"]) == (7, 7)
 
 
-def test_masses_reaches_and_cosines_have_mean_and_range():
+def test_masses_reaches_and_cosine_similarities_have_mean_and_range():
     made = combined()
     found = statistics(made, LIBRARY)
     robots = [compose_member(m, LIBRARY) for m in made.train]
@@ -51,7 +51,7 @@ def test_masses_reaches_and_cosines_have_mean_and_range():
         assert got == pytest.approx(expected, abs=5e-5)
 
 
-def test_a_robot_with_two_tasks_counts_twice():
+def test_a_robot_with_two_tasks_is_counted_twice():
     reaching = replace(member("cubes"), name="reaching", task="reach")
     found = statistics(split(["cubes", reaching], ["base=gantry ee=cube"]), LIBRARY)
     assert (found["train"]["robots"], found["train"]["bodies"]) == (2, 1)

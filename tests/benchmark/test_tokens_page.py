@@ -1,4 +1,4 @@
-"""The page on tokens agrees with the code."""
+"""The tokens documentation page agrees with the code."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ def test_the_example_runs_and_has_the_documented_shapes():
     np.testing.assert_allclose(tokens(names["again"], names["shapes"]), names["table"][0])
 
 
-def test_the_page_has_every_field():
+def test_the_page_documents_every_field():
     for field in LAYOUT:
         columns = f"{field.start}:{field.columns.stop}"
         assert f"| {field.name} | {columns} | {field.content} |" in PAGE

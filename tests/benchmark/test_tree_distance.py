@@ -162,7 +162,7 @@ def test_cost_of_a_changed_shape(other, cost):
     assert edit_distance(tree(cube), tree(changed)) == cost
 
 
-def test_a_capsule_counts_as_a_cylinder_and_a_shape_as_more_than_none():
+def test_a_capsule_costs_the_same_as_a_cylinder_and_a_missing_shape_costs_more():
     joint = ("prismatic", 0, (0, 0, 1), 0.2)
     capsule, cylinder = Shape(Capsule(0.1, 0.3)), Shape(Cylinder(0.1, 0.5))
     a, b = (tree(body(joint, shapes=[None, shape])) for shape in (capsule, cylinder))
@@ -193,7 +193,7 @@ def test_axes_are_compared_at_home():
     assert edit_distance(tree(turned), tree(along_y)) == pytest.approx(0, abs=1e-12)
 
 
-def test_bare_frames_do_not_count():
+def test_empty_links_do_not_change_the_distance():
     plain = body(("revolute", 0, (0, 0, 1), 0.3), ("revolute", 1, (0, 1, 0), 0.2))
     framed = body(
         ("fixed", 0, (1, 0, 0), 0.1),
@@ -206,7 +206,7 @@ def test_bare_frames_do_not_count():
     assert distance(plain, framed) == pytest.approx(0, abs=1e-12)
 
 
-def test_a_link_with_a_shape_on_a_fixed_joint_counts():
+def test_fixed_links_with_shapes_change_the_distance():
     plain = body(("revolute", 0, (0, 0, 1), 0.3))
     stood = body(
         ("fixed", 0, (1, 0, 0), 0.1), ("revolute", 1, (0, 0, 1), 0.3), shapes=[None, BLOCK]
@@ -274,7 +274,7 @@ def test_names_do_not_matter():
     assert distance(robot, other) == 0.0
 
 
-def test_similar_robots_are_nearer_than_others():
+def test_similar_robots_have_smaller_distances():
     near = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm=lwr ee=plane"))
     far = distance(morphgen.compose("arm=lwr ee=stick"), morphgen.compose("arm3"))
     assert 0 < near < 0.1 < far

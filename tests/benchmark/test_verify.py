@@ -1,4 +1,4 @@
-"""A split that is not what it claims to be is told, robot by robot."""
+"""Verifying split files and split folders against the robots that they describe."""
 
 import hashlib
 import io
@@ -50,18 +50,18 @@ def summed(folder):
     (folder / "SHA256SUMS").write_text(text)
 
 
-def test_a_file_that_was_not_touched_is_verified(tmp_path):
+def test_an_unchanged_file_passes(tmp_path):
     made = combined()
     seen = verify(written(tmp_path, made), LIBRARY)
     assert (seen.split, seen.id, seen.differences) == (made, split_id(made), ())
 
 
-def test_a_shipped_split_is_verified_by_its_name():
+def test_a_shipped_split_can_be_verified_by_name():
     assert "composition/ee-task" in split_names()
     assert found("composition/ee-task") == []
 
 
-def test_a_line_that_was_changed_is_told_by_the_robots_name_and_by_the_id(tmp_path):
+def test_a_changed_line_is_reported_for_the_robot_and_the_id(tmp_path):
     path = written(tmp_path, combined())
     path.write_text(path.read_text().replace("cube(size=0.1)", "cube(size=0.11)"))
     (file, id_), (robot, why) = found(path)
@@ -73,7 +73,7 @@ def test_a_line_that_was_changed_is_told_by_the_robots_name_and_by_the_id(tmp_pa
     assert "was made with body" in why
 
 
-def test_a_robot_that_was_left_out_is_told_by_the_id(tmp_path):
+def test_a_removed_robot_changes_the_id(tmp_path):
     path = written(tmp_path, combined())
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(line for line in lines if "gantry-plane" not in line))
@@ -81,7 +81,7 @@ def test_a_robot_that_was_left_out_is_told_by_the_id(tmp_path):
     assert (where, "its id is" in why) == (str(path), True)
 
 
-def test_words_about_a_split_may_be_changed(tmp_path):
+def test_the_summary_of_a_split_may_change(tmp_path):
     path = written(tmp_path, combined())
     path.write_text(path.read_text().replace("a split of a test", "another summary"))
     assert found(path) == []
@@ -95,20 +95,20 @@ def test_words_about_a_split_may_be_changed(tmp_path):
         ("base=planar[", "invalid derivation"),
     ],
 )
-def test_a_robot_that_cannot_be_composed_is_told(tmp_path, derivation, why):
+def test_a_robot_that_cannot_be_composed_is_reported(tmp_path, derivation, why):
     wrong = replace(member(TRAIN[1]), derivation=derivation)
     path = written(tmp_path, combined(train=[TRAIN[0], wrong]))
     ((where, told),) = found(path)
     assert (where, why in told) == ("planar-cube", True)
 
 
-def test_every_member_of_a_wrong_derivation_is_told(tmp_path):
+def test_every_member_with_a_wrong_derivation_is_reported(tmp_path):
     wrong = replace(member(TRAIN[0]), robot_hash="0" * 32)
     path = written(tmp_path, combined(train=[wrong, replace(wrong, name="again", task="reach")]))
     assert [where for where, _ in found(path)] == ["gantry-plane", "again"]
 
 
-def test_a_built_split_is_verified_wherever_it_was_moved_to(whole, tmp_path):
+def test_a_moved_split_folder_passes(whole, tmp_path):
     whole.rename(tmp_path / "elsewhere")
     seen = []
     assert found(tmp_path / "elsewhere", progress=lambda *counts: seen.append(counts)) == []
@@ -116,7 +116,7 @@ def test_a_built_split_is_verified_wherever_it_was_moved_to(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_processes_change_nothing(tmp_path):
+def test_the_number_of_processes_does_not_matter(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["base=planar ee=plane"])
     folder = build_split(made, tmp_path / "data", LIBRARY, settings=LIGHT).folder
@@ -135,7 +135,7 @@ def test_processes_change_nothing(tmp_path):
     ],
 )
 @pytest.mark.parametrize("change", ["cut", "longer", "gone"])
-def test_a_file_that_was_damaged_is_told(whole, path, where, change):
+def test_a_damaged_file_is_reported(whole, path, where, change):
     data = (whole / path).read_bytes()
     match change:
         case "cut":
@@ -151,7 +151,7 @@ def test_a_file_that_was_damaged_is_told(whole, path, where, change):
     assert {place for place, _ in told} <= {where, "gantry-plane"}
 
 
-def test_a_file_too_many_is_told(whole):
+def test_an_extra_file_is_reported(whole):
     (whole / "robots" / "planar-cube" / "notes.txt").write_text("mine")
     (whole / "robots" / "stranger").mkdir()
     (whole / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
@@ -161,7 +161,7 @@ def test_a_file_too_many_is_told(whole):
     ]
 
 
-def test_a_urdf_that_was_changed_with_its_sums_is_not_the_robots(whole):
+def test_a_urdf_changed_with_its_checksum_is_reported(whole):
     path = whole / "robots" / "planar-cube" / "robot.urdf"
     path.write_text(path.read_text().replace('effort="', 'effort="1', 1))
     card = path.with_name("card.json")
@@ -176,7 +176,7 @@ def test_a_urdf_that_was_changed_with_its_sums_is_not_the_robots(whole):
 @pytest.mark.parametrize(
     ("key", "value"), [("mass", 3.0), ("home", {}), ("ignore_pairs", [["a", "b"]]), ("dof", 4)]
 )
-def test_a_card_that_was_changed_with_its_sums_is_not_the_robots(bundles, key, value):
+def test_a_card_changed_with_its_checksum_is_reported(bundles, key, value):
     path = bundles / "robots" / "planar-cube" / "card.json"
     card = json.loads(path.read_text())
     path.write_text(json.dumps(card | {key: value}))
@@ -184,7 +184,7 @@ def test_a_card_that_was_changed_with_its_sums_is_not_the_robots(bundles, key, v
     assert found(bundles) == [("planar-cube", f"file card.json: its {key!r} is not the robot's")]
 
 
-def test_a_card_of_another_machine_may_differ_in_the_last_digits(bundles):
+def test_a_card_may_differ_in_the_last_digits(bundles):
     path = bundles / "robots" / "planar-cube" / "card.json"
     card = json.loads(path.read_text())
     path.write_text(json.dumps(card | {"reach": card["reach"] * (1 + 1e-9)}))
@@ -192,7 +192,7 @@ def test_a_card_of_another_machine_may_differ_in_the_last_digits(bundles):
     assert found(bundles) == []
 
 
-def test_meshes_of_a_real_arm_are_verified(tmp_path):
+def test_meshes_are_verified(tmp_path):
     made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
     folder = build_split(made, tmp_path / "data", LIBRARY).folder
     assert found(folder) == []
@@ -226,7 +226,7 @@ def test_meshes_of_a_real_arm_are_verified(tmp_path):
         (lambda records: records.pop(), ("robots.jsonl", "it has 3 robots, not 4")),
     ],
 )
-def test_a_record_that_was_changed_with_its_sums_is_told(whole, change, expected):
+def test_a_record_changed_with_its_checksum_is_reported(whole, change, expected):
     path = whole / "robots.jsonl"
     records = [json.loads(line) for line in path.read_text().splitlines()]
     change(records)
@@ -247,7 +247,7 @@ def changed_tokens(folder, change):
 
 
 @pytest.mark.parametrize("field", [PARENT, ORIGIN, GEOMETRY])
-def test_tokens_that_were_changed_with_their_sums_are_told(whole, field):
+def test_tokens_changed_with_their_checksum_are_reported(whole, field):
     def change(arrays):
         arrays["tokens"][1, 2, field.start] += 0.01
 
@@ -256,12 +256,12 @@ def test_tokens_that_were_changed_with_their_sums_are_told(whole, field):
     assert found(whole) == [("planar-cube", why)]
 
 
-def test_tokens_that_are_not_numbers_are_told(whole):
+def test_nan_tokens_are_reported(whole):
     changed_tokens(whole, lambda arrays: arrays["tokens"].__setitem__((0, 0, 5), np.nan))
     assert [where for where, _ in found(whole)] == ["gantry-plane"]
 
 
-def test_a_mask_and_names_are_compared_too(whole):
+def test_changed_masks_and_names_of_tokens_are_reported(whole):
     changed_tokens(whole, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
     assert found(whole) == [
         ("gantry-cylinder", "tokens.npz: its mask is not that of its links"),
@@ -270,7 +270,7 @@ def test_a_mask_and_names_are_compared_too(whole):
     assert found(whole) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
 
 
-def test_a_split_that_was_exchanged_is_told(whole):
+def test_an_exchanged_split_file_is_reported(whole):
     other = combined(test=["base=planar ee=cylinder"])
     (whole / "split.yaml").write_text(split_text(other))
     summed(whole)
@@ -291,7 +291,7 @@ def test_a_split_that_was_exchanged_is_told(whole):
         ("split.yaml", b"format: 1\n", "split.yaml:1: a split lacks"),
     ],
 )
-def test_what_cannot_be_verified_at_all_is_refused(bundles, path, content, message):
+def test_unreadable_folders_are_errors(bundles, path, content, message):
     if content is None:
         (bundles / path).unlink()
     else:
@@ -300,7 +300,7 @@ def test_what_cannot_be_verified_at_all_is_refused(bundles, path, content, messa
         verify(bundles, LIBRARY)
 
 
-def test_what_is_no_split_is_refused(tmp_path):
+def test_a_path_without_a_split_is_an_error(tmp_path):
     with pytest.raises(BenchmarkError, match="split of this name; did you"):
         verify("interpolation/arm4/reach", LIBRARY)
     with pytest.raises(BenchmarkError, match="is no built split"):

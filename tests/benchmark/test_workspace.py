@@ -76,7 +76,7 @@ def test_disjoint_workspaces_have_no_overlap():
     assert density_overlap(up, flat) == 0.0
 
 
-def test_a_hinge_reaches_a_circle():
+def test_the_workspace_of_a_revolute_joint_is_a_circle():
     found = workspace(chain(("revolute", (0, 0, 1), (0, 0, 1)), tool=(0.5, 0.0, 0.2)))
     assert found.shoulder == pytest.approx((0, 0, 1.2))
     assert found.reach == pytest.approx(0.5)
@@ -87,7 +87,7 @@ def test_a_hinge_reaches_a_circle():
 
 
 @pytest.mark.parametrize("factor", [0.01, 3.0])
-def test_size_does_not_matter(factor):
+def test_the_scale_of_a_robot_does_not_matter(factor):
     robot = morphgen.compose(LWR)
     large = scale_links(robot, {link.name: factor for link in robot.links})
     assert workspace(large).reach == pytest.approx(factor * workspace(robot).reach)

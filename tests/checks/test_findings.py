@@ -37,12 +37,12 @@ def test_a_mimic_gripper_has_only_the_finding_about_loaders():
 
 
 @pytest.mark.parametrize("code", ROBOTS)
-def test_a_fault_is_found(code):
+def test_each_fault_has_its_finding(code):
     assert code in {finding.code for finding in check(ROBOTS[code]())}
 
 
 @pytest.mark.parametrize("code", MESHES)
-def test_a_fault_of_a_mesh_is_found(code, tmp_path, monkeypatch):
+def test_each_fault_of_a_mesh_has_its_finding(code, tmp_path, monkeypatch):
     monkeypatch.setattr(shapes, "MAX_STL_FACES", 1000)
     assert code in {finding.code for finding in check(MESHES[code](tmp_path))}
 

@@ -39,12 +39,12 @@ def assert_fixable_means_fixed(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("code", [code for code in ROBOTS if not code.startswith("name-")])
-def test_fixable_means_fixed(code):
+def test_fixable_findings_are_fixed(code):
     assert_fixable_means_fixed(ROBOTS[code]())
 
 
 @pytest.mark.parametrize("code", MESHES)
-def test_fixable_means_fixed_with_meshes(code, tmp_path, monkeypatch):
+def test_fixable_findings_of_meshes_are_fixed(code, tmp_path, monkeypatch):
     monkeypatch.setattr(shapes, "MAX_STL_FACES", 1000)
     assert_fixable_means_fixed(MESHES[code](tmp_path))
 
@@ -105,7 +105,7 @@ def test_names_are_changed_everywhere():
 
 
 @pytest.mark.parametrize("code", ["name-characters", "name-reserved"])
-def test_repaired_names_are_sound(code):
+def test_repaired_names_are_valid(code):
     robot, gone = fix(ROBOTS[code]())
     assert code in {finding.code for finding in gone}
     assert check(robot) == ()

@@ -1,4 +1,4 @@
-"""A body that looks alike in several poses gets one of them."""
+"""Canonical poses of primitives that look alike in several poses."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def turned(geometry, rotation, position=(0.1, -0.05, 0.02)):
 
 
 @pytest.mark.parametrize("geometry", GEOMETRIES, ids=lambda g: type(g).__name__)
-def test_the_body_stays_and_a_second_time_nothing_changes(geometry):
+def test_canonicalization_preserves_the_solid_and_is_idempotent(geometry):
     for rotation in Rotation.random(20, random_state=1):
         shape = turned(geometry, rotation)
         found = canonical(shape)
@@ -31,7 +31,7 @@ def test_the_body_stays_and_a_second_time_nothing_changes(geometry):
         assert again.T_link_shape.matrix == pytest.approx(found.T_link_shape.matrix, abs=1e-9)
 
 
-def test_all_ways_to_write_a_box_become_one():
+def test_equivalent_boxes_have_one_canonical_form():
     R = Rotation.from_rotvec((0.2, 0.1, -0.3))
     shapes = []
     for quarter in Rotation.create_group("O"):
@@ -42,7 +42,7 @@ def test_all_ways_to_write_a_box_become_one():
         assert shape.T_link_shape.matrix == pytest.approx(shapes[0].T_link_shape.matrix, abs=1e-9)
 
 
-def test_all_ways_to_write_a_cylinder_become_one():
+def test_equivalent_cylinders_have_one_canonical_form():
     R = Rotation.from_rotvec((0.4, -0.2, 0.3))
     flip = Rotation.from_rotvec((np.pi, 0, 0))
     poses = [
@@ -55,7 +55,7 @@ def test_all_ways_to_write_a_cylinder_become_one():
     assert poses[0].quaternion[3] == 0
 
 
-def test_a_sphere_is_not_turned_and_a_mesh_is_left(tmp_path):
+def test_spheres_have_no_rotation_and_meshes_are_unchanged(tmp_path):
     R = Rotation.from_rotvec((1.0, 2.0, 0.5))
     assert canonical(turned(Sphere(0.1), R)).T_link_shape == Pose((0.1, -0.05, 0.02))
     mesh = turned(Mesh(tmp_path / "m.stl"), R)

@@ -1,4 +1,4 @@
-"""Hollow shells: what is within them, and what is not."""
+"""Openness of points in hollow meshes, and the filling of tubes."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def solid_from(mesh, tmp_path):
     return solid_of([Shape(Mesh(tmp_path / "mesh.stl"))])
 
 
-def test_openness_is_zero_in_a_closed_box_one_far_off_and_a_half_on_a_wall():
+def test_openness_is_zero_inside_a_box_one_far_away_and_half_on_a_wall():
     around = Cavities(trimesh.creation.box((1, 1, 1)))
     points = np.array([(0.1, 0.2, -0.3), (50.0, 0, 0), (0.5 + 1e-4, 0, 0)])
     inside, outside, wall = around.openness(points)
@@ -34,7 +34,7 @@ def test_openness_is_zero_in_a_closed_box_one_far_off_and_a_half_on_a_wall():
     assert around.openness(np.zeros((0, 3))).shape == (0,)
 
 
-def test_openness_of_a_cup_is_the_solid_angle_of_its_mouth():
+def test_openness_in_a_cup_is_the_solid_angle_of_its_opening():
     cup = trimesh.util.concatenate(
         [
             trimesh.creation.annulus(0.49, 0.5, 1.0, transform=None),
@@ -47,14 +47,14 @@ def test_openness_of_a_cup_is_the_solid_angle_of_its_mouth():
     assert openness == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)
 
 
-def test_outside_of_the_hull_nothing_is_enclosed():
+def test_points_outside_the_convex_hull_are_not_enclosed():
     mesh = tube()
     beyond = POINTS[~np.asarray(trimesh.convex.convex_hull(mesh).contains(POINTS))]
     assert Cavities(mesh).openness(beyond).min() > MAX_OPENNESS
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_tube_is_filled_but_near_its_mouth(tmp_path, closed):
+def test_a_tube_is_filled_except_near_its_opening(tmp_path, closed):
     solid = solid_from(tube(closed=closed), tmp_path)
     assert solid.method == "filled"
     deep, mouth, beside = solid.contains(
@@ -84,7 +84,7 @@ def test_rings_forks_and_boxes_are_not_filled(tmp_path, mesh):
     assert solid_from(mesh, tmp_path).method != "filled"
 
 
-def test_the_surface_of_a_filled_tube_is_its_outer_one(tmp_path):
+def test_the_surface_of_a_filled_tube_is_its_outer_surface(tmp_path):
     solid = solid_from(tube(), tmp_path)
     points = solid.surface(2000, np.random.default_rng(0))
     middle = points[np.abs(points[:, 2]) < 0.15]

@@ -1,4 +1,4 @@
-"""The primitive fitted to several is good, and does not depend on the last bits of numbers."""
+"""Fitting one primitive to the primitives of a link."""
 
 import math
 from dataclasses import replace
@@ -40,30 +40,30 @@ def overlap(shapes, *found):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_primitive_of_the_link_overlaps_more(seed):
+def test_the_fit_overlaps_at_least_as_well_as_any_primitive_of_the_link(seed):
     shapes = drawn(seed)
     own = max(overlap(shapes, shape) for shape in shapes)
     assert overlap(shapes, fitted(seed)) > own - 0.01
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_last_bits_change_nothing(seed):
+def test_the_last_bits_of_numbers_do_not_change_the_fit(seed):
     assert fitted(seed) == fit_composite(drawn(seed, noise=3e-16))
 
 
-def test_of_two_rails_one_stands_for_the_link():
+def test_two_rails_are_fitted_by_one_of_them():
     rails = [Shape(Box((1.1, 0.03, 0.03)), Pose((0.0, y, 1.05))) for y in (0.6, -0.6)]
     assert fit_composite(rails) == rails[0]
 
 
-def test_sides_are_flush_with_those_of_the_link():
+def test_the_sides_of_the_fit_are_flush_with_the_link():
     prongs = [Shape(Box((0.02, 0.01, 0.04)), Pose((0.0, y, 0.02))) for y in (0.02, -0.02)]
     bridge = Shape(Box((0.02, 0.03, 0.01)), Pose((0.0, 0.0, 0.035)))
     found = fit_composite([*prongs, bridge])
     assert found == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
 
 
-def test_a_rod_in_two_parts_is_one_rod():
+def test_two_collinear_rods_are_fitted_by_one_rod():
     turned = Pose.from_xyz_rpy((0.1, 0.0, 0.0), (0.0, math.pi / 2, 0.0))
     rod = Shape(Cylinder(0.02, 0.2), turned)
     found = fit_composite(
@@ -93,11 +93,11 @@ def test_mirrored_fingers_have_mirrored_primitives():
     assert overlap(finger(1), left) > 0.6
 
 
-def test_nothing_stands_for_nothing():
+def test_empty_and_flat_links_have_no_fit():
     assert fit_composite([]) is None
     assert fit_composite([Shape(Box((0.1, 0.1, 0.0)))]) is None
 
 
-def test_other_shapes_are_refused():
+def test_other_shapes_are_errors():
     with pytest.raises(TypeError, match="Capsule"):
         fit_composite([Shape(Capsule(0.1, 0.2))])

@@ -1,4 +1,4 @@
-"""Meshes of real links, moved, mirrored and spoilt."""
+"""Congruence of the meshes of real links under motions, reflections and noise."""
 
 import math
 
@@ -64,12 +64,12 @@ def farthest(a: trimesh.Trimesh, b: trimesh.Trimesh, T: np.ndarray) -> float:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_motions_and_mirrorings_of_a_link_are_found(base, seed, mirrored):
+def test_motions_and_reflections_of_a_link_are_recovered(base, seed, mirrored):
     T = motion(seed, mirrored)
     np.testing.assert_allclose(congruence(base, shuffled(base, T)), T, atol=1e-6)
 
 
-def test_equal_meshes_give_the_identity_and_shifted_ones_do_not_turn(base):
+def test_equal_meshes_give_the_identity_and_shifted_meshes_a_translation(base):
     assert np.array_equal(congruence(base, base.copy()), np.eye(4))
     shift = trimesh.transformations.translation_matrix([0.1, 0.2, 0.3])
     found = congruence(base, shuffled(base, shift))
@@ -89,7 +89,7 @@ def test_equal_meshes_give_the_identity_and_shifted_ones_do_not_turn(base):
     ids=["cylinder", "box", "cube", "icosahedron", "annulus"],
 )
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_symmetric_bodies_are_found_by_a_rotation(mesh, mirrored):
+def test_symmetric_meshes_are_matched_by_a_rotation(mesh, mirrored):
     other = shuffled(mesh, motion(5, mirrored))
     found = congruence(mesh, other)
     assert farthest(mesh, other, found) < 1e-6
@@ -106,7 +106,7 @@ def test_noise_within_the_tolerance_is_averaged_out(base):
 
 
 @pytest.mark.parametrize("moved_by", [0.01, -0.01])
-def test_one_vertex_elsewhere_is_another_mesh(base, moved_by):
+def test_one_moved_vertex_makes_meshes_incongruent(base, moved_by):
     other = base.copy()
     size = np.linalg.norm(base.extents)
     vertices = np.array(base.vertices)
@@ -119,7 +119,7 @@ def test_one_vertex_elsewhere_is_another_mesh(base, moved_by):
     assert congruence(base, other) is not None
 
 
-def test_other_counts_sizes_and_proportions_are_other_meshes(base):
+def test_different_counts_sizes_or_proportions_are_incongruent(base):
     assert congruence(base, links("ur5")["shoulder_link"]) is None
     scaled = base.copy().apply_scale(1.001)
     assert congruence(base, scaled) is None
@@ -131,7 +131,7 @@ def test_other_counts_sizes_and_proportions_are_other_meshes(base):
     assert congruence(trimesh.creation.box((0.1, 0.2, 0.3)), flipped) is None
 
 
-def test_vertices_at_equal_distances_but_elsewhere_are_another_mesh(base):
+def test_vertices_at_equal_distances_in_other_directions_are_incongruent(base):
     other = base.copy()
     vertices = np.array(base.vertices) - base.vertices.mean(axis=0)
     far = np.argsort(-np.linalg.norm(vertices, axis=1))[:2]
@@ -141,7 +141,7 @@ def test_vertices_at_equal_distances_but_elsewhere_are_another_mesh(base):
     assert congruence(base, other, tolerance=5e-3) is None
 
 
-def test_the_same_vertices_under_another_surface_are_another_mesh():
+def test_the_same_vertices_with_another_surface_are_incongruent():
     corners = np.array([[0, 0, 0], [2, 0, 0], [2, 3, 0.5], [0, 3, 0], [0.7, 1.2, 4]], dtype=float)
     sides = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
     one = trimesh.Trimesh(corners, [*sides, [0, 2, 1], [0, 3, 2]], process=False)
@@ -150,7 +150,7 @@ def test_the_same_vertices_under_another_surface_are_another_mesh():
     assert congruence(one, trimesh.Trimesh(corners, one.faces[::-1], process=False)) is not None
 
 
-def test_a_vertex_without_a_partner_makes_another_mesh():
+def test_a_vertex_without_a_counterpart_makes_meshes_incongruent():
     ends = np.concatenate([np.eye(3), -np.eye(3)])
     sides = [[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)]
     doubled = [[0, 0, 1], [0, 0, -1]]
@@ -164,7 +164,7 @@ def test_a_vertex_without_a_partner_makes_another_mesh():
     assert congruence(one, shuffled(one, motion(3))) is not None
 
 
-def test_landmarks_closer_than_the_tolerance_do_no_harm():
+def test_landmarks_closer_than_the_tolerance_are_distinguished():
     def needle(angles: np.ndarray) -> trimesh.Trimesh:
         ring = 0.018 * np.stack([0 * angles, np.cos(angles), np.sin(angles)], axis=1)
         vertices = np.concatenate([[[1, 0.01, 0], [1, -0.01, 0]], ring])
@@ -180,7 +180,7 @@ def test_landmarks_closer_than_the_tolerance_do_no_harm():
 
 @pytest.mark.parametrize("geometry", KINDS)
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_a_moved_primitive_is_as_far_from_moved_points(geometry, mirrored):
+def test_moving_a_primitive_and_points_preserves_distances(geometry, mirrored):
     shape = Shape(geometry, Pose.from_xyz_rpy((0.1, 0.2, -0.3), (0.5, 0.6, 0.7)), (1, 0, 0, 1))
     points = np.random.default_rng(0).normal((0.1, 0.2, -0.3), 0.2, (500, 3))
     before = signed_distance([shape], points)
@@ -196,14 +196,14 @@ def test_a_moved_primitive_is_as_far_from_moved_points(geometry, mirrored):
         assert np.linalg.norm(there.T_link_shape.quaternion) == pytest.approx(1)
 
 
-def test_moving_refuses_meshes_and_what_is_no_motion(tmp_path):
+def test_moving_meshes_or_by_an_invalid_motion_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="primitive"):
         moved(Shape(Mesh(tmp_path / "a.stl")), np.eye(4))
     with pytest.raises(ValueError, match="neither a rotation nor a mirroring"):
         moved(Shape(Sphere(1.0)), np.diag([2.0, 2.0, 2.0, 1.0]))
 
 
-def test_representatives_are_the_first_of_their_kind(base):
+def test_representatives_are_the_first_of_each_congruence_class(base):
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     moves = [motion(1), motion(2, mirrored=True)]
     meshes = [
@@ -221,14 +221,14 @@ def test_representatives_are_the_first_of_their_kind(base):
     assert representatives([]) == []
 
 
-def test_the_arms_of_yumi_share_their_links():
+def test_the_arms_of_yumi_have_congruent_links():
     left, right = links("yumi_left"), links("yumi_right")
     found = representatives([*left.values(), *right.values()])
     assert [first for first, _ in found] == 2 * list(range(8))
     assert all(np.array_equal(T, np.eye(4)) for _, T in found)
 
 
-def test_jacos_halves_and_wrists_are_turned_copies_and_ur5s_wrists_are_not():
+def test_jaco_has_congruent_halves_and_wrists_and_ur5_has_no_congruent_wrists():
     jaco = links("jaco2")
     for one, other in (("link_2", "link_3"), ("link_5", "link_6")):
         a, b = (jaco[f"j2s7s300_{name}"] for name in (one, other))

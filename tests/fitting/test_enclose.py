@@ -1,3 +1,5 @@
+"""The smallest box, cylinder or sphere that encloses a set of points."""
+
 from __future__ import annotations
 
 import itertools
@@ -72,7 +74,7 @@ def test_a_turned_primitive_is_recovered(kind: Kind, seed: int) -> None:
     assert outside(shape, points) <= 1e-9
 
 
-def test_a_primitive_along_the_links_axes_keeps_them() -> None:
+def test_a_primitive_aligned_with_the_link_axes_stays_aligned() -> None:
     centre = np.array([0.5, 0.0, -0.2])
     box = enclose(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices) + centre)
     assert box.geometry == Box((0.1, 0.2, 0.3))
@@ -92,7 +94,7 @@ def test_a_primitive_along_the_links_axes_keeps_them() -> None:
     assert sphere == Shape(Sphere(0.1), box.T_link_shape)
 
 
-def test_noise_does_not_turn_a_box_away_from_the_links_axes() -> None:
+def test_noise_does_not_rotate_a_box_away_from_the_link_axes() -> None:
     points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
     noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
     box = enclose(points + noise)
@@ -102,7 +104,7 @@ def test_noise_does_not_turn_a_box_away_from_the_links_axes() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_holds_all_points_after_rounding(kind: Kind, seed: int) -> None:
+def test_every_kind_encloses_all_points_after_rounding(kind: Kind, seed: int) -> None:
     points = cloud(np.random.default_rng(seed))
     shape = enclose(points, [kind])
     assert isinstance(shape.geometry, GEOMETRY[kind])
@@ -116,7 +118,7 @@ def test_every_kind_holds_all_points_after_rounding(kind: Kind, seed: int) -> No
     assert pose.quaternion[0] >= 0
 
 
-def test_rounding_up_is_all_that_a_small_thing_gains() -> None:
+def test_small_primitives_grow_by_rounding_only() -> None:
     points = 1e-4 * cloud(np.random.default_rng(3))
     for kind in KINDS:
         shape = enclose(points, [kind])
@@ -124,7 +126,7 @@ def test_rounding_up_is_all_that_a_small_thing_gains() -> None:
 
 
 @pytest.mark.parametrize("robot", ["ur5", pytest.param("panda", marks=pytest.mark.slow)])
-def test_no_link_gets_more_than_the_tightest_bound_of_trimesh(robot: str) -> None:
+def test_enclosures_of_links_are_not_larger_than_those_of_trimesh(robot: str) -> None:
     links = load_part(default_library(()).manifest(robot)).fragment.links
     meshes = [solid_of(link.collisions).mesh for link in links if link.collisions]
     assert len(meshes) >= 7
@@ -143,7 +145,7 @@ def test_no_link_gets_more_than_the_tightest_bound_of_trimesh(robot: str) -> Non
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_cloud_gets_more_than_trimesh_gives_it(seed: int) -> None:
+def test_enclosures_of_point_clouds_are_not_larger_than_those_of_trimesh(seed: int) -> None:
     points = cloud(np.random.default_rng(seed), n=12)
     _, extents = trimesh.bounds.oriented_bounds(points)
     cylinder = trimesh.bounds.minimum_cylinder(points)
@@ -152,7 +154,7 @@ def test_no_cloud_gets_more_than_trimesh_gives_it(seed: int) -> None:
     assert size(enclose(points, ["cylinder"])) <= least * ROUNDING
 
 
-def test_the_cube_is_the_least_box_of_a_regular_tetrahedron() -> None:
+def test_the_smallest_box_of_a_regular_tetrahedron_is_a_cube() -> None:
     corners = CUBE[[0, 3, 5, 6]]
     turn = Rotation.from_rotvec([0.3, 1.1, -0.4]).as_matrix()
     assert size(enclose(corners @ turn.T, ["box"])) == pytest.approx(1e-3, rel=1e-3)
@@ -161,7 +163,7 @@ def test_the_cube_is_the_least_box_of_a_regular_tetrahedron() -> None:
     assert sphere.radius == pytest.approx(0.05 * math.sqrt(3), abs=2e-6)
 
 
-def test_a_thin_rod_is_found_whichever_way_it_points() -> None:
+def test_a_thin_rod_is_recovered_in_any_direction() -> None:
     rod = np.random.default_rng(0).uniform(-1, 1, (400, 3)) * (1, 0.003, 0.003)
     along = math.pi * np.hypot(rod[:, 1], rod[:, 2]).max() ** 2 * np.ptp(rod[:, 0])
     for turn in Rotation.random(3, random_state=0).as_matrix():
@@ -181,7 +183,7 @@ def smallest_sphere(points: Array) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_sphere_is_the_smallest(seed: int) -> None:
+def test_the_sphere_is_the_minimum_enclosing_sphere(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(8, 3))
     if seed % 3 == 1:
@@ -201,7 +203,7 @@ def test_the_volume_does_not_depend_on_the_links_frame(kind: Kind) -> None:
     assert max(volumes) <= min(volumes) * ROUNDING
 
 
-def test_of_several_kinds_the_least_is_taken() -> None:
+def test_the_smallest_of_several_kinds_is_returned() -> None:
     points = cloud(np.random.default_rng(7))
     alone = {kind: enclose(points, [kind]) for kind in KINDS}
     assert enclose(points) == min(alone.values(), key=size)
@@ -209,7 +211,7 @@ def test_of_several_kinds_the_least_is_taken() -> None:
     assert enclose(points, rest) == min((alone[kind] for kind in rest), key=size)
 
 
-def test_the_same_points_get_the_same_shape_and_inner_points_do_not_matter() -> None:
+def test_the_result_is_deterministic_and_independent_of_interior_points() -> None:
     rng = np.random.default_rng(8)
     points = cloud(rng)
     shape = enclose(points)
@@ -218,7 +220,7 @@ def test_the_same_points_get_the_same_shape_and_inner_points_do_not_matter() -> 
     assert enclose(np.concatenate([points, inner, points])) == shape
 
 
-def test_a_dense_round_hull_is_held_as_tightly_as_a_coarse_one() -> None:
+def test_a_dense_round_hull_is_enclosed_tightly() -> None:
     egg = np.asarray(trimesh.creation.icosphere(5).vertices) * (0.3, 0.2, 0.1)
     assert len(egg) > 10_000
     turn = Rotation.from_rotvec([0.5, 0.2, 1.0]).as_matrix()
@@ -239,12 +241,12 @@ def test_a_dense_round_hull_is_held_as_tightly_as_a_coarse_one() -> None:
         (np.vstack([CUBE, [0.0, -np.inf, 0.0]]), "not finite"),
     ],
 )
-def test_what_has_no_volume_is_refused(points: Array, reason: str) -> None:
+def test_points_without_volume_are_an_error(points: Array, reason: str) -> None:
     with pytest.raises(FitError, match=reason):
         enclose(points)
 
 
-def test_a_wrong_call_is_a_programming_error() -> None:
+def test_invalid_arguments_raise_value_error() -> None:
     with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
         enclose(CUBE[:, :2])
     with pytest.raises(ValueError, match="valid: some of box, cylinder, sphere"):

@@ -1,4 +1,4 @@
-"""Measures of primitives whose answers are known in closed form."""
+"""Quality measures of fitted primitives, compared with closed forms."""
 
 import math
 
@@ -58,7 +58,7 @@ def test_signed_distances_of_one_primitive_are_exact(geometry, point, expected, 
     assert found == pytest.approx([expected], abs=1e-12)
 
 
-def test_the_signed_distance_of_a_union_is_to_the_nearest_and_within_a_bound():
+def test_the_signed_distance_of_a_union_is_that_of_the_nearest_primitive():
     pair = [Shape(Box((2, 2, 2)), at(-0.5)), Shape(Box((2, 2, 2)), at(0.5))]
     found = signed_distance(pair, np.array([[3, 0, 0], [-4.5, 0, 5], [0, 0, 0], [0, 0, 0.9]]))
     np.testing.assert_allclose(found, [1.5, 5, -0.5, -0.1], atol=1e-12)
@@ -67,11 +67,11 @@ def test_the_signed_distance_of_a_union_is_to_the_nearest_and_within_a_bound():
 
 
 @pytest.mark.parametrize("shape", [BLOCK, CUBE, Shape(Box((0.1, 0.2, 0.3)), TILTED)])
-def test_a_box_stands_for_itself(shape):
+def test_a_box_is_a_perfect_fit_of_itself(shape):
     assert_perfect(quality(solid_of([shape]), [shape]))
 
 
-def test_a_box_a_tenth_too_long_protrudes_by_what_it_is_too_long():
+def test_a_box_a_tenth_too_long_protrudes_by_the_excess():
     found = quality(solid_of([BLOCK]), [Shape(Box((0.44, 0.2, 0.1)), at(0.02))])
     assert found.iou == pytest.approx(1 / 1.1, abs=1e-4)
     assert found.coverage == 1
@@ -84,7 +84,7 @@ def test_a_box_a_tenth_too_long_protrudes_by_what_it_is_too_long():
     assert found.hausdorff == pytest.approx(0.04, abs=1e-9)
 
 
-def test_a_sphere_in_a_cube_leaves_the_corners():
+def test_a_sphere_in_a_cube_does_not_cover_the_corners():
     found = quality(solid_of([CUBE]), [Shape(Sphere(0.1))])
     assert found.iou == found.coverage == found.volume_ratio
     assert found.iou == pytest.approx(math.pi / 6, abs=1e-3)
@@ -103,7 +103,7 @@ def test_a_cube_around_a_ball_protrudes_at_the_corners():
     assert found.gap_p95 == 0
 
 
-def test_a_cylinder_stands_for_its_tessellation_but_for_the_slivers():
+def test_a_cylinder_fits_its_tessellation_up_to_the_sagitta():
     shape = Shape(Cylinder(0.05, 0.2), TILTED)
     found = quality(solid_of([shape]), [shape])
     assert found.iou == pytest.approx(48 / math.tau * math.sin(math.tau / 48), abs=5e-4)
@@ -115,7 +115,7 @@ def test_a_cylinder_stands_for_its_tessellation_but_for_the_slivers():
 
 
 @pytest.mark.parametrize("shift", [0.05, 0.1])
-def test_what_two_boxes_share_counts_once(shift):
+def test_the_overlap_of_two_boxes_is_counted_once(shift):
     pair = [Shape(Box((0.2, 0.2, 0.1)), at(-shift)), Shape(Box((0.2, 0.2, 0.1)), at(shift))]
     assert_perfect(quality(solid((Box((0.2 + 2 * shift, 0.2, 0.1)), Pose())), pair))
 
@@ -125,7 +125,7 @@ def test_what_two_boxes_share_counts_once(shift):
     [Shape(Sphere(0.09)), Shape(Box((0.2, 0.2, 0.1)), at(0, 0, 0.05)), CUBE],
     ids=["within", "flush", "equal"],
 )
-def test_a_primitive_within_another_changes_nothing(idle):
+def test_a_primitive_inside_another_changes_nothing(idle):
     small = solid((Box((0.04, 0.04, 0.04)), at(0, 0, -0.06)))
     once = quality(small, [CUBE])
     for both in ([CUBE, idle], [idle, CUBE]):
@@ -134,7 +134,7 @@ def test_a_primitive_within_another_changes_nothing(idle):
             assert getattr(found, name) == pytest.approx(getattr(once, name), rel=5e-3, abs=1e-9)
 
 
-def test_a_skin_around_several_boxes_is_as_thin_as_it_is():
+def test_protrusion_of_a_thin_skin_equals_its_thickness():
     skin = 1e-4
     pair = [
         Shape(Box((0.3 + skin, 0.2 + 2 * skin, 0.1 + 2 * skin)), at(sign * (0.05 + skin / 2)))
@@ -146,7 +146,7 @@ def test_a_skin_around_several_boxes_is_as_thin_as_it_is():
     assert found.hausdorff == pytest.approx(math.sqrt(3) * skin, rel=1e-6)
 
 
-def test_shapes_apart_share_nothing():
+def test_disjoint_shapes_have_no_overlap():
     found = quality(solid_of([CUBE]), [Shape(CUBE.geometry, at(0.5))])
     assert found.iou == found.coverage == 0
     assert found.volume_ratio == pytest.approx(1, rel=1e-3)
@@ -161,7 +161,7 @@ def test_shapes_apart_share_nothing():
         [Shape(Box((0.11, 0.2, 0.2)), at(-0.045)), Shape(Box((0.12, 0.2, 0.2)), at(0.04))],
     ],
 )
-def test_the_walls_of_a_slot_are_as_far_from_the_surface_as_it_is_deep(primitives):
+def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
     slotted = solid(
         (Box((0.096, 0.2, 0.2)), at(-0.052)),
         (Box((0.096, 0.2, 0.2)), at(0.052)),
@@ -175,7 +175,7 @@ def test_the_walls_of_a_slot_are_as_far_from_the_surface_as_it_is_deep(primitive
 
 
 @pytest.mark.parametrize("geometry", KINDS)
-def test_surfaces_are_sampled_evenly(geometry):
+def test_surfaces_are_sampled_uniformly(geometry):
     kernel = Shape(Box((0.02, 0.05, 0.01)), TILTED @ at(0.05, 0.02, 0.03))
     small = solid_of([kernel])
     found = quality(small, [Shape(geometry, TILTED)])
@@ -190,7 +190,7 @@ def test_surfaces_are_sampled_evenly(geometry):
     assert found.coverage == 1
 
 
-def test_a_motion_of_both_changes_no_measure():
+def test_measures_are_invariant_under_rigid_motion():
     pieces = [Shape(Box((0.3, 0.1, 0.1))), Shape(Cylinder(0.06, 0.3), at(0.1, 0, 0.1))]
     stand_ins = [Shape(Capsule(0.06, 0.2), at(0.1, 0, 0.08)), Shape(Box((0.3, 0.12, 0.08)))]
     moved = [
@@ -204,7 +204,7 @@ def test_a_motion_of_both_changes_no_measure():
         assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-3)
 
 
-def test_the_seed_decides_and_errors_are_small():
+def test_measures_are_reproducible_and_sampling_errors_are_small():
     ball = [Shape(Sphere(0.1))]
     cube = solid_of([CUBE])
     found = [quality(cube, ball, seed=seed) for seed in range(8)]
@@ -215,7 +215,7 @@ def test_the_seed_decides_and_errors_are_small():
     assert quality(cube, ball, volume_points=1000) == quality(cube, ball, volume_points=1024)
 
 
-def test_a_mesh_nothing_and_a_flat_box_are_no_primitives(tmp_path):
+def test_meshes_empty_lists_and_flat_boxes_are_errors(tmp_path):
     cube = solid_of([CUBE])
     for wrong in ([], [CUBE, Shape(Mesh(tmp_path / "a.stl"))], [Shape(Box((1, 0, 1)))]):
         with pytest.raises(ValueError, match="primitive"):
@@ -224,7 +224,7 @@ def test_a_mesh_nothing_and_a_flat_box_are_no_primitives(tmp_path):
             signed_distance(wrong, np.zeros((1, 3)))
 
 
-def test_a_solid_too_small_to_be_hit_is_refused():
+def test_a_solid_without_sample_points_is_an_error():
     speck = solid((Box((1e-3, 1e-3, 1e-3)), Pose()))
     with pytest.raises(FitError, match="none of 64 sample points"):
         quality(speck, [Shape(Sphere(1.0), at(5))], volume_points=64)

@@ -1,4 +1,4 @@
-"""A primitive is found again in its own solid, and two in an L; where a search begins."""
+"""Searching for primitives that fit a solid, and the initial guesses of the search."""
 
 import math
 from dataclasses import replace
@@ -51,7 +51,7 @@ def assert_well_formed(shape):
 
 
 @pytest.mark.parametrize("geometry", PRIMITIVES, ids=lambda geometry: type(geometry).__name__)
-def test_a_turned_primitive_is_found_again(geometry):
+def test_a_rotated_primitive_is_recovered(geometry):
     shape, score, solid = fitted(geometry)
     assert type(shape.geometry) is type(geometry)
     assert_well_formed(shape)
@@ -62,7 +62,7 @@ def test_a_turned_primitive_is_found_again(geometry):
     assert score == pytest.approx(quality(solid, [shape]).iou, abs=0.015)
 
 
-def test_the_axis_of_a_cylinder_is_found():
+def test_the_axis_of_a_cylinder_is_recovered():
     shape, _, _ = fitted(Cylinder(0.06, 0.3), seed=1)
     found, true = (pose.matrix[:3, 2] for pose in (shape.T_link_shape, TILTED))
     assert abs(found @ true) == pytest.approx(1.0, abs=1e-3)
@@ -74,7 +74,7 @@ def test_a_sphere_has_no_rotation():
 
 
 @pytest.mark.parametrize("size", [0.01, 10.0])
-def test_neither_size_nor_place_matters(size):
+def test_the_result_does_not_depend_on_size_or_position(size):
     box = Box((0.5 * size, 0.8 * size, size))
     far = Pose((3.0, -2.0, 1.0), TILTED.quaternion)
     shape, score, solid = fitted(box, far)
@@ -84,7 +84,7 @@ def test_neither_size_nor_place_matters(size):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_plate_is_a_plate(seed):
+def test_a_thin_plate_is_recovered(seed):
     """What a primitive holds beyond the points that are drawn must not be free."""
     shape, score, solid = fitted(Box((0.3, 0.2, 0.006)), Pose(), seed)
     iou = quality(solid, [shape]).iou
@@ -94,12 +94,12 @@ def test_a_plate_is_a_plate(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_strut_is_found_however_it_lies(seed):
+def test_a_strut_is_recovered_in_any_orientation(seed):
     shape, _, solid = fitted(Cylinder(0.02, 0.5), TILTED, seed)
     assert quality(solid, [shape]).iou > 0.9
 
 
-def test_two_boxes_are_found_in_an_l():
+def test_an_l_shape_is_fitted_by_two_boxes():
     target = target_of(*ANGLE)
     one = best_single(target)
     two = best_several(target, one, 0)
@@ -116,7 +116,7 @@ def test_two_boxes_are_found_in_an_l():
 
 
 @pytest.mark.slow
-def test_a_cylinder_and_a_box_are_found_together():
+def test_a_cylinder_and_a_box_are_recovered_together():
     parts = (Shape(Cylinder(0.05, 0.3)), Shape(Box((0.4, 0.2, 0.06)), Pose((0, 0, 0.18))))
     target = target_of(*parts)
     shapes = best_several(target, best_single(target), 0).shapes
@@ -153,7 +153,7 @@ def test_another_seed_gives_nearly_the_same_shape():
     )
 
 
-def test_the_points_are_those_of_the_solid_and_around_it():
+def test_sample_points_cover_the_solid_and_its_surroundings():
     shape = Shape(Box((0.1, 0.2, 0.4)), Pose((1.0, 2.0, 3.0)))
     target = target_of(shape)
     size = math.hypot(0.1, 0.2, 0.4)
@@ -170,7 +170,7 @@ def test_the_points_are_those_of_the_solid_and_around_it():
 
 
 @pytest.mark.parametrize("count", [None, 4096])
-def test_weights_are_volumes_so_that_shares_are_those_of_geometry(count):
+def test_sample_weights_are_volumes(count):
     """Also over the first points alone, for they are in no order."""
     target = target_of(Shape(Box((0.1, 0.2, 0.4))))
     points, inside, weights = (
@@ -183,7 +183,7 @@ def test_weights_are_volumes_so_that_shares_are_those_of_geometry(count):
         assert ratio == pytest.approx(factor**3, rel=0.1 if count else 0.03)
 
 
-def test_a_solid_that_fills_next_to_nothing_of_its_bounds_is_refused():
+def test_a_solid_that_fills_almost_none_of_its_bounds_is_an_error():
     frame = [
         trimesh.creation.box((0.001, 0.001, 1.0)),
         trimesh.creation.box((0.001, 1.0, 0.001)),
@@ -204,7 +204,7 @@ def cloud(n=2000):
     return points @ R.T + (0.1, 0.0, 0.2), R
 
 
-def test_guesses_around_a_cloud_are_boxes_and_cylinders_and_if_asked_a_sphere():
+def test_initial_guesses_are_boxes_cylinders_and_optionally_a_sphere():
     points, _ = cloud()
     quick = around(points, [np.eye(3)])
     thorough = around(points, [np.eye(3), TILTED.matrix[:3, :3]], sphere=True)
@@ -221,7 +221,7 @@ def test_guesses_around_a_cloud_are_boxes_and_cylinders_and_if_asked_a_sphere():
         )
 
 
-def test_one_of_the_guesses_is_near_the_truth():
+def test_one_initial_guess_is_near_the_true_primitive():
     points, R = cloud()
     surroundings = np.random.default_rng(1).uniform(-0.4, 0.4, (8000, 3))
     surroundings += (0.1, 0.0, 0.2)
@@ -230,7 +230,7 @@ def test_one_of_the_guesses_is_near_the_truth():
     assert overlaps(around(points, [np.eye(3)]), surroundings, inside).max() > 0.8
 
 
-def test_the_guessed_sphere_is_the_sphere_of_points_in_a_ball():
+def test_the_guessed_sphere_matches_points_in_a_ball():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.3, 0.3, (20000, 3))
     guesses = around(points[np.linalg.norm(points, axis=1) < 0.3] + (1, 2, 3), [], sphere=True)
@@ -239,7 +239,7 @@ def test_the_guessed_sphere_is_the_sphere_of_points_in_a_ball():
     np.testing.assert_allclose(guesses.centres[sphere, 0], (1, 2, 3), atol=0.01)
 
 
-def test_pieces_give_three_guesses_a_clustering_and_the_same_seeds_the_same():
+def test_pieces_give_three_reproducible_guesses_per_clustering():
     target = target_of(*ANGLE)
     seeds = [5, 6]
     first, second = (
@@ -257,13 +257,13 @@ def test_pieces_give_three_guesses_a_clustering_and_the_same_seeds_the_same():
     assert found.max() > 0.6
 
 
-def test_a_solid_of_few_points_is_not_cut():
+def test_a_solid_with_few_points_is_not_split():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
     few = np.arange(500) < 3 * MIN_POINTS
     assert by_pieces(points, few, np.ones(500), 4, [0, 1, 2]) is None
 
 
-def test_more_primitives_than_points_allow_are_none():
+def test_too_few_points_give_no_further_primitives():
     target = target_of(Shape(Cylinder(0.02, 0.5), TILTED))
     one = best_single(target)
     few = replace(target, inside=target.inside & (np.cumsum(target.inside) < MIN_POINTS))
@@ -271,7 +271,7 @@ def test_more_primitives_than_points_allow_are_none():
 
 
 @pytest.mark.slow
-def test_one_more_primitive_begins_where_those_found_leave_the_solid_out():
+def test_an_added_primitive_starts_at_the_uncovered_part_of_the_solid():
     arms = [Shape(Box((0.5, 0.1, 0.1)), Pose((0.0, y, 0.0))) for y in (-0.4, 0.0, 0.4)]
     spine = Shape(Box((0.1, 0.9, 0.1)), Pose((-0.2, 0.0, 0.0)))
     target = target_of(spine, *arms)
@@ -282,7 +282,7 @@ def test_one_more_primitive_begins_where_those_found_leave_the_solid_out():
     assert quality(target.solid, found.shapes).iou > 0.93
 
 
-def test_nothing_left_out_gives_no_guess_of_one_more():
+def test_a_fully_covered_solid_gives_no_further_guess():
     target = target_of(Shape(Box((0.1, 0.2, 0.3))))
     one = best_single(target)
     some = target.points[target.inside & covered(one.candidate, target.points)[0]]
@@ -290,7 +290,7 @@ def test_nothing_left_out_gives_no_guess_of_one_more():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_thin_solid_at_an_angle_is_met_by_points_too(seed):
+def test_thin_tilted_solids_are_sampled_and_fitted(seed):
     rod = Shape(Cylinder(0.005, 0.3), TILTED)
     plate = Shape(Box((0.3, 0.3, 0.006)), TILTED)
     for shape in (rod, plate):

@@ -1,4 +1,4 @@
-"""Overlaps that geometry knows, and candidates that climb to where they belong."""
+"""The soft overlap of primitives and points: closed forms and gradient ascent."""
 
 import itertools
 import math
@@ -50,7 +50,7 @@ def iou(first, second):
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 @pytest.mark.parametrize("quaternion", [UPRIGHT, TILTED])
 @pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE])
-def test_a_primitive_overlaps_itself_wholly(kind, quaternion, scale):
+def test_a_primitive_overlaps_itself_completely(kind, quaternion, scale):
     inside = within(kind, turned(GRID, quaternion), HALVES)
     assert inside.sum() > 400
     again = primitive(kind, quaternion=tuple(scale * q for q in quaternion))
@@ -69,7 +69,7 @@ def test_the_frame_of_the_tilted_primitive_is_a_rotation():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("shift", [0.05, 0.1])
-def test_the_overlap_of_shifted_boxes_is_that_of_geometry(axis, shift):
+def test_the_overlap_of_shifted_boxes_matches_the_closed_form(axis, shift):
     inside = within(BOX, GRID, HALVES)
     centre = np.eye(3)[axis] * shift
     edge = 2 * HALVES[axis]
@@ -77,14 +77,14 @@ def test_the_overlap_of_shifted_boxes_is_that_of_geometry(axis, shift):
     assert overlaps(primitive(BOX, centre), GRID, inside) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_box_turned_a_quarter_has_its_edges_swapped():
+def test_a_box_rotated_by_90_degrees_has_swapped_edges():
     inside = within(BOX, GRID, (0.2, 0.3, 0.1))
     quarter = (math.sqrt(0.5), 0, 0, math.sqrt(0.5))
     assert overlaps(primitive(BOX, quaternion=quarter), GRID, inside) == pytest.approx(1.0)
     assert overlaps(primitive(BOX), GRID, inside) == pytest.approx(0.04 / 0.08, abs=1e-6)
 
 
-def test_concentric_spheres_and_cylinders_overlap_by_their_volumes():
+def test_the_overlap_of_concentric_primitives_is_their_volume_ratio():
     ball = within(SPHERE, GRID, (0.45,))
     found = overlaps(primitive(SPHERE, halves=(0.36, 1, 1)), GRID, ball)
     assert found == pytest.approx(0.8**3, rel=0.02)
@@ -95,14 +95,14 @@ def test_concentric_spheres_and_cylinders_overlap_by_their_volumes():
     assert found == pytest.approx(0.7 / 0.9, abs=1e-6)
 
 
-def test_what_misses_overlaps_nothing():
+def test_disjoint_primitives_and_empty_targets_have_zero_overlap():
     nothing = np.zeros(len(GRID), dtype=bool)
     assert overlaps(primitive(BOX), GRID, nothing).tolist() == [0.0]
     assert overlaps(primitive(BOX, (9, 9, 9)), GRID, nothing).tolist() == [0.0]
     assert overlaps(primitive(BOX, (9, 9, 9)), GRID, ~nothing).tolist() == [0.0]
 
 
-def test_points_count_by_their_weights():
+def test_points_are_weighted():
     left = primitive(BOX, (-0.15, 0, 0), halves=(0.15, 0.2, 0.1))
     inside = within(BOX, GRID, HALVES)
     weights = np.where(GRID[:, 0] < 0, 3.0, 1.0)
@@ -133,7 +133,7 @@ def test_the_order_of_kinds_in_a_row_does_not_matter(order):
     assert overlaps(row, GRID, inside) == pytest.approx(iou(union, inside), abs=1e-3)
 
 
-def test_rows_of_other_kinds_do_not_mix():
+def test_candidates_of_different_kinds_are_independent():
     rows = [primitive(kind, centre, TILTED, halves) for kind, centre, halves in PARTS]
     inside = within(BOX, GRID, HALVES)
     alone = [overlaps(row, GRID, inside)[0] for row in rows]
@@ -143,14 +143,14 @@ def test_rows_of_other_kinds_do_not_mix():
         np.testing.assert_array_equal(overlaps(stacked, GRID, inside), [alone[i] for i in order])
 
 
-def test_overlapping_primitives_count_once():
+def test_overlapping_primitives_are_counted_once():
     halves = [primitive(BOX, (x, 0, 0), halves=(0.2, 0.2, 0.1)) for x in (-0.1, 0.1)]
     inside = within(BOX, GRID, HALVES)
     assert overlaps(Candidates.join(halves), GRID, inside) == pytest.approx(1.0)
     assert overlaps(Candidates.join([halves[0]] * 2), GRID, inside) == pytest.approx(2 / 3)
 
 
-def test_more_candidates_than_are_evaluated_together_give_the_same():
+def test_evaluation_in_batches_does_not_change_the_result():
     rng = np.random.default_rng(0)
     n = 200
     many = Candidates(
@@ -168,7 +168,7 @@ def test_more_candidates_than_are_evaluated_together_give_the_same():
         )
 
 
-def test_candidates_are_taken_stacked_and_joined():
+def test_candidates_can_be_indexed_stacked_and_joined():
     one, two = primitive(BOX), primitive(SPHERE, (0.1, 0.2, 0.3))
     stacked = Candidates.stack([one, two])
     assert stacked.kinds.tolist() == [[BOX], [SPHERE]]
@@ -184,7 +184,7 @@ TRUE = (0.35, 0.25, 0.15)
 
 
 @pytest.mark.parametrize("quaternion", [UPRIGHT, TILTED])
-def test_a_box_that_is_shifted_and_shrunk_climbs_onto_the_true_one(quaternion):
+def test_ascent_recovers_a_shifted_and_shrunk_box(quaternion):
     inside = within(BOX, turned(POINTS, quaternion), TRUE)
     halves = tuple(0.8 * half for half in TRUE)
     start = primitive(BOX, (0.05, -0.04, 0.03), quaternion, halves)
@@ -200,14 +200,14 @@ def test_a_box_that_is_shifted_and_shrunk_climbs_onto_the_true_one(quaternion):
     ("kind", "true", "start"),
     [(CYLINDER, (0.3, 0.3, 0.4), (0.2, 0.2, 0.3)), (SPHERE, (0.4,) * 3, (0.25,) * 3)],
 )
-def test_cylinders_and_spheres_climb_too(kind, true, start):
+def test_ascent_recovers_cylinders_and_spheres(kind, true, start):
     inside = within(kind, POINTS, true)
     moved = ascend(primitive(kind, (0.05, 0.05, -0.05), halves=start), POINTS, inside, **CLIMB)
     assert overlaps(moved, GRID, within(kind, GRID, true))[0] > 0.97
     assert moved.halves[0, 0, 0] == pytest.approx(true[0], abs=0.01)
 
 
-def test_a_tilt_is_turned_back():
+def test_ascent_recovers_a_tilt():
     inside = within(BOX, POINTS, TRUE)
     moved = ascend(
         primitive(BOX, quaternion=(1.0, 0.1, -0.05, 0.15), halves=TRUE), POINTS, inside, **CLIMB
@@ -215,7 +215,7 @@ def test_a_tilt_is_turned_back():
     assert overlaps(moved, GRID, within(BOX, GRID, TRUE))[0] > 0.97
 
 
-def test_several_candidates_of_several_primitives_climb_at_once():
+def test_ascent_of_several_candidates_with_several_primitives():
     left, right = (np.array((x, 0, 0)) for x in (-0.25, 0.25))
     inside = within(BOX, POINTS - left, (0.15, 0.3, 0.2)) | within(SPHERE, POINTS - right, (0.2,))
     pair = Candidates.join(
@@ -234,7 +234,7 @@ def test_several_candidates_of_several_primitives_climb_at_once():
     np.testing.assert_allclose(moved.centres[0], moved.centres[1, ::-1], atol=1e-3)
 
 
-def test_points_of_no_weight_are_not_missed():
+def test_points_with_zero_weight_are_ignored():
     """A solid of two boxes: a candidate spans both, or holds the one that its weights leave."""
     halves = (0.125, 0.3, 0.2)
     boxes = [within(BOX, POINTS - np.array((x, 0, 0)), halves) for x in (-0.25, 0.25)]
@@ -249,7 +249,7 @@ def test_points_of_no_weight_are_not_missed():
     np.testing.assert_allclose(plain.halves[:, 0, 0], 0.375, atol=0.01)
 
 
-def test_the_start_is_left_alone_and_the_same_start_ends_the_same():
+def test_ascent_is_deterministic_and_does_not_modify_its_start():
     inside = within(BOX, turned(POINTS, TILTED), TRUE)
     start = Candidates.stack([primitive(kind, (0.02, 0, 0)) for kind in (SPHERE, BOX, CYLINDER)])
     before = [array.copy() for array in (start.centres, start.quaternions, start.halves)]
@@ -262,7 +262,7 @@ def test_the_start_is_left_alone_and_the_same_start_ends_the_same():
 
 
 @pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE])
-def test_a_point_in_the_very_middle_spoils_no_gradient(kind):
+def test_a_point_at_the_centre_has_finite_gradients(kind):
     points = np.concatenate([np.zeros((1, 3)), POINTS[:500]])
     moved = ascend(primitive(kind), points, within(BOX, points, TRUE), **(CLIMB | {"num_steps": 5}))
     assert all(

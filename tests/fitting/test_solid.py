@@ -1,4 +1,4 @@
-"""What is inside of meshes as they are found: open, nested, inside out, doubled, flat, enormous."""
+"""Solids of defective meshes: open, nested, inverted, duplicated, flat and very large."""
 
 import math
 
@@ -69,7 +69,7 @@ def strip(angle, n=24):
     return trimesh.Trimesh(vertices, faces)
 
 
-def test_a_closed_box_is_the_box():
+def test_a_closed_box_is_its_own_solid():
     solid = solid_of_mesh(box())
     assert (solid.method, solid.decimated_from) == ("watertight", None)
     assert counted(solid) == pytest.approx(BOX_VOLUME, rel=1e-9)
@@ -77,18 +77,18 @@ def test_a_closed_box_is_the_box():
     assert solid.hull.volume == pytest.approx(BOX_VOLUME)
 
 
-def test_what_is_inside_of_an_l_is_not_what_is_inside_of_its_hull():
+def test_the_solid_of_an_l_is_not_its_convex_hull():
     solid = solid_of_mesh(angle())
     assert solid.method == "watertight"
     assert counted(solid) == pytest.approx(0.014, rel=1e-9)
     assert solid.contains(np.array([(-0.15, 0.1, 0), (0, 0, 0)])).tolist() == [True, False]
 
 
-def test_points_beyond_the_bounding_box_are_outside():
+def test_points_outside_the_bounding_box_are_outside():
     assert not solid_of_mesh(box()).contains(np.array([(0.1001, 0, 0), (5, 5, 5)])).any()
 
 
-def test_a_box_that_is_inside_out_is_turned():
+def test_an_inverted_box_is_repaired():
     solid = solid_of_mesh(box(inverted=True))
     assert solid.method == "repaired"
     assert solid.mesh.volume == pytest.approx(BOX_VOLUME)
@@ -96,7 +96,7 @@ def test_a_box_that_is_inside_out_is_turned():
 
 
 @pytest.mark.parametrize("flipped", range(1, 12, 3))
-def test_triangles_that_are_turned_the_wrong_way_are_turned_back(flipped):
+def test_inverted_triangles_are_repaired(flipped):
     mesh = box()
     faces = mesh.faces.copy()
     faces[:flipped] = faces[:flipped, ::-1]
@@ -107,7 +107,7 @@ def test_triangles_that_are_turned_the_wrong_way_are_turned_back(flipped):
 
 @pytest.mark.parametrize("outer", [False, True])
 @pytest.mark.parametrize("inner", [False, True])
-def test_a_cavity_is_filled_whichever_way_its_triangles_face(inner, outer):
+def test_a_cavity_is_filled_for_any_triangle_orientation(inner, outer):
     nested = [box(inverted=outer), box((0.1, 0.1, 0.1), inverted=inner)]
     solid = solid_of_mesh(trimesh.util.concatenate(nested))
     assert solid.method == ("repaired" if inner or outer else "watertight")
@@ -115,7 +115,7 @@ def test_a_cavity_is_filled_whichever_way_its_triangles_face(inner, outer):
 
 
 @pytest.mark.parametrize("inverted", [(False, False), (False, True), (True, True)])
-def test_boxes_that_overlap_count_as_their_union(inverted):
+def test_overlapping_boxes_form_their_union(inverted):
     first, second = inverted
     boxes = [box((0.2,) * 3, (-0.06, 0, 0), first), box((0.2,) * 3, (0.06, 0, 0), second)]
     solid = solid_of_mesh(trimesh.util.concatenate(boxes))
@@ -125,7 +125,7 @@ def test_boxes_that_overlap_count_as_their_union(inverted):
 
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize("inverted", [False, True])
-def test_a_mesh_that_is_there_twice_counts_once(merged, inverted):
+def test_a_duplicated_mesh_is_counted_once(merged, inverted):
     again = angle()
     if inverted:
         again.invert()
@@ -135,7 +135,7 @@ def test_a_mesh_that_is_there_twice_counts_once(merged, inverted):
     assert counted(solid_of_mesh(twice)) == pytest.approx(0.014, rel=1e-9)
 
 
-def test_boxes_that_share_the_vertices_of_a_face_are_one_body():
+def test_boxes_that_share_the_vertices_of_a_face_are_one_solid():
     stacked = trimesh.util.concatenate([box((0.2,) * 3, (0, 0, z)) for z in (-0.1, 0.1)])
     stacked.merge_vertices()
     solid = solid_of_mesh(stacked)
@@ -145,7 +145,7 @@ def test_boxes_that_share_the_vertices_of_a_face_are_one_body():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_box_without_a_face_is_filled(axis, side):
+def test_a_box_with_a_missing_face_is_closed(axis, side):
     whole = box()
     mesh = without(whole, whole.face_normals[:, axis] * side > 0.5)
     assert len(mesh.faces) == 10
@@ -156,7 +156,7 @@ def test_a_box_without_a_face_is_filled(axis, side):
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
-def test_triangles_that_share_no_vertices_are_welded(size):
+def test_unmerged_vertices_are_welded(size):
     rng = np.random.default_rng(0)
     corners = size * box().triangles
     mesh = soup(corners + rng.uniform(-1e-7, 1e-7, corners.shape) * size)
@@ -166,7 +166,7 @@ def test_triangles_that_share_no_vertices_are_welded(size):
     assert solid.mesh.volume == pytest.approx(BOX_VOLUME * size**3, rel=1e-5)
 
 
-def test_triangles_that_share_no_vertices_and_face_any_way_are_turned_outwards():
+def test_unmerged_randomly_oriented_triangles_are_oriented_outwards():
     corners = box().triangles.copy()
     corners[::3] = corners[::3, ::-1]
     solid = solid_of_mesh(soup(corners))
@@ -176,7 +176,7 @@ def test_triangles_that_share_no_vertices_and_face_any_way_are_turned_outwards()
 
 @pytest.mark.parametrize("gap", [1e-5, 1e-4, 1e-3])
 @pytest.mark.parametrize("whole", [box(), angle()], ids=["box", "angle"])
-def test_faces_that_stand_apart_still_enclose(whole, gap):
+def test_faces_with_gaps_enclose_a_solid(whole, gap):
     mesh = soup(whole.triangles + gap * whole.face_normals[:, None])
     mesh.merge_vertices()
     solid = solid_of_mesh(mesh)
@@ -185,7 +185,7 @@ def test_faces_that_stand_apart_still_enclose(whole, gap):
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_a_sphere_with_holes_all_over_is_decided_by_its_winding_number(inverted):
+def test_a_sphere_with_many_holes_is_solid_by_winding_number(inverted):
     ball = trimesh.creation.icosphere(3, 0.2)
     if inverted:
         ball.invert()
@@ -197,7 +197,7 @@ def test_a_sphere_with_holes_all_over_is_decided_by_its_winding_number(inverted)
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_half_a_tube_holds_part_of_what_it_bends_around(turned):
+def test_half_a_tube_is_solid_by_winding_number(turned):
     mesh = strip(math.pi)
     if turned:
         mesh.invert()
@@ -209,7 +209,7 @@ def test_half_a_tube_holds_part_of_what_it_bends_around(turned):
     assert 0.3 < counted(solid) / (math.pi * 0.2**2 / 2 * 0.4) < 1
 
 
-def test_a_sheet_that_encloses_next_to_nothing_is_its_hull():
+def test_a_sheet_that_encloses_almost_nothing_becomes_its_convex_hull():
     axis = np.linspace(-0.2, 0.2, 20)
     x, y = (each.ravel() for each in np.meshgrid(axis, axis, indexing="ij"))
     corner = np.arange(400).reshape(20, 20)
@@ -231,7 +231,7 @@ def write(mesh, path):
 @pytest.mark.parametrize(
     "pose", [Pose(), Pose((3.0, -2.0, 1.0)), TILTED], ids=["here", "off", "tilted"]
 )
-def test_what_is_flat_is_refused(tmp_path, pose):
+def test_flat_meshes_are_errors(tmp_path, pose):
     square = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], [(0, 1, 2), (1, 3, 2)])
     shape = Shape(write(square, tmp_path / "square.stl").geometry, pose)
     with pytest.raises(FitError, match="flat"):
@@ -241,12 +241,12 @@ def test_what_is_flat_is_refused(tmp_path, pose):
     assert counted(solid_of([shape, Shape(Box(SIZE))])) == pytest.approx(BOX_VOLUME, rel=1e-9)
 
 
-def test_no_shapes_are_refused():
+def test_an_empty_list_of_shapes_is_an_error():
     with pytest.raises(FitError, match="no shapes"):
         solid_of([])
 
 
-def test_a_mesh_that_cannot_be_read_is_refused(tmp_path):
+def test_an_unreadable_mesh_is_an_error(tmp_path):
     with pytest.raises(MeshError, match=r"lost\.stl"):
         solid_of([Shape(Box(SIZE)), Shape(Mesh(tmp_path / "lost.stl"))])
 
@@ -265,7 +265,7 @@ def test_a_primitive_is_its_own_solid(geometry, pose):
     np.testing.assert_allclose(inside.mean(axis=0), pose.position, atol=1e-3)
 
 
-def test_shapes_of_every_kind_are_one_solid_and_the_worst_names_its_method(tmp_path):
+def test_shapes_of_all_kinds_form_one_solid_with_the_least_reliable_method(tmp_path):
     whole = box()
     ball = trimesh.creation.icosphere(3, 0.1)
     holes = np.random.default_rng(0).random(len(ball.faces)) < 0.2
@@ -288,12 +288,12 @@ def test_shapes_of_every_kind_are_one_solid_and_the_worst_names_its_method(tmp_p
     assert solid_of([opened, ragged, *closed]).method == "winding"
 
 
-def test_the_same_shape_twice_is_the_shape():
+def test_a_duplicated_shape_is_counted_once():
     shape = Shape(Box(SIZE))
     assert counted(solid_of([shape, shape])) == pytest.approx(BOX_VOLUME, rel=1e-9)
 
 
-def test_an_enormous_mesh_is_decimated_and_says_from_what(tmp_path):
+def test_a_very_large_mesh_is_decimated_and_records_its_face_count(tmp_path):
     ball = trimesh.creation.icosphere(7, 0.2)
     assert len(ball.faces) > MAX_FACES
     solid = solid_of_mesh(ball)
@@ -306,13 +306,13 @@ def test_an_enormous_mesh_is_decimated_and_says_from_what(tmp_path):
     assert several.decimated_from == len(ball.faces) + 12
 
 
-def test_distances_are_those_of_the_surface():
+def test_distances_are_measured_to_the_surface():
     points = np.array([(0, 0, 0), (0.1, 0, 0), (0.3, 0, 0), (0.09, 0, 0), (0.2, 0.35, 0.2)])
     far = [0.1, 0, 0.2, 0.01, math.hypot(0.1, 0.2)]
     np.testing.assert_allclose(solid_of_mesh(box()).distance(points), far, atol=1e-12)
 
 
-def test_the_surface_of_a_box_is_sampled_evenly():
+def test_the_surface_of_a_box_is_sampled_uniformly():
     points = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
     assert len(points) == pytest.approx(6000, rel=0.02)
     beyond = np.abs(points) - np.array(SIZE) / 2
@@ -324,7 +324,7 @@ def test_the_surface_of_a_box_is_sampled_evenly():
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_the_surface_leaves_out_what_is_within(inverted):
+def test_the_surface_excludes_enclosed_faces(inverted):
     nested = [box(), box((0.15, 0.25, 0.35), inverted=inverted)]
     solid = solid_of_mesh(trimesh.util.concatenate(nested))
     points = solid.surface(4000, np.random.default_rng(0))
@@ -334,7 +334,7 @@ def test_the_surface_leaves_out_what_is_within(inverted):
     np.testing.assert_allclose(beyond.max(axis=1), 0, atol=1e-9)
 
 
-def test_the_surface_of_boxes_that_overlap_is_that_of_their_union():
+def test_the_surface_of_overlapping_boxes_is_that_of_their_union():
     boxes = [box((0.2, 0.2, 0.2), (-0.05, 0, 0)), box((0.2, 0.1, 0.1), (0.1, 0, 0))]
     solid = solid_of_mesh(trimesh.util.concatenate(boxes))
     points = solid.surface(4000, np.random.default_rng(0))
@@ -349,13 +349,13 @@ def test_the_surface_of_boxes_that_overlap_is_that_of_their_union():
     }
 
 
-def test_the_same_generator_draws_the_same_surface():
+def test_surface_samples_are_reproducible():
     solid = solid_of_mesh(angle())
     first, second = (solid.surface(100, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
-def test_the_meshes_that_are_given_are_left_alone():
+def test_the_given_meshes_are_not_modified():
     for mesh in (box(inverted=True), without(box(), np.arange(12) < 2)):
         before = mesh.vertices.copy(), mesh.faces.copy()
         solid_of_mesh(mesh)

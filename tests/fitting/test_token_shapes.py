@@ -1,4 +1,4 @@
-"""The one primitive of each link, from wherever it is cheapest."""
+"""The primitive that represents each link in the tokens."""
 
 import json
 
@@ -36,12 +36,12 @@ def robot_of(*shapes):
     return Robot("r", links, (Joint("j", "fixed", "base", "body"),))
 
 
-def test_a_link_that_is_one_primitive_keeps_it(no_search):
+def test_a_link_of_one_primitive_keeps_it(no_search):
     can = Shape(Cylinder(0.1, 0.2), Pose((0.1, 0.0, 0.0)), rgba=(1.0, 0.0, 0.0, 1.0))
     assert token_shapes(robot_of(can)) == {"body": Shape(can.geometry, can.T_link_shape)}
 
 
-def test_a_link_that_only_shows_has_no_primitive(no_search):
+def test_a_link_without_collision_shapes_has_no_primitive(no_search):
     can = Shape(Cylinder(0.1, 0.2))
     links = (Link("base", visuals=(can,)), Link("body", visuals=(can,), collisions=(can,)))
     robot = Robot("r", links, (Joint("j", "fixed", "base", "body"),))
@@ -49,7 +49,7 @@ def test_a_link_that_only_shows_has_no_primitive(no_search):
 
 
 @pytest.mark.parametrize("words", ["prims", "stick", "chain", "tongs"])
-def test_rails_and_masts_of_bodies_are_scenery(words):
+def test_rails_and_masts_without_collision_shapes_have_no_primitive(words):
     robot = morphgen.compose(words)
     shapes = token_shapes(robot)
     seen = {link.name for link in robot.links if link.visuals and not link.collisions}
@@ -57,14 +57,14 @@ def test_rails_and_masts_of_bodies_are_scenery(words):
     assert shapes.keys() == {link.name for link in robot.links if link.collisions}
 
 
-def test_a_primitive_that_others_hardly_add_to_stands_for_the_link(no_search):
+def test_a_dominant_primitive_represents_the_link(no_search):
     disc, lug = Shape(Cylinder(0.07, 0.05)), Shape(Box((0.02, 0.005, 0.03)), Pose((0.0, 0.0, 0.02)))
     assert token_shapes(robot_of(lug, disc)) == {"body": disc}
     with pytest.raises(AssertionError, match="searched for"):
         token_shapes(robot_of(disc, Shape(Sphere(0.08), Pose((0.05, 0.0, 0.0)))))
 
 
-def test_meshes_of_the_library_cost_no_search_also_scaled_ones(no_search):
+def test_library_meshes_need_no_search_even_if_scaled(no_search):
     arm = morphgen.compose("arm=panda")
     larger = morphgen.compose("arm=panda_scaled arm.scale3=1.4")
     plain, scaled = (token_shapes(robot, FOLDERS) for robot in (arm, larger))
@@ -79,7 +79,7 @@ def test_meshes_of_the_library_cost_no_search_also_scaled_ones(no_search):
     assert scaled[other[0]] == morphgen.model.geometry.scale_shape(plain[other[0]], 1.4)
 
 
-def test_what_is_stored_nowhere_is_searched_once(monkeypatch, cache):
+def test_a_new_mesh_is_searched_once(monkeypatch, cache):
     shapes = [Shape(Box((0.1, 0.1, 0.4))), Shape(Box((0.1, 0.1, 0.38)), Pose((0.0, 0.0, 0.02)))]
     first = token_shapes(robot_of(*shapes))
     assert isinstance(first["body"].geometry, Box)
@@ -88,7 +88,7 @@ def test_what_is_stored_nowhere_is_searched_once(monkeypatch, cache):
     assert token_shapes(robot_of(*shapes)) == first
 
 
-def test_a_flat_link_has_no_primitive_and_that_is_remembered(tmp_path, monkeypatch):
+def test_a_flat_link_has_no_primitive_and_the_result_is_cached(tmp_path, monkeypatch):
     flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     flat.export(tmp_path / "flat.stl")
     robot = robot_of(Shape(Mesh(tmp_path / "flat.stl")))
@@ -97,7 +97,7 @@ def test_a_flat_link_has_no_primitive_and_that_is_remembered(tmp_path, monkeypat
     assert token_shapes(robot) == {}
 
 
-def test_a_broken_cache_is_named(cache):
+def test_a_broken_cache_is_an_error(cache):
     shapes = [Shape(Sphere(0.1)), Shape(Sphere(0.1), Pose((0.05, 0.0, 0.0)))]
     token_shapes(robot_of(*shapes))
     (path,) = cache.rglob("*.json")
@@ -106,7 +106,7 @@ def test_a_broken_cache_is_named(cache):
         token_shapes(robot_of(*shapes))
 
 
-def test_a_cache_that_cannot_be_written_is_told(cache):
+def test_a_cache_that_cannot_be_written_is_reported(cache):
     cache.write_text("a file")
     shapes = [Shape(Sphere(0.1)), Shape(Sphere(0.1), Pose((0.05, 0.0, 0.0)))]
     with pytest.warns(UserWarning, match="cannot keep a fit"):

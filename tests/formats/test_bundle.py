@@ -1,4 +1,4 @@
-"""The bundle: complete or absent, the same bytes each time, and it reads back."""
+"""Robot bundles: atomic and reproducible writing, reading, and detection of changed files."""
 
 import json
 import stat
@@ -22,13 +22,13 @@ def files(folder):
     }
 
 
-def test_it_holds_urdf_mjcf_card_and_picture(tmp_path):
+def test_a_bundle_has_urdf_mjcf_card_and_picture(tmp_path):
     folder = write_bundle(arm(), tmp_path / "arm")
     assert set(files(folder)) == {"robot.urdf", "robot.xml", "card.json", "preview.png"}
     assert (tmp_path / "arm").stat().st_mode & stat.S_IROTH
 
 
-def test_it_reads_back(tmp_path):
+def test_a_bundle_round_trips(tmp_path):
     robot = arm()
     back = read_bundle(write_bundle(robot, tmp_path / "arm", picture=False))
     assert back.home == robot.home
@@ -49,7 +49,7 @@ def test_reading_and_writing_again_gives_the_same_urdf(tmp_path):
     assert files(first)["robot.urdf"] == files(second)["robot.urdf"]
 
 
-def test_the_picture_shows_something(tmp_path):
+def test_the_picture_is_not_blank(tmp_path):
     picture = Image.open(write_bundle(arm(), tmp_path / "arm") / "preview.png")
     pixels = np.asarray(picture.convert("L"))
     assert picture.size == (640, 480)
@@ -57,7 +57,7 @@ def test_the_picture_shows_something(tmp_path):
     assert 0.01 < drawn < 0.6
 
 
-def test_meshes_are_written_once_in_metres(tmp_path):
+def test_meshes_are_written_once_and_in_metres(tmp_path):
     source = tmp_path / "cube.stl"
     trimesh.creation.box(extents=(100, 100, 100)).export(source)
     mesh = Mesh(source, (0.001, 0.001, 0.001))
@@ -69,7 +69,7 @@ def test_meshes_are_written_once_in_metres(tmp_path):
     assert [p.name for p in (again / "meshes").iterdir()] == [written.name]
 
 
-def test_an_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
+def test_an_interrupted_write_leaves_no_folder(tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -79,7 +79,7 @@ def test_an_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_an_interrupted_replacement_leaves_the_old_one(tmp_path, monkeypatch):
+def test_an_interrupted_replacement_keeps_the_old_bundle(tmp_path, monkeypatch):
     before = files(write_bundle(arm(), tmp_path / "arm", picture=False))
 
     def interrupt(*_):
@@ -100,21 +100,21 @@ def test_a_folder_that_is_not_a_bundle_is_not_replaced(tmp_path):
     assert (tmp_path / "precious" / "thesis.txt").exists()
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(FormatError, match="cannot write to"):
         write_bundle(arm(), tmp_path / "file" / "arm")
 
 
 @pytest.mark.parametrize(("content", "message"), [("{", "invalid JSON"), ('{"format": 99}', "99")])
-def test_a_broken_card_is_refused(tmp_path, content, message):
+def test_a_broken_card_is_an_error(tmp_path, content, message):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     (folder / "card.json").write_text(content)
     with pytest.raises(FormatError, match=message):
         read_bundle(folder)
 
 
-def test_the_card_says_what_the_robot_is(tmp_path):
+def test_the_card_describes_the_robot(tmp_path):
     card = json.loads(
         (write_bundle(arm(), tmp_path / "arm", picture=False) / "card.json").read_text()
     )
@@ -124,7 +124,7 @@ def test_the_card_says_what_the_robot_is(tmp_path):
     assert set(card["actuation"]) == {"shoulder", "elbow", "extend", "left"}
 
 
-def test_a_file_that_was_changed_or_lost_is_told(tmp_path):
+def test_changed_and_missing_files_are_reported(tmp_path):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     assert file_findings(folder) == ()
     (folder / "robot.urdf").write_text((folder / "robot.urdf").read_text() + "<!-- mine -->")
@@ -134,7 +134,7 @@ def test_a_file_that_was_changed_or_lost_is_told(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../other", "meshes/../../x"])
-def test_a_card_that_names_a_file_outside_is_refused(tmp_path, name):
+def test_a_card_that_references_a_file_outside_the_bundle_is_an_error(tmp_path, name):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     card = json.loads((folder / "card.json").read_text())
     (folder / "card.json").write_text(json.dumps({**card, "hashes": {name: "0"}}))
@@ -143,7 +143,7 @@ def test_a_card_that_names_a_file_outside_is_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a" * 300])
-def test_a_card_that_names_what_no_file_is_called_tells_so(tmp_path, name):
+def test_an_invalid_file_name_in_a_card_is_reported_as_missing(tmp_path, name):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     card = json.loads((folder / "card.json").read_text())
     (folder / "card.json").write_text(json.dumps({**card, "hashes": {name: "0"}}))
@@ -167,7 +167,7 @@ def test_a_card_that_names_what_no_file_is_called_tells_so(tmp_path, name):
     ],
     ids=str,
 )
-def test_a_card_of_the_wrong_kind_is_refused(tmp_path, change):
+def test_a_card_of_the_wrong_type_is_an_error(tmp_path, change):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     card = json.loads((folder / "card.json").read_text())
     (folder / "card.json").write_text(json.dumps({**card, **change}))

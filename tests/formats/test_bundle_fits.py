@@ -1,4 +1,4 @@
-"""Fits travel with the bundle, and are believed only where they fit."""
+"""Stored fits in bundles: carried over, validated, and ignored when shapes change."""
 
 import json
 import shutil
@@ -40,7 +40,7 @@ def folder(written, tmp_path):
     return shutil.copytree(written, tmp_path / "ur5")
 
 
-def test_a_bundle_brings_the_fits_of_its_parts(folder):
+def test_a_bundle_contains_the_fits_of_its_parts(folder):
     robot, back = morphgen.compose(WORDS), read_bundle(folder)
     assert token_shapes(back) == token_shapes(robot)
     ours, theirs = (
@@ -49,7 +49,7 @@ def test_a_bundle_brings_the_fits_of_its_parts(folder):
     assert ours == theirs
 
 
-def test_one_robot_has_one_token_a_link_whatever_its_geometry(tmp_path):
+def test_token_shapes_do_not_depend_on_the_collision_geometry(tmp_path):
     robot = morphgen.compose(WORDS)
     made = morphgen.compose(WORDS, geometry="primitive")
     back = read_bundle(write_bundle(made, tmp_path / "prims", picture=False))
@@ -59,17 +59,17 @@ def test_one_robot_has_one_token_a_link_whatever_its_geometry(tmp_path):
     )
 
 
-def test_fits_survive_a_second_bundle(folder, tmp_path):
+def test_fits_are_kept_when_a_bundle_is_rewritten(folder, tmp_path):
     again = write_bundle(read_bundle(folder), tmp_path / "again", picture=False)
     assert (again / FITS).read_bytes() == (folder / FITS).read_bytes()
 
 
-def test_a_robot_without_meshes_has_no_file_of_fits(tmp_path):
+def test_a_robot_without_meshes_has_no_fits_file(tmp_path):
     folder = write_bundle(morphgen.compose("prims"), tmp_path / "prims", picture=False)
     assert not (folder / FITS).exists()
 
 
-def test_an_edited_mesh_is_not_given_the_fit_of_the_one_before(folder):
+def test_an_edited_mesh_does_not_use_the_fit_of_the_original(folder):
     link = read_bundle(folder).link("arm_forearm_link")
     path = link.collisions[0].geometry.path
     trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
@@ -77,7 +77,7 @@ def test_an_edited_mesh_is_not_given_the_fit_of_the_one_before(folder):
         token_shapes(read_bundle(folder))
 
 
-def test_fits_of_another_fitter_are_left_alone(folder):
+def test_fits_of_another_fitter_version_are_ignored(folder):
     data = json.loads((folder / FITS).read_text())
     (folder / FITS).write_text(json.dumps(data | {"fitter": 1}))
     assert read_bundle(folder).fits == {}
@@ -108,7 +108,7 @@ def foreign(folder, change):
         ),
     ],
 )
-def test_a_stranger_s_fits_are_refused_in_one_line(folder, capsys, change, why):
+def test_invalid_fits_are_a_one_line_error(folder, capsys, change, why):
     foreign(folder, change)
     assert main(["tokens", str(folder)]) == 2
     error = capsys.readouterr().err.strip()
@@ -117,14 +117,14 @@ def test_a_stranger_s_fits_are_refused_in_one_line(folder, capsys, change, why):
     assert "\n" not in error
 
 
-def test_fits_outside_of_the_bundle_are_not_read(folder, tmp_path):
+def test_links_to_fits_outside_the_bundle_are_not_followed(folder, tmp_path):
     (folder / FITS).rename(tmp_path / "elsewhere.json")
     (folder / FITS).symlink_to(tmp_path / "elsewhere.json")
     with pytest.raises(FormatError, match="leaves the bundle"):
         read_bundle(folder)
 
 
-def test_fits_do_not_outlive_the_shapes(folder):
+def test_fits_are_ignored_when_the_shapes_change(folder):
     robot = read_bundle(folder)
     link = robot.link("arm_forearm_link")
     changed = replace(link, collisions=robot.link("arm_upper_arm_link").collisions)

@@ -1,4 +1,4 @@
-"""Files that mean harm: ``check``, ``show``, ``import`` say why in one line and keep nothing."""
+"""Malicious input files: `check`, `show` and `import` fail with one line and leave no files."""
 
 import json
 import os
@@ -155,14 +155,14 @@ def refused(path, capsys, tmp_path, codes=(2,)):
 
 
 @pytest.mark.parametrize("name", URDFS)
-def test_a_hostile_urdf_is_refused_in_a_line(name, tmp_path, capsys):
+def test_a_hostile_urdf_is_a_one_line_error(name, tmp_path, capsys):
     path = tmp_path / "x.urdf"
     path.write_bytes(URDFS[name])
     refused(path, capsys, tmp_path)
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_a_hostile_mesh_is_refused_in_a_line(name, tmp_path, capsys):
+def test_a_hostile_mesh_is_a_one_line_error(name, tmp_path, capsys):
     (tmp_path / "robot").mkdir()
     (tmp_path / "secret.bin").write_bytes(struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0))
     path = tmp_path / "robot" / "x.urdf"
@@ -179,7 +179,7 @@ def test_a_hostile_mesh_is_refused_in_a_line(name, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("library", ["pipe.mtl", "/dev/zero", "../../../../../../dev/zero", "."])
-def test_an_obj_takes_its_colours_from_files_of_its_folder_only(library, tmp_path, capsys):
+def test_an_obj_reads_materials_from_its_own_folder_only(library, tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.mtl")
     (tmp_path / "m.obj").write_text(f"mtllib {library}\nusemtl red\n{SOLID}")
     path = tmp_path / "x.urdf"
@@ -188,7 +188,7 @@ def test_an_obj_takes_its_colours_from_files_of_its_folder_only(library, tmp_pat
     assert "mesh" not in capsys.readouterr().out
 
 
-def test_what_is_no_regular_file_is_not_opened(tmp_path, capsys):
+def test_files_that_are_not_regular_are_not_opened(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.urdf")
     (tmp_path / "zero.urdf").symlink_to("/dev/zero")
     (tmp_path / "folder.urdf").mkdir()
@@ -201,7 +201,7 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads all")
-def test_a_file_without_permission_is_refused(tmp_path, capsys):
+def test_an_unreadable_file_is_an_error(tmp_path, capsys):
     path = tmp_path / "x.urdf"
     path.write_text(SOUND)
     path.chmod(0)
@@ -226,7 +226,7 @@ CARDS = {
 
 
 @pytest.mark.parametrize("name", CARDS)
-def test_a_hostile_card_is_refused_in_a_line(name, tmp_path, capsys):
+def test_a_hostile_card_is_a_one_line_error(name, tmp_path, capsys):
     (tmp_path / "robot.urdf").write_text(SOUND)
     content = CARDS[name]
     (tmp_path / "card.json").write_bytes(
@@ -248,7 +248,7 @@ def test_a_card_that_is_a_pipe_is_not_opened(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", ["many attributes", "shapes without end", "entity bomb"])
-def test_no_urdf_takes_a_gibibyte_or_ten_seconds(name, tmp_path):
+def test_hostile_urdfs_use_bounded_memory_and_time(name, tmp_path):
     path = tmp_path / "x.urdf"
     path.write_bytes(URDFS[name])
     code = (

@@ -1,4 +1,4 @@
-"""MJCF: the same robot as ours, to the digits that matter, and whatever MuJoCo is fussy about."""
+"""MJCF export agrees with the robot in MuJoCo, including MuJoCo's special cases."""
 
 import re
 from dataclasses import replace
@@ -76,19 +76,19 @@ def test_inertias_keep_their_digits():
     assert R @ np.diag(body.inertia) @ R.T == pytest.approx(matrix, abs=1e-6 * 3e-8)
 
 
-def test_every_link_is_a_body_and_the_mass_is_ours():
+def test_every_link_is_a_body_and_the_mass_is_unchanged():
     robot = arm()
     model = compiled(robot)
     assert [model.body(i).name for i in range(1, model.nbody)] == [x.name for x in robot.links]
     assert model.body_mass.sum() == pytest.approx(robot.mass, rel=1e-9)
 
 
-def test_the_spec_is_the_text():
+def test_the_spec_equals_the_text():
     robot = arm()
     assert to_spec(robot).to_xml() == mujoco.MjSpec.from_string(text(robot)).to_xml()
 
 
-def test_the_same_robot_gives_the_same_text():
+def test_mjcf_text_is_reproducible():
     assert text(arm()) == text(arm())
     assert "e-17" not in text(arm())
 
@@ -140,7 +140,7 @@ def test_continuous_and_unlimited_joints_have_no_range():
         assert model.actuator_forcelimited.tolist() == [0]
 
 
-def test_actuators_have_the_gains_of_the_body():
+def test_actuators_have_the_gains_of_the_robot():
     robot = arm()
     model = compiled(robot)
     assert model.nu == robot.dof
@@ -155,7 +155,7 @@ def test_actuators_have_the_gains_of_the_body():
         assert actuator.ctrlrange == pytest.approx(joint.limits)
 
 
-def test_home_is_a_keyframe_with_its_mimics_and_holds():
+def test_home_is_a_keyframe_with_mimic_joints_that_the_actuators_hold():
     robot = arm()
     model = compiled(robot)
     data = mujoco.MjData(model)
@@ -171,7 +171,7 @@ def test_home_is_a_keyframe_with_its_mimics_and_holds():
                                        robot.independent_joints], abs=1e-3)  # fmt: skip
 
 
-def test_branches_keep_the_keyframe_in_mujocos_order():
+def test_the_keyframe_of_a_branching_robot_has_the_joint_order_of_mujoco():
     links = tuple(rod(name) for name in ("root", "left", "right", "left_tip", "right_tip"))
     joints = tuple(
         Joint(child, "revolute", parent, child, Pose((x, 0, 0.3)), (0, 1, 0), (-2.0, 2.0))
@@ -190,7 +190,7 @@ def test_branches_keep_the_keyframe_in_mujocos_order():
     assert [data.actuator(j.name).ctrl[0] for j in joints] == pytest.approx(robot.home)
 
 
-def test_mimic_joints_follow_through_a_chain():
+def test_mimic_joints_follow_through_chains():
     links = tuple(rod(name) for name in "abcd")
     limits = {"limits": (-2.0, 2.0)}
     joints = (
@@ -209,7 +209,7 @@ def test_ignored_pairs_are_excluded():
     assert compiled(robot).nexclude == 2
 
 
-def test_massless_moving_links_are_legal_and_weigh_nothing():
+def test_massless_moving_links_compile_and_add_no_mass():
     links = (Link("root"), Link("x"), Link("y"), rod("tip"), Link("leaf"))
     joints = (
         Joint("x", "prismatic", "root", "x", axis=(1, 0, 0), limits=(-1.0, 1.0)),
@@ -230,16 +230,16 @@ def test_massless_moving_links_are_legal_and_weigh_nothing():
     assert data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
 
 
-def test_a_body_of_one_link_compiles():
+def test_a_robot_of_one_link_compiles():
     assert compiled(single("body", collisions=(Shape(Sphere(0.1)),))).nkey == 1
 
 
-def test_frames_are_sites_also_on_the_root():
+def test_frames_are_sites_even_on_the_root():
     robot = Robot("r", (Link("root"),), frames=(Frame("tool", "root", Pose((1, 2, 3))),))
     assert compiled(robot).site("tool").pos.tolist() == [1, 2, 3]
 
 
-def test_a_root_named_world_is_the_world():
+def test_a_root_named_world_is_the_world_body():
     robot = hinged(rod("rod"))
     joint = replace(robot.joints[0], parent="world")
     robot = replace(robot, links=(Link("world"), robot.links[1]), joints=(joint,))
@@ -250,7 +250,7 @@ def test_a_root_named_world_is_the_world():
 
 
 @pytest.mark.parametrize("limits", [(0.0, 0.0), (1.0, -1.0)])
-def test_limits_without_room_are_refused(limits):
+def test_limits_without_a_range_are_errors(limits):
     with pytest.raises(FormatError, match=r"'hinge'.*fixed"):
         text(hinged(rod("rod"), Joint("hinge", "revolute", "root", "rod", limits=limits)))
 
@@ -280,7 +280,7 @@ def test_meshes_without_files_are_in_the_model(tmp_path, collision):
     assert extents == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
 
 
-def test_a_file_is_named_once(tmp_path):
+def test_each_mesh_file_is_declared_once(tmp_path):
     path = export(trimesh.creation.box(), tmp_path / "cube.stl")
     shape = Shape(Mesh(path))
     robot = single("body", visuals=(shape, shape), collisions=(shape,))
@@ -289,7 +289,7 @@ def test_a_file_is_named_once(tmp_path):
     assert written.count('mesh="cube"') == 3
 
 
-def test_meshes_of_one_stem_have_names_of_their_own(tmp_path):
+def test_meshes_with_the_same_file_stem_have_unique_names(tmp_path):
     shapes = []
     for k in (1, 2):
         (tmp_path / str(k)).mkdir()
@@ -311,14 +311,14 @@ def test_flat_collision_meshes_get_a_thickness(flat):
         assert min(np.ptp(model.mesh_vert, axis=0)) == pytest.approx(FLAT_THICKNESS, rel=1e-3)
 
 
-def test_a_single_triangle_can_be_seen(tmp_path):
+def test_a_mesh_of_one_triangle_compiles(tmp_path):
     path = tmp_path / "triangle.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
     assert to_spec(meshed(path, collision=False)).compile().nmesh == 1
 
 
 @pytest.mark.slow
-def test_a_mesh_of_more_faces_than_an_stl_may_have(tmp_path):
+def test_a_mesh_with_more_faces_than_mujoco_reads_from_stl(tmp_path):
     sphere = trimesh.creation.icosphere(subdivisions=7)
     assert len(sphere.faces) > 200_000
     path = export(sphere, tmp_path / "sphere.stl")

@@ -1,4 +1,4 @@
-"""A composed robot stands at home in MuJoCo as its card says."""
+"""The position actuators of composed robots hold the home configuration in MuJoCo."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""MuJoCo's warnings are logged; they leave no file in the current folder of a user."""
+"""MuJoCo warnings go to the log and not to a file in the current folder."""
 
 import subprocess
 import sys
@@ -25,7 +25,7 @@ def test_a_warning_is_logged_and_writes_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_callback_of_the_user_stays(tmp_path):
+def test_a_warning_callback_of_the_user_is_kept(tmp_path):
     code = "import mujoco; mujoco.set_mju_user_warning(lambda text: print('mine', text))\n" + CODE
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path

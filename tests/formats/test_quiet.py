@@ -1,4 +1,4 @@
-"""What C code prints stays out of a program's output, also when that is a pipe."""
+"""Output of C libraries is suppressed, even when standard output is a pipe."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ libc.fflush(None)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="C's buffers are reached by POSIX's names")
-def test_what_c_buffers_within_is_not_printed_at_the_end():
+def test_buffered_c_output_is_not_printed_at_exit():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     assert done.stdout == "after\n"
     assert done.stderr == ""

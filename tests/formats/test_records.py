@@ -1,4 +1,4 @@
-"""Plain data becomes dataclasses; errors name the file, the line, the key and what is valid."""
+"""Converting plain data to dataclasses; errors name file, line, key and valid values."""
 
 import math
 from typing import Annotated, Literal
@@ -46,7 +46,7 @@ extra: {anything: [1, null]}
 """
 
 
-def test_data_becomes_dataclasses_all_the_way_down():
+def test_nested_data_becomes_dataclasses():
     assert read_record(yaml.safe_load(WHOLE), Part, "arm.yaml") == Part(
         "arm",
         "00ff",
@@ -98,19 +98,19 @@ def test_an_error_names_line_key_value_and_what_is_valid(old, new, message):
 
 
 @pytest.mark.parametrize("data", [None, 3, "text", [], [["name", "arm"]]])
-def test_what_is_no_object_is_refused(data):
+def test_data_that_is_not_an_object_is_an_error(data):
     with pytest.raises(FormatError, match=r"^x\.json: invalid value .*; expected keys and values$"):
         read_record(data, Part, "x.json")
 
 
-def test_without_text_no_line_is_named():
+def test_errors_without_source_text_have_no_line_number():
     with pytest.raises(FormatError) as error:
         read_record({"name": "a", "home": [0, math.inf, "x" * 200]}, Part, "x.json")
     assert str(error.value).startswith("x.json: home: invalid value [0, inf, 'xxxx")
     assert len(str(error.value)) < 160
 
 
-def test_lists_of_records_are_read_by_their_index():
+def test_errors_in_lists_name_the_index():
     rows = [{"low": 1, "high": 2}, {"low": -1, "high": 2}]
     with pytest.raises(FormatError, match=r"^x: \[1\]\.low: invalid value -1; expected a number"):
         read_record(rows, list[Range], "x")

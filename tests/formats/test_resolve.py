@@ -1,3 +1,5 @@
+"""Resolving mesh and include references to files, without leaving the permitted folders."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -70,14 +72,14 @@ def test_a_package_copied_into_a_folder_without_the_ros_suffix_is_found(tmp_path
     assert resolve_uri("package://kuka_kr6_support/meshes/a.stl", urdf, NOWHERE) == mesh
 
 
-def test_a_folder_given_for_a_package_wins(tmp_path: Path, urdf: Path) -> None:
+def test_a_folder_given_for_a_package_takes_precedence(tmp_path: Path, urdf: Path) -> None:
     touch(urdf.parent.parent / "a.stl")
     mine = touch(tmp_path / "mine" / "a.stl")
     finder = default_finder(packages={"arm_description": tmp_path / "mine"})
     assert resolve_uri("package://arm_description/a.stl", urdf, finder) == mine
 
 
-def test_a_package_that_is_nowhere_says_where_it_was_looked_for(tmp_path: Path, urdf: Path) -> None:
+def test_a_missing_package_error_lists_the_searched_folders(tmp_path: Path, urdf: Path) -> None:
     message = failure("package://lost/a.stl", urdf, PackageFinder((tmp_path / "root",)))
     assert "'lost'" in message
     assert str(urdf) in message
@@ -85,22 +87,22 @@ def test_a_package_that_is_nowhere_says_where_it_was_looked_for(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("package", [".ssh", "..", "a b", "%2e%2e"])
-def test_what_is_no_package_name_is_refused(package: str, urdf: Path) -> None:
+def test_invalid_package_names_are_errors(package: str, urdf: Path) -> None:
     assert "is not a package name" in failure(f"package://{package}/id", urdf)
 
 
-def test_the_root_of_the_file_system_holds_no_packages(urdf: Path) -> None:
+def test_the_file_system_root_is_not_searched_for_packages(urdf: Path) -> None:
     assert "not found" in failure("package://etc/hostname", urdf)
 
 
-def test_letter_case_matters_and_the_near_miss_is_named(urdf: Path) -> None:
+def test_names_are_case_sensitive_and_a_near_match_is_suggested(urdf: Path) -> None:
     touch(urdf.parent / "Base.STL")
     message = failure("base.stl", urdf)
     assert str(urdf.parent / "base.stl") in message
     assert "'Base.STL'" in message
 
 
-def test_relative_paths_start_at_the_descriptions_folder(
+def test_relative_paths_start_at_the_folder_of_the_description(
     urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = touch(urdf.parent / "a.stl")
@@ -112,7 +114,7 @@ def test_relative_paths_start_at_the_descriptions_folder(
     assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
 
 
-def test_escapes_and_backslashes_are_understood(urdf: Path) -> None:
+def test_percent_escapes_and_backslashes_are_accepted(urdf: Path) -> None:
     spaced = touch(urdf.parent / "my mesh.stl")
     literal = touch(urdf.parent / "100%20.stl")
     assert resolve_uri("my%20mesh.stl", urdf, NOWHERE) == spaced
@@ -121,17 +123,17 @@ def test_escapes_and_backslashes_are_understood(urdf: Path) -> None:
 
 
 @pytest.mark.parametrize("uri", ["../../secret.stl", "%2e%2e/%2e%2e/secret.stl"])
-def test_a_relative_path_may_not_climb_out_of_its_package(uri: str, urdf: Path) -> None:
+def test_a_relative_path_cannot_leave_its_package(uri: str, urdf: Path) -> None:
     touch(urdf.parents[2] / "secret.stl")
     assert "leaves" in failure(uri, urdf)
 
 
-def test_a_package_uri_may_not_climb_out_of_the_package(urdf: Path) -> None:
+def test_a_package_uri_cannot_leave_the_package(urdf: Path) -> None:
     touch(urdf.parents[2] / "secret.stl")
     assert "leaves" in failure("package://arm_description/../secret.stl", urdf)
 
 
-def test_without_a_package_a_path_may_climb_one_folder(tmp_path: Path) -> None:
+def test_without_a_package_a_path_may_leave_one_folder(tmp_path: Path) -> None:
     urdf = touch(tmp_path / "robot" / "urdf" / "robot.urdf")
     mesh = touch(tmp_path / "robot" / "meshes" / "a.stl")
     touch(tmp_path / "a.stl")
@@ -139,7 +141,7 @@ def test_without_a_package_a_path_may_climb_one_folder(tmp_path: Path) -> None:
     assert "leaves" in failure("../../a.stl", urdf)
 
 
-def test_absolute_paths_reach_the_own_tree_packages_and_roots_only(
+def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(
     tmp_path: Path, urdf: Path
 ) -> None:
     own = touch(urdf.parent.parent / "meshes" / "a.stl")
@@ -153,11 +155,11 @@ def test_absolute_paths_reach_the_own_tree_packages_and_roots_only(
 
 
 @pytest.mark.parametrize("uri", ["", " ", "http://host/a.stl", "package://", "C:/a.stl"])
-def test_what_is_no_reference_to_a_file_is_refused(uri: str, urdf: Path) -> None:
+def test_invalid_file_references_are_errors(uri: str, urdf: Path) -> None:
     assert repr(uri) in failure(uri, urdf)
 
 
-def test_a_folder_is_not_a_file(urdf: Path) -> None:
+def test_a_folder_instead_of_a_file_is_an_error(urdf: Path) -> None:
     assert "does not exist" in failure("../urdf", urdf)
 
 
@@ -186,7 +188,7 @@ def test_the_data_packages_are_found_from_anywhere(uri: str, urdf: Path) -> None
     assert resolve_uri(uri, urdf, default_finder()).is_file()
 
 
-def test_a_distributions_file_is_found_and_a_missing_one_is_explained() -> None:
+def test_distribution_files_are_found_and_missing_ones_are_errors() -> None:
     path = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
     assert path.is_absolute()
     assert path.is_file()
@@ -194,19 +196,21 @@ def test_a_distributions_file_is_found_and_a_missing_one_is_explained() -> None:
         distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robott.urdf.xacro")
 
 
-def test_a_missing_distribution_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_distribution_error_has_the_install_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("sys.path", [])
     with pytest.raises(FormatError, match=r"pip install rtb-data==1\.1\.0"):
         distribution_file("rtb-data", "rtbdata/x.urdf")
 
 
 @pytest.mark.parametrize("relative", ["../x", "/etc/hostname", "rtbdata/../../x"])
-def test_a_distributions_file_lies_below_its_install_root(relative: str) -> None:
+def test_a_distribution_file_cannot_be_outside_its_install_root(relative: str) -> None:
     with pytest.raises(FormatError, match="not a path below"):
         distribution_file("rtb-data", relative)
 
 
-def test_a_symbolic_link_may_not_lead_out_of_the_tree(tmp_path: Path, urdf: Path) -> None:
+def test_a_symbolic_link_cannot_leave_the_tree(tmp_path: Path, urdf: Path) -> None:
     private = touch(tmp_path / "private" / "a.stl")
     inside = touch(urdf.parent.parent / "meshes" / "b.stl")
     (urdf.parent / "out.stl").symlink_to(private)
@@ -226,7 +230,7 @@ def test_links_between_packages_are_followed(tmp_path: Path, urdf: Path) -> None
     assert resolve_uri("a.stl", urdf, NOWHERE) == urdf.parent / "a.stl"
 
 
-def test_a_description_that_is_a_link_may_name_what_lies_beside_its_file(tmp_path: Path) -> None:
+def test_a_symlinked_description_may_reference_files_beside_its_target(tmp_path: Path) -> None:
     """Caches of downloads keep every file as a link into a folder of blobs."""
     store, shown = tmp_path / "store" / "blobs", tmp_path / "shown" / "snapshot"
     shown.mkdir(parents=True)
@@ -236,7 +240,7 @@ def test_a_description_that_is_a_link_may_name_what_lies_beside_its_file(tmp_pat
     assert resolve_uri("a.stl", shown / "robot.urdf", NOWHERE) == shown / "a.stl"
 
 
-def test_a_root_widens_the_tree(tmp_path: Path) -> None:
+def test_a_root_extends_the_permitted_tree(tmp_path: Path) -> None:
     urdf = touch(tmp_path / "data" / "robots" / "x" / "x.urdf")
     mesh = touch(tmp_path / "data" / "meshes" / "a.stl")
     packaged = touch(tmp_path / "data" / "hand" / "b.stl")
@@ -261,7 +265,7 @@ def refused_text(path: Path, base: Path, finder: PackageFinder = NOWHERE) -> boo
     return False
 
 
-def test_text_is_read_from_the_own_folder_packages_and_roots_only(tmp_path: Path) -> None:
+def test_text_files_are_limited_to_own_folder_packages_and_roots(tmp_path: Path) -> None:
     download = touch(tmp_path / "home" / "downloads" / "x.xacro")
     nested = touch(tmp_path / "home" / "downloads" / "urdf" / "x.xacro")
     near = touch(tmp_path / "home" / "secret.yaml")
@@ -279,7 +283,7 @@ def test_text_is_read_from_the_own_folder_packages_and_roots_only(tmp_path: Path
     assert not refused_text(described, download, default_finder([tmp_path / "home"]))
 
 
-def test_what_was_installed_is_known_from_what_was_not(tmp_path: Path) -> None:
+def test_installed_files_are_distinguished_from_user_files(tmp_path: Path) -> None:
     file = distribution_file("rtb-data", "rtbdata/xacro/ur_description/urdf/ur5_robot.urdf.xacro")
     assert is_installed(file)
     assert is_installed(default_library().manifest("plane").path)

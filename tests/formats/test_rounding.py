@@ -1,4 +1,4 @@
-"""A robot's numbers are the same whether it was composed or read back."""
+"""Rounding makes a composed robot equal to the same robot read from its file."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ def from_file(pose):
 
 
 @pytest.mark.parametrize("rpy", [*NEAR_GIMBAL, *HALF_TURNS, *TINY, *RANDOM])
-def test_a_pose_that_was_written_and_read_is_the_same_once_rounded(rpy):
+def test_rounded_poses_round_trip_through_a_file(rpy):
     pose = Pose.from_xyz_rpy(tuple(RNG.normal(size=3)), rpy)
     rounded = rounded_pose(pose)
     assert rounded_pose(rounded) == rounded
@@ -72,7 +72,7 @@ def odd_robot(seed):
 
 
 @pytest.mark.parametrize("robot", [arm(), *map(odd_robot, range(10))])
-def test_a_robot_that_was_written_and_read_is_the_same_once_rounded(tmp_path, robot):
+def test_rounded_robots_round_trip_through_a_file(tmp_path, robot):
     here = as_written(robot)
     there = as_written(read_bundle(write_bundle(robot, tmp_path / "r", picture=False)))
     assert as_written(here).joints == here.joints
@@ -85,7 +85,7 @@ def test_a_robot_that_was_written_and_read_is_the_same_once_rounded(tmp_path, ro
         assert shapes[0] == shapes[1]
 
 
-def test_links_stay_in_their_order(tmp_path):
+def test_the_order_of_links_is_preserved(tmp_path):
     robot = morphgen.compose("arm=yumi left.ee=plane right.ee=yumi_gripper")
     back = read_bundle(write_bundle(robot, tmp_path / "r", picture=False))
     assert [link.name for link in back.links] == [link.name for link in robot.links]

@@ -1,4 +1,4 @@
-"""Faults in a URDF's structure are named with their line; what is left converts."""
+"""Findings about the structure of a URDF have line numbers; recoverable faults still load."""
 
 import io
 
@@ -130,13 +130,13 @@ def read(tmp_path):
     return read
 
 
-def test_a_sound_document_has_no_findings_and_loads():
+def test_a_valid_document_has_no_findings_and_loads():
     assert findings(SOUND) == ()
     assert load(SOUND).robot.name == "r"
 
 
 @pytest.mark.parametrize(("code", "change", "line"), FAULTS)
-def test_a_fault_is_found_at_its_line(code, change, line):
+def test_faults_are_reported_with_their_line(code, change, line):
     found = [finding for finding in findings(changed(change)) if finding.code == code]
     assert found, findings(changed(change))
     assert found[0].severity == "error"
@@ -146,22 +146,22 @@ def test_a_fault_is_found_at_its_line(code, change, line):
 
 
 @pytest.mark.parametrize(("code", "change"), SUSPICIOUS)
-def test_what_can_still_be_read_is_a_warning_and_loads(code, change):
+def test_recoverable_faults_are_warnings_and_load(code, change):
     assert [(f.code, f.severity) for f in findings(changed(change))] == [(code, "warning")]
     load(changed(change))
 
 
-def test_the_owner_is_named():
+def test_findings_name_the_enclosing_link_or_joint():
     (finding,) = findings(SOUND.replace('<sphere radius="1"/>', '<sphere radius="0"/>'))
     assert finding.where == "r.urdf:10 link 'b'"
 
 
-def test_a_near_miss_is_suggested():
+def test_a_near_match_is_suggested():
     (finding, *_) = findings(SOUND.replace("revolute", "revolut"))
     assert "did you mean 'revolute'" in finding.fix
 
 
-def test_an_unexpanded_xacro_explains_the_faults_around_it():
+def test_an_unexpanded_xacro_is_reported_instead_of_the_faults_it_causes():
     text = SOUND.replace(
         '<robot name="r">',
         '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/>',
@@ -170,7 +170,7 @@ def test_an_unexpanded_xacro_explains_the_faults_around_it():
     assert (finding.code, finding.severity) == ("xacro-unexpanded", "error")
 
 
-def test_every_cycle_is_named_once():
+def test_every_cycle_is_reported_once():
     links = "".join(f'<link name="{name}"/>' for name in "abcdef")
     pairs = [("b", "c"), ("c", "b"), ("d", "e"), ("e", "f"), ("f", "d")]
     joints = "".join(
@@ -182,7 +182,7 @@ def test_every_cycle_is_named_once():
     assert [why.partition(": ")[2] for why in cycles] == ["b -> c -> b", "f -> d -> e -> f"]
 
 
-def test_foreign_elements_are_left_alone():
+def test_unknown_elements_are_ignored():
     foreign = (
         '<gazebo reference="b"><origin xyz="x"/><box/></gazebo>'
         '<transmission name="t"><joint/></transmission>'
@@ -213,7 +213,7 @@ def mutations() -> list[str]:
     return texts
 
 
-def test_whatever_passes_is_parsed_without_a_crash(read):
+def test_documents_without_errors_are_parsed_without_a_crash(read):
     texts = mutations()
     passed = [t for t in texts if not any(f.severity == "error" for f in findings(t))]
     assert 0 < len(passed) < len(texts)
@@ -241,7 +241,7 @@ REPAIRED = [
 
 
 @pytest.mark.parametrize(("code", "change", "left"), REPAIRED)
-def test_what_ros_reads_over_is_read_and_told(read, code, change, left):
+def test_faults_that_ros_tolerates_are_read_with_a_warning(read, code, change, left):
     robot = read(changed(change))
     (finding,) = robot.source_findings
     assert (finding.code, finding.severity) == (code, "warning")
@@ -256,7 +256,7 @@ def test_what_ros_reads_over_is_read_and_told(read, code, change, left):
     assert f"{finding.where}: {finding.repair}" in repaired.provenance["repairs"]
 
 
-def test_a_joint_that_mimics_none_moves_by_itself(read):
+def test_an_invalid_mimic_joint_becomes_independent(read):
     robot = read(changed(('mimic joint="j"', 'mimic joint="z"')))
     assert robot.dof == 2
 
@@ -267,7 +267,7 @@ def test_a_capsule_is_read(read):
 
 
 @pytest.mark.parametrize("tag", ["link", "joint"])
-def test_a_robot_without_end_is_refused_at_once(tag):
+def test_a_robot_with_too_many_elements_is_an_error(tag):
     (finding,) = findings(f'<robot name="r">{f"<{tag}/>" * 10_000}</robot>')
     assert finding.code == "robot-too-large"
     assert "10000" in finding.why

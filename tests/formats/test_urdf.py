@@ -1,4 +1,4 @@
-"""URDF in and out: the same robot comes back, and faults are named by line."""
+"""Reading and writing URDF: round trips, and errors with line numbers."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def written(robot: Robot, folder: Path) -> Path:
     return path
 
 
-def test_a_robot_survives_the_trip(tmp_path):
+def test_a_robot_round_trips_through_urdf(tmp_path):
     robot = arm()
     back = with_frames(read_urdf(written(robot, tmp_path)), ["tool"])
     assert [link.name for link in back.links] == [link.name for link in robot.links]
@@ -39,13 +39,13 @@ def test_a_robot_survives_the_trip(tmp_path):
     np.testing.assert_allclose(frame_pose(back, q), frame_pose(robot, q), atol=1e-11)
 
 
-def test_text_of_the_text_is_the_text(tmp_path):
+def test_written_text_round_trips(tmp_path):
     first = written(arm(), tmp_path)
     again = urdf_text(with_frames(read_urdf(first), ["tool"]), no_mesh)
     assert again == first.read_text()
 
 
-def test_links_come_root_first_whatever_their_order(tmp_path):
+def test_links_are_sorted_from_the_root(tmp_path):
     path = tmp_path / "shuffled.urdf"
     path.write_text(
         '<robot name="r"><link name="c"/><link name="a"/><link name="b"/>'
@@ -75,7 +75,7 @@ def test_home_is_in_the_middle_of_a_range_without_zero(tmp_path):
     assert read_urdf(path).home == (0.5,)
 
 
-def test_a_urdf_alone_has_its_tool_and_home(tmp_path):
+def test_a_urdf_without_its_bundle_keeps_tool_and_home(tmp_path):
     path = written(arm(), tmp_path)
     alone = read_robot(path)
     assert alone.home == arm().home
@@ -88,14 +88,14 @@ def test_a_urdf_alone_has_its_tool_and_home(tmp_path):
 
 
 @pytest.mark.parametrize("position", ["nan", "inf", "1e999", "left", ""])
-def test_a_home_that_is_no_number_is_refused(tmp_path, position):
+def test_a_home_that_is_not_a_number_is_an_error(tmp_path, position):
     path = written(arm(), tmp_path)
     path.write_text(path.read_text().replace('position="0.4"', f'position="{position}"'))
     with pytest.raises(FormatError, match=rf"robot.urdf:\d+: home position '{position}'"):
         read_robot(path)
 
 
-def test_a_turned_inertial_frame_is_turned_into_link_axes(tmp_path):
+def test_a_rotated_inertial_frame_is_expressed_in_link_axes(tmp_path):
     path = tmp_path / "turned.urdf"
     path.write_text(
         '<robot name="r"><link name="a"><inertial><origin rpy="0 0 1.5707963267948966"/>'
@@ -117,19 +117,19 @@ def test_a_capsule_is_written_as_cylinder_and_spheres(tmp_path):
     np.testing.assert_allclose((ends[0] + ends[1]) / 2, T.position, atol=1e-12)
 
 
-def test_links_without_mass_say_so_for_pybullet(tmp_path):
+def test_links_without_mass_are_written_explicitly_for_pybullet(tmp_path):
     text = urdf_text(Robot("r", (Link("a"),)), no_mesh)
     assert '<mass value="0"/>' in text
 
 
-def test_broken_structure_is_named_by_line(tmp_path):
+def test_structural_errors_have_a_line_number(tmp_path):
     path = tmp_path / "two.urdf"
     path.write_text('<robot name="r">\n<link name="a"/>\n<link name="a"/>\n</robot>')
     with pytest.raises(UnsoundError, match=r"two\.urdf:3"):
         read_urdf(path)
 
 
-def test_a_missing_mesh_is_named(tmp_path):
+def test_a_missing_mesh_is_an_error(tmp_path):
     path = tmp_path / "bare.urdf"
     path.write_text(
         '<robot name="r"><link name="a"><visual><geometry><mesh filename="gone.stl"/></geometry>'
@@ -140,7 +140,7 @@ def test_a_missing_mesh_is_named(tmp_path):
     assert caught.value.findings[0].code == "mesh-unresolved"
 
 
-def test_a_missing_file_and_arguments_for_no_xacro(tmp_path):
+def test_missing_files_and_arguments_without_a_xacro_are_errors(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         read_urdf(tmp_path / "none.urdf")
     with pytest.raises(FormatError, match="not a xacro"):

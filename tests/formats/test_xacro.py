@@ -1,3 +1,5 @@
+"""Expanding xacro files in process, without access to Python, the environment or other files."""
+
 from __future__ import annotations
 
 import math
@@ -47,7 +49,7 @@ def origin(tmp_path: Path) -> Path:
     return tmp_path / "part.xacro"
 
 
-def test_arguments_have_defaults_that_a_caller_can_replace(origin: Path) -> None:
+def test_arguments_have_defaults_that_the_caller_can_override(origin: Path) -> None:
     body = '<xacro:arg name="n" default="3"/><link name="l$(arg n)"/>'
     assert expanded(body, origin) == [{"name": "l3"}]
     assert expanded(body, origin, n="7") == [{"name": "l7"}]
@@ -65,31 +67,31 @@ def test_macros_properties_conditions_and_python_work(origin: Path) -> None:
     assert names == ["l0", "l1", "l2"]
 
 
-def test_an_argument_declared_nowhere_is_refused_with_the_nearest(origin: Path) -> None:
+def test_an_undeclared_argument_is_an_error_that_suggests_the_nearest(origin: Path) -> None:
     body = '<xacro:arg name="length" default="1"/><link name="l"/>'
     message = failure(body, origin, lenght="2")
     assert "'lenght'" in message
     assert "did you mean 'length'" in message
 
 
-def test_an_argument_declared_in_a_branch_not_taken_is_known(origin: Path) -> None:
+def test_an_argument_declared_in_a_skipped_branch_is_valid(origin: Path) -> None:
     body = '<xacro:if value="false"><xacro:arg name="a" default="1"/></xacro:if><link name="l"/>'
     assert expanded(body, origin, a="2") == [{"name": "l"}]
 
 
-def test_an_argument_without_default_must_be_given(origin: Path) -> None:
+def test_an_argument_without_default_is_required(origin: Path) -> None:
     body = '<link name="$(arg prefix)link"/>'
     assert "'prefix'" in failure(body, origin)
     assert expanded(body, origin, prefix="left_") == [{"name": "left_link"}]
 
 
-def test_the_callers_arguments_are_not_changed(origin: Path) -> None:
+def test_the_arguments_of_the_caller_are_not_modified(origin: Path) -> None:
     args: dict[str, str] = {}
     expand_text(robot('<xacro:arg name="n" default="3"/>'), args, origin, NOWHERE)
     assert args == {}
 
 
-def test_nothing_of_one_call_is_left_for_the_next(origin: Path) -> None:
+def test_calls_share_no_state(origin: Path) -> None:
     expanded('<xacro:property name="p" value="1"/><xacro:arg name="a" default="1"/>', origin)
     assert "'p'" in failure('<link name="${p}"/>', origin)
     failure('<link name="${1/0}"/>', origin)
@@ -107,7 +109,7 @@ def test_includes_are_relative_to_the_file_that_includes(
     assert [link.get("name") for link in root] == [str(tmp_path / "sub")]
 
 
-def test_find_looks_around_the_file_and_in_roots(tmp_path: Path, origin: Path) -> None:
+def test_find_searches_around_the_file_and_in_roots(tmp_path: Path, origin: Path) -> None:
     (tmp_path / "near_description").mkdir()
     (tmp_path / "far" / "far_description").mkdir(parents=True)
     finder = PackageFinder((tmp_path / "far",))
@@ -170,7 +172,7 @@ def test_a_macro_that_calls_itself_without_end_is_an_error(origin: Path) -> None
         ("<link name=\"${load_yaml('lost.yaml')}\"/>", "lost.yaml"),
     ],
 )
-def test_faults_are_one_line_that_names_the_file(body: str, reason: str, origin: Path) -> None:
+def test_errors_are_one_line_that_names_the_file(body: str, reason: str, origin: Path) -> None:
     assert reason in failure(body, origin)
 
 
@@ -185,12 +187,12 @@ def test_faults_are_one_line_that_names_the_file(body: str, reason: str, origin:
         "(i for i in ()).gi_frame",
     ],
 )
-def test_expressions_do_not_reach_pythons_internals(expression: str, origin: Path) -> None:
+def test_expressions_cannot_access_python_internals(expression: str, origin: Path) -> None:
     failure(f'<link name="${{{expression}}}"/>', origin)
     failure(f'<link name="$(eval {expression.replace(")", "")})"/>', origin)
 
 
-def test_the_environment_plays_no_part(origin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_is_not_read(origin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EXTRA", "surprise")
     assert expanded('<link name="$(optenv EXTRA usual)"/>', origin) == [{"name": "usual"}]
 
@@ -201,27 +203,27 @@ def test_yaml_can_be_loaded_with_units(tmp_path: Path, origin: Path) -> None:
     assert expanded(body, origin) == [{"name": "0.5"}]
 
 
-def test_warnings_stay_off_the_terminal(origin: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_warnings_are_not_printed(origin: Path, capfd: pytest.CaptureFixture[str]) -> None:
     body = '<xacro:property name="pi" value="3"/><xacro:property name="a" value="1" odd="2"/>'
     expanded(body, origin)
     failure(body + "<xacro:nope/>", origin)
     assert capfd.readouterr() == ("", "")
 
 
-def test_text_and_attributes_survive_with_their_special_characters(origin: Path) -> None:
+def test_special_characters_in_text_and_attributes_are_preserved(origin: Path) -> None:
     text = robot('<!-- gone --><link name="a&lt;&quot;b\'&amp;é"/><gazebo>1 &lt; 2</gazebo>')
     root = parse_xml(expand_text(text, {}, origin, NOWHERE), "out")
     assert root[0].get("name") == "a<\"b'&é"
     assert root[1].text == "1 < 2"
 
 
-def test_the_packages_changes_to_minidom_reach_nobody(origin: Path) -> None:
+def test_changes_of_the_xacro_package_to_minidom_are_undone(origin: Path) -> None:
     expanded('<link name="l"/>', origin)
     text = '<a z="1" b="2"> <c/> </a>'
     assert minidom.parseString(text).documentElement.toxml() == text  # type: ignore[union-attr]
 
 
-def test_threads_do_not_disturb_one_another(tmp_path: Path) -> None:
+def test_expansion_is_thread_safe(tmp_path: Path) -> None:
     results: dict[int, list[list[dict[str, str]]]] = {}
 
     def work(k: int) -> None:
@@ -247,7 +249,7 @@ def test_threads_do_not_disturb_one_another(tmp_path: Path) -> None:
         ("kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.xacro", 10),
     ],
 )
-def test_the_data_packages_robots_expand(file: str, links: int) -> None:
+def test_robots_of_the_data_packages_expand(file: str, links: int) -> None:
     path = distribution_file("rtb-data", f"rtbdata/xacro/{file}")
     data = expand(path, {}, default_finder())
     assert len(parse_xml(data, file).findall("link")) == links
@@ -265,7 +267,7 @@ def test_the_data_packages_robots_expand(file: str, links: int) -> None:
         ("${e}", 9.0),
     ],
 )
-def test_an_expression_is_a_number(expression: str, value: float) -> None:
+def test_a_numeric_expression_is_evaluated(expression: str, value: float) -> None:
     assert evaluate(expression, {"length": 0.3, "e": 9.0}) == pytest.approx(value)
 
 
@@ -282,7 +284,7 @@ def test_an_expression_is_a_number(expression: str, value: float) -> None:
         ("${().__class__}", "__class__"),
     ],
 )
-def test_what_is_no_number_is_refused(expression: str, reason: str) -> None:
+def test_expressions_that_are_not_numbers_are_errors(expression: str, reason: str) -> None:
     with pytest.raises(FormatError) as caught:
         evaluate(expression, {"length": 0.3})
     assert reason in str(caught.value)
@@ -290,7 +292,7 @@ def test_what_is_no_number_is_refused(expression: str, reason: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_an_installed_file_that_reads_a_strangers_is_expanded_in_a_process_of_its_own(
+def test_an_installed_file_that_includes_a_user_file_is_expanded_in_a_subprocess(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed = tmp_path / "installed"
@@ -318,7 +320,7 @@ def test_an_installed_file_that_reads_a_strangers_is_expanded_in_a_process_of_it
     assert len(asked) == 1
 
 
-def test_warnings_of_a_process_of_its_own_reach_the_log(
+def test_warnings_of_the_subprocess_are_logged(
     origin: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     origin.write_text(robot("<link name=\"l${xacro.warning('odd')}\"/>"))

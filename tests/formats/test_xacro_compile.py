@@ -1,4 +1,4 @@
-"""A xacro that is compiled and filled in gives the bytes of expanding it."""
+"""A compiled xacro filled with values has the same bytes as its expansion."""
 
 import os
 
@@ -45,7 +45,7 @@ def values_of(manifest, rng):
 
 
 @pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
-def test_every_template_is_compiled_and_filled_to_the_bytes_of_its_expansion(manifest):
+def test_every_compiled_template_fills_to_the_bytes_of_its_expansion(manifest):
     rng = np.random.default_rng(0)
     for _ in range(6):
         constants, numbers = values_of(manifest, rng)
@@ -56,7 +56,7 @@ def test_every_template_is_compiled_and_filled_to_the_bytes_of_its_expansion(man
 
 
 @pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
-def test_ends_and_whole_numbers_are_filled_in_alike(manifest):
+def test_range_limits_and_integers_fill_to_the_bytes_of_the_expansion(manifest):
     constants, _ = values_of(manifest, np.random.default_rng(1))
     for pick in (min, max):
         numbers = {
@@ -111,14 +111,14 @@ def test_arithmetic_is_compiled(write, body, value):
         "<a v=\"${'a' if str(x) == '0.3' else 'b'}\"/>",
     ],
 )
-def test_what_is_more_than_arithmetic_is_left_to_the_expansion(write, body):
+def test_documents_with_more_than_arithmetic_are_not_compiled(write, body):
     path = write(body)
     assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
     assert b"<robot" in expand(path, {"x": "0.3"}, FINDER)
 
 
 @pytest.mark.parametrize("body", ['<a v="${nothing}"/>', '<a v="${1/(x-0.3)}"/>', "<a>", "<a b=/>"])
-def test_what_cannot_be_expanded_is_left_to_the_expansion_to_tell(write, body):
+def test_documents_with_errors_are_not_compiled(write, body):
     path = write(body)
     assert compile_xacro(path, {}, {"x": "0.3"}, FINDER) is None
     with pytest.raises(FormatError, match=r"x\.xacro"):
@@ -126,7 +126,7 @@ def test_what_cannot_be_expanded_is_left_to_the_expansion_to_tell(write, body):
 
 
 @pytest.mark.parametrize("expression", ["().__class__", "2", "p_x", "lambda: 0", "1" * 20_000])
-def test_the_marks_of_expressions_in_a_document_are_text(write, expression):
+def test_marker_characters_in_a_document_are_kept_as_text(write, expression):
     path = write(f'<a v="\ue000{expression}\ue001"/>')
     for trusted in (False, True):
         assert trace(path, FINDER, {}, {"x": "0.3"}, installed_only=trusted) is None
@@ -134,14 +134,14 @@ def test_the_marks_of_expressions_in_a_document_are_text(write, expression):
     assert f"\ue000{expression}\ue001" in expand(path, {"x": "0.3"}, FINDER).decode()
 
 
-def test_a_value_for_which_an_expression_fails_is_told(write):
+def test_a_value_for_which_an_expression_fails_is_an_error(write):
     compiled = compile_xacro(write('<a v="${1/(x-0.3)}"/>'), {}, {"x": "1"}, FINDER)
     assert compiled.fill({"x": "2"}) == b'<robot name="x"><a v="0.5882352941176471"></a></robot>'
     with pytest.raises(FormatError, match=r"fails for \{'x': '0.3'\}: float division by zero"):
         compiled.fill({"x": "0.3"})
 
 
-def test_a_constant_decides_the_structure(write, tmp_path):
+def test_constants_may_change_the_structure(write, tmp_path):
     body = '<xacro:arg name="n" default="1"/><xacro:if value="${n > 1}"><a v="${x}"/></xacro:if>'
     path = write(body.replace("n >", "$(arg n) >"))
     for n in ("1", "2"):
@@ -149,13 +149,13 @@ def test_a_constant_decides_the_structure(write, tmp_path):
         assert compiled.fill({"x": "0.4"}) == expand(path, {"n": n, "x": "0.4"}, FINDER)
 
 
-def test_a_file_is_compiled_once_whatever_the_values(write):
+def test_a_file_is_compiled_once_for_all_values(write):
     path = write('<a v="${x}"/>')
     first = compile_xacro(path, {}, {"x": "0.3"}, FINDER)
     assert compile_xacro(path, {}, {"x": "0.4"}, FINDER) is first
 
 
-def test_a_file_that_changed_is_compiled_again(write):
+def test_a_changed_file_is_recompiled(write):
     path = write('<a v="${x}"/>')
     before = compile_xacro(path, {}, {"x": "0.3"}, FINDER)
     write('<a v="${2*x}"/>')
@@ -168,7 +168,7 @@ def test_a_file_that_changed_is_compiled_again(write):
     )
 
 
-def test_compiling_leaves_nothing_behind_for_an_expansion(write):
+def test_compiling_does_not_affect_later_expansions(write):
     path = write('<a v="${max(x, 1)}"/>')
     plain = expand(path, {"x": "3"}, FINDER)
     compile_xacro(path, {}, {"x": "0.3"}, FINDER)

@@ -1,4 +1,4 @@
-"""Expressions compute what xacro's do, and nothing else."""
+"""Xacro expressions are evaluated by an interpreter with an allowlist and resource bounds."""
 
 import ast
 import math
@@ -62,7 +62,7 @@ def value(text, names=NAMES):
         "x is not None",
     ],
 )
-def test_an_expression_is_worth_what_python_says(text):
+def test_expressions_have_the_values_of_python(text):
     python = {"__builtins__": {}} | {
         name: getattr(math, name, None) or getattr(__builtins__, name, None) or given
         for name, given in NAMES.items()
@@ -72,7 +72,7 @@ def test_an_expression_is_worth_what_python_says(text):
     assert value(text) == eval(text, python)
 
 
-def test_a_dot_reaches_entries():
+def test_a_dot_accesses_dictionary_entries():
     assert value("limits.elbow.max") == 2.5
     assert value("limits.elbow.keys") == 7
     assert value("limits.elbow.keys()") == ["max", "keys"]
@@ -105,7 +105,7 @@ def test_a_dot_reaches_entries():
         ("sin", "its value is a function"),
     ],
 )
-def test_what_is_not_on_the_list_is_refused_by_name(text, construct):
+def test_syntax_outside_the_allowlist_is_an_error(text, construct):
     with pytest.raises(RefusedError) as caught:
         value(text)
     assert construct in str(caught.value)
@@ -115,13 +115,13 @@ def test_what_is_not_on_the_list_is_refused_by_name(text, construct):
     "text",
     ["vars(x)", "type(x)", "open('a')", "eval('1')", "getattr(x, 'real')", "__import__('os')"],
 )
-def test_other_builtins_are_unknown(text):
+def test_builtins_outside_the_allowlist_are_unknown(text):
     with pytest.raises(NameError, match="is not defined"):
         value(text)
 
 
 @pytest.mark.parametrize("text", ["str(sin)", "[sin]", "dict(a=sin)", "sin == sin", "min(key=len)"])
-def test_a_function_is_no_data(text):
+def test_functions_are_not_data(text):
     with pytest.raises(TypeError, match="is not data"):
         value(text)
 
@@ -160,14 +160,14 @@ def test_a_function_is_no_data(text):
         "(" * 150 + "[" * 150,
     ],
 )
-def test_no_expression_takes_long_or_makes_much(text):
+def test_expressions_have_bounded_time_and_size(text):
     start = time.process_time()
     with pytest.raises((RefusedError, SyntaxError)):
         value(text)
     assert time.process_time() - start < 2
 
 
-def test_nothing_of_a_document_is_given_to_python_to_run():
+def test_no_text_of_a_document_is_executed_by_python():
     """The only ``exec`` is that of the package's own code; ``eval`` and ``compile`` are nowhere."""
     folder = Path(morphgen.formats.__file__).parent
     calls = [
@@ -181,7 +181,7 @@ def test_nothing_of_a_document_is_given_to_python_to_run():
     assert calls == ["xacro_engine.py: exec(_BODY, module.__dict__)"]
 
 
-def test_the_page_names_every_function_and_bound():
+def test_the_page_documents_every_function_and_bound():
     page = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
     words = set(re.findall(r"\w+", page))
     assert set(BUILTINS) - words == set()
@@ -198,7 +198,7 @@ def test_the_page_names_every_function_and_bound():
     assert [bound for bound in bounds if bound not in page] == []
 
 
-def test_python_prints_nothing_about_an_odd_expression():
+def test_suspicious_expressions_print_no_python_warning():
     code = (
         "from morphgen.formats.xacro import evaluate; "
         r"print(evaluate('${2if 1 else 3}', {}), evaluate('${len(\'\\d\')}', {}))"

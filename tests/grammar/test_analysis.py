@@ -1,4 +1,4 @@
-"""What a grammar can make is counted, listed, and found faulty before a robot is drawn."""
+"""Static analysis of grammars: counting structures, listing them, and reporting faults."""
 
 import itertools
 import math
@@ -56,14 +56,14 @@ def test_shipped_grammars_are_sound(name):
         (["robot -> @weight(0) cubes"], "g:1:1: all weights of 'robot' are zero"),
     ],
 )
-def test_a_fault_is_told_with_its_place(lines, message):
+def test_a_fault_is_reported_with_line_and_column(lines, message):
     found = check_grammar(grammar(*lines), LIBRARY)
     assert found
     assert any(message in fault for fault in found)
     assert all(fault.startswith("g:") and "\n" not in fault for fault in found)
 
 
-def test_all_faults_are_told_at_once():
+def test_all_faults_are_reported_together():
     found = check_grammar(
         grammar("let r = 1", "robot -> gantri plane(sise=1)", "a -> ur55"),
         LIBRARY,
@@ -77,12 +77,12 @@ def test_all_faults_are_told_at_once():
     ]
 
 
-def test_what_is_used_by_a_weight_or_another_value_is_used():
+def test_values_referenced_by_weights_or_other_values_count_as_used():
     lines = "let a = 1", "let b = a", "robot -> @weight(b) cubes | cartpole"
     assert check_grammar(grammar(*lines), LIBRARY) == []
 
 
-def test_a_recursion_that_can_end_is_sound():
+def test_a_terminating_recursion_has_no_faults():
     assert check_grammar(grammar("robot -> slides tail", "tail -> bead tail | bead"), LIBRARY) == []
 
 
@@ -108,26 +108,26 @@ def test_a_recursion_that_can_end_is_sound():
         (["robot -> gantry ee", "ee -> @weight(0) plane | cube | jaw"], 2),
     ],
 )
-def test_the_count_is_that_of_the_list_and_nothing_is_listed_twice(lines, number):
+def test_the_structure_count_equals_the_number_of_distinct_listed_structures(lines, number):
     found = grammar(*lines)
     listed = structures(found)
     assert count_structures(found) == number == len(listed) == len(set(listed))
 
 
-def test_the_list_is_all_that_can_be_drawn():
+def test_the_list_contains_exactly_the_structures_that_sampling_draws():
     found = grammar("robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw")
     rng = np.random.default_rng(0)
     drawn = {str(derive(found, LIBRARY, RandomChooser(rng))) for _ in range(600)}
     assert drawn == set(structures(found))
 
 
-def test_an_alternative_written_twice_is_listed_once():
+def test_duplicate_alternatives_are_listed_once():
     found = grammar("robot -> gantry ee", "ee -> plane | plane | cube")
     assert count_structures(found) == 3
     assert len(structures(found)) == 2
 
 
-def test_a_recursion_has_infinitely_many_listed_by_size():
+def test_structures_of_a_recursive_grammar_are_listed_by_size():
     found = grammar("robot -> slides tail", "tail -> bead | beam tail")
     assert math.isinf(count_structures(found))
     listed = structures(found, 6)
@@ -135,7 +135,7 @@ def test_a_recursion_has_infinitely_many_listed_by_size():
     assert len(set(listed)) == 6
 
 
-def test_a_structure_that_cannot_be_is_told_when_its_turn_comes():
+def test_an_impossible_structure_raises_when_it_is_reached():
     listed = enumerate_structures(
         grammar("robot -> gantry ee", "ee -> plane | plane cube"), LIBRARY
     )
@@ -144,7 +144,7 @@ def test_a_structure_that_cannot_be_is_told_when_its_turn_comes():
         next(listed)
 
 
-def test_shipped_grammars_have_as_many_structures_as_they_say():
+def test_shipped_grammars_have_the_documented_number_of_structures():
     counts = {name: count_structures(shipped(name)) for name in CATEGORIES}
     assert counts["chain"] == 6
     assert counts["nlink"] == 4
@@ -153,7 +153,7 @@ def test_shipped_grammars_have_as_many_structures_as_they_say():
     assert counts["arm3"] == 1
 
 
-def test_all_that_is_drawn_is_named_with_its_distribution():
+def test_every_random_choice_is_listed_with_its_distribution():
     found = variables(
         grammar(
             "let r = uniform(1cm, 2cm)",

@@ -14,7 +14,7 @@ LIBRARY = default_library()
 STORED = json.loads(FACTS_FILE.read_text())
 
 
-def test_the_catalogue_has_a_row_a_part_with_figures_that_can_be():
+def test_the_catalogue_has_one_row_per_part_with_plausible_values():
     rows = {row["name"]: row for row in catalogue(LIBRARY, "base")}
     assert set(rows) == set(LIBRARY.names("base"))
     assert rows["gantry"]["dof"] == 5
@@ -29,7 +29,7 @@ def test_facts_are_stored_for_every_shipped_part():
 
 
 @pytest.mark.parametrize("name", LIBRARY.names())
-def test_stored_facts_are_those_of_the_part(name):
+def test_stored_facts_equal_the_computed_ones(name):
     assert STORED[name] == compute_facts(LIBRARY.manifest(name))
 
 
@@ -38,7 +38,7 @@ def test_the_shipped_catalogue_loads_no_part(monkeypatch):
     assert len(catalogue(LIBRARY)) == len(STORED)
 
 
-def test_a_part_that_is_not_stored_or_that_changed_is_computed(tmp_path):
+def test_facts_of_new_or_changed_parts_are_computed(tmp_path):
     write_part(tmp_path, name="cube")
     (row,) = catalogue(Library([tmp_path]))
     assert (row["name"], row["dof"]) == ("cube", 2)

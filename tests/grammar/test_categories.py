@@ -1,4 +1,4 @@
-"""Every category of the benchmark, as `morphgen sample` draws it."""
+"""Robots that `morphgen sample` draws from each category of the benchmark."""
 
 import pytest
 
@@ -50,7 +50,7 @@ def test_robots_have_the_counts_of_the_benchmark_and_all_loaders_agree(category,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_a_hundred_robots_are_sound_and_all_loaders_agree(category, tmp_path):
+def test_a_hundred_robots_have_no_errors_and_all_loaders_agree(category, tmp_path):
     found = shipped(category)
     for index in range(100):
         drawn = sample_robot(found, LIBRARY, index, seed=12)

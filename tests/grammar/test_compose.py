@@ -1,4 +1,4 @@
-"""Composition: parts are joined exactly, and what each of them was it stays."""
+"""Composition joins parts at exact poses and keeps the properties of each part."""
 
 import json
 import math
@@ -94,19 +94,19 @@ def turn(yaw):
 
 
 @pytest.mark.parametrize("ee", [name for name in EES if name != "none"])
-def test_an_end_effectors_mount_lies_on_the_flange_turned_by_the_yaw_alone(ee):
+def test_the_end_effector_mount_equals_the_flange_up_to_mount_yaw(ee):
     there = Situation(f"arm=ur5 ee={ee} ee.mount_yaw=33deg")
     expected = there.flange() @ turn(math.radians(33))
     np.testing.assert_allclose(there.mount(), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("arm", PAPER_ARMS)
-def test_every_arm_carries_a_hand_on_its_flange(arm):
+def test_every_arm_accepts_an_end_effector_on_its_flange(arm):
     there = Situation(f"arm={arm} ee=panda_hand", seed=1)
     np.testing.assert_allclose(there.mount(), there.flange(), atol=1e-12)
 
 
-def test_with_no_end_effector_the_tool_is_the_flange():
+def test_without_an_end_effector_the_tool_is_the_flange():
     there = Situation("arm=ur5 ee.mount_yaw=90deg ee=none")
     tool = frame_pose(there.robot, there.q)
     np.testing.assert_allclose(tool, there.flange() @ turn(math.pi / 2), atol=1e-12)
@@ -115,7 +115,7 @@ def test_with_no_end_effector_the_tool_is_the_flange():
 @pytest.mark.parametrize(
     "text", ["base=planar arm=panda ee=robotiq_2f85", "arm=lwr ee=jaco_fingers"]
 )
-def test_parts_move_in_the_robot_as_they_move_alone(text):
+def test_parts_have_the_same_kinematics_in_the_robot_as_alone(text):
     there = Situation(text, seed=2)
     for label in there.placed:
         for T_world_link, T_part_link in there.links(label):
@@ -136,7 +136,7 @@ def test_joints_keep_axis_limits_effort_velocity_damping_and_mimic():
                 assert found.mimic == replace(joint.mimic, joint=f"{label}_{joint.mimic.joint}")
 
 
-def test_mimic_joints_follow_the_leader_of_their_own_hand():
+def test_mimic_joints_follow_the_leader_of_the_same_gripper():
     robot = composed(
         "base=pedestal left.arm=lwr left.ee=robotiq_2f85 right.arm=lwr right.ee=robotiq_2f85"
     )
@@ -146,7 +146,7 @@ def test_mimic_joints_follow_the_leader_of_their_own_hand():
         assert joint.mimic.joint.split("_ee_")[0] == joint.name.split("_ee_")[0]
 
 
-def test_names_say_which_part_they_belong_to_and_do_not_clash():
+def test_names_are_unique_and_prefixed_with_the_label_of_their_part():
     robot = composed("base=pedestal left.arm=ur5 left.ee=plane right.arm=ur5 right.ee=plane")
     scopes = ("base_", "left_arm_", "left_ee_", "right_arm_", "right_ee_")
     for names in ([j.name for j in robot.joints], [link.name for link in robot.links]):
@@ -156,13 +156,13 @@ def test_names_say_which_part_they_belong_to_and_do_not_clash():
     assert "right_arm_wrist_3_joint" in robot.joint_index
 
 
-def test_mass_is_the_sum_of_the_parts():
+def test_mass_is_the_sum_over_the_parts():
     text = "base=pedestal left.arm=ur5 left.ee=stick right.arm=panda right.ee=panda_hand"
     parts = load_parts(derive(text), LIBRARY).values()
     assert joined(text).mass == pytest.approx(math.fsum(here.part.fragment.mass for here in parts))
 
 
-def test_home_is_each_parts_own():
+def test_home_concatenates_the_homes_of_the_parts():
     robot = composed("base=gantry ee=robotiq_2f140")
     home = dict(
         zip([robot.joints[k].name for k in robot.independent_joints], robot.home, strict=True)
@@ -174,7 +174,7 @@ def test_home_is_each_parts_own():
     assert ur5.home == pytest.approx((0, -1.57, 1.57, -1.57, -1.57, 0, 0.025))
 
 
-def test_the_tool_is_at_the_working_point():
+def test_the_tool_frame_is_at_the_working_point_of_the_end_effector():
     """At the plate's far edge, the centre of the stick's ball, and where fingers meet."""
     for ee, ahead in (
         ("plane ee.size=80mm", 0.08),
@@ -189,7 +189,7 @@ def test_the_tool_is_at_the_working_point():
         assert T_flange_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-9)
 
 
-def test_the_panda_and_its_hand_make_the_real_robot():
+def test_the_composed_panda_equals_the_published_robot():
     """The hand sits turned by 45 degrees, as Franka Emika delivers it."""
     there = Situation("arm=panda ee=panda_hand")
     hand = there.T_world_link[there.robot.link_index["ee_panda_hand"]]
@@ -212,7 +212,7 @@ def test_no_robot_collides_with_itself_at_home(text):
     assert {name for pair in robot.ignore_pairs for name in pair} <= set(robot.link_index)
 
 
-def test_what_can_collide_is_not_ignored():
+def test_link_pairs_that_can_collide_are_not_ignored():
     """Arms side by side can strike each other, and an arm its own foot."""
     robot = composed("left.arm=ur5 right.arm=ur5 base=fixed base.spread=0.5")
     assert ("left_arm_forearm_link", "right_arm_forearm_link") not in robot.ignore_pairs
@@ -224,7 +224,7 @@ def test_what_can_collide_is_not_ignored():
     assert ("left_arm_forearm_link", "right_arm_upper_arm_link") in inwards
 
 
-def test_two_arms_stand_where_their_ports_are():
+def test_two_arms_are_mounted_at_their_ports():
     robot = composed("base=pedestal left.arm=ur5 left.ee=stick right.arm=xarm7 right.ee=panda_hand")
     T_root_link = forward_kinematics(robot, robot.home)
     left = T_root_link[robot.link_index["left_arm_base_link"]]
@@ -234,7 +234,7 @@ def test_two_arms_stand_where_their_ports_are():
     assert robot.dof == 6 + 7 + 1
 
 
-def test_one_limb_has_one_tool_and_several_have_one_each():
+def test_each_limb_has_one_tool_frame():
     assert [frame.name for frame in joined("arm=ur5 ee=plane").frames] == ["tool"]
     robot = joined("base=pedestal left.arm=ur5 left.ee=stick right.arm=ur5 right.ee=plane")
     assert {frame.name for frame in robot.frames} == {"tool", "left_tool", "right_tool"}
@@ -254,7 +254,7 @@ def test_both_hands_of_yumi_hold_a_gripper_and_the_right_one_is_the_tool():
     assert tools["left_tool"][:3, 3] == pytest.approx(mirrored, abs=0.03)
 
 
-def test_a_plate_under_the_gantry_is_the_papers_primitive_and_points_down():
+def test_a_plate_on_the_gantry_is_the_primitive_of_the_paper_and_points_down():
     robot = composed("base=gantry ee=plane")
     assert len(robot.links) == 7
     assert len(robot.movable_joints) == robot.dof == 5
@@ -266,13 +266,13 @@ def test_a_plate_under_the_gantry_is_the_papers_primitive_and_points_down():
     assert tool[:3, 3] == pytest.approx([0, 0, 0.8 - 0.1], abs=1e-12)
 
 
-def test_a_parts_root_that_is_a_bare_frame_adds_no_body():
+def test_an_empty_root_link_of_a_part_adds_no_link():
     robot = joined("arm=ur5 ee=none")
     assert [link.name for link in robot.links if link.name.startswith("ee")] in ([], ["ee_link"])
     assert robot.mass == pytest.approx(joined("arm=ur5 ee=plane").mass - 0.01 * 0.1 * 0.1 * 1000)
 
 
-def test_the_derivation_says_which_parts_with_which_parameters_stand_where():
+def test_the_derivation_lists_parts_parameters_and_ports():
     derivation = derive("base=pedestal base.height=40cm arm=ur5 ee=plane ee.mount_yaw=90deg")
     assert str(derivation) == (
         "base=pedestal(height=0.4, radius=0.08, spread=0.6)"
@@ -297,7 +297,7 @@ def test_provenance_names_licence_and_citation_of_every_part():
     assert "notes" not in parts[0]
 
 
-def test_a_finding_that_a_part_accepts_is_information_with_its_reason():
+def test_a_finding_accepted_by_a_part_has_severity_info_and_a_reason():
     robot = joined("arm=panda")
     by_itself = [f for f in check(replace(robot, provenance={})) if f.severity == "warning"]
     assert ("inertia-implausible", "link arm_panda_link1") in {(f.code, f.where) for f in by_itself}
@@ -344,13 +344,13 @@ def test_accepting_one_finding_accepts_no_other(tmp_path):
         (Derivation("arm", "yumi"), "'yumi' needs a base: its mount is not its root"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(node, message):
+def test_incompatible_parts_are_an_error(node, message):
     with pytest.raises(CompositionError) as caught:
         compose(node, LIBRARY, "robot")
     assert str(caught.value) == message
 
 
-def test_a_derivation_of_an_unknown_part_is_refused():
+def test_a_derivation_with_an_unknown_part_is_an_error():
     with pytest.raises(PartError, match="unknown part 'ur55'; did you mean 'ur5'"):
         compose(Derivation("arm", "ur55"), LIBRARY, "robot")
 
@@ -364,7 +364,7 @@ OVERLAPPING = {
 """Hands whose shapes reach behind the flange, into the arm: the card says so."""
 
 
-def test_parts_that_overlap_are_told_and_not_ignored():
+def test_overlapping_parts_are_reported_and_not_ignored():
     words = "base=pedestal base.spread=0 left.arm=lwr right.arm=lwr"
     robot = compose(derive(words), LIBRARY, "robot")
     findings = [finding for finding in check(robot) if finding.severity != "info"]
@@ -372,7 +372,7 @@ def test_parts_that_overlap_are_told_and_not_ignored():
     assert any("left_arm" in f.where and "right_arm" in f.where for f in findings)
 
 
-def test_the_order_of_words_changes_nothing():
+def test_the_order_of_the_request_does_not_matter():
     words = "left.arm=ur5 left.ee=stick right.arm=lwr right.ee=plane"
     turned = "right.ee=plane right.arm=lwr left.ee=stick left.arm=ur5"
     assert derive(words) == derive(turned)

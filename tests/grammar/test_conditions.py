@@ -1,4 +1,4 @@
-"""Conditions over what a robot is."""
+"""Conditions on the properties of a robot."""
 
 from dataclasses import replace
 
@@ -44,14 +44,14 @@ def test_mimic_joints_move_and_are_not_independent():
     assert properties.movable_to_tool == 3
 
 
-def test_height_is_that_of_the_highest_point_at_home():
+def test_height_is_measured_at_the_highest_point_at_home():
     straight = replace(arm(), home=(0.0, 0.0, 0.0, 0.0))
     assert RobotProperties(straight).height == pytest.approx(0.05 + 0.3 + 0.3 + 0.2 + 0.1 - 0.03)
     lying = replace(arm(), home=(np.pi / 2, 0.0, 0.0, 0.0))
     assert RobotProperties(lying).height == pytest.approx(0.05 + 0.02, abs=1e-3)
 
 
-def test_reach_counts_from_the_root_and_is_nothing_without_a_tool():
+def test_reach_is_measured_from_the_root_and_undefined_without_a_tool():
     assert RobotProperties(arm()).reach == pytest.approx(0.05 + 0.3 + 0.3 + 0.04 + 0.28, abs=0.02)
     toolless = replace(arm(), frames=())
     assert (RobotProperties(toolless).reach, RobotProperties(toolless).movable_to_tool) == (0, 0)
@@ -74,11 +74,11 @@ def test_reach_counts_from_the_root_and_is_nothing_without_a_tool():
         ("dof * 2 == 10 and not (dof == 4 or dof == 6)", True),
     ],
 )
-def test_a_condition_is_true_or_false(gantry, text, expected):
+def test_a_condition_evaluates_to_true_or_false(gantry, text, expected):
     assert true_of(text, gantry) is expected
 
 
-def test_clauses_are_what_and_joins():
+def test_clauses_are_the_operands_of_and():
     condition = parse_condition("mass < 4 and (dof > 2 or links > 3) and 1 < reach < 2")
     assert [str(clause) for clause in clauses(condition)] == [
         "(mass < 4)",
@@ -100,7 +100,7 @@ def test_clauses_are_what_and_joins():
         ("reach > 1furlong", "unknown unit 'furlong'"),
     ],
 )
-def test_what_is_no_condition_is_refused(text, message):
+def test_invalid_conditions_are_errors(text, message):
     with pytest.raises(GrammarError) as caught:
         require_condition(parse_condition(text, "g"))
     assert str(caught.value).startswith("g:")
@@ -108,5 +108,5 @@ def test_what_is_no_condition_is_refused(text, message):
 
 
 @pytest.mark.parametrize("name", PROPERTIES)
-def test_every_property_can_be_asked_for(gantry, name):
+def test_every_property_can_be_used_in_a_condition(gantry, name):
     assert true_of(f"{name} >= 0", gantry)

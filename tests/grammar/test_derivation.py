@@ -1,4 +1,4 @@
-"""A derivation is text that parses back, hashes and diffs."""
+"""Derivations as text: parsing, printing, hashing and differences."""
 
 import pytest
 from hypothesis import given
@@ -23,18 +23,18 @@ TREES = st.recursive(
 
 
 @given(TREES)
-def test_printing_what_was_parsed_from_print_is_the_identity(tree):
+def test_printing_and_parsing_a_derivation_round_trips(tree):
     assert str(parse_derivation(str(tree))) == str(tree)
     assert parse_derivation(str(tree)).digest == tree.digest
 
 
 @pytest.mark.parametrize("text", ["", "arm", "arm=ur5(", "arm=ur5[top ee=x]", "a=b(c=d)", "a=b]"])
-def test_what_is_no_derivation_is_refused_with_its_place(text):
+def test_invalid_derivations_are_errors_with_a_position(text):
     with pytest.raises(GrammarError, match=r"^card:1:\d+: invalid derivation"):
         parse_derivation(text, "card")
 
 
-def test_a_difference_names_parts_and_parameters():
+def test_a_difference_lists_parts_and_parameters():
     a = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.1)]]")
     b = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.2)]]")
     c = parse_derivation("base=fixed[top: arm=panda]")
@@ -43,7 +43,7 @@ def test_a_difference_names_parts_and_parameters():
     assert difference(a, c)[:2] == ["- arm = ur5 on base:top", "+ arm = panda on base:top"]
 
 
-def test_an_outline_has_a_line_a_part():
+def test_an_outline_has_one_line_per_part():
     tree = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.1)]]")
     assert outline(tree).splitlines() == [
         "base=fixed",

@@ -1,4 +1,4 @@
-"""A grammar and a chooser make a derivation: labels, ports, and an end."""
+"""Deriving a robot from a grammar and a chooser: labels, ports, random values and termination."""
 
 import itertools
 
@@ -29,18 +29,18 @@ def places(derivation):
     return [(c.label, node.label, port) for node in derivation.walk() for port, c in node.children]
 
 
-def test_a_symbol_that_becomes_one_part_gives_it_its_name():
+def test_a_symbol_of_one_part_labels_that_part():
     tree = first("robot -> base arm ee", "base -> fixed", "arm -> any", "any -> ur5", "ee -> stick")
     assert labels(tree) == ["base", "arm", "ee"]
     assert [node.part for node in tree.walk()] == ["fixed", "ur5", "stick"]
 
 
-def test_a_symbol_that_becomes_several_parts_leaves_them_their_names():
+def test_parts_of_a_symbol_of_several_parts_keep_their_own_labels():
     tree = first("robot -> fixed limb", "limb -> ur5 ee", "ee -> stick")
     assert labels(tree) == ["fixed", "ur5", "ee"]
 
 
-def test_copies_are_numbered_even_if_there_is_but_one():
+def test_repeated_parts_are_numbered_even_if_there_is_only_one():
     assert labels(first("robot -> post beam{3} plane")) == [
         "post",
         "beam1",
@@ -51,16 +51,16 @@ def test_copies_are_numbered_even_if_there_is_but_one():
     assert labels(first("robot -> post beam{1}")) == ["post", "beam1"]
 
 
-def test_copies_of_several_parts_each_have_their_number_before():
+def test_labels_in_a_repeated_symbol_start_with_the_number_of_the_copy():
     tree = first("robot -> post pair{2}", "pair -> beam bead")
     assert labels(tree) == ["post", "pair1_beam", "pair1_bead", "pair2_beam", "pair2_bead"]
 
 
-def test_a_name_that_is_taken_gets_a_number():
+def test_duplicate_labels_are_numbered():
     assert labels(first("robot -> post beam beam beam")) == ["post", "beam", "beam_2", "beam_3"]
 
 
-def test_limbs_carry_the_name_of_their_port():
+def test_labels_of_a_limb_start_with_its_port():
     tree = first(
         "robot -> pedestal left:limb right:limb", "limb -> arm ee", "arm -> ur5", "ee -> stick"
     )
@@ -72,7 +72,7 @@ def test_limbs_carry_the_name_of_their_port():
     ]
 
 
-def test_what_has_no_port_goes_on_from_the_trunk_and_not_from_a_limb():
+def test_items_without_a_port_attach_to_the_trunk_not_to_a_limb():
     tree = first("robot -> pedestal left:ur5 panda stick")
     assert places(tree) == [
         ("left_ur5", "pedestal", "left"),
@@ -81,7 +81,7 @@ def test_what_has_no_port_goes_on_from_the_trunk_and_not_from_a_limb():
     ]
 
 
-def test_ports_of_a_part_inside_a_symbol_are_named_in_it():
+def test_ports_can_be_named_inside_the_symbol_of_their_part():
     tree = first("robot -> fixed torso", "torso -> yumi left:yumi_gripper right:none")
     assert places(tree)[1:] == [
         ("left_yumi_gripper", "yumi", "left"),
@@ -89,7 +89,7 @@ def test_ports_of_a_part_inside_a_symbol_are_named_in_it():
     ]
 
 
-def test_parameters_are_complete_and_the_turn_of_a_mount_only_if_there_is_one():
+def test_all_parameters_are_recorded_and_mount_yaw_only_if_set():
     tree = first("let r = 3cm", "robot -> gantry plane(size=2*r) ")
     assert dict(tree.children[0][1].parameters) == {"size": 0.06, "thickness": 0.01}
     turned = first("robot -> gantry plane(mount_yaw=90deg)")
@@ -97,11 +97,11 @@ def test_parameters_are_complete_and_the_turn_of_a_mount_only_if_there_is_one():
     assert "mount_yaw" not in str(first("robot -> gantry plane(mount_yaw=0)"))
 
 
-def test_a_full_turn_is_in_range_although_it_is_written_with_12_digits():
+def test_a_mount_yaw_of_360_degrees_is_in_range_after_rounding():
     assert "mount_yaw=6.28318530718" in str(first("robot -> gantry plane(mount_yaw=360deg)"))
 
 
-def test_a_let_is_drawn_once_and_an_argument_for_every_copy():
+def test_a_let_is_drawn_once_and_an_argument_once_per_copy():
     shared = draw(grammar("let r = uniform(0.1, 0.5)", "robot -> post beam(length=r){4}"))
     own = draw(grammar("robot -> post beam(length=uniform(0.1, 0.5)){4}"))
     lengths = [[n.parameters[0][1] for n in tree.walk()][1:] for tree in (shared, own)]
@@ -109,14 +109,14 @@ def test_a_let_is_drawn_once_and_an_argument_for_every_copy():
     assert len(set(lengths[1])) == 4
 
 
-def test_two_distributions_in_one_expression_are_drawn_apart():
+def test_two_distributions_in_one_expression_are_drawn_independently():
     recorded = RecordedChooser(RandomChooser(np.random.default_rng(0)))
     found = grammar("robot -> gantry plane(size=uniform(0.1, 0.2) + uniform(0.1, 0.2))")
     derive(found, LIBRARY, recorded)
     assert list(recorded.choices) == ["robot/1.plane.size", "robot/1.plane.size~2"]
 
 
-def test_first_takes_the_first_possible_alternative_and_the_smallest_count():
+def test_the_first_chooser_takes_the_first_possible_alternative_and_the_smallest_count():
     tree = first(
         "robot -> post links ee",
         "links -> beam(length=uniform(0.1, 0.5)){2,5}",
@@ -127,7 +127,7 @@ def test_first_takes_the_first_possible_alternative_and_the_smallest_count():
     assert [node.part for node in tree.walk()][-1] == "claw"
 
 
-def test_weights_are_shares():
+def test_weights_are_relative_probabilities():
     found = grammar(
         "robot -> @weight(3) cubes | @weight(2*0.5) cartpole | @weight(0) gantry | post"
     )
@@ -138,7 +138,7 @@ def test_weights_are_shares():
     assert shares[2] == 0
 
 
-def test_a_weight_may_be_drawn():
+def test_a_weight_may_be_random():
     found = grammar(
         "let w = choice(0, 1)",
         "robot -> @weight(w) cubes | @weight(1 - w) cartpole | @weight(0) post",
@@ -149,7 +149,7 @@ def test_a_weight_may_be_drawn():
         assert part == ("cubes" if recorded.choices["let w"] else "cartpole")
 
 
-def test_counts_of_a_repetition_are_equally_likely():
+def test_repetition_counts_are_uniform():
     found = grammar("robot -> post beam{2,4}")
     rng = np.random.default_rng(0)
     counts = [len(labels(derive(found, LIBRARY, RandomChooser(rng)))) - 1 for _ in range(900)]
@@ -157,7 +157,7 @@ def test_counts_of_a_repetition_are_equally_likely():
 
 
 @pytest.mark.parametrize("name", CATEGORIES)
-def test_recorded_choices_make_the_same_derivation_again(name):
+def test_recorded_choices_reproduce_the_derivation(name):
     found = shipped(name)
     for seed in range(5):
         recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
@@ -168,7 +168,7 @@ def test_recorded_choices_make_the_same_derivation_again(name):
         assert again.choices == recorded.choices
 
 
-def test_choices_that_do_not_fit_are_made_by_the_other():
+def test_invalid_recorded_choices_fall_back_to_the_other_chooser():
     found = grammar("robot -> post links", "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw")
     given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
     assert derive(found, LIBRARY, RecordedChooser(FirstChooser(), given)) == derive(
@@ -176,7 +176,7 @@ def test_choices_that_do_not_fit_are_made_by_the_other():
     )
 
 
-def test_a_recursion_may_end():
+def test_a_recursion_may_terminate():
     found = grammar("robot -> slides tail", "tail -> bead | bead tail")
     sizes = {sum(1 for _ in draw(found, seed).walk()) for seed in range(30)}
     assert {2, 3, 4} <= sizes
@@ -190,7 +190,7 @@ def test_a_recursion_may_end():
         ("robot -> slides a", "a -> bead b", "b -> bead a"),
     ],
 )
-def test_a_recursion_without_end_is_given_up(lines):
+def test_an_endless_recursion_is_an_error(lines):
     with pytest.raises(TooManyPartsError, match=r"^g:\d:\d: "):
         first(*lines)
 
@@ -240,13 +240,13 @@ def test_no_robot_has_more_parts_than_allowed():
         (["let r = r", "robot -> cubes"], "g:1:9: unknown value 'r'"),
     ],
 )
-def test_what_cannot_be_derived_is_refused_with_its_place(lines, message):
+def test_derivation_errors_have_a_position(lines, message):
     with pytest.raises(GrammarError, match=r"^g:[^\n]*$") as caught:
         first(*lines)
     assert message in str(caught.value)
 
 
-def test_labels_are_unique_whatever_is_drawn():
+def test_labels_are_unique_for_random_derivations():
     found = grammar(
         "robot -> pedestal left:limb right:limb limb",
         "limb -> beam{1,3} | beam2 beam1 | limb beam",

@@ -1,4 +1,4 @@
-"""Grammars are files that include each other; printed, they are the same grammar."""
+"""Grammar files: includes, printing, library lookup and digests."""
 
 import pytest
 
@@ -51,7 +51,7 @@ def test_there_is_a_grammar_for_each_category():
 
 
 @pytest.mark.parametrize("name", CATEGORIES)
-def test_a_printed_grammar_is_the_same_grammar(name):
+def test_shipped_grammars_round_trip_through_printing(name):
     text = grammar_text(shipped(name))
     again = grammar_from_text(text, name)
     assert grammar_text(again) == text
@@ -59,7 +59,7 @@ def test_a_printed_grammar_is_the_same_grammar(name):
     assert first(again) == first(shipped(name))
 
 
-def test_printing_keeps_all_that_a_grammar_can_say():
+def test_printing_preserves_every_language_feature():
     lines = [
         "let r = (0.1 * uniform(3.141592653589793mm, 1e-05m))",
         "robot -> base left:limb right:limb | @weight((r / 2)) body(size=-(r + 1), x=r){2,7}",
@@ -70,7 +70,7 @@ def test_printing_keeps_all_that_a_grammar_can_say():
     assert grammar_text(grammar(*lines)).splitlines() == lines
 
 
-def test_the_start_is_the_first_symbol_of_the_file_itself(write):
+def test_the_start_symbol_is_the_first_symbol_of_the_main_file(write):
     write("limbs", "limb -> arm plane", "arm -> ur5 | panda")
     path = write("mine", "include limbs", "include limbs", "robot -> fixed limb")
     found = load_grammar(path, [path.parent])
@@ -79,12 +79,12 @@ def test_the_start_is_the_first_symbol_of_the_file_itself(write):
     assert "arm=ur5" in first(found)
 
 
-def test_a_file_that_only_includes_starts_where_the_included_one_does(write):
+def test_a_file_of_includes_only_has_the_start_symbol_of_the_included_file(write):
     write("body", "robot -> gantry ee", "ee -> plane")
     assert load_grammar(write("mine", 'include "body.grammar"', "let r = 1")).start == "robot"
 
 
-def test_a_file_says_anew_what_an_included_one_says(write):
+def test_a_file_overrides_included_definitions(write):
     write("body", "let r = 5cm", "robot -> gantry ee", "ee -> plane(size=r)", "where dof > 2")
     path = write("mine", 'include "body.grammar"', "let r = 8cm", "ee -> cube(size=r)")
     found = load_grammar(path)
@@ -101,7 +101,7 @@ def test_shipped_grammars_can_be_included_by_name(write):
     assert "end: jaw=jaw" in first(load_grammar(path))
 
 
-def test_a_library_comes_before_the_shipped_grammars(write, tmp_path):
+def test_user_libraries_take_precedence_over_shipped_grammars(write, tmp_path):
     own = write("cubes", "robot -> cartpole")
     assert find_grammar("cubes", [tmp_path]) == own
     assert find_grammar("cubes") != own
@@ -110,7 +110,7 @@ def test_a_library_comes_before_the_shipped_grammars(write, tmp_path):
 
 
 @pytest.mark.parametrize("target", ["a.grammar", "../{}/a.grammar", "./a.grammar"])
-def test_grammars_that_include_each_other_are_refused(write, tmp_path, target):
+def test_include_cycles_are_errors(write, tmp_path, target):
     target = target.format(tmp_path.name)
     path = write("a", 'include "b.grammar"', "robot -> cubes")
     write("b", f'include "{target}"', "x -> cubes")
@@ -137,13 +137,13 @@ def test_two_files_may_include_the_same_third(write):
         (["include nlink", "robot -> a"], "1:9: a grammar given as text cannot include others"),
     ],
 )
-def test_a_grammar_that_contradicts_itself_is_refused(lines, message):
+def test_contradictory_grammars_are_errors(lines, message):
     with pytest.raises(GrammarError) as caught:
         grammar(*lines)
     assert message in str(caught.value)
 
 
-def test_an_include_that_leads_nowhere_is_told_where_it_stands(write):
+def test_a_missing_include_is_reported_with_its_position(write):
     path = write("mine", "robot -> cubes", "include nlnk")
     with pytest.raises(GrammarError) as caught:
         load_grammar(path)
@@ -152,7 +152,7 @@ def test_an_include_that_leads_nowhere_is_told_where_it_stands(write):
         find_grammar(str(path.with_name("other.grammar")))
 
 
-def test_the_digest_is_that_of_all_texts(write):
+def test_the_digest_covers_all_included_files(write):
     write("body", "ee -> plane")
     path = write("mine", 'include "body.grammar"', "robot -> gantry ee")
     before = load_grammar(path).digest
@@ -164,6 +164,6 @@ def test_the_digest_is_that_of_all_texts(write):
 @pytest.mark.parametrize(
     "target", ["/etc/passwd", "/etc/x.grammar", "../x.grammar", "a/../../x.grammar"]
 )
-def test_an_include_stays_in_its_folder(write, target):
+def test_an_include_cannot_leave_its_folder(write, target):
     with pytest.raises(GrammarError, match="leads outside of"):
         load_grammar(write("mine", f'include "{target}"', "robot -> cubes"))

@@ -1,4 +1,4 @@
-"""docs/grammar.md says what the code does: its examples are drawn, its messages are real."""
+"""docs/grammar.md agrees with the code: its examples run and its error messages are real."""
 
 import re
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_there_are_five_examples():
 
 
 @pytest.mark.parametrize("text", EXAMPLES)
-def test_an_example_is_sound_and_can_be_drawn(load, text):
+def test_examples_have_no_faults_and_can_be_sampled(load, text):
     found = load(text)
     assert check_grammar(found, LIBRARY) == []
     for drawn in sample_robots(found, LIBRARY, 3):
@@ -49,7 +49,7 @@ def test_an_example_is_sound_and_can_be_drawn(load, text):
         assert any(frame.name == "tool" for frame in drawn.robot.frames)
 
 
-def test_two_limbs_have_the_names_that_the_page_gives(load):
+def test_two_limbs_have_the_documented_names(load):
     (text,) = (text for text in EXAMPLES if "left:limb" in text)
     (drawn,) = sample_robots(load(text), LIBRARY, 1)
     labels = [node.label for node in drawn.derivation.walk()]
@@ -58,7 +58,7 @@ def test_two_limbs_have_the_names_that_the_page_gives(load):
     assert frames == {"tool", "left_tool", "right_tool"}
 
 
-def test_the_first_example_weighs_its_arms_two_to_one(load):
+def test_the_arms_of_the_first_example_have_weights_two_to_one(load):
     import numpy as np
 
     found, rng = load(EXAMPLES[0]), np.random.default_rng(0)
@@ -66,12 +66,12 @@ def test_the_first_example_weighs_its_arms_two_to_one(load):
     assert arms.count("ur5") / 300 == pytest.approx(2 / 3, abs=0.08)
 
 
-def test_there_are_mistakes_of_many_kinds():
+def test_the_page_shows_mistakes_of_many_kinds():
     assert len(MISTAKES) >= 10
 
 
 @pytest.mark.parametrize(("lines", "message"), MISTAKES)
-def test_a_mistake_is_answered_as_the_page_says(load, lines, message):
+def test_each_mistake_raises_the_documented_message(load, lines, message):
     text = "\n".join(re.findall("`(.*?)`", lines)) + "\n"
     try:
         found = check_grammar(load(text), LIBRARY)
@@ -82,25 +82,25 @@ def test_a_mistake_is_answered_as_the_page_says(load, lines, message):
     assert message in found
 
 
-def test_the_message_of_a_condition_that_cannot_be_met_is_the_pages(monkeypatch):
+def test_an_unsatisfiable_condition_raises_the_documented_message(monkeypatch):
     (told,) = re.findall(r"`(robot 0 of .*?)`", PAGE)
     with pytest.raises(SamplingError) as caught:
         next(sample_robots(shipped("cubes"), LIBRARY, 1, where=[parse_condition("mass > 900")]))
     assert str(caught.value) == told
 
 
-def test_all_units_distributions_and_properties_are_on_the_page():
+def test_all_units_distributions_and_properties_are_documented():
     for name in (*(f"`{d}(" for d in DISTRIBUTIONS), *(f"`{p}`" for p in PROPERTIES)):
         assert name in PAGE
     (units,) = re.findall(r"\*\*Units\*\* are (.*?)\.", PAGE)
     assert set(units.split(", ")) == set(UNITS)
 
 
-def test_what_the_page_pins_can_be_pinned():
+def test_documented_pins_are_valid():
     assert pin(shipped("chain"), ["beads=5", "bead.rod=3cm", "radius=2cm"], LIBRARY)
 
 
-def test_the_index_has_the_facts_that_the_page_names(tmp_path):
+def test_the_index_has_the_documented_fields(tmp_path):
     (row,) = re.findall(r"\| `index\.jsonl` \| one line per robot: (.*?) \|", PAGE)
     named = set(row.replace("rejected draws", "rejected").split(", "))
     plan = SetConfig(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())

@@ -1,4 +1,4 @@
-"""The library: every part there is can be found, composed and trusted, and so can a user's own."""
+"""The part library: shipped parts, user folders and lookup errors."""
 
 import os
 import re
@@ -66,7 +66,7 @@ def _no_library_of_the_users_own(monkeypatch):
     "name",
     [pytest.param(n, marks=[pytest.mark.slow] if n in DETAILED else []) for n in PARTS],
 )
-def test_every_part_composes_into_a_robot_that_the_checks_find_sound(name):
+def test_every_part_composes_into_a_robot_without_errors(name):
     derivation = parse_request(PARTS[name].format(name).split(), LIBRARY)
     robot = compose(derivation, LIBRARY, default_name(derivation, LIBRARY))
     assert [finding for finding in check(robot) if finding.severity != "info"] == []
@@ -74,12 +74,12 @@ def test_every_part_composes_into_a_robot_that_the_checks_find_sound(name):
 
 
 @pytest.mark.parametrize("name", sorted(DEGREES_OF_FREEDOM))
-def test_parts_have_the_joints_that_they_are_known_for(name):
+def test_parts_have_the_expected_number_of_joints(name):
     assert load_part(LIBRARY.manifest(name)).fragment.dof == DEGREES_OF_FREEDOM[name]
 
 
 @pytest.mark.parametrize("name", LIBRARY.names("ee"))
-def test_a_tool_points_out_of_the_hand_and_lies_in_front_of_it(name):
+def test_tool_frames_lie_in_front_of_the_mount_and_point_outwards(name):
     part = load_part(LIBRARY.manifest(name))
     T_root_link = forward_kinematics(part.fragment, part.fragment.home)
     T_root_tool = (
@@ -93,14 +93,14 @@ def test_a_tool_points_out_of_the_hand_and_lies_in_front_of_it(name):
 
 
 @pytest.mark.parametrize("name", [m.name for m in LIBRARY.manifests() if not m.is_template])
-def test_every_real_part_says_whose_work_it_is(name):
+def test_every_real_part_names_its_source_and_licence(name):
     manifest = LIBRARY.manifest(name)
     assert re.fullmatch(r"[A-Za-z]+-[A-Za-z0-9.-]+|MIT|ISC", manifest.licence)
     assert len(manifest.citation) > 20
     assert manifest.summary
 
 
-def test_templates_and_real_parts_of_every_kind_are_there():
+def test_the_library_has_templates_and_real_parts_of_every_kind():
     assert {"fixed", "pedestal", "planar", "gantry"} <= set(LIBRARY.names("base"))
     assert {"ur5", "lwr", "widowx"} <= set(LIBRARY.names("arm"))
     assert {"none", "stick", "robotiq_2f85", "rethink", "sake_ez"} <= set(LIBRARY.names("ee"))
@@ -109,25 +109,25 @@ def test_templates_and_real_parts_of_every_kind_are_there():
     assert len(kinds) == len(LIBRARY.names())
 
 
-def test_an_unknown_part_names_the_nearest_of_its_kind():
+def test_an_unknown_part_suggests_the_nearest_of_its_kind():
     with pytest.raises(PartError, match="unknown ee 'plan'; did you mean 'plane'") as caught:
         LIBRARY.manifest("plan", "ee")
     assert "ur5" not in str(caught.value)
 
 
-def test_a_part_of_another_kind_is_refused():
+def test_a_part_of_the_wrong_kind_is_an_error():
     with pytest.raises(PartError, match="'plane' is of kind ee, not arm"):
         LIBRARY.manifest("plane", "arm")
 
 
-def test_a_folder_of_ones_own_adds_parts(tmp_path):
+def test_a_user_folder_adds_parts(tmp_path):
     write_part(tmp_path / "deep" / "down")
     library = default_library([tmp_path])
     assert "pincer" in library.names("ee")
     assert "pincer" not in default_library().names()
 
 
-def test_the_environment_names_folders_like_a_path(tmp_path, monkeypatch):
+def test_the_environment_variable_lists_folders_like_path(tmp_path, monkeypatch):
     write_part(tmp_path / "a", name="pincer_a")
     write_part(tmp_path / "b", name="pincer_b")
     monkeypatch.setenv(
@@ -136,21 +136,21 @@ def test_the_environment_names_folders_like_a_path(tmp_path, monkeypatch):
     assert {"pincer_a", "pincer_b"} <= set(default_library().names("ee"))
 
 
-def test_a_folder_that_is_given_twice_is_one_folder(tmp_path, monkeypatch):
+def test_duplicate_folders_are_merged(tmp_path, monkeypatch):
     write_part(tmp_path)
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
     monkeypatch.chdir(tmp_path)
     assert "pincer" in default_library([tmp_path, tmp_path.relative_to(tmp_path)]).names()
 
 
-def test_the_name_of_another_part_is_refused(tmp_path):
+def test_duplicate_part_names_are_errors(tmp_path):
     own = write_part(tmp_path, name="ur5", kind="arm")
     message = rf"part 'ur5' is in \S*/robots_real/ur5\.yaml and in {re.escape(str(own))}"
     with pytest.raises(PartError, match=message):
         default_library([tmp_path]).names()
 
 
-def test_two_files_of_one_name_are_refused(tmp_path):
+def test_two_files_with_one_name_are_errors(tmp_path):
     write_part(tmp_path / "a")
     write_part(tmp_path / "b")
     with pytest.raises(PartError, match="part 'pincer' is in"):
@@ -162,7 +162,7 @@ def test_a_missing_folder_is_named(tmp_path):
         default_library([tmp_path / "nowhere"]).names()
 
 
-def test_a_broken_manifest_does_not_keep_the_other_parts_from_being_used(tmp_path):
+def test_a_broken_manifest_does_not_affect_other_parts(tmp_path):
     write_part(tmp_path)
     (tmp_path / "broken.yaml").write_text("name: ]")
     library = default_library([tmp_path])

@@ -1,4 +1,4 @@
-"""A manifest is read as it is written, or refused with the file and the key."""
+"""Reading part manifests; errors name the file, the line and the key."""
 
 import pytest
 
@@ -30,7 +30,7 @@ def text_refusal(tmp_path, text):
     return refusal(path)
 
 
-def test_a_template_has_a_xacro_beside_it_and_parameters(tmp_path):
+def test_a_template_manifest_has_a_xacro_file_and_parameters(tmp_path):
     path = write_part(tmp_path)
     manifest = read_manifest(path)
     assert manifest.is_template
@@ -41,7 +41,7 @@ def test_a_template_has_a_xacro_beside_it_and_parameters(tmp_path):
     assert manifest.home == {"left_slide": 0.01, "wheel": 0.5}
 
 
-def test_a_real_part_names_a_package_and_xacro_arguments_as_xacro_spells_them(tmp_path):
+def test_a_real_part_manifest_has_a_package_and_xacro_arguments(tmp_path):
     manifest = read_manifest(write_part(tmp_path, **REAL))
     assert not manifest.is_template
     source = manifest.source
@@ -51,7 +51,7 @@ def test_a_real_part_names_a_package_and_xacro_arguments_as_xacro_spells_them(tm
     assert manifest.citation == "A. Body"
 
 
-def test_what_may_be_left_out_is_empty(tmp_path):
+def test_optional_keys_default_to_empty(tmp_path):
     manifest = read_manifest(write_part(tmp_path, mount=None, tool=None, home=None))
     assert manifest.mount is None
     assert manifest.tool is None
@@ -60,24 +60,24 @@ def test_what_may_be_left_out_is_empty(tmp_path):
     assert manifest.without == ()
 
 
-def test_an_unknown_key_names_the_nearest(tmp_path):
+def test_an_unknown_key_suggests_the_nearest(tmp_path):
     message = refusal(write_part(tmp_path, paramters={}))
     assert message.startswith(": unknown key 'paramters'; did you mean 'parameters'? valid: ")
 
 
 @pytest.mark.parametrize(("key", "of"), [("mass", {}), ("drop", {}), ("citation", "x")])
-def test_keys_of_real_parts_are_none_of_templates(tmp_path, key, of):
+def test_templates_reject_keys_of_real_parts(tmp_path, key, of):
     assert f"unknown key {key!r}" in refusal(write_part(tmp_path, **{key: of}))
 
 
 @pytest.mark.parametrize("key", ["density"])
-def test_keys_of_templates_are_none_of_real_parts(tmp_path, key):
+def test_real_parts_reject_keys_of_templates(tmp_path, key):
     changes = REAL | {key: MANIFEST[key]}
     assert f"unknown key {key!r}" in refusal(write_part(tmp_path, **changes))
 
 
 @pytest.mark.parametrize("key", ["kind", "licence", "name", "root", "summary"])
-def test_a_missing_key_is_named(tmp_path, key):
+def test_a_missing_key_is_an_error(tmp_path, key):
     assert refusal(write_part(tmp_path, **{key: None})) == f":1: missing key {key!r}"
 
 
@@ -166,11 +166,11 @@ def test_a_missing_key_is_named(tmp_path, key):
         ),
     ],
 )
-def test_a_value_of_the_wrong_type_is_refused_by_file_and_key(tmp_path, changes, message):
+def test_a_value_of_the_wrong_type_is_an_error_that_names_file_and_key(tmp_path, changes, message):
     assert message in refusal(write_part(tmp_path, **changes))
 
 
-def test_the_name_is_the_files(tmp_path):
+def test_the_name_must_equal_the_file_name(tmp_path):
     path = write_part(tmp_path).rename(tmp_path / "tongs.yaml")
     assert refusal(path) == ": name 'pincer' differs from the file's, 'tongs'"
 
@@ -197,15 +197,15 @@ def test_the_name_is_the_files(tmp_path):
         ("5: 5\n", ":1: key 5 is not text; quote it"),
     ],
 )
-def test_what_is_no_manifest_is_refused_at_its_line_and_column(tmp_path, text, message):
+def test_invalid_yaml_is_an_error_with_line_and_column(tmp_path, text, message):
     assert text_refusal(tmp_path, text).startswith(message)
 
 
-def test_a_manifest_in_another_encoding_is_refused(tmp_path):
+def test_a_manifest_that_is_not_utf8_is_an_error(tmp_path):
     path = tmp_path / "pincer.yaml"
     path.write_bytes("summary: prénom".encode("latin-1"))
     assert "invalid YAML" in refusal(path)
 
 
-def test_a_missing_file_is_refused(tmp_path):
+def test_a_missing_file_is_an_error(tmp_path):
     assert refusal(tmp_path / "pincer.yaml") == ": cannot be read: No such file or directory"

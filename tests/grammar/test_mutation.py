@@ -1,4 +1,4 @@
-"""A neighbour of a robot has one choice of its grammar made anew."""
+"""Mutation redraws one choice of a robot's derivation."""
 
 import json
 
@@ -31,7 +31,7 @@ def assert_one_choice_differs(before, after):
 
 
 @pytest.mark.parametrize("category", [name for name in CATEGORIES if name != "panda_variations"])
-def test_one_choice_differs_and_what_it_opens(category):
+def test_a_neighbour_differs_in_one_choice_and_its_dependants(category):
     found = shipped(category)
     origin = sample_robot(found, LIBRARY, 3)
     for neighbour in neighbours(found, origin, 5):
@@ -39,7 +39,7 @@ def test_one_choice_differs_and_what_it_opens(category):
         assert neighbour.derivation != origin.derivation
 
 
-def test_all_else_stays_to_the_last_digit():
+def test_all_other_values_are_unchanged_to_the_last_digit():
     found = grammar(
         "let r = uniform(0.031234567, 0.04)",
         "robot -> gantry(low=uniform(0.1, 0.2), stroke=r*17) plane(size=1.7*r/0.9)",
@@ -52,7 +52,7 @@ def test_all_else_stays_to_the_last_digit():
             assert names in ({"gantry.low"}, {"gantry.stroke", "plane.size"})
 
 
-def test_a_choice_that_a_file_rounded_is_kept():
+def test_choices_rounded_in_a_file_are_kept():
     found = grammar(
         "robot -> gantry plane(size=uniform(0.1, 0.2), mount_yaw=choice(60deg, 60deg, 30deg))"
     )
@@ -64,7 +64,7 @@ def test_a_choice_that_a_file_rounded_is_kept():
             assert_one_choice_differs(as_in_index(origin.choices), as_in_index(neighbour.choices))
 
 
-def test_another_alternative_brings_its_own_parameters():
+def test_a_new_alternative_draws_its_own_parameters():
     found = grammar("robot -> gantry ee", "ee -> plane(size=uniform(0.1, 0.2)) | stick")
     origin = next(
         o
@@ -75,7 +75,7 @@ def test_another_alternative_brings_its_own_parameters():
         assert set(neighbour.choices) == {"robot/1.ee", "robot/1.ee/plane.size"}
 
 
-def test_conditions_hold_for_neighbours_too():
+def test_neighbours_satisfy_the_conditions():
     found = grammar(
         "robot -> post beam(length=uniform(0.1, 0.3)){2,5} jaw", "where 0.5 < reach < 0.9"
     )
@@ -85,7 +85,7 @@ def test_conditions_hold_for_neighbours_too():
     assert sum(len(neighbour.rejected) for neighbour in drawn) > 0
 
 
-def test_neighbours_are_the_same_for_a_seed_however_many_are_drawn():
+def test_neighbours_depend_on_the_seed_not_on_their_number():
     found = shipped("chain")
     origin = sample_robot(found, LIBRARY, 0)
     few, many = neighbours(found, origin, 2, seed=4), neighbours(found, origin, 5, seed=4)
@@ -102,7 +102,7 @@ def test_a_grammar_without_choices_has_no_neighbours():
         )
 
 
-def test_a_choice_that_cannot_change_anything_is_told(monkeypatch):
+def test_a_choice_without_effect_is_an_error(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 20)
     found = grammar("robot -> cubes(size=choice(0.1, 0.1))")
     with pytest.raises(SamplingError, match="in 20 draws: 20 x nothing changed"):

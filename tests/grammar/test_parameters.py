@@ -1,4 +1,4 @@
-"""Values have units and ranges, and an error says which."""
+"""Part parameters: units, ranges and error messages."""
 
 import math
 
@@ -27,28 +27,28 @@ def test_degrees_become_radians():
 
 
 @pytest.mark.parametrize("text", ["45deg", "1kg", "3 furlongs"])
-def test_unit_of_another_kind_is_refused_with_the_right_ones(text):
+def test_a_wrong_unit_is_an_error_that_lists_the_valid_ones(text):
     with pytest.raises(PartError, match=r"ee\.size=.*wrong unit.*units: m/cm/mm"):
         parse_value(text, SIZE, "ee.size")
 
 
 @pytest.mark.parametrize("text", ["big", "", "1.2.3", "nan", "inf", "0x10"])
-def test_what_is_no_number_is_refused(text):
+def test_values_that_are_not_numbers_are_errors(text):
     with pytest.raises(PartError, match="not a number"):
         parse_value(text, SIZE, "ee.size")
 
 
 @pytest.mark.parametrize("text", ["0.6", "10mm", "-0.1"])
-def test_out_of_range_names_the_range(text):
+def test_a_value_out_of_range_is_an_error_that_names_the_range(text):
     with pytest.raises(PartError, match=r"out of range; expected 0\.05 to 0\.5 m"):
         parse_value(text, SIZE, "ee.size")
 
 
-def test_unknown_parameter_names_the_nearest():
+def test_an_unknown_parameter_suggests_the_nearest():
     with pytest.raises(PartError, match="no parameter 'sise'; did you mean 'size'"):
         resolve_values({"sise": 0.1}, {"size": SIZE}, "plane")
 
 
-def test_default_outside_its_range_is_a_fault_of_the_manifest():
+def test_a_default_outside_its_range_is_a_manifest_error():
     with pytest.raises(ValueError, match="default 2 is outside"):
         Parameter(2.0, 0.0, 1.0, "m")

@@ -1,4 +1,4 @@
-"""A part is what its source says, corrected by what its manifest says."""
+"""Loading parts: the source file with the corrections of the manifest."""
 
 import importlib.metadata
 import math
@@ -39,19 +39,19 @@ def real(tmp_path, monkeypatch):
     return make
 
 
-def test_a_part_begins_at_its_root(tmp_path):
+def test_the_fragment_starts_at_the_root_link_of_the_manifest(tmp_path):
     body = template(tmp_path).fragment
     assert [link.name for link in body.links] == ["palm", "left", "right", "disc"]
     assert [joint.name for joint in body.joints] == ["left_slide", "right_slide", "wheel"]
 
 
-def test_links_that_it_goes_without_are_cut_off_with_their_joints(tmp_path):
+def test_excluded_links_are_removed_with_their_joints(tmp_path):
     body = template(tmp_path, without=["disc"], home={"left_slide": 0.01}).fragment
     assert [link.name for link in body.links] == ["palm", "left", "right"]
     assert body.home == (0.01,)
 
 
-def test_parameters_shape_the_links_and_the_frames(tmp_path):
+def test_parameters_change_links_and_frames(tmp_path):
     part = template(tmp_path, {"length": 0.4})
     assert part.fragment.link("palm").collisions[0].geometry == Box((0.02, 0.02, 0.4))
     assert part.tool.T_link_frame.position == pytest.approx((0, 0, 0.45))
@@ -59,12 +59,12 @@ def test_parameters_shape_the_links_and_the_frames(tmp_path):
     assert template(tmp_path).values == {"length": 0.2}
 
 
-def test_expressions_stand_in_home_too(tmp_path):
+def test_home_may_contain_expressions(tmp_path):
     part = template(tmp_path, {"length": 0.3}, home={"left_slide": "${length / 10}"})
     assert part.fragment.home == pytest.approx((0.03, 0.0))
 
 
-def test_the_density_gives_masses_where_there_are_none(tmp_path):
+def test_the_density_sets_missing_masses(tmp_path):
     part = template(tmp_path)
     palm = part.fragment.link("palm").inertial
     assert palm.mass == pytest.approx(BAR * 0.2)
@@ -72,14 +72,14 @@ def test_the_density_gives_masses_where_there_are_none(tmp_path):
     assert palm.inertia[0] == pytest.approx(palm.mass * (0.02**2 + 0.2**2) / 12)
 
 
-def test_the_same_part_is_built_once(tmp_path):
+def test_loaded_parts_are_cached(tmp_path):
     manifest = read_manifest(write_part(tmp_path))
     assert load_part(manifest, {"length": 0.3}) is load_part(manifest, {"length": 0.3})
     assert load_part(manifest, {"length": 0.2}) is load_part(manifest)
     assert load_part(manifest, {"length": 0.3}) is not load_part(manifest)
 
 
-def test_home_effort_and_velocity_of_the_manifest_replace_the_sources(tmp_path):
+def test_home_effort_and_velocity_of_the_manifest_take_precedence(tmp_path):
     body = template(tmp_path, effort={"wheel": 7}, velocity={"left_slide": 0.3}).fragment
     left, right, wheel = body.joints
     assert body.home == (0.01, 0.5)
@@ -92,7 +92,7 @@ def test_a_continuous_joint_has_no_limits(tmp_path):
     assert template(tmp_path).fragment.joints[2].limits is None
 
 
-def test_names_that_loaders_dislike_are_made_safe_in_every_place(tmp_path):
+def test_unsafe_names_are_replaced_in_every_reference(tmp_path):
     xacro = PINCER.replace('"palm"', '"the palm"').replace('name="wheel"', 'name="big/wheel"')
     link = {"link": "the palm"}
     part = template(
@@ -102,7 +102,7 @@ def test_names_that_loaders_dislike_are_made_safe_in_every_place(tmp_path):
     assert part.fragment.joints[2].name == "big_wheel"
 
 
-def test_a_mount_may_lie_behind_a_fixed_joint(tmp_path):
+def test_a_mount_may_be_on_a_link_behind_a_fixed_joint(tmp_path):
     mount = {"link": "palm", "xyz": [0, 0, 0.01], "rpy": [0, 0, math.pi / 2]}
     part = template(tmp_path, root="plinth", mount=mount)
     assert part.T_root_mount.position == pytest.approx((0, 0, 1.01))
@@ -110,7 +110,7 @@ def test_a_mount_may_lie_behind_a_fixed_joint(tmp_path):
     assert x_axis == pytest.approx([0, 1, 0])
 
 
-def test_a_mass_of_the_manifest_brings_the_inertia_of_the_geometry(real):
+def test_a_mass_in_the_manifest_sets_the_inertia_from_the_geometry(real):
     body = real(mass={"palm": 2}).fragment
     palm = body.link("palm").inertial
     assert palm.mass == 2
@@ -119,18 +119,18 @@ def test_a_mass_of_the_manifest_brings_the_inertia_of_the_geometry(real):
     assert body.link("disc").inertial is None
 
 
-def test_a_mass_of_zero_takes_the_inertial_away(real):
+def test_a_mass_of_zero_removes_the_inertial(real):
     assert real(mass={"palm": 0, "left": 1}).fragment.link("palm").inertial is None
 
 
-def test_visual_shapes_can_stand_for_collision_shapes(real):
+def test_visual_shapes_can_replace_collision_shapes(real):
     palm = real(collision_from_visual=["palm"]).fragment.link("palm")
     assert [shape.geometry for shape in palm.collisions] == [Box((0.02, 0.02, 0.2))]
     assert palm.collisions[0].rgba is None
     assert palm.visuals[0].rgba == (1, 0, 0, 1)
 
 
-def test_a_dropped_mesh_is_gone_from_sight_and_touch():
+def test_a_dropped_mesh_is_removed_from_visuals_and_collisions():
     """The palm belongs to Jaco's hand, not to the last link of its arm."""
     arm = load_part(default_library().manifest("jaco2"))
     shapes = [s for link in arm.fragment.links for s in (*link.visuals, *link.collisions)]
@@ -162,7 +162,7 @@ def test_a_dropped_mesh_is_gone_from_sight_and_touch():
         ({"xacro": PINCER.replace("length", "size")}, "no argument 'length'"),
     ],
 )
-def test_a_manifest_that_does_not_fit_its_source_is_refused_by_name(tmp_path, changes, message):
+def test_a_manifest_that_contradicts_its_source_is_an_error(tmp_path, changes, message):
     with pytest.raises(PartError, match=r"^[^\n]*$") as caught:
         template(tmp_path, **changes)
     assert message in str(caught.value)
@@ -170,7 +170,7 @@ def test_a_manifest_that_does_not_fit_its_source_is_refused_by_name(tmp_path, ch
 
 
 @pytest.mark.parametrize("key", ["mass", "drop"])
-def test_keys_of_real_parts_name_links_that_are_there(real, key):
+def test_keys_of_real_parts_with_unknown_links_are_errors(real, key):
     value = 1 if key == "mass" else ["x.dae"]
     with pytest.raises(PartError, match=f"{key}: no link 'pam'; did you mean 'palm'"):
         real(**{key: {"pam": value}})
@@ -183,7 +183,7 @@ def test_keys_of_real_parts_name_links_that_are_there(real, key):
         ({"length": 2.0}, r"pincer\.length=2: out of range; expected 0\.1 to 0\.5 m"),
     ],
 )
-def test_parameters_are_checked(tmp_path, values, message):
+def test_invalid_parameters_are_errors(tmp_path, values, message):
     with pytest.raises(PartError, match=message):
         template(tmp_path, values)
 
@@ -195,7 +195,9 @@ def test_parameters_are_checked(tmp_path, values, message):
         ("example-robot-data", "pip install example-robot-data"),
     ],
 )
-def test_a_missing_data_package_says_how_to_install_it(tmp_path, monkeypatch, package, install):
+def test_a_missing_data_package_error_has_the_install_command(
+    tmp_path, monkeypatch, package, install
+):
     def absent(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -207,7 +209,7 @@ def test_a_missing_data_package_says_how_to_install_it(tmp_path, monkeypatch, pa
         load_part(manifest)
 
 
-def test_a_file_that_the_data_package_lacks_is_named(tmp_path):
+def test_a_file_missing_in_the_data_package_is_named(tmp_path):
     source = {"package": "rtb-data", "file": "rtbdata/xacro/nowhere.urdf"}
     gone = {"file": None, "density": None, "parameters": None}
     manifest = read_manifest(write_part(tmp_path, source=source, **gone))
@@ -215,7 +217,7 @@ def test_a_file_that_the_data_package_lacks_is_named(tmp_path):
         load_part(manifest)
 
 
-def test_a_part_that_was_edited_is_read_again(tmp_path):
+def test_an_edited_part_is_reloaded(tmp_path):
     manifest = write_part(tmp_path, density=1000)
     library = default_library([tmp_path])
     name = manifest.stem
@@ -224,7 +226,7 @@ def test_a_part_that_was_edited_is_read_again(tmp_path):
     assert load_part(library.manifest(name)).fragment.mass == pytest.approx(3 * light)
 
 
-def test_a_link_grows_by_a_parameter_and_its_face_stays_on_its_parent(real):
+def test_a_link_scaled_by_a_parameter_stays_in_contact_with_its_parent(real):
     size = {"size": {"default": 1, "min": 0.5, "max": 2}}
     plain = real(parameters=size, scaling={"disc": "size"})
     assert plain.fragment.joints == real().fragment.joints
@@ -240,7 +242,7 @@ def test_a_link_grows_by_a_parameter_and_its_face_stays_on_its_parent(real):
     assert moved.position == pytest.approx((0, 0, -0.01))
 
 
-def test_a_link_that_keeps_its_size_may_follow_the_face_of_its_parent(real):
+def test_an_unscaled_link_may_follow_the_face_of_its_parent(real):
     size = {"size": {"default": 1, "min": 0.5, "max": 2}}
     scaling = {"palm": {"by": "size"}, "disc": {"face": [0, 0, 0.01]}}
     part = real(parameters=size, scaling=scaling)
@@ -259,7 +261,7 @@ def test_a_link_that_keeps_its_size_may_follow_the_face_of_its_parent(real):
         ({"disc": {"by": "sise"}}, "scaling: no parameter 'sise'; did you mean 'size'?"),
     ],
 )
-def test_what_scaling_names_must_exist(real, scaling, message):
+def test_scaling_of_unknown_links_or_parameters_is_an_error(real, scaling, message):
     size = {"size": {"default": 1, "min": 0.5, "max": 2}}
     with pytest.raises(PartError) as caught:
         real(parameters=size, scaling=scaling)

@@ -1,4 +1,4 @@
-"""``key=value`` words make some of a grammar's choices."""
+"""``key=value`` words fix choices of a grammar."""
 
 import pytest
 
@@ -33,31 +33,31 @@ def found():
     )
 
 
-def test_nothing_pinned_is_the_first_of_all(found):
+def test_without_pins_the_first_structure_is_taken(found):
     assert parts(found) == ["slides", "bead", "bead", "plane"]
 
 
-def test_a_symbol_is_pinned_to_an_alternative(found):
+def test_a_symbol_can_be_pinned_to_an_alternative(found):
     assert parts(found, "base=gantry", "links=beam", "ee=stick") == ["gantry", "beam", "stick"]
 
 
-def test_a_count_is_pinned(found):
+def test_a_count_can_be_pinned(found):
     assert parts(found, "links=4").count("bead") == 4
 
 
-def test_a_parameter_is_pinned_wherever_the_part_stands(found):
+def test_a_parameter_is_pinned_for_every_instance_of_the_part(found):
     pinned = values(found, "bead.rod=80mm", "slides.low=0.3")
     assert [pinned[bead]["rod"] for bead in ("bead1", "bead2")] == [0.08, 0.08]
     assert pinned["bead1"]["radius"] == pytest.approx(0.015)
     assert pinned["base"]["low"] == 0.3
 
 
-def test_a_turn_of_the_mount_is_pinned(found):
+def test_mount_yaw_can_be_pinned(found):
     assert values(found, "plane.mount_yaw=90deg")["ee"]["mount_yaw"] == pytest.approx(1.57079632679)
 
 
 @pytest.mark.parametrize("text", ["r=0.02", "r=20mm", "r=+2cm"])
-def test_a_let_is_pinned_with_or_without_a_unit(found, text):
+def test_a_let_can_be_pinned_with_or_without_a_unit(found, text):
     assert values(found, text)["bead1"]["radius"] == pytest.approx(0.02)
 
 
@@ -66,7 +66,7 @@ def test_the_order_of_words_does_not_matter(found):
     assert values(found, *words) == values(found, *reversed(words))
 
 
-def test_what_is_pinned_is_the_same_in_every_sample(found):
+def test_pinned_choices_are_the_same_in_every_sample(found):
     drawn = list(sample_robots(pin(found, ["links=2", "r=2cm"], LIBRARY), LIBRARY, 3))
     assert {str(d.derivation).count("=bead") for d in drawn} == {2}
     assert all("radius=0.02" in str(d.derivation) for d in drawn)
@@ -93,13 +93,13 @@ def test_what_is_pinned_is_the_same_in_every_sample(found):
         ("r=2cm+", "r=2cm+:1:5: found the end, expected"),
     ],
 )
-def test_a_word_that_names_nothing_is_refused(found, word, message):
+def test_an_unknown_pin_is_an_error(found, word, message):
     with pytest.raises(MorphgenError, match=r"^[^\n]*$") as caught:
         pin(found, [word], LIBRARY)
     assert message in str(caught.value)
 
 
-def test_a_value_of_another_unit_is_refused_where_it_is_used(found):
+def test_a_pinned_value_with_a_wrong_unit_is_an_error_at_its_use(found):
     with pytest.raises(MorphgenError, match="radius is in m, r in rad"):
         values(found, "r=2deg")
 
@@ -111,7 +111,7 @@ def test_words_may_begin_with_a_grammar():
     assert parse_words(["chain"], LIBRARY)[1] == "chain"
 
 
-def test_only_a_repetition_that_is_open_can_be_counted():
+def test_only_a_repetition_with_a_range_can_be_pinned():
     two = grammar("robot -> post links", "links -> beam{1,2} bead{1,2} | jaw")
     with pytest.raises(MorphgenError, match="'links' has 2 repetitions to pin, not one"):
         parts(two, "links=2")

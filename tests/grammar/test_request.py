@@ -1,4 +1,4 @@
-"""``key=value`` words become a derivation, or one clear message."""
+"""``key=value`` words are parsed to a derivation, or are an error."""
 
 import pytest
 
@@ -16,7 +16,7 @@ def derive(library, text):
     return parse_request(text.split(), library)
 
 
-def test_an_arm_stands_on_a_fixed_base_and_holds_nothing_by_default(library):
+def test_an_arm_has_a_fixed_base_and_no_end_effector_by_default(library):
     assert (
         str(derive(library, "arm=ur5")) == "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=none]]"
     )
@@ -28,7 +28,7 @@ def test_order_of_words_does_not_matter(library):
     assert a.digest == derive(library, "ee.size=80mm ee=plane base=fixed arm=ur5").digest
 
 
-def test_limbs_go_to_named_ports(library):
+def test_limbs_attach_to_named_ports(library):
     text = "base=pedestal left.arm=ur5 left.ee=stick right.arm=xarm7 right.ee=panda_hand"
     derivation = derive(library, text)
     assert [port for port, _ in derivation.children] == ["left", "right"]
@@ -43,7 +43,7 @@ def test_an_arm_with_two_ports_takes_an_end_effector_on_each(library):
     assert [node.part for node in derivation.walk()][2:] == ["yumi_gripper", "none"]
 
 
-def test_an_end_effector_may_stand_on_the_base(library):
+def test_an_end_effector_may_attach_to_the_base(library):
     assert default_name(derive(library, "base=gantry ee=plane"), library) == "gantry-plane"
 
 
@@ -57,7 +57,7 @@ def test_different_robots_have_different_names(library):
     assert len({default_name(derive(library, text), library) for text in texts}) == len(texts)
 
 
-def test_name_tells_that_a_parameter_was_changed(library):
+def test_the_name_marks_changed_parameters(library):
     plain = default_name(derive(library, "arm=ur5 ee=plane"), library)
     small = default_name(derive(library, "arm=ur5 ee=plane ee.size=80mm"), library)
     turned = default_name(derive(library, "arm=ur5 ee=plane ee.mount_yaw=90deg"), library)
@@ -85,7 +85,7 @@ def test_name_tells_that_a_parameter_was_changed(library):
         ("arm=yumi ee=plane", "'yumi' has no port 'flange'"),
     ],
 )
-def test_mistakes(library, text, message):
+def test_invalid_requests_are_errors(library, text, message):
     with pytest.raises(MorphgenError, match=r"^[^\n]*$") as caught:
         derive(library, text)
     assert message in str(caught.value)

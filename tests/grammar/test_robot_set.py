@@ -1,4 +1,4 @@
-"""A set on disk has the same bytes however it was made, and however often it was interrupted."""
+"""Robot sets on disk have the same bytes for any number of processes and after interruptions."""
 
 import json
 import math
@@ -57,7 +57,7 @@ def interrupted(plan, n, done):
         make_set(plan, n, work)
 
 
-def test_a_light_set_has_a_folder_a_robot_an_index_and_its_grammar(whole):
+def test_a_light_set_has_one_folder_per_robot_an_index_and_the_grammar(whole):
     names = [f"cubes-{i:06d}" for i in range(8)]
     assert sorted(path.name for path in whole.iterdir()) == sorted(
         [*names, GRAMMAR, INDEX, SETTINGS]
@@ -67,7 +67,7 @@ def test_a_light_set_has_a_folder_a_robot_an_index_and_its_grammar(whole):
     assert (whole / GRAMMAR).read_text() == grammar_text(shipped("cubes"))
 
 
-def test_the_index_is_a_line_of_json_a_robot(whole):
+def test_the_index_has_one_json_line_per_robot(whole):
     for line in (whole / INDEX).read_text().splitlines():
         record = json.loads(line)
         written = (whole / record["name"] / "derivation.txt").read_text().strip()
@@ -83,13 +83,13 @@ def test_the_index_can_be_read_with_pandas(whole):
     assert table["mass"].dtype == float
 
 
-def test_a_whole_set_holds_bundles(tmp_path):
+def test_a_full_set_consists_of_bundles(tmp_path):
     make_set(plan(tmp_path / "s", light=False), 1, make_serially)
     files = {path.name for path in (tmp_path / "s" / "cubes-000000").iterdir()}
     assert {"card.json", "robot.urdf", "robot.xml"} <= files
 
 
-def test_progress_counts_up_to_all_of_them(tmp_path):
+def test_progress_reaches_the_number_of_robots(tmp_path):
     seen = []
     make_set(plan(tmp_path / "s"), 3, make_serially, seen.append)
     assert seen == [0, 1, 2, 3]
@@ -99,7 +99,7 @@ def test_progress_counts_up_to_all_of_them(tmp_path):
 
 
 @pytest.mark.parametrize("light", [True, False])
-def test_two_processes_make_the_same_bytes_as_one(tmp_path, light):
+def test_two_processes_write_the_same_bytes_as_one(tmp_path, light):
     one = plan(tmp_path / "one", "chain", light=light)
     two = replace(one, folder=tmp_path / "two")
     n = 20 if light else 3
@@ -108,7 +108,7 @@ def test_two_processes_make_the_same_bytes_as_one(tmp_path, light):
     assert tree(one.folder) == tree(two.folder)
 
 
-def test_the_order_in_which_robots_are_made_does_not_matter(tmp_path, whole):
+def test_the_order_of_generation_does_not_matter(tmp_path, whole):
     def backwards(plan, indices):
         return make_serially(plan, indices[::-1])
 
@@ -116,7 +116,7 @@ def test_the_order_in_which_robots_are_made_does_not_matter(tmp_path, whole):
     assert tree(tmp_path / "s") == tree(whole)
 
 
-def test_a_larger_set_holds_the_smaller(tmp_path, whole):
+def test_a_larger_set_contains_the_smaller_one(tmp_path, whole):
     own = plan(tmp_path / "s")
     assert make_set(own, 3, make_serially).made == 3
     report = make_set(own, 8, make_serially)
@@ -127,7 +127,7 @@ def test_a_larger_set_holds_the_smaller(tmp_path, whole):
 
 
 @pytest.mark.parametrize("done", [0, 1, 7, 8])
-def test_what_was_done_before_an_interruption_is_kept(tmp_path, whole, done):
+def test_robots_written_before_an_interruption_are_kept(tmp_path, whole, done):
     own = plan(tmp_path / "s")
     interrupted(own, 8, done)
     assert not (own.folder / INDEX).exists()
@@ -136,7 +136,7 @@ def test_what_was_done_before_an_interruption_is_kept(tmp_path, whole, done):
     assert tree(own.folder) == tree(whole)
 
 
-def test_robots_that_were_deleted_are_made_again(tmp_path, whole):
+def test_deleted_robots_are_regenerated(tmp_path, whole):
     before = tree(whole)
     shutil.rmtree(whole / "cubes-000003")
     (whole / "cubes-000005" / "robot.urdf").unlink()
@@ -145,7 +145,7 @@ def test_robots_that_were_deleted_are_made_again(tmp_path, whole):
     assert tree(whole) == before
 
 
-def test_without_its_journal_or_index_all_is_made_again(tmp_path, whole):
+def test_without_journal_or_index_everything_is_regenerated(tmp_path, whole):
     before = tree(whole)
     (whole / INDEX).unlink()
     assert make_set(plan(whole), 8, make_serially).made == 8
@@ -153,7 +153,7 @@ def test_without_its_journal_or_index_all_is_made_again(tmp_path, whole):
 
 
 @pytest.mark.parametrize("cut", [1, 40, -1])
-def test_a_journal_that_was_cut_short_costs_one_robot(tmp_path, whole, cut):
+def test_a_truncated_journal_regenerates_one_robot(tmp_path, whole, cut):
     own = plan(tmp_path / "s")
     interrupted(own, 8, 5)
     lines = (own.folder / JOURNAL).read_text().splitlines()
@@ -164,7 +164,7 @@ def test_a_journal_that_was_cut_short_costs_one_robot(tmp_path, whole, cut):
     assert tree(own.folder) == tree(whole)
 
 
-def test_half_written_robots_are_swept_away(tmp_path, whole):
+def test_partially_written_robots_are_removed(tmp_path, whole):
     own = plan(tmp_path / "s")
     interrupted(own, 8, 2)
     (own.folder / ".cubes-000002.x1y2").mkdir()
@@ -174,7 +174,7 @@ def test_half_written_robots_are_swept_away(tmp_path, whole):
 
 
 @pytest.mark.parametrize("left", [[], [f".{GRAMMAR}.partial"], [GRAMMAR, f".{SETTINGS}.partial"]])
-def test_an_interruption_before_the_first_robot_is_no_foreign_folder(tmp_path, whole, left):
+def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, whole, left):
     own = plan(tmp_path / "s")
     own.folder.mkdir()
     for name in left:
@@ -183,7 +183,7 @@ def test_an_interruption_before_the_first_robot_is_no_foreign_folder(tmp_path, w
     assert tree(own.folder) == tree(whole)
 
 
-def test_an_index_is_whole_or_not_there(tmp_path, whole):
+def test_the_index_is_written_atomically(tmp_path, whole):
     own = plan(tmp_path / "s")
     interrupted(own, 8, 3)
     with pytest.raises(FormatError, match=r"is not a finished set: it has no index\.jsonl"):
@@ -191,7 +191,7 @@ def test_an_index_is_whole_or_not_there(tmp_path, whole):
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path, jobs):
+def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     words = ("sample", "chain", "-n", 32, "--seed", 3, "--light", "--jobs", jobs)
     process = start(*words, "--out", tmp_path / "killed")
     journal = tmp_path / "killed" / JOURNAL
@@ -225,7 +225,7 @@ def wait_for(happened, process):
         ({"grammar_text": "robot -> cubes\n"}, "holds a set of another grammar"),
     ],
 )
-def test_a_set_is_only_continued_as_it_was_begun(whole, change, message):
+def test_a_set_is_continued_only_with_the_same_settings(whole, change, message):
     before = tree(whole)
     with pytest.raises(FormatError) as caught:
         make_set(plan(whole, **change), 9, make_serially)
@@ -234,7 +234,7 @@ def test_a_set_is_only_continued_as_it_was_begun(whole, change, message):
 
 
 @pytest.mark.parametrize("name", ["notes.txt", GRAMMAR])
-def test_a_folder_with_something_else_is_refused(tmp_path, name):
+def test_a_folder_with_other_files_is_an_error(tmp_path, name):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / name).write_text("mine")
     with pytest.raises(
@@ -244,20 +244,20 @@ def test_a_folder_with_something_else_is_refused(tmp_path, name):
     assert tree(tmp_path / "s") == {name: b"mine"}
 
 
-def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
+def test_a_file_instead_of_the_folder_is_an_error(tmp_path):
     (tmp_path / "s").write_text("mine")
     with pytest.raises(FormatError):
         make_set(plan(tmp_path / "s"), 1, make_serially)
     assert (tmp_path / "s").read_text() == "mine"
 
 
-def test_broken_settings_are_told(whole):
+def test_a_broken_settings_file_is_an_error(whole):
     (whole / SETTINGS).write_text("{")
     with pytest.raises(FormatError, match=r"set\.json: invalid JSON"):
         make_set(plan(whole), 8, make_serially)
 
 
-def test_robots_with_the_same_body_are_told(tmp_path):
+def test_duplicate_robots_are_reported(tmp_path):
     made = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
     report = make_set(made, 3, make_serially)
     assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
@@ -265,7 +265,7 @@ def test_robots_with_the_same_body_are_told(tmp_path):
     assert len(hashes) == 1
 
 
-def test_robots_with_other_bodies_are_no_duplicates(whole):
+def test_different_robots_are_not_reported_as_duplicates(whole):
     assert make_set(plan(whole), 8, make_serially).duplicates == []
 
 
@@ -279,12 +279,12 @@ def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
 
 
 @pytest.mark.parametrize("work", [make_serially, make_in_processes(2)], ids=["1 job", "2 jobs"])
-def test_a_condition_that_cannot_be_met_stops_the_set(tmp_path, work):
+def test_an_unsatisfiable_condition_stops_the_run(tmp_path, work):
     with pytest.raises(SamplingError, match=r"500 failed at: where \(mass > 900\)"):
         make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, work)
 
 
-def test_meshes_of_a_light_robot_are_named_where_their_package_has_them(tmp_path):
+def test_a_light_robot_references_meshes_in_their_packages(tmp_path):
     made = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
     make_set(made, 1, make_serially)
     text = (made.folder / "g-000000" / "robot.urdf").read_text()
@@ -292,7 +292,7 @@ def test_meshes_of_a_light_robot_are_named_where_their_package_has_them(tmp_path
     assert str(Path.home()) not in text
 
 
-def test_a_second_run_into_the_same_folder_is_refused(tmp_path):
+def test_a_concurrent_run_in_the_same_folder_is_an_error(tmp_path):
     made = plan(tmp_path / "set")
 
     def work(plan, indices):
@@ -317,7 +317,7 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path):
         {"rejected": [1]},
     ],
 )
-def test_a_line_of_an_index_that_morphgen_did_not_write_is_refused(whole, change):
+def test_an_invalid_index_line_is_an_error(whole, change):
     lines = (whole / INDEX).read_text().splitlines()
     lines[1] = json.dumps(json.loads(lines[1]) | change)
     (whole / INDEX).write_text("\n".join(lines))
@@ -328,7 +328,7 @@ def test_a_line_of_an_index_that_morphgen_did_not_write_is_refused(whole, change
 
 
 @pytest.mark.parametrize("line", ["[" * 100_000, "[]", "null", "5", "{}"])
-def test_a_journal_of_anything_else_is_passed_over(whole, line):
+def test_an_invalid_journal_is_ignored(whole, line):
     (whole / JOURNAL).write_text(line + "\n")
     assert make_set(plan(whole), 9, make_serially).made == 1
     assert len(read_index(whole)) == 9
@@ -338,7 +338,7 @@ def test_a_journal_of_anything_else_is_passed_over(whole, line):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[]", "{", '{"grammar": 5}', "\0"])
-def test_settings_that_are_none_are_refused(whole, text):
+def test_invalid_settings_are_errors(whole, text):
     (whole / SETTINGS).write_text(text)
     with pytest.raises(
         FormatError, match=r"set.json: (invalid JSON|is nested deeper|expected the settings)"

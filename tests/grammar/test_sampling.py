@@ -1,4 +1,4 @@
-"""The same seed draws the same robots, and only sound ones that meet the conditions."""
+"""Sampling is reproducible and yields only robots that pass the checks and conditions."""
 
 import itertools
 
@@ -25,7 +25,7 @@ def bodies(name, n, **options):
     return [str(drawn.derivation) for drawn in sample_robots(shipped(name), LIBRARY, n, **options)]
 
 
-def test_robot_17_is_the_same_however_many_are_drawn():
+def test_a_robot_does_not_depend_on_the_number_of_samples():
     assert bodies("chain", 3) == bodies("chain", 7)[:3]
     alone = sample_robot(shipped("chain"), LIBRARY, 5)
     assert str(alone.derivation) == bodies("chain", 7)[5]
@@ -36,12 +36,12 @@ def test_another_seed_gives_other_robots():
     assert not set(bodies("cubes", 5)) & set(bodies("cubes", 5, seed=1))
 
 
-def test_robots_are_drawn_when_they_are_asked_for():
+def test_robots_are_drawn_lazily():
     endless = sample_robots(shipped("cubes"), LIBRARY, 10**9)
     assert len(list(itertools.islice(endless, 2))) == 2
 
 
-def test_a_sample_says_what_was_drawn():
+def test_a_sample_records_its_choices():
     (drawn,) = sample_robots(shipped("cubes"), LIBRARY, 1)
     assert list(drawn.choices) == ["robot/0.cubes.size"]
     assert drawn.choices["robot/0.cubes.size"] == dict(drawn.derivation.parameters)["size"]
@@ -57,7 +57,7 @@ def test_conditions_hold_for_every_robot_and_rejected_draws_are_counted():
     assert rejected == {"where (dof > 9)", "where (mass < 14)"}
 
 
-def test_a_rejected_draw_moves_no_other_robot():
+def test_a_rejected_draw_does_not_change_other_robots():
     free = bodies("cubes", 12)
     condition = parse_condition("mass < 0.5")
     kept = list(sample_robots(shipped("cubes"), LIBRARY, 12, where=[condition]))
@@ -66,7 +66,7 @@ def test_a_rejected_draw_moves_no_other_robot():
     assert all(str(kept[i].derivation) == free[i] for i in same)
 
 
-def test_conditions_of_the_grammar_count_too():
+def test_conditions_in_the_grammar_apply():
     found = grammar("robot -> cubes(size=choice(0.05, 0.1))", "where mass < 0.1")
     sizes = {dict(d.derivation.parameters)["size"] for d in sample_robots(found, LIBRARY, 8)}
     assert sizes == {0.05}
@@ -79,33 +79,33 @@ def test_conditions_of_the_grammar_count_too():
         ("dof == 2 and mass > 900 and reach > 0", "500 failed at: where (mass > 900)"),
     ],
 )
-def test_a_condition_that_cannot_be_met_is_named(condition, message):
+def test_an_unsatisfiable_condition_is_named(condition, message):
     with pytest.raises(SamplingError) as caught:
         next(sample_robots(shipped("cubes"), LIBRARY, 1, where=[parse_condition(condition)]))
     assert str(caught.value) == f"robot 0 of 'cubes': 0 of 500 draws were accepted; {message}"
 
 
-def test_what_failed_most_is_named(monkeypatch):
+def test_the_most_frequent_reason_of_rejection_is_named(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 40)
     found = grammar("robot -> @weight(3) cubes | cartpole", "where mass > 900 or links > 3")
     with pytest.raises(SamplingError, match=r"40 failed at: where \(\(mass > 900\) or \(links > 3"):
         sample_robot(found, LIBRARY, 0)
 
 
-def test_links_that_overlap_at_home_are_drawn_again(monkeypatch):
+def test_robots_with_overlapping_links_at_home_are_redrawn(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 5)
     found = grammar("robot -> pedestal(spread=0.05) left:arm3 right:arm3")
     with pytest.raises(SamplingError, match="5 failed at: links overlap at home"):
         sample_robot(found, LIBRARY, 0)
 
 
-def test_a_robot_that_fails_a_check_is_drawn_again(monkeypatch):
+def test_robots_that_fail_a_check_are_redrawn(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 5)
     with pytest.raises(SamplingError, match="5 failed at: check tool-still"):
         sample_robot(grammar("robot -> pedestal left:arm3 plane"), LIBRARY, 0)
 
 
-def test_a_recursion_that_went_on_for_too_long_is_drawn_again():
+def test_too_deep_recursions_are_redrawn():
     found = grammar(
         "robot -> slides tail", "tail -> @weight(30) bead tail | jaw", "where links < 20"
     )
@@ -138,7 +138,7 @@ TEXTS = st.builds(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(TEXTS)
-def test_a_small_grammar_makes_sound_robots_or_is_refused_with_a_reason(monkeypatch, text):
+def test_random_small_grammars_yield_valid_robots_or_an_error(monkeypatch, text):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 2)
     found = grammar_from_text(text, "g")
     drawn, why = [], ""
@@ -156,7 +156,7 @@ def test_a_small_grammar_makes_sound_robots_or_is_refused_with_a_reason(monkeypa
 # Few random grammars are sound, and how few is chance: that is no fault of the test.
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(TEXTS, st.integers(0, 3))
-def test_what_is_found_sound_can_be_derived(text, seed):
+def test_grammars_without_faults_can_be_derived(text, seed):
     found = grammar_from_text(text, "g")
     assume(count_structures(found) <= 100)
     wrong = [f for f in check_grammar(found, LIBRARY) if "cannot be reached" not in f]
@@ -165,7 +165,7 @@ def test_what_is_found_sound_can_be_derived(text, seed):
 
 
 @given(TEXTS)
-def test_a_grammar_that_is_printed_and_read_prints_the_same(text):
+def test_random_grammars_round_trip_through_printing(text):
     printed = grammar_text(grammar_from_text(text, "g"))
     assert grammar_text(grammar_from_text(printed, "g")) == printed
 

@@ -1,4 +1,4 @@
-"""The Panda with links of other sizes stays in one piece."""
+"""A Panda with scaled links has no gaps between its links."""
 
 import numpy as np
 import pytest
@@ -25,13 +25,13 @@ def variation(*factors):
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.tuples(*[FACTOR] * 7))
-def test_no_gap_opens_between_neighbours_whatever_the_factors(factors):
+def test_neighbouring_links_stay_in_contact_for_all_scale_factors(factors):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(home_pose, "MAX_GAP", SLIT)
         assert list(check_links_apart(variation(*factors))) == []
 
 
-def test_at_factors_of_one_it_is_the_panda():
+def test_unit_scale_factors_give_the_original_panda():
     panda, same = load_part(default_library().manifest("panda")).fragment, variation(*[1] * 7)
     assert (
         panda.links[8].name == "panda_link8"
@@ -39,14 +39,14 @@ def test_at_factors_of_one_it_is_the_panda():
     assert (same.links, same.joints, same.home) == (panda.links[:8], panda.joints[:7], panda.home)
 
 
-def test_the_offset_between_two_joint_faces_grows_with_the_link_between_them():
+def test_the_offset_between_joint_faces_scales_with_the_link():
     q = np.zeros(7)
     plain, taller = (forward_kinematics(variation(*f), q) for f in ([1] * 7, [1, 1.4] + [1] * 5))
     lifted = taller[3:, :3, 3] - plain[3:, :3, 3]
     assert lifted == pytest.approx(np.tile([0, 0, 0.4 * 0.1925], (len(lifted), 1)))
 
 
-def test_factors_scale_lengths_masses_and_inertias_at_equal_density():
+def test_lengths_masses_and_inertias_scale_at_constant_density():
     plain, other = variation(*[1] * 7), variation(1.2, 0.5, 1.5, 0.8, 1.1, 0.9, 1.3)
     for i, f in enumerate((1.2, 0.5, 1.5, 0.8, 1.1, 0.9, 1.3, 1.0)):
         a, b = plain.links[i].inertial, other.links[i].inertial

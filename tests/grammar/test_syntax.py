@@ -1,4 +1,4 @@
-"""Text becomes a syntax tree, or a message with line and column and what was expected."""
+"""Parsing grammar text to a syntax tree; syntax errors have line, column and what was expected."""
 
 import pytest
 from hypothesis import given
@@ -64,7 +64,7 @@ def test_every_kind_of_statement():
     assert parse_grammar(text, "g")[1].target == "a/b c.grammar"
 
 
-def test_comments_blank_lines_and_line_ends_of_windows_mean_nothing():
+def test_comments_blank_lines_and_windows_line_ends_are_ignored():
     plain = parse_grammar("a -> b\nc -> d", "g")
     noisy = parse_grammar("# x -> y\r\n\r\na -> b # e\r\n\r\n  # f\r\nc -> d\r\n\r\n", "g")
     assert [names(p) for p in noisy] == [names(p) for p in plain]
@@ -80,11 +80,11 @@ def test_comments_blank_lines_and_line_ends_of_windows_mean_nothing():
         "a ->\n  b(x=1, y=2)\n\n# between\n\n  c | d\n",
     ],
 )
-def test_a_statement_goes_on_where_the_next_line_begins_with_a_space_or_a_bar(text):
+def test_indented_lines_and_lines_with_a_bar_continue_a_statement(text):
     assert names(only(text)) == [["b", "c"], ["d"]]
 
 
-def test_without_a_space_the_next_line_is_another_statement():
+def test_an_unindented_line_starts_a_statement():
     assert len(parse_grammar("a -> b\nc -> d", "g")) == 2
 
 
@@ -105,7 +105,7 @@ def test_without_a_space_the_next_line_is_another_statement():
         ("android + nothing + orbit + including", "(((android + nothing) + orbit) + including)"),
     ],
 )
-def test_arithmetic_is_read_as_at_school(text, read):
+def test_arithmetic_has_the_usual_precedence(text, read):
     assert str(argument(text)) == read
 
 
@@ -125,7 +125,7 @@ def test_and_binds_closer_than_or_and_comparisons_chain(text, read):
     assert str(parse_condition(text)) == read
 
 
-def test_a_number_keeps_its_unit_and_what_was_written():
+def test_a_number_keeps_its_unit_and_its_text():
     assert argument("45deg") == Expression("number", (), SourceLocation("g", 1, 17), "deg", 45.0)
 
 
@@ -156,7 +156,7 @@ def test_a_number_keeps_its_unit_and_what_was_written():
         ('include "a\nrobot -> a', '1:9: found \'"\', expected a "path" or a name'),
     ],
 )
-def test_a_mistake_is_told_with_its_place_and_what_was_expected(text, message):
+def test_syntax_errors_have_a_position_and_the_expected_tokens(text, message):
     with pytest.raises(GrammarError, match=r"^[^\n]*$") as caught:
         parse_grammar(text, "my.grammar")
     assert str(caught.value).startswith(f"my.grammar:{message}")
@@ -170,7 +170,7 @@ def test_a_mistake_is_told_with_its_place_and_what_was_expected(text, message):
         ("reach > 1 2", "--where:1:11: found '2', expected '*' or '/' or '+' or '-' or 'and'"),
     ],
 )
-def test_a_condition_is_told_to_be_none(text, message):
+def test_invalid_conditions_are_errors(text, message):
     with pytest.raises(GrammarError) as caught:
         parse_condition(text)
     assert str(caught.value).startswith(message)
@@ -198,5 +198,5 @@ def combined(below):
 
 
 @given(st.recursive(NUMBERS | NAMES, combined, max_leaves=8))
-def test_an_expression_that_is_printed_and_read_prints_the_same(expression):
+def test_random_expressions_round_trip_through_printing(expression):
     assert str(argument(str(expression))) == str(expression)

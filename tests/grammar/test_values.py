@@ -1,4 +1,4 @@
-"""Arithmetic with units, and distributions whose figures are what their names say."""
+"""Arithmetic with units, and the statistics of distributions."""
 
 import math
 import statistics
@@ -73,7 +73,7 @@ def test_arithmetic_keeps_units(text, expected):
         ("randint(1, 2.5)", "randint needs whole numbers"),
     ],
 )
-def test_what_means_nothing_is_refused_with_its_place(text, message):
+def test_invalid_arithmetic_is_an_error_with_a_position(text, message):
     with pytest.raises(GrammarError, match=r"^g:[^\n]*$") as caught:
         value(text)
     assert message in str(caught.value)
@@ -90,7 +90,7 @@ def test_what_means_nothing_is_refused_with_its_place(text, message):
         ("uniform(2, 2)", 2, 2),
     ],
 )
-def test_no_value_leaves_the_bounds_and_the_bounds_are_reached(text, low, high):
+def test_values_cover_the_bounds_and_stay_within_them(text, low, high):
     values = drawn(text)
     assert low <= min(values) <= max(values) <= high
     assert min(values) <= low + 0.02 * (high - low)
@@ -107,25 +107,25 @@ def test_no_value_leaves_the_bounds_and_the_bounds_are_reached(text, low, high):
         ("choice(0, 10)", 5, 5),
     ],
 )
-def test_mean_and_deviation_are_those_of_the_distribution(text, mean, deviation):
+def test_mean_and_standard_deviation_match_the_distribution(text, mean, deviation):
     values = drawn(text)
     assert statistics.fmean(values) == pytest.approx(mean, abs=4 * deviation / math.sqrt(4000))
     assert statistics.pstdev(values) == pytest.approx(deviation, rel=0.05)
 
 
-def test_factors_of_a_loguniform_are_equally_likely():
+def test_loguniform_is_uniform_in_the_logarithm():
     values = drawn("loguniform(1, 16)")
     shares = [sum(2**k <= x < 2 ** (k + 1) for x in values) / len(values) for k in range(4)]
     assert shares == pytest.approx([0.25] * 4, abs=0.03)
 
 
-def test_a_normal_is_clipped_and_not_drawn_again():
+def test_a_normal_is_clipped_not_redrawn():
     values = drawn("normal(0, 1, 0, 1)")
     assert values.count(0.0) / len(values) == pytest.approx(0.5, abs=0.03)
     assert values.count(1.0) / len(values) == pytest.approx(0.159, abs=0.03)
 
 
-def test_whole_numbers_and_choices_are_equally_likely():
+def test_integers_and_choices_are_uniform():
     for text, options in (("randint(2, 5)", (2, 3, 4, 5)), ("choice(7, 1, 4, 1)", (7, 4))):
         values = drawn(text)
         assert [values.count(o) / len(values) for o in options] == pytest.approx(
@@ -160,5 +160,5 @@ def test_the_typical_value_is_the_middle_or_the_first(text, typical):
         (Distribution("randint", (2.0, 5.0)), 6.0, None),
     ],
 )
-def test_a_value_that_was_rounded_for_a_file_is_found_again(distribution, asked, given):
+def test_a_value_rounded_for_a_file_is_recognized(distribution, asked, given):
     assert distribution.closest(asked) == given

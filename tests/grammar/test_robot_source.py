@@ -1,4 +1,4 @@
-"""Any URDF or xacro becomes a robot with a tool, a home and pairs to ignore."""
+"""Importing a URDF or xacro as a robot: tool, home, repairs and ignored pairs."""
 
 from dataclasses import replace
 
@@ -30,44 +30,44 @@ def urdf(tmp_path):
     return write
 
 
-def test_the_tool_is_the_frame_of_the_link_that_is_named(urdf):
+def test_the_tool_frame_is_at_the_given_link(urdf):
     robot = import_robot(urdf(arm()), tool="left")
     frame = robot.frame("tool")
     assert (frame.link, frame.T_link_frame) == ("left", IDENTITY)
     assert robot.provenance["source"] == "some_robot.urdf"
 
 
-def test_without_a_tool_there_is_no_frame(urdf):
+def test_without_a_tool_there_is_no_tool_frame(urdf):
     robot = import_robot(urdf(arm()))
     assert robot.frames == ()
     assert "tool-missing" in {finding.code for finding in check(robot)}
 
 
-def test_the_robot_begins_at_the_root_that_is_named(urdf):
+def test_the_given_root_link_becomes_the_root(urdf):
     robot = import_robot(urdf(arm()), root_link="lower", tool="slider")
     assert [link.name for link in robot.links] == ["lower", "slider", "left", "right"]
     assert frame_pose(robot, (0.02, 0.0))[:3, 3] == pytest.approx([0, 0, 0.32])
 
 
-def test_it_has_the_files_name_or_the_one_that_is_given(urdf):
+def test_the_robot_has_the_name_of_the_file_unless_a_name_is_given(urdf):
     assert import_robot(urdf(arm())).name == "arm"
     assert import_robot(urdf(arm()), name="limb").name == "limb"
 
 
-def test_nothing_is_in_self_collision_at_home(urdf):
+def test_home_has_no_self_collision(urdf):
     robot = import_robot(urdf(arm()))
     assert list(SelfCollisionChecker(robot).penetrations([robot.home])) == [{}]
     assert ("left", "slider") in robot.ignore_pairs
 
 
-def test_a_home_is_zero_or_the_middle_of_a_range_without_zero(urdf):
+def test_home_is_zero_or_the_middle_of_a_range_without_zero(urdf):
     path = urdf(with_joint(arm(), "elbow", limits=(0.5, 1.5)))
     assert import_robot(path).home == pytest.approx(arm().home)  # morphgen's own, which says it
     path.write_text(path.read_text().replace("morphgen>", "others>"))
     assert import_robot(path).home == pytest.approx((0.0, 1.0, 0.0, 0.0))
 
 
-def test_safe_repairs_are_made_and_told(urdf):
+def test_safe_repairs_are_applied_and_reported(urdf):
     path = urdf(arm())
     path.write_text(path.read_text().replace('<axis xyz="1 0 0"', '<axis xyz="2 0 0"'))
     robot = import_robot(path)
@@ -78,12 +78,12 @@ def test_safe_repairs_are_made_and_told(urdf):
     assert as_is.provenance["repairs"] == []
 
 
-def test_a_sound_robot_is_not_repaired(urdf):
+def test_a_valid_robot_is_not_repaired(urdf):
     path = urdf(with_joint(arm(), "right", mimic=None))
     assert import_robot(path).provenance["repairs"] == []
 
 
-def test_a_link_that_is_called_tool_makes_room_for_the_frame(urdf):
+def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(urdf):
     path = urdf(rename(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
     robot = import_robot(path, tool="tool")
     assert robot.frame("tool").link == "tool_link"
@@ -96,7 +96,7 @@ def test_a_link_that_is_called_tool_makes_room_for_the_frame(urdf):
     )
 
 
-def test_a_xacro_takes_arguments(tmp_path):
+def test_xacro_arguments_are_passed(tmp_path):
     path = tmp_path / "pincer.urdf.xacro"
     path.write_text(PINCER)
     robot = import_robot(path, {"length": "0.3"}, root_link="palm")
@@ -119,13 +119,13 @@ def test_a_xacro_takes_arguments(tmp_path):
         ({"args": {"length": "1"}}, "xacro arguments length for a file that is not a xacro"),
     ],
 )
-def test_what_the_file_does_not_have_is_refused(urdf, options, message):
+def test_unknown_links_are_errors(urdf, options, message):
     path = urdf(arm())
     with pytest.raises(FormatError) as caught:
         import_robot(path, **options)
     assert str(caught.value).startswith(f"{path}: {message}")
 
 
-def test_a_missing_file_is_refused(tmp_path):
+def test_a_missing_file_is_an_error(tmp_path):
     with pytest.raises(FormatError, match=r"nowhere\.urdf: no such file"):
         import_robot(tmp_path / "nowhere.urdf")

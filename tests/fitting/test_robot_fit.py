@@ -1,4 +1,4 @@
-"""Robots with primitives in place of meshes: what changes, what stays, what is told."""
+"""Fitting robots: replacing meshes by primitives, shared and stored fits, and agreement."""
 
 import dataclasses
 
@@ -56,7 +56,7 @@ def wedge():
     return trimesh.convex.convex_hull(np.array(points))
 
 
-def test_a_mirrored_link_shares_its_fit(tmp_path, wedge):
+def test_mirrored_links_share_a_fit(tmp_path, wedge):
     mirrored = wedge.copy()
     mirrored.apply_transform(np.diag([1.0, -1, 1, 1]))
     robot = arm(
@@ -70,7 +70,7 @@ def test_a_mirrored_link_shares_its_fit(tmp_path, wedge):
 
 
 @pytest.mark.slow
-def test_the_result_does_not_depend_on_the_processes(tmp_path, wedge):
+def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path, wedge):
     ball = trimesh.creation.icosphere(3, 0.1)
     robot = arm([mesh_shape(tmp_path, wedge, "a.stl")], [mesh_shape(tmp_path, ball, "b.stl")])
     one, two = (fit_links(robot, FitOptions(), jobs=jobs).links for jobs in (1, 2))
@@ -88,7 +88,7 @@ def test_a_flat_link_gets_no_primitive_and_a_finding(tmp_path, wedge):
     assert made.links[0].collisions == ()
 
 
-def test_primitives_that_are_there_stay_as_they_are():
+def test_existing_primitives_are_unchanged():
     shapes = (Shape(Box((0.1, 0.2, 0.3)), Pose((0.0, 0.1, 0.0))), Shape(Sphere(0.1)))
     kept = fit_shapes(shapes, FitOptions(max_primitives=2))
     assert kept.primitives == shapes
@@ -97,7 +97,7 @@ def test_primitives_that_are_there_stay_as_they_are():
     assert len(fit_shapes(shapes, FitOptions(max_primitives=1)).primitives) == 1
 
 
-def test_enclosing_primitives_hold_every_vertex(tmp_path, wedge):
+def test_enclosing_primitives_contain_every_vertex(tmp_path, wedge):
     bent = trimesh.util.concatenate(
         [
             trimesh.creation.box((0.4, 0.1, 0.1)),
@@ -118,7 +118,7 @@ def test_enclosing_primitives_hold_every_vertex(tmp_path, wedge):
 
 
 @pytest.mark.slow
-def test_more_primitives_are_better_until_they_are_good_enough(tmp_path):
+def test_primitives_are_added_until_the_fit_is_good_enough(tmp_path):
     bent = trimesh.util.concatenate(
         [
             trimesh.creation.cylinder(0.05, 0.4),
@@ -143,12 +143,12 @@ def test_more_primitives_are_better_until_they_are_good_enough(tmp_path):
         ({"seed": -1}, "seed -1"),
     ],
 )
-def test_options_out_of_range_are_refused(options, message):
+def test_options_out_of_range_are_errors(options, message):
     with pytest.raises(ValueError, match=message):
         FitOptions(**options)
 
 
-def test_a_robot_in_primitives_keeps_its_masses_and_joints():
+def test_replacing_collisions_preserves_masses_and_joints():
     meshes = morphgen.compose("arm=ur5 ee=plane")
     made = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
     written = as_written(meshes)
@@ -174,7 +174,7 @@ def test_visuals_are_replaced_on_request(tmp_path, wedge):
     assert replaced.visuals == (dataclasses.replace(box[0], rgba=(1, 0, 0, 1)),)
 
 
-def test_links_that_are_not_stored_are_fitted_now(tmp_path):
+def test_links_without_stored_fits_are_fitted(tmp_path):
     robot = arm([mesh_shape(tmp_path, trimesh.creation.box((0.1, 0.2, 0.3)))])
     assert stored_primitives(robot, read_stored_fits(LIBRARY.folders)) == ({}, ["l0"])
     made = as_primitives(robot, LIBRARY.folders)
@@ -182,13 +182,13 @@ def test_links_that_are_not_stored_are_fitted_now(tmp_path):
     assert worth.iou > 0.95
 
 
-def test_a_link_that_nothing_can_stand_for_stops_composing(tmp_path):
+def test_a_link_that_cannot_be_fitted_is_an_error(tmp_path):
     flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (1, 1, 0)], [(0, 1, 2)])
     with pytest.raises(FitError, match="link l0"):
         as_primitives(arm([mesh_shape(tmp_path, flat)]), LIBRARY.folders)
 
 
-def test_primitives_agree_better_with_meshes_than_hulls_do():
+def test_primitives_agree_better_with_meshes_than_convex_hulls():
     meshes = load_part(LIBRARY.manifest("ur5")).fragment
     found, _ = stored_primitives(meshes, read_stored_fits(LIBRARY.folders))
     primitives, hulls = agreement(meshes, with_primitives(meshes, found), 300)
@@ -198,7 +198,7 @@ def test_primitives_agree_better_with_meshes_than_hulls_do():
     assert hulls.recall == 1.0
 
 
-def test_a_robot_agrees_with_itself():
+def test_a_robot_agrees_perfectly_with_itself():
     robot = morphgen.compose("chain beads=6")
     same, _ = agreement(robot, robot, 200)
     assert (same.precision, same.recall, same.accuracy) == (1, 1, 1)
@@ -206,12 +206,12 @@ def test_a_robot_agrees_with_itself():
     assert same.neither
 
 
-def test_every_real_part_is_stored():
+def test_every_real_part_has_stored_fits():
     assert [m.name for m in parts_with_meshes(LIBRARY, missing=True)] == []
 
 
 @pytest.mark.slow
-def test_a_user_s_part_is_stored_beside_its_manifest(tmp_path):
+def test_fits_of_a_user_part_are_stored_beside_its_manifest(tmp_path):
     source = LIBRARY.paths["so101_jaw"]
     own = tmp_path / "my_jaw.yaml"
     own.write_text(source.read_text().replace("name: so101_jaw", "name: my_jaw"))
@@ -283,7 +283,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
         pytest.param("xarm7", COLLISION_OPTIONS, marks=pytest.mark.slow),
     ],
 )
-def test_what_is_stored_reproduces(name, options):
+def test_stored_fits_are_reproducible(name, options):
     """To a hundredth: other processors round sums otherwise, and a search amplifies that."""
     body = load_part(LIBRARY.manifest(name)).fragment
     stored = read_stored_fits(LIBRARY.folders)

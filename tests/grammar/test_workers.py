@@ -1,4 +1,4 @@
-"""The same work on a Ray cluster: two nodes, a process each, on this machine."""
+"""Sampling on a Ray cluster of two local nodes with one process each."""
 
 from pathlib import Path
 
@@ -32,19 +32,19 @@ def plan(folder: Path, where=()) -> SetConfig:
     return SetConfig(folder, "cubes", text, 0, where, light=True, picture=False, library=())
 
 
-def test_ray_makes_the_same_bytes_as_one_process(address, tmp_path):
+def test_a_ray_cluster_writes_the_same_bytes_as_one_process(address, tmp_path):
     make_set(plan(tmp_path / "serial"), 40, make_serially)
     report = make_set(plan(tmp_path / "ray"), 40, make_on_ray(address))
     assert report.made == 40
     assert tree(tmp_path / "ray") == tree(tmp_path / "serial")
 
 
-def test_a_condition_that_cannot_be_met_says_so(address, tmp_path):
+def test_an_unsatisfiable_condition_is_an_error(address, tmp_path):
     with pytest.raises(SamplingError, match="0 of 500 draws") as refused:
         make_set(plan(tmp_path / "set", ("mass > 1000",)), 4, make_on_ray(address))
     assert "Traceback" not in str(refused.value)
 
 
-def test_an_address_without_a_cluster_is_named(tmp_path):
+def test_an_address_without_a_cluster_is_an_error(tmp_path):
     with pytest.raises(MorphgenError, match=r"no Ray cluster at '127\.0\.0\.1:1': .*refused"):
         make_set(plan(tmp_path / "set"), 4, make_on_ray("127.0.0.1:1"))

@@ -1,4 +1,4 @@
-"""A split that was built is whole, reads back, and is the same however it was made."""
+"""Split folders: complete, loadable, reproducible, resumable and protected against overwriting."""
 
 import hashlib
 import json
@@ -40,7 +40,7 @@ def whole(tmp_path, made):
     return build_split(made, tmp_path / "whole", LIBRARY).folder
 
 
-def test_its_folder_has_the_splits_name(tmp_path, made):
+def test_the_folder_has_the_name_of_the_split(tmp_path, made):
     report = build_split(made, tmp_path / "data", LIBRARY)
     assert report.folder == tmp_path / "data" / "mine" / "some"
     assert (report.num_written, report.num_kept) == (4, 0)
@@ -58,7 +58,7 @@ def test_every_robot_is_a_bundle(whole, made):
         assert (read.name, read.home, len(read.links)) == (one.name, robot.home, len(robot.links))
 
 
-def test_a_line_of_json_tells_a_robot(whole, made):
+def test_each_robot_has_one_line_of_json(whole, made):
     records = [json.loads(line) for line in (whole / "robots.jsonl").read_text().splitlines()]
     assert [record["name"] for record in records] == [m.name for m in (*made.train, *made.test)]
     assert [record["side"] for record in records] == ["train"] * 3 + ["test"]
@@ -82,7 +82,7 @@ def test_a_line_of_json_tells_a_robot(whole, made):
     assert table.groupby("side").size().to_dict() == {"test": 1, "train": 3}
 
 
-def test_tokens_are_those_of_the_robots(whole, made):
+def test_tokens_match_the_robots(whole, made):
     with np.load(whole / "tokens.npz", allow_pickle=False) as data:
         assert data["tokens"].shape == (4, 23, 48)
         assert data["columns"].tolist()[0] == [0, 1]
@@ -94,7 +94,7 @@ def test_tokens_are_those_of_the_robots(whole, made):
             np.testing.assert_array_equal(data["mask"][i], mask)
 
 
-def test_a_robot_with_more_links_than_the_split_allows_is_not_built(tmp_path):
+def test_a_robot_with_more_than_max_links_is_an_error(tmp_path):
     made = split(["chain beads=7"], ["base=gantry ee=cube"])
     with pytest.raises(
         BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_links 23"
@@ -102,7 +102,7 @@ def test_a_robot_with_more_links_than_the_split_allows_is_not_built(tmp_path):
         build_split(made, tmp_path, LIBRARY, settings=LIGHT)
 
 
-def test_max_links_of_a_split_widens_all_tokens(tmp_path):
+def test_max_links_of_a_split_pads_all_tokens(tmp_path):
     made = split(["chain beads=7"], ["base=gantry ee=cube"], provenance={"max_links": 25})
     built = load_split_folder(build_split(made, tmp_path, LIBRARY, settings=LIGHT).folder)
     assert built.tokens.shape == (2, 25, 48)
@@ -112,7 +112,7 @@ def test_max_links_of_a_split_widens_all_tokens(tmp_path):
         np.testing.assert_array_equal(table[: len(expected)], expected)
 
 
-def test_sums_are_of_every_other_file(whole):
+def test_checksums_cover_every_other_file(whole):
     lines = (whole / "SHA256SUMS").read_text().splitlines()
     told = {line[66:]: line[:64] for line in lines}
     files = {name: data for name, data in tree(whole).items() if data is not None}
@@ -122,7 +122,7 @@ def test_sums_are_of_every_other_file(whole):
     assert [line[64:66] for line in lines] == ["  "] * len(lines)
 
 
-def test_the_readme_tells_how_to_load_it_and_that_runs(whole, monkeypatch, capsys):
+def test_the_loading_example_of_the_readme_runs(whole, monkeypatch, capsys):
     monkeypatch.chdir(whole)
     text = Path("README.md").read_text()
     (code,) = [part.split("```")[0] for part in text.split("```python\n")[1:]]
@@ -132,7 +132,7 @@ def test_the_readme_tells_how_to_load_it_and_that_runs(whole, monkeypatch, capsy
     )
 
 
-def test_a_light_build_names_meshes_where_their_packages_have_them(tmp_path):
+def test_a_light_build_references_meshes_in_their_packages(tmp_path):
     made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
     folder = build_split(made, tmp_path, LIBRARY, settings=LIGHT).folder
     own = folder / "robots" / "ur5-plane"
@@ -143,7 +143,7 @@ def test_a_light_build_names_meshes_where_their_packages_have_them(tmp_path):
     assert "derivation.txt" in (folder / "README.md").read_text()
 
 
-def test_a_body_that_is_named_twice_is_written_once(tmp_path):
+def test_a_robot_listed_twice_is_written_once(tmp_path):
     twin = member("base=gantry ee=plane", "twin", task="reach")
     made = combined(test=[twin, *combined().test])
     report = build_split(made, tmp_path, LIBRARY, settings=LIGHT)
@@ -160,7 +160,7 @@ def test_a_body_that_is_named_twice_is_written_once(tmp_path):
     assert (record["path"], record["task"]) == ("robots/gantry-plane", "reach")
 
 
-def test_pictures_are_drawn_if_asked_for(tmp_path):
+def test_pictures_are_written_on_request(tmp_path):
     made = split(["cubes"], ["base=planar ee=plane"])
     folder = build_split(made, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).folder
     assert (folder / "robots" / "cubes" / "preview.png").is_file()
@@ -170,7 +170,7 @@ def test_pictures_are_drawn_if_asked_for(tmp_path):
 @pytest.mark.parametrize(
     "settings", [pytest.param(BUNDLED, marks=pytest.mark.slow), LIGHT], ids=["bundles", "light"]
 )
-def test_twice_and_in_two_processes_it_is_the_same_bytes(tmp_path, settings):
+def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     made = split(cubes, ["arm=ur5 ee=plane"])
     one = build_split(made, tmp_path / "one", LIBRARY, settings=settings)
@@ -181,7 +181,7 @@ def test_twice_and_in_two_processes_it_is_the_same_bytes(tmp_path, settings):
     assert tree(one.folder) == tree(two.folder)
 
 
-def test_progress_counts_bodies(tmp_path, made):
+def test_progress_counts_distinct_robots(tmp_path, made):
     seen = []
     build_split(
         made, tmp_path, LIBRARY, settings=LIGHT, progress=lambda *counts: seen.append(counts)
@@ -195,7 +195,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
 @pytest.mark.parametrize("done", [1, 3, 4])
-def test_what_was_done_before_an_interruption_is_kept(tmp_path, made, settings, done):
+def test_files_written_before_an_interruption_are_kept(tmp_path, made, settings, done):
     whole = build_split(made, tmp_path / "whole", LIBRARY, settings=settings).folder
 
     def stop(number, total):
@@ -228,7 +228,7 @@ def test_what_was_done_before_an_interruption_is_kept(tmp_path, made, settings, 
         ("robots/.planar-cube.x1y2/robot.urdf", b"<rob"),
     ],
 )
-def test_what_is_not_as_it_should_be_is_made_again(tmp_path, whole, made, path, content):
+def test_invalid_files_are_rebuilt(tmp_path, whole, made, path, content):
     before = tree(whole)
     if content is None:
         (whole / path).unlink()
@@ -239,7 +239,7 @@ def test_what_is_not_as_it_should_be_is_made_again(tmp_path, whole, made, path, 
     assert tree(whole) == before
 
 
-def test_a_robot_whose_card_was_changed_with_its_file_is_made_again(tmp_path, whole, made):
+def test_a_robot_with_a_changed_card_and_file_is_rebuilt(tmp_path, whole, made):
     before = tree(whole)
     folder = whole / "robots" / "planar-cube"
     text = (folder / "robot.urdf").read_text().replace('effort="', 'effort="1')
@@ -251,7 +251,7 @@ def test_a_robot_whose_card_was_changed_with_its_file_is_made_again(tmp_path, wh
     assert tree(whole) == before
 
 
-def test_a_robot_of_another_version_is_made_again(tmp_path, whole, made):
+def test_a_robot_of_another_version_is_rebuilt(tmp_path, whole, made):
     before = tree(whole)
     path = whole / "robots" / "planar-cube" / "card.json"
     path.write_text(path.read_text().replace('"morphgen": "', '"morphgen": "0.0.'))
@@ -259,7 +259,7 @@ def test_a_robot_of_another_version_is_made_again(tmp_path, whole, made):
     assert tree(whole) == before
 
 
-def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path):
+def test_a_killed_build_resumes_to_the_same_bytes(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(30)]
     made = split(cubes, ["base=planar ee=plane"])
     write_split(made, tmp_path / "some.yaml")
@@ -279,7 +279,7 @@ def test_a_run_that_was_killed_is_completed_to_the_same_bytes(tmp_path):
     assert tree(robots.parent) == tree(whole)
 
 
-def test_a_folder_of_another_build_is_refused(tmp_path, whole, made):
+def test_a_folder_of_another_build_is_an_error(tmp_path, whole, made):
     before = tree(whole)
     for other, settings, message in (
         (combined(test=["base=planar ee=cylinder"]), BUNDLED, "its split is '[0-9a-f]{32}', not"),
@@ -291,7 +291,7 @@ def test_a_folder_of_another_build_is_refused(tmp_path, whole, made):
     assert tree(whole) == before
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path, made):
+def test_a_folder_with_other_files_is_an_error(tmp_path, made):
     (tmp_path / "mine" / "some").mkdir(parents=True)
     (tmp_path / "mine" / "some" / "notes.txt").write_text("mine")
     before = tree(tmp_path)
@@ -301,7 +301,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path, made):
 
 
 @pytest.mark.parametrize("place", ["mine", "mine/some"])
-def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path, made, place):
+def test_a_file_instead_of_a_folder_is_an_error(tmp_path, made, place):
     (tmp_path / place).parent.mkdir(exist_ok=True)
     (tmp_path / place).write_text("mine")
     with pytest.raises(BenchmarkError, match=r"exists and is no built split|cannot write"):
@@ -310,20 +310,20 @@ def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path, made, place):
 
 
 @pytest.mark.parametrize("name", ["../up", "a//b", "/tmp/x", "", ".hidden"])
-def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+def test_a_name_that_is_a_path_is_an_error(tmp_path, name):
     with pytest.raises(FormatError, match="use letters, digits"):
         build_split(combined(name=name), tmp_path / "data", LIBRARY)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_of_two_bodies_is_refused(tmp_path):
+def test_a_name_shared_by_two_robots_is_an_error(tmp_path):
     made = combined(test=[member("base=planar ee=cylinder", "gantry-plane")])
     with pytest.raises(BenchmarkError, match="both named 'gantry-plane'; rename one"):
         build_split(made, tmp_path / "data", LIBRARY)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_second_run_into_the_same_folder_is_refused(tmp_path, made):
+def test_a_concurrent_build_in_the_same_folder_is_an_error(tmp_path, made):
     def again(done, total):
         with pytest.raises(FormatError, match="is being written by another run"):
             build_split(made, tmp_path, LIBRARY, settings=LIGHT)
@@ -332,7 +332,7 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, made):
     assert len(load_split_folder(report.folder)) == 4
 
 
-def test_a_disk_that_is_full_is_told_and_nothing_half_written_is_left(tmp_path, made, monkeypatch):
+def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, made, monkeypatch):
     written = Path.write_text
 
     def full(path, *args, **options):
@@ -348,7 +348,7 @@ def test_a_disk_that_is_full_is_told_and_nothing_half_written_is_left(tmp_path, 
     assert build_split(made, tmp_path, LIBRARY).num_written == 4
 
 
-def test_loading_gives_plain_records_with_tokens(whole, made):
+def test_loading_returns_plain_records_with_tokens(whole, made):
     built = load_split_folder(whole)
     assert [robot["name"] for robot in built] == [m.name for m in (*made.train, *made.test)]
     assert [len(each) for each in (built, built.train, built.test)] == [4, 3, 1]
@@ -363,7 +363,7 @@ def test_loading_gives_plain_records_with_tokens(whole, made):
     assert load_split_folder(str(whole)).folder == whole
 
 
-def test_loading_needs_no_torch(whole):
+def test_loading_does_not_import_torch(whole):
     code = (
         "import sys; from morphgen.benchmark.split_folder import load_split_folder; "
         f"print(len(load_split_folder({str(whole)!r}).train), 'torch' in sys.modules)"
@@ -387,7 +387,7 @@ def test_loading_needs_no_torch(whole):
         ("tokens.npz", b"PK\x03\x04 and so on", "tokens.npz: cannot be read"),
     ],
 )
-def test_what_cannot_be_loaded_is_refused_by_name(whole, path, content, message):
+def test_unreadable_files_are_errors_that_name_the_file(whole, path, content, message):
     if content is None:
         (whole / path).unlink()
     else:
@@ -397,7 +397,7 @@ def test_what_cannot_be_loaded_is_refused_by_name(whole, path, content, message)
 
 
 @pytest.mark.parametrize("change", ["tokens", "mask", "names"])
-def test_tokens_that_do_not_go_together_are_refused(whole, change):
+def test_inconsistent_token_arrays_are_errors(whole, change):
     with np.load(whole / "tokens.npz") as data:
         arrays = dict(data)
     arrays[change] = arrays[change][:2]
@@ -410,7 +410,7 @@ def test_tokens_that_do_not_go_together_are_refused(whole, change):
         load_split_folder(whole)
 
 
-def test_the_folder_above_hints_at_the_one_that_is_meant(tmp_path, whole):
+def test_loading_a_parent_folder_suggests_the_split_folder(tmp_path, whole):
     with pytest.raises(BenchmarkError, match=r"did you mean .*whole/mine/some\?"):
         load_split_folder(tmp_path / "whole")
     with pytest.raises(BenchmarkError, match="nowhere: no such folder"):

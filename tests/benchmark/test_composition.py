@@ -1,4 +1,4 @@
-"""Which robots are held out of combinations of parts."""
+"""Holding out combinations of parts for the composition regime."""
 
 import itertools
 
@@ -44,7 +44,7 @@ CELLS = st.lists(
 
 @settings(max_examples=200, deadline=None)
 @given(CELLS, st.integers(1, 3), st.integers(1, 4), st.integers(0, 99))
-def test_what_is_held_out_is_fair_and_is_found_if_there_is_any(cells, n, left, seed):
+def test_hold_out_finds_a_valid_test_set_if_one_exists(cells, n, left, seed):
     exists = any(is_fair(cells, test, left) for test in itertools.combinations(cells, n))
     if not exists:
         with pytest.raises(BenchmarkError, match=f" of {n} test robots can be held out of "):
@@ -61,13 +61,13 @@ def test_what_is_held_out_is_fair_and_is_found_if_there_is_any(cells, n, left, s
     assert not needed <= {what for c in train[: k - 1] for what in (*c.parts, c.task)}
 
 
-def test_the_seed_decides():
+def test_the_held_out_robots_depend_on_the_seed():
     cells = [cell(arm, ee) for arm in "abcd" for ee in "wxyz"]
     assert chosen(cells, 3, 2, 7) == chosen(cells, 3, 2, 7)
     assert len({tuple(chosen(cells, 1, 1, seed)[0]) for seed in range(30)}) > 8
 
 
-def test_different_combinations_are_held_out_before_a_second_of_one():
+def test_each_combination_is_held_out_once_before_any_is_repeated():
     cells = [
         HoldoutCandidate(
             f"{arm}{ee}{k}", (), f"{arm}{ee}{k}", arm + ee, frozenset((arm, ee)), ee, "reach"
@@ -84,13 +84,13 @@ def test_different_combinations_are_held_out_before_a_second_of_one():
     assert train
 
 
-def test_a_thousand_combinations_are_no_matter():
+def test_a_thousand_combinations_are_handled_quickly():
     cells = [cell(f"a{i}", f"e{j}") for i in range(40) for j in range(25)]
     test, train = chosen(cells, 100, 800)
     assert (len(test), len(train)) == (100, 900)
 
 
-def test_why_nothing_is_found_is_told():
+def test_an_impossible_hold_out_is_an_error_with_the_reason():
     with pytest.raises(BenchmarkError) as caught:
         chosen([cell("a", "x"), cell("a", "y")])
     assert "0 of 1 test robots can be held out of 2 combinations" in str(caught.value)

@@ -1,4 +1,4 @@
-"""Fits as they are kept on disk, and the keys by which they are found again."""
+"""Stored fits: the file format and the keys that identify the shapes of a link."""
 
 import json
 import math
@@ -55,24 +55,24 @@ def shape(**changes):
     return {k: v for k, v in (shape_to_data(CAN) | changes).items() if v is not None}
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_stored_fits_round_trip(tmp_path):
     fits = {"one": ARM, "two": HAND}
     write(tmp_path, fits_text(fits))
     assert read_stored_fits([tmp_path]) == fits
 
 
-def test_overlaps_are_kept_to_four_decimals(tmp_path):
+def test_overlaps_are_stored_with_four_decimals(tmp_path):
     write(tmp_path, fits_text({"key": replace(ARM, token_iou=2 / 3, collision_iou=1 / 3)}))
     fit = read_stored_fits([tmp_path])["key"]
     assert (fit.token_iou, fit.collision_iou) == (0.6667, 0.3333)
 
 
-def test_no_fits_are_a_file_too(tmp_path):
+def test_an_empty_set_of_fits_is_a_valid_file(tmp_path):
     write(tmp_path, fits_text({}))
     assert read_stored_fits([tmp_path]) == {}
 
 
-def test_a_link_is_a_line_so_that_changes_show():
+def test_each_link_has_one_line():
     lines = fits_text({"one": ARM, "two": HAND}).splitlines()
     assert len(lines) == 4
     assert [name in line for line, name in zip(lines[1:3], ("one", "two"), strict=True)] == [
@@ -81,7 +81,7 @@ def test_a_link_is_a_line_so_that_changes_show():
     assert fits_text({"one": ARM, "two": HAND}) == fits_text({"one": ARM, "two": HAND})
 
 
-def test_plain_data_names_the_kind_and_where_it_is():
+def test_plain_data_has_the_kind_and_the_pose():
     pose = Pose((1.0, 2.0, 3.0))
     assert shape_to_data(Shape(Box((0.1, 0.2, 0.3)), pose)) == {
         "box": [0.1, 0.2, 0.3],
@@ -98,7 +98,7 @@ def test_only_boxes_cylinders_and_spheres_are_stored(geometry):
         shape_to_data(Shape(geometry))
 
 
-def test_all_files_of_all_folders_are_read_whatever_else_lies_there(tmp_path):
+def test_all_fit_files_of_all_folders_are_read_and_other_files_ignored(tmp_path):
     write(tmp_path / "a", fits_text({"one": ARM}))
     write(tmp_path / "b" / "deep" / "deeper", fits_text({"two": HAND}))
     (tmp_path / "a" / "robot.json").write_text("{")
@@ -110,7 +110,7 @@ def test_all_files_of_all_folders_are_read_whatever_else_lies_there(tmp_path):
 
 
 @pytest.mark.parametrize("version", [FITTER_VERSION - 1, FITTER_VERSION + 1, None, "1"])
-def test_another_version_of_the_fitter_is_ignored(tmp_path, version):
+def test_fits_of_another_fitter_version_are_ignored(tmp_path, version):
     data = json.loads(fits_text({"key": ARM}))
     write(tmp_path, json.dumps(data | {"fitter": version}))
     write(tmp_path, json.dumps({"fitter": version, "whatever": []}), "other")
@@ -162,7 +162,7 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("fault", list(MALFORMED))
-def test_a_malformed_file_is_named_in_one_line(tmp_path, fault):
+def test_a_malformed_file_is_a_one_line_error(tmp_path, fault):
     path = write(tmp_path, MALFORMED[fault])
     with pytest.raises(FormatError) as caught:
         read_stored_fits([tmp_path])
@@ -171,7 +171,7 @@ def test_a_malformed_file_is_named_in_one_line(tmp_path, fault):
     assert len(str(caught.value)) < len(str(path)) + 300
 
 
-def test_a_file_that_is_no_text_is_named(tmp_path):
+def test_a_file_that_is_not_text_is_an_error(tmp_path):
     path = tmp_path / f"robot{SUFFIX}"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FormatError, match="robot") as caught:
@@ -179,7 +179,7 @@ def test_a_file_that_is_no_text_is_named(tmp_path):
     assert str(path) in str(caught.value)
 
 
-def test_a_file_is_read_again_when_it_changes(tmp_path):
+def test_a_changed_file_is_reloaded(tmp_path):
     path = write(tmp_path, fits_text({"one": ARM}))
     assert read_stored_fits([tmp_path]) == {"one": ARM}
     path.write_text(fits_text({"one": HAND}), encoding="utf-8")
@@ -187,7 +187,7 @@ def test_a_file_is_read_again_when_it_changes(tmp_path):
     assert read_stored_fits([tmp_path]) == {"one": HAND}
 
 
-def test_what_is_read_can_be_changed_without_changing_what_is_read_next(tmp_path):
+def test_modifying_the_result_does_not_affect_the_cache(tmp_path):
     write(tmp_path, fits_text({"one": ARM}))
     read_stored_fits([tmp_path]).clear()
     assert read_stored_fits([tmp_path]) == {"one": ARM}
@@ -207,7 +207,7 @@ def test_a_key_is_short_hexadecimal(mesh):
     assert shapes_key([Shape(mesh)]) == key
 
 
-def test_the_same_content_by_another_name_has_the_same_key(mesh, tmp_path):
+def test_the_same_content_under_another_name_has_the_same_key(mesh, tmp_path):
     (tmp_path / "deep").mkdir()
     copy = Mesh(tmp_path / "deep" / "other.stl")
     shutil.copy(mesh.path, copy.path)
@@ -215,7 +215,7 @@ def test_the_same_content_by_another_name_has_the_same_key(mesh, tmp_path):
     assert shapes_key([Shape(copy, TILTED)]) == shapes_key([Shape(mesh, TILTED)])
 
 
-def test_another_content_has_another_key(mesh):
+def test_different_content_has_a_different_key(mesh):
     before = shapes_key([Shape(mesh)])
     trimesh.creation.box((0.1, 0.2, 0.4)).export(mesh.path)
     os.utime(mesh.path, ns=(1, 1))
@@ -241,7 +241,7 @@ def test_fits_follow_the_working_directory(tmp_path, monkeypatch):
         assert read_stored_fits([Path("parts")]) == {"one": fit}
 
 
-def test_whatever_changes_the_solid_changes_the_key(mesh):
+def test_changes_of_the_solid_change_the_key(mesh):
     shapes = [
         Shape(mesh),
         Shape(replace(mesh, scale=(1.0, 1.0, -1.0))),
@@ -263,7 +263,7 @@ def test_whatever_changes_the_solid_changes_the_key(mesh):
     assert len(set(keys)) == len(keys)
 
 
-def test_shapes_scaled_as_a_whole_have_the_same_key_and_their_fit_grows_with_them(mesh):
+def test_uniformly_scaled_shapes_share_a_key_and_their_fit_scales(mesh):
     shapes = [Shape(mesh, TILTED), Shape(Box((0.1, 0.2, 0.3)), Pose((0.1, 0.0, 0.2)))]
     larger = [scale_shape(shape, 1.3) for shape in shapes]
     assert shapes_key(larger) == shapes_key(shapes)

@@ -1,4 +1,4 @@
-"""What regimes mean: structures, hulls, and rules that are broken."""
+"""Regimes of splits: structures, parameter hulls, and findings about broken rules."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def codes(regime, train, test, **made):
     return [each.code for each in findings]
 
 
-def test_a_structure_is_parts_and_counts_without_sizes_and_labels():
+def test_a_structure_has_parts_and_counts_but_no_sizes_and_labels():
     assert structure(derivation("arm=ur5 ee=plane"), LIBRARY) == "fixed[top: ur5[flange: plane]]"
     large = derivation("arm=ur5 ee=plane ee.size=0.2 ee.mount_yaw=45deg")
     assert structure(large, LIBRARY) == structure(derivation("arm=ur5 ee=plane"), LIBRARY)
@@ -53,21 +53,21 @@ def test_a_structure_is_parts_and_counts_without_sizes_and_labels():
     )
 
 
-def test_counts_that_are_not_named_are_their_defaults():
+def test_omitted_counts_have_their_defaults():
     named = derivation("arm=ur5 ee=tongs")
     bare = parse_derivation("base=fixed[top: arm=ur5[flange: ee=tongs]]")
     assert structure(bare, LIBRARY) == structure(named, LIBRARY)
     assert parameters(bare, LIBRARY) == parameters(named, LIBRARY)
 
 
-def test_parts_leave_out_nothing():
+def test_parts_include_the_default_base():
     assert parts(derivation("arm=ur5 ee=plane")) == {"fixed", "ur5", "plane"}
     assert parts(derivation("arm=ur5")) == {"fixed", "ur5"}
     two = derivation("base=pedestal left.arm=ur5 left.ee=plane right.arm=lwr")
     assert parts(two) == {"pedestal", "ur5", "plane", "lwr"}
 
 
-def test_parameters_are_numbered_along_the_tree():
+def test_parameters_are_in_tree_order():
     found = parameters(derivation("arm=arm3 arm.length=0.3 ee=claw ee.mount_yaw=1"), LIBRARY)
     assert found["1.length"] == 0.3
     assert found["2.mount_yaw"] == 1.0
@@ -76,7 +76,7 @@ def test_parameters_are_numbered_along_the_tree():
     assert "0.mount_yaw" not in found, "the root hangs on nothing"
 
 
-def test_distances_from_a_hull():
+def test_hull_distances_are_in_units_of_the_parameter_range():
     square = [(0, 0), (2, 0), (0, 2), (2, 2)]
     assert hull_distance((1, 0.5), square) == pytest.approx(0, abs=1e-9)
     assert hull_distance((2, 2), square) == pytest.approx(0, abs=1e-9)
@@ -84,7 +84,7 @@ def test_distances_from_a_hull():
     assert hull_distance((3, 4), square) == pytest.approx(1.5)
 
 
-def test_what_does_not_vary_is_left_out_unless_it_differs():
+def test_constant_parameters_are_ignored_unless_they_differ():
     flat = [(0.0, 5.0, 1e-3), (1.0, 5.0, 3e-3)]
     assert hull_distance((0.5, 5.0, 2e-3), flat) == pytest.approx(0, abs=1e-9)
     assert hull_distance((0.5, 5.1, 2e-3), flat) == np.inf
@@ -95,7 +95,7 @@ def test_what_does_not_vary_is_left_out_unless_it_differs():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 4), st.integers(6, 40), st.floats(0.4, 1.4))
-def test_inside_is_what_a_triangulation_says(seed, d, n, spread):
+def test_points_inside_the_hull_agree_with_a_delaunay_triangulation(seed, d, n, spread):
     rng = np.random.default_rng(seed)
     points = rng.random((n, d)) * 10.0 ** rng.integers(-3, 3, d)
     centre = points.mean(axis=0)
@@ -107,7 +107,7 @@ def test_inside_is_what_a_triangulation_says(seed, d, n, spread):
 ARM3 = "arm=arm3 arm.length={} ee=claw"
 
 
-def test_interpolation_wants_the_structure_of_a_train_robot():
+def test_interpolation_requires_a_trained_structure():
     train = [member("a", ARM3.format(0.1)), member("b", ARM3.format(0.4))]
     assert codes("interpolation", train, [member("t", ARM3.format(0.3))]) == []
     assert codes("interpolation", train, [member("t", "arm=arm5 ee=claw")]) == ["structure-unseen"]
@@ -126,14 +126,14 @@ def test_interpolation_wants_the_structure_of_a_train_robot():
         (0.3, "any", []),
     ],
 )
-def test_interpolation_keeps_to_its_hull(length, hull, expected):
+def test_interpolation_requires_parameters_within_the_hull(length, hull, expected):
     train = [member("a", ARM3.format(0.1)), member("b", ARM3.format(0.4)), member("c", "arm=ur5")]
     test = [member("t", ARM3.format(length))]
     assert codes("interpolation", train, test, hull=hull) == expected
     assert codes("interpolation", train, test) == []
 
 
-def test_composition_wants_all_parts_and_a_new_combination():
+def test_composition_requires_trained_parts_in_a_new_combination():
     train = [member("a", "arm=ur5 ee=plane"), member("b", "arm=lwr ee=stick")]
     assert codes("composition", train, [member("t", "arm=ur5 ee=stick")]) == []
     assert codes("composition", train, [member("t", "arm=ur5 ee=cube")]) == ["part-unseen"]
@@ -141,7 +141,7 @@ def test_composition_wants_all_parts_and_a_new_combination():
     assert codes("composition", train, sized) == ["combination-seen"]
 
 
-def test_composition_of_body_and_task_wants_a_pair_that_is_not_trained():
+def test_composition_with_tasks_requires_a_new_pair_of_robot_and_task():
     train = [
         member("a", "base=gantry ee=plane", "push"),
         member("b", "arm=ur5 ee=stick", "reach"),
@@ -156,7 +156,7 @@ def test_composition_of_body_and_task_wants_a_pair_that_is_not_trained():
     ]
 
 
-def test_extrapolation_wants_another_category_and_structure():
+def test_extrapolation_requires_a_new_category_and_structure():
     train = [member("a", "nlink links=3", category="nlink"), member("b", "arm=ur5")]
     assert codes("extrapolation", train, [member("t", "chain", category="chain")]) == []
     assert codes("extrapolation", train, [member("t", "nlink links=4", category="nlink")]) == [
@@ -169,7 +169,7 @@ def test_extrapolation_wants_another_category_and_structure():
 
 
 @pytest.mark.parametrize("regime", ["interpolation", "extrapolation", "composition"])
-def test_a_task_that_is_not_trained_is_none_to_test(regime):
+def test_a_test_task_must_be_trained(regime):
     train = [member("a", "arm=ur5 ee=plane"), member("b", "arm=lwr ee=stick")]
     test = [member("t", "arm=ur5 ee=stick", "push")]
     assert "task-unseen" in codes(regime, train, test)
