@@ -24,60 +24,67 @@ def found(made, **options):
 
 
 def test_a_valid_split_passes():
-    done = audit(combined(), LIBRARY)
-    assert (done.findings, done.accepted, done.passed(strict=True)) == ((), (), True)
+    report = audit(combined(), LIBRARY)
+    assert (report.findings, report.accepted, report.passed(strict=True)) == ((), (), True)
 
 
 def test_the_nearest_train_robot_is_reported_for_every_measure():
-    made = split([*TRAIN, "base=planar ee=cube ee.size=0.3"], [*TEST, "base=gantry ee=cube"])
+    example_split = split(
+        [*TRAIN, "base=planar ee=cube ee.size=0.3"], [*TEST, "base=gantry ee=cube"]
+    )
     expected = {}
-    robots = {m.name: compose_member(m, LIBRARY) for m in (*made.train, *made.test)}
+    robots = {
+        m.name: compose_member(m, LIBRARY) for m in (*example_split.train, *example_split.test)
+    }
     known = {name: features(robot, token_shapes(robot)) for name, robot in robots.items()}
-    for test in made.test:
+    for test in example_split.test:
         for name, measure in MEASURES.items():
             best = max if measure.larger_is_more_alike else min
-            values = {m.name: measure.function(known[test.name], known[m.name]) for m in made.train}
+            values = {
+                m.name: measure.function(known[test.name], known[m.name])
+                for m in example_split.train
+            }
             nearest = best(values, key=values.get)
             expected[test.name, name] = (nearest, values[nearest])
-    neighbours = audit(made, LIBRARY).neighbours
+    neighbours = audit(example_split, LIBRARY).neighbours
     assert {(n.test, n.measure): (n.train, n.value) for n in neighbours} == expected
 
 
 def test_the_same_robot_in_train_and_test_is_a_leak_under_any_name():
     twin = member(TRAIN[0], "somebody_else")
-    done = audit(combined(test=[*TEST, twin]), LIBRARY)
-    (leak,) = [each for each in done.findings if each.code == "body-shared"]
+    report = audit(combined(test=[*TEST, twin]), LIBRARY)
+    (leak,) = [each for each in report.findings if each.code == "body-shared"]
     assert leak.where == "test robot somebody_else"
     assert leak.why == "train robot gantry-plane has the same body, and learns the same task"
-    assert not done.passed()
+    assert not report.passed()
 
 
 def test_the_same_robot_with_another_task_is_not_a_leak():
-    made = combined(train=[*TRAIN, member(TEST[0], task="reach", name="planar-reach")])
-    codes = {code for code, _ in found(made)}
+    example_split = combined(train=[*TRAIN, member(TEST[0], task="reach", name="planar-reach")])
+    codes = {code for code, _ in found(example_split)}
     assert "combination-seen" in codes
     assert not codes & {"body-shared", "body-near"}
 
 
 def test_a_near_duplicate_of_a_train_robot_is_a_leak():
     near = split([member(f"{TEST[0]} ee.size=100.1mm", "near"), *TRAIN], TEST)
-    done = audit(near, LIBRARY)
-    (leak,) = [each for each in done.findings if each.code == "body-near"]
+    report = audit(near, LIBRARY)
+    (leak,) = [each for each in report.findings if each.code == "body-near"]
     assert leak.where == "test robot planar-plane"
     assert "train robot near is nearly the same: tree distance" in leak.why
     assert "body-near" not in {code for code, _ in found(near, near=NearThresholds(0.0, 1.0))}
 
 
 def test_a_near_duplicate_needs_both_measures():
-    made = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
-    likeness = survey_split(made, LIBRARY)
+    example_split = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
+    likeness = survey_split(example_split, LIBRARY)
     tree, alike = likeness.by_measure("tree")[0, 0], likeness.by_measure("cosine")[0, 0]
     for near, expected in (
         (NearThresholds(tree * 1.01, alike - 1e-12), True),
         (NearThresholds(tree, alike - 1e-12), False),
         (NearThresholds(tree * 1.01, alike), False),
     ):
-        codes = {code for code, _ in found(made, near=near)}
+        codes = {code for code, _ in found(example_split, near=near)}
         assert ("body-near" in codes) == expected
 
 
@@ -113,17 +120,21 @@ def test_near_duplicates_differ_by_about_one_per_cent_in_size(category):
 
 
 def test_a_name_shared_by_two_robots_is_a_finding():
-    made = combined(test=[*TEST, member("base=planar ee=cylinder", "gantry-plane")])
-    assert found(made) == [("name-shared", "test robot gantry-plane")]
+    example_split = combined(test=[*TEST, member("base=planar ee=cylinder", "gantry-plane")])
+    assert found(example_split) == [("name-shared", "test robot gantry-plane")]
 
 
 def test_an_unknown_part_is_reported_with_the_nearest():
     wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
-    done = audit(combined(train=[TRAIN[0], wrong, TRAIN[2], "base=planar ee=stick"]), LIBRARY)
-    (missing,) = done.findings
+    report = audit(combined(train=[TRAIN[0], wrong, TRAIN[2], "base=planar ee=stick"]), LIBRARY)
+    (missing,) = report.findings
     assert (missing.code, missing.where) == ("part-missing", "train robot planar-cube")
     assert "no part 'cubw'; did you mean 'cube" in missing.why
-    assert {n.train for n in done.neighbours} <= {"gantry-plane", "gantry-cylinder", "planar-stick"}
+    assert {n.train for n in report.neighbours} <= {
+        "gantry-plane",
+        "gantry-cylinder",
+        "planar-stick",
+    }
 
 
 @pytest.mark.parametrize(
@@ -144,9 +155,9 @@ def test_robots_that_cannot_be_composed_or_compared_are_reported(derivation, why
 
 def test_an_invalid_test_robot_has_no_neighbours():
     wrong = replace(member(TEST[0]), derivation="base=planar[top: ee=cubw]")
-    done = audit(combined(test=[wrong]), LIBRARY)
-    assert [each.code for each in done.findings] == ["part-missing"]
-    assert done.neighbours == ()
+    report = audit(combined(test=[wrong]), LIBRARY)
+    assert [each.code for each in report.findings] == ["part-missing"]
+    assert report.neighbours == ()
 
 
 def test_a_split_without_valid_train_robots_can_be_audited():
@@ -156,8 +167,8 @@ def test_a_split_without_valid_train_robots_can_be_audited():
 
 def test_a_changed_robot_hash_is_reported():
     changed = replace(member(TRAIN[0]), robot_hash="0" * 32)
-    done = audit(combined(train=[changed, *TRAIN[1:]]), LIBRARY)
-    (finding,) = done.findings
+    report = audit(combined(train=[changed, *TRAIN[1:]]), LIBRARY)
+    (finding,) = report.findings
     assert finding.code == "body-changed"
     assert (
         f"names body {'0' * 32}, its derivation gives {member(TRAIN[0]).robot_hash}" in finding.why
@@ -165,12 +176,12 @@ def test_a_changed_robot_hash_is_reported():
 
 
 def test_a_duplicate_robot_is_a_warning():
-    done = audit(combined(train=[*TRAIN, member(TRAIN[0], "again")]), LIBRARY)
-    (finding,) = done.findings
+    report = audit(combined(train=[*TRAIN, member(TRAIN[0], "again")]), LIBRARY)
+    (finding,) = report.findings
     assert (finding.code, finding.severity) == ("body-repeated", "warning")
     assert finding.where == "train robot again"
-    assert done.passed()
-    assert not done.passed(strict=True)
+    assert report.passed()
+    assert not report.passed(strict=True)
 
 
 def test_violations_of_regime_rules_are_reported():
@@ -187,9 +198,9 @@ def drawn(category, n, seed, **changes):
     grammar = load_grammar(find_grammar(category))
     for i in range(n):
         robot = sample_robot(grammar, LIBRARY, i, seed=seed)
-        made = member("cubes", f"{category}-{seed}-{i}", category=category)
+        new_member = member("cubes", f"{category}-{seed}-{i}", category=category)
         body = str(parse_derivation(str(robot.derivation)))
-        yield replace(made, derivation=body, robot_hash=_hash(body), **changes)
+        yield replace(new_member, derivation=body, robot_hash=_hash(body), **changes)
 
 
 def _hash(derivation):
@@ -207,21 +218,21 @@ def test_a_declared_hull_is_checked():
     assert inside
     assert outside
     for hull, wrong in (("inside", outside), ("outside", inside), ("any", [])):
-        made = split(train, tests, regime="interpolation", provenance={"hull": hull})
-        told = {where for code, where in found(made) if code == "hull"}
-        assert told == {f"test robot {m.name}" for m in wrong}
+        example_split = split(train, tests, regime="interpolation", provenance={"hull": hull})
+        locations = {where for code, where in found(example_split) if code == "hull"}
+        assert locations == {f"test robot {m.name}" for m in wrong}
 
 
 def test_a_trained_category_is_not_extrapolation():
-    made = split([*drawn("cubes", 2, 0)], [*drawn("cubes", 1, 1)], regime="extrapolation")
-    assert {code for code, _ in found(made)} >= {"category-seen", "structure-seen"}
+    example_split = split([*drawn("cubes", 2, 0)], [*drawn("cubes", 1, 1)], regime="extrapolation")
+    assert {code for code, _ in found(example_split)} >= {"category-seen", "structure-seen"}
 
 
 def test_a_declared_similarity_bound_is_checked():
     likeness = survey_split(combined(), LIBRARY).by_measure("cosine").max()
     for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
-        made = combined(provenance={"similarity": bound})
-        codes = {code for code, _ in found(made)}
+        example_split = combined(provenance={"similarity": bound})
+        codes = {code for code, _ in found(example_split)}
         assert codes == (set() if holds else {"similarity-bound"})
     assert 0.99 < likeness < 1
     with pytest.raises(BenchmarkError, match=r"split 'mine/some': made: .*'<'"):
@@ -230,44 +241,46 @@ def test_a_declared_similarity_bound_is_checked():
 
 def test_accepted_findings_are_listed_with_their_reason_and_do_not_fail_the_audit():
     accepted = {"part-unseen": "the sphere is new on purpose"}
-    done = audit(combined(test=["base=planar ee=sphere"], accepted=accepted), LIBRARY)
-    assert done.findings == ()
-    ((finding, reason),) = done.accepted
+    report = audit(combined(test=["base=planar ee=sphere"], accepted=accepted), LIBRARY)
+    assert report.findings == ()
+    ((finding, reason),) = report.accepted
     assert (finding.code, reason) == ("part-unseen", accepted["part-unseen"])
-    assert done.passed(strict=True)
+    assert report.passed(strict=True)
 
 
 def test_accepting_one_finding_accepts_no_other():
     accepted = {"part-unseen": "on purpose"}
     tests = ["base=planar ee=sphere", member(TRAIN[0], "twin")]
-    done = audit(combined(test=tests, accepted=accepted), LIBRARY)
-    assert {each.code for each in done.findings} == {"body-shared", "combination-seen"}
-    assert not done.passed()
+    report = audit(combined(test=tests, accepted=accepted), LIBRARY)
+    assert {each.code for each in report.findings} == {"body-shared", "combination-seen"}
+    assert not report.passed()
 
 
 def test_accepting_an_absent_finding_is_a_warning():
-    done = audit(combined(accepted={"body-naer": "a typo"}), LIBRARY)
-    (finding,) = done.findings
+    report = audit(combined(accepted={"body-naer": "a typo"}), LIBRARY)
+    (finding,) = report.findings
     assert (finding.code, finding.severity) == ("accepted-unused", "warning")
     assert finding.where == "accepted body-naer"
-    assert done.passed()
+    assert report.passed()
 
 
 def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
     words = [f"base=planar ee=cube ee.size={50 + i}mm" for i in range(9)]
-    made = combined(train=[*TRAIN, *(member(each, f"cube-{i}") for i, each in enumerate(words))])
+    example_split = combined(
+        train=[*TRAIN, *(member(each, f"cube-{i}") for i, each in enumerate(words))]
+    )
     seen = []
-    one = audit(made, LIBRARY, progress=lambda done, total: seen.append((done, total)))
+    one = audit(example_split, LIBRARY, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(i, 13) for i in range(1, 14)]
-    assert audit(made, LIBRARY, jobs=2) == one
+    assert audit(example_split, LIBRARY, jobs=2) == one
 
 
 def test_a_derivation_shared_by_two_members_is_composed_once():
-    made = combined(train=[*TRAIN, member(TRAIN[0], "reaching", task="reach")])
+    example_split = combined(train=[*TRAIN, member(TRAIN[0], "reaching", task="reach")])
     seen = []
-    survey_split(made, LIBRARY, progress=lambda done, total: seen.append(total))
+    survey_split(example_split, LIBRARY, progress=lambda done, total: seen.append(total))
     assert seen == [4] * 4
-    both = survey_split(made, LIBRARY)
+    both = survey_split(example_split, LIBRARY)
     assert both.train[0] == both.train[3]
     np.testing.assert_array_equal(both.similarity[0], both.similarity[3])
 

@@ -19,17 +19,19 @@ def apart(points):
 @given(PLANES)
 @settings(deadline=None)
 def test_points_of_a_plane_keep_their_distances(points):
-    found = classical_mds(apart(points))
-    np.testing.assert_allclose(apart(found.points), apart(points), atol=1e-5)
-    assert found.kept == pytest.approx(1)
-    np.testing.assert_allclose(found.points.mean(axis=0), 0, atol=1e-5)
+    embedding = classical_mds(apart(points))
+    np.testing.assert_allclose(apart(embedding.points), apart(points), atol=1e-5)
+    assert embedding.kept == pytest.approx(1)
+    np.testing.assert_allclose(embedding.points.mean(axis=0), 0, atol=1e-5)
 
 
 def test_the_first_axis_varies_most_and_its_farthest_point_is_on_the_right():
-    found = classical_mds(apart(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 5.0], [0.5, 2.0]])))
-    assert np.ptp(found.points[:, 0]) > np.ptp(found.points[:, 1])
-    assert found.points[:, 0].argmax() == 2
-    np.testing.assert_allclose(np.sort(found.points[:, 0])[-1], np.abs(found.points[:, 0]).max())
+    embedding = classical_mds(apart(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 5.0], [0.5, 2.0]])))
+    assert np.ptp(embedding.points[:, 0]) > np.ptp(embedding.points[:, 1])
+    assert embedding.points[:, 0].argmax() == 2
+    np.testing.assert_allclose(
+        np.sort(embedding.points[:, 0])[-1], np.abs(embedding.points[:, 0]).max()
+    )
 
 
 def test_the_order_of_robots_only_reorders_the_points():
@@ -41,28 +43,28 @@ def test_the_order_of_robots_only_reorders_the_points():
 
 def test_the_share_of_the_variation_excludes_further_dimensions():
     box = np.array([[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)], dtype=float)
-    found = classical_mds(apart(box))
-    assert found.kept == pytest.approx((9 + 4) / (9 + 4 + 1))
+    embedding = classical_mds(apart(box))
+    assert embedding.kept == pytest.approx((9 + 4) / (9 + 4 + 1))
 
 
 def test_non_euclidean_distances_reduce_the_share():
     star = np.array([[0, 1, 1, 1], [1, 0, 2, 2], [1, 2, 0, 2], [1, 2, 2, 0]], dtype=float)
     values = np.linalg.eigvalsh(-(np.eye(4) - 0.25) @ (star**2) @ (np.eye(4) - 0.25) / 2)
     assert values.min() < -0.1
-    found = classical_mds(star)
-    assert found.kept == pytest.approx(np.sort(values)[-2:].sum() / np.abs(values).sum())
+    embedding = classical_mds(star)
+    assert embedding.kept == pytest.approx(np.sort(values)[-2:].sum() / np.abs(values).sum())
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_equal_robots_are_one_point(n):
-    found = classical_mds(np.zeros((n, n)))
-    np.testing.assert_array_equal(found.points, np.zeros((n, 2)))
-    assert found.kept == 1.0
+    embedding = classical_mds(np.zeros((n, n)))
+    np.testing.assert_array_equal(embedding.points, np.zeros((n, 2)))
+    assert embedding.kept == 1.0
 
 
 def test_the_distance_of_two_robots_is_exact():
-    found = classical_mds([[0.0, 0.4], [0.4, 0.0]])
-    np.testing.assert_allclose(found.points, [[0.2, 0.0], [-0.2, 0.0]], atol=1e-12)
+    embedding = classical_mds([[0.0, 0.4], [0.4, 0.0]])
+    np.testing.assert_allclose(embedding.points, [[0.2, 0.0], [-0.2, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -213,11 +213,11 @@ def cosines(split):
     """Of every test robot to every train robot."""
     rows = []
     for side in (split.test, split.train):
-        made = [compose_member(member, LIBRARY) for member in side]
+        robots = [compose_member(member, LIBRARY) for member in side]
         rows.append(
             [
                 features(robot, token_shapes(robot, LIBRARY.folders), max_links=split.max_links)
-                for robot in made
+                for robot in robots
             ]
         )
     return np.array([[cosine(test, train) for train in rows[1]] for test in rows[0]])
@@ -251,10 +251,10 @@ def test_too_many_links_are_a_finding_unless_max_links_is_raised():
     narrow = replace(
         made, provenance={k: v for k, v in made.provenance.items() if k != "max_links"}
     )
-    told = [each for each in audit(narrow, LIBRARY).findings if each.code == "links-many"]
-    assert told
-    assert {each.why for each in told} == {"it has 25 links, more than max_links 23"}
-    assert all("--max-links" in each.fix for each in told)
+    findings = [each for each in audit(narrow, LIBRARY).findings if each.code == "links-many"]
+    assert findings
+    assert {each.why for each in findings} == {"it has 25 links, more than max_links 23"}
+    assert all("--max-links" in each.fix for each in findings)
 
 
 @pytest.mark.parametrize("given", ["many", 1, 2.5, True, None, [25]])
@@ -428,14 +428,14 @@ def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
     body = RobotFactory(LIBRARY.folders)(ComposedRecipe(("base=planar", "ee=cube")))
     assert "travel_yaw=3.14159265359" in str(body.derivation)
     assert dict(body.derivation.parameters)["travel_yaw"] == 3.14159265359
-    own = grammar("robot -> planar ee", "ee -> cube(size=uniform(0.05, 0.1))")
-    drawn = RobotFactory(LIBRARY.folders)(SampledRecipe(own, 0, 1, "x"))
+    robot_grammar = grammar("robot -> planar ee", "ee -> cube(size=uniform(0.05, 0.1))")
+    drawn = RobotFactory(LIBRARY.folders)(SampledRecipe(robot_grammar, 0, 1, "x"))
     again = parse_derivation(str(drawn.derivation))
     assert again == drawn.derivation
 
 
 def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
-    found = [Finding("overlap", "error", "link a", "too deep", "move it")]
-    monkeypatch.setattr(robot_factory, "check", lambda robot: found)
+    findings = [Finding("overlap", "error", "link a", "too deep", "move it")]
+    monkeypatch.setattr(robot_factory, "check", lambda robot: findings)
     with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
         make_robots([ComposedRecipe(("base=gantry", "ee=cube"))], RobotFactory(LIBRARY.folders))

@@ -68,12 +68,12 @@ def test_parts_include_the_default_base():
 
 
 def test_parameters_are_in_tree_order():
-    found = parameters(derivation("arm=arm3 arm.length=0.3 ee=claw ee.mount_yaw=1"), LIBRARY)
-    assert found["1.length"] == 0.3
-    assert found["2.mount_yaw"] == 1.0
-    assert found["1.mount_yaw"] == 0.0
-    assert "1.wrist" not in found, "a count is part of the structure"
-    assert "0.mount_yaw" not in found, "the root hangs on nothing"
+    values = parameters(derivation("arm=arm3 arm.length=0.3 ee=claw ee.mount_yaw=1"), LIBRARY)
+    assert values["1.length"] == 0.3
+    assert values["2.mount_yaw"] == 1.0
+    assert values["1.mount_yaw"] == 0.0
+    assert "1.wrist" not in values, "a count is part of the structure"
+    assert "0.mount_yaw" not in values, "the root hangs on nothing"
 
 
 def test_hull_distances_are_in_units_of_the_parameter_range():

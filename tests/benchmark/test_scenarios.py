@@ -50,9 +50,9 @@ def test_the_shipped_files_equal_the_generated_splits(name, tmp_path):
     paths = write_scenarios(tmp_path, [name])
     assert [path for path in paths if not path.is_file()] == []
     for path in paths:
-        own = find_split(path.relative_to(tmp_path).with_suffix("").as_posix())
-        made = path.read_text(encoding="utf-8")
-        assert versionless(own.read_text(encoding="utf-8")) == versionless(made)
+        shipped_path = find_split(path.relative_to(tmp_path).with_suffix("").as_posix())
+        generated_text = path.read_text(encoding="utf-8")
+        assert versionless(shipped_path.read_text(encoding="utf-8")) == versionless(generated_text)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -62,8 +62,8 @@ def test_the_cosine_uses_flattened_padded_tokens_without_q():
     ]
     for (a, u), (b, v) in itertools.combinations(zip(robots, flat, strict=True), 2):
         expected = u @ v / np.sqrt((u @ u) * (v @ v))
-        found = cosine(features(a, token_shapes(a)), features(b, token_shapes(b)))
-        assert found == pytest.approx(expected, abs=1e-12)
+        similarity = cosine(features(a, token_shapes(a)), features(b, token_shapes(b)))
+        assert similarity == pytest.approx(expected, abs=1e-12)
 
 
 def test_home_changes_the_tree_but_not_the_cosine():

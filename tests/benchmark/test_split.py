@@ -234,8 +234,8 @@ def test_a_composed_member_has_its_name():
 
 def test_a_robot_with_another_hash_is_an_error():
     changed = member("base=gantry ee=plane", robot_hash="0" * 32)
-    own = member("base=gantry ee=plane").robot_hash
-    with pytest.raises(BenchmarkError, match=f"'gantry-plane'.*{'0' * 32}.*{own}"):
+    composed_hash = member("base=gantry ee=plane").robot_hash
+    with pytest.raises(BenchmarkError, match=f"'gantry-plane'.*{'0' * 32}.*{composed_hash}"):
         compose_member(changed, LIBRARY)
 
 

@@ -124,11 +124,12 @@ def test_a_changed_file_is_an_error_unless_allowed(written):
     written.write_text(text.replace("size=0.1,", "size=0.2,", 1))
     with pytest.raises(BenchmarkError) as caught:
         read_split(written)
-    found = read_split_file(written)
-    assert not found.is_whole
-    place = f"{written}:{found.id_line}: id: {split_id(SPLIT)} is not that of its robots, which is "
-    assert str(caught.value).startswith(place + split_id(found.split))
-    assert text.splitlines()[found.id_line - 1].startswith("id: ")
+    split_file = read_split_file(written)
+    assert not split_file.is_whole
+    line = f"{written}:{split_file.id_line}"
+    prefix = f"{line}: id: {split_id(SPLIT)} is not that of its robots, which is "
+    assert str(caught.value).startswith(prefix + split_id(split_file.split))
+    assert text.splitlines()[split_file.id_line - 1].startswith("id: ")
     written.write_text(text.replace("A UR5", "My UR5"))
     assert read_split(written).summary.startswith("My UR5")
 

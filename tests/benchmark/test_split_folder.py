@@ -95,18 +95,18 @@ def test_tokens_match_the_robots(whole, made):
 
 
 def test_a_robot_with_more_than_max_links_is_an_error(tmp_path):
-    made = split(["chain beads=7"], ["base=gantry ee=cube"])
+    example_split = split(["chain beads=7"], ["base=gantry ee=cube"])
     with pytest.raises(
         BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_links 23"
     ):
-        build_split(made, tmp_path, LIBRARY, settings=LIGHT)
+        build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
 
 
 def test_max_links_of_a_split_pads_all_tokens(tmp_path):
-    made = split(["chain beads=7"], ["base=gantry ee=cube"], provenance={"max_links": 25})
-    built = load_split_folder(build_split(made, tmp_path, LIBRARY, settings=LIGHT).folder)
+    example_split = split(["chain beads=7"], ["base=gantry ee=cube"], provenance={"max_links": 25})
+    built = load_split_folder(build_split(example_split, tmp_path, LIBRARY, settings=LIGHT).folder)
     assert built.tokens.shape == (2, 25, 48)
-    for one, table in zip((*made.train, *made.test), built.tokens, strict=True):
+    for one, table in zip((*example_split.train, *example_split.test), built.tokens, strict=True):
         robot = compose_member(one, LIBRARY)
         expected = tokens(robot, token_shapes(robot), max_links=25)
         np.testing.assert_array_equal(table[: len(expected)], expected)
@@ -114,10 +114,10 @@ def test_max_links_of_a_split_pads_all_tokens(tmp_path):
 
 def test_checksums_cover_every_other_file(whole):
     lines = (whole / "SHA256SUMS").read_text().splitlines()
-    told = {line[66:]: line[:64] for line in lines}
+    checksums = {line[66:]: line[:64] for line in lines}
     files = {name: data for name, data in tree(whole).items() if data is not None}
-    assert told.keys() == files.keys() - {"SHA256SUMS"}
-    for name, value in told.items():
+    assert checksums.keys() == files.keys() - {"SHA256SUMS"}
+    for name, value in checksums.items():
         assert hashlib.sha256(files[name]).hexdigest() == value
     assert [line[64:66] for line in lines] == ["  "] * len(lines)
 
@@ -133,20 +133,22 @@ def test_the_loading_example_of_the_readme_runs(whole, monkeypatch, capsys):
 
 
 def test_a_light_build_references_meshes_in_their_packages(tmp_path):
-    made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
-    folder = build_split(made, tmp_path, LIBRARY, settings=LIGHT).folder
+    example_split = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
+    folder = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT).folder
     own = folder / "robots" / "ur5-plane"
     assert sorted(path.name for path in own.iterdir()) == ["derivation.txt", "robot.urdf"]
-    assert (own / "derivation.txt").read_text() == f"{made.train[0].derivation}\n"
-    assert (own / "robot.urdf").read_text() == light_urdf(compose_member(made.train[0], LIBRARY))
+    assert (own / "derivation.txt").read_text() == f"{example_split.train[0].derivation}\n"
+    assert (own / "robot.urdf").read_text() == light_urdf(
+        compose_member(example_split.train[0], LIBRARY)
+    )
     assert 'filename="package://' in (own / "robot.urdf").read_text()
     assert "derivation.txt" in (folder / "README.md").read_text()
 
 
 def test_a_robot_listed_twice_is_written_once(tmp_path):
     twin = member("base=gantry ee=plane", "twin", task="reach")
-    made = combined(test=[twin, *combined().test])
-    report = build_split(made, tmp_path, LIBRARY, settings=LIGHT)
+    example_split = combined(test=[twin, *combined().test])
+    report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
     assert report.num_written == 4
     assert {path.name for path in (report.folder / "robots").iterdir()} == {
         "gantry-plane",
@@ -161,10 +163,15 @@ def test_a_robot_listed_twice_is_written_once(tmp_path):
 
 
 def test_pictures_are_written_on_request(tmp_path):
-    made = split(["cubes"], ["base=planar ee=plane"])
-    folder = build_split(made, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).folder
+    example_split = split(["cubes"], ["base=planar ee=plane"])
+    folder = build_split(
+        example_split, tmp_path, LIBRARY, settings=BuildSettings(picture=True)
+    ).folder
     assert (folder / "robots" / "cubes" / "preview.png").is_file()
-    assert build_split(made, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).num_kept == 2
+    assert (
+        build_split(example_split, tmp_path, LIBRARY, settings=BuildSettings(picture=True)).num_kept
+        == 2
+    )
 
 
 @pytest.mark.parametrize(
@@ -172,11 +179,11 @@ def test_pictures_are_written_on_request(tmp_path):
 )
 def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
-    made = split(cubes, ["arm=ur5 ee=plane"])
-    one = build_split(made, tmp_path / "one", LIBRARY, settings=settings)
-    two = build_split(made, tmp_path / "two", LIBRARY, settings=settings, jobs=2)
+    example_split = split(cubes, ["arm=ur5 ee=plane"])
+    one = build_split(example_split, tmp_path / "one", LIBRARY, settings=settings)
+    two = build_split(example_split, tmp_path / "two", LIBRARY, settings=settings, jobs=2)
     assert tree(one.folder) == tree(two.folder)
-    again = build_split(made, tmp_path / "one", LIBRARY, settings=settings)
+    again = build_split(example_split, tmp_path / "one", LIBRARY, settings=settings)
     assert (again.num_written, again.num_kept) == (0, 10)
     assert tree(one.folder) == tree(two.folder)
 
@@ -261,8 +268,8 @@ def test_a_robot_of_another_version_is_rebuilt(tmp_path, whole, made):
 
 def test_a_killed_build_resumes_to_the_same_bytes(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(30)]
-    made = split(cubes, ["base=planar ee=plane"])
-    write_split(made, tmp_path / "some.yaml")
+    example_split = split(cubes, ["base=planar ee=plane"])
+    write_split(example_split, tmp_path / "some.yaml")
     words = ("split", "build", tmp_path / "some.yaml", "--out", tmp_path / "killed", "--jobs", 2)
     process = start(*words)
     robots = tmp_path / "killed" / "mine" / "some" / "robots"
@@ -274,8 +281,8 @@ def test_a_killed_build_resumes_to_the_same_bytes(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=30)
     assert not (robots.parent / "SHA256SUMS").exists()
-    whole = build_split(made, tmp_path / "whole", LIBRARY).folder
-    assert build_split(made, tmp_path / "killed", LIBRARY).num_kept > 0
+    whole = build_split(example_split, tmp_path / "whole", LIBRARY).folder
+    assert build_split(example_split, tmp_path / "killed", LIBRARY).num_kept > 0
     assert tree(robots.parent) == tree(whole)
 
 
@@ -317,9 +324,9 @@ def test_a_name_that_is_a_path_is_an_error(tmp_path, name):
 
 
 def test_a_name_shared_by_two_robots_is_an_error(tmp_path):
-    made = combined(test=[member("base=planar ee=cylinder", "gantry-plane")])
+    example_split = combined(test=[member("base=planar ee=cylinder", "gantry-plane")])
     with pytest.raises(BenchmarkError, match="both named 'gantry-plane'; rename one"):
-        build_split(made, tmp_path / "data", LIBRARY)
+        build_split(example_split, tmp_path / "data", LIBRARY)
     assert not list(tmp_path.iterdir())
 
 
@@ -368,8 +375,10 @@ def test_loading_does_not_import_torch(whole):
         "import sys; from morphgen.benchmark.split_folder import load_split_folder; "
         f"print(len(load_split_folder({str(whole)!r}).train), 'torch' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["3", "False"]
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.split() == ["3", "False"]
 
 
 @pytest.mark.parametrize(

@@ -16,36 +16,36 @@ from morphgen.model.kinematics import reach
 
 
 def test_link_and_joint_counts_are_means_over_train_or_test():
-    found = statistics(split(["base=gantry ee=plane", "cubes"], ["chain beads=2"]), LIBRARY)
-    assert (found["train"]["robots"], found["test"]["robots"]) == (2, 1)
+    summary = statistics(split(["base=gantry ee=plane", "cubes"], ["chain beads=2"]), LIBRARY)
+    assert (summary["train"]["robots"], summary["test"]["robots"]) == (2, 1)
     for key, gantry, cubes, chain in (
         ("links", 7, 3, 10),
         ("movable", 5, 2, 7),
         ("movable_to_tool", 5, 2, 7),
     ):
-        assert found["train"][key] == (gantry + cubes) / 2
-        assert found["test"][key] == chain
+        assert summary["train"][key] == (gantry + cubes) / 2
+        assert summary["test"][key] == chain
 
 
 def test_joints_beyond_the_tool_and_mimic_joints_do_not_count_as_movable_to_tool():
-    found = statistics(split(["arm=lwr ee=claw"], ["arm=lwr ee=plane"]), LIBRARY)
-    assert (found["train"]["movable"], found["train"]["movable_to_tool"]) == (11, 7)
-    assert (found["test"]["movable"], found["test"]["movable_to_tool"]) == (7, 7)
+    summary = statistics(split(["arm=lwr ee=claw"], ["arm=lwr ee=plane"]), LIBRARY)
+    assert (summary["train"]["movable"], summary["train"]["movable_to_tool"]) == (11, 7)
+    assert (summary["test"]["movable"], summary["test"]["movable_to_tool"]) == (7, 7)
 
 
 def test_masses_reaches_and_cosine_similarities_have_mean_and_range():
-    made = combined()
-    found = statistics(made, LIBRARY)
-    robots = [compose_member(m, LIBRARY) for m in made.train]
-    (test,) = (compose_member(m, LIBRARY) for m in made.test)
+    example_split = combined()
+    summary = statistics(example_split, LIBRARY)
+    robots = [compose_member(m, LIBRARY) for m in example_split.train]
+    (test,) = (compose_member(m, LIBRARY) for m in example_split.test)
     alike = [
         cosine(features(test, token_shapes(test)), features(robot, token_shapes(robot)))
         for robot in robots
     ]
     for got, values in (
-        (found["train"]["mass"], [robot.mass for robot in robots]),
-        (found["train"]["reach"], [reach(robot) for robot in robots]),
-        (found["cosine"], alike),
+        (summary["train"]["mass"], [robot.mass for robot in robots]),
+        (summary["train"]["reach"], [reach(robot) for robot in robots]),
+        (summary["cosine"], alike),
     ):
         expected = {"mean": np.mean(values), "min": min(values), "max": max(values)}
         assert got == pytest.approx(expected, abs=5e-5)
@@ -53,15 +53,15 @@ def test_masses_reaches_and_cosine_similarities_have_mean_and_range():
 
 def test_a_robot_with_two_tasks_is_counted_twice():
     reaching = replace(member("cubes"), name="reaching", task="reach")
-    found = statistics(split(["cubes", reaching], ["base=gantry ee=cube"]), LIBRARY)
-    assert (found["train"]["robots"], found["train"]["bodies"]) == (2, 1)
+    summary = statistics(split(["cubes", reaching], ["base=gantry ee=cube"]), LIBRARY)
+    assert (summary["train"]["robots"], summary["train"]["bodies"]) == (2, 1)
 
 
 @pytest.mark.slow
 def test_the_number_of_processes_does_not_matter():
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
-    made = split(cubes, ["base=gantry ee=cube"])
-    assert statistics(made, LIBRARY, jobs=2) == statistics(made, LIBRARY)
+    example_split = split(cubes, ["base=gantry ee=cube"])
+    assert statistics(example_split, LIBRARY, jobs=2) == statistics(example_split, LIBRARY)
 
 
 def test_a_robot_that_cannot_be_composed_is_an_error():

@@ -45,29 +45,29 @@ def test_fields_have_the_order_and_size_of_the_paper():
 
 
 def test_every_number_of_an_arm():
-    made = arm_tokens()
-    assert made.shape == (6, 48)
-    np.testing.assert_allclose(made[:, 0], np.arange(6) / 22)
-    np.testing.assert_allclose(made[:, 1], np.array([-1, 0, 1, 2, 3, 3]) / 22)
+    token_array = arm_tokens()
+    assert token_array.shape == (6, 48)
+    np.testing.assert_allclose(token_array[:, 0], np.arange(6) / 22)
+    np.testing.assert_allclose(token_array[:, 1], np.array([-1, 0, 1, 2, 3, 3]) / 22)
     flags = np.zeros((6, 4))
     flags[3] = 1
-    np.testing.assert_array_equal(made[:, 2:6], flags)
-    np.testing.assert_allclose(made[0, 6:12], [0, 0, 1, 0.1, 0.1, 0.04])
-    np.testing.assert_allclose(made[1, 6:12], [0, 1, 0, 0.02, 0.02, 0.24])
-    np.testing.assert_allclose(made[1, 12:19], [0, 0, 0.15, 1, 0, 0, 0])
+    np.testing.assert_array_equal(token_array[:, 2:6], flags)
+    np.testing.assert_allclose(token_array[0, 6:12], [0, 0, 1, 0.1, 0.1, 0.04])
+    np.testing.assert_allclose(token_array[1, 6:12], [0, 1, 0, 0.02, 0.02, 0.24])
+    np.testing.assert_allclose(token_array[1, 12:19], [0, 0, 0.15, 1, 0, 0, 0])
     axes = [(0, 0, 0), (0, 1, 0), (1, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 0)]
-    np.testing.assert_array_equal(made[:, 19:22], axes)
-    np.testing.assert_allclose(made[0, 22:29], [0, 0, 0, 1, 0, 0, 0])
-    np.testing.assert_allclose(made[5, 22:29], [0, -0.05, 0.2, 1, 0, 0, 0])
+    np.testing.assert_array_equal(token_array[:, 19:22], axes)
+    np.testing.assert_allclose(token_array[0, 22:29], [0, 0, 0, 1, 0, 0, 0])
+    np.testing.assert_allclose(token_array[5, 22:29], [0, -0.05, 0.2, 1, 0, 0, 0])
     slide, turn, fixed = np.eye(3)
-    np.testing.assert_array_equal(made[:, 29:32], [fixed, turn, turn, slide, slide, slide])
+    np.testing.assert_array_equal(token_array[:, 29:32], [fixed, turn, turn, slide, slide, slide])
     # The home (0.4, 0.5, 0.01, 0.02) within (-2, 2), (-2, 2), (0, 0.04), (0, 0.04); "right"
     # mimics "left" and stands at -0.02 within (-0.04, 0).
     x = np.array([0.2, 0.25, -0.5, 0.0, 0.0])
     angles = x[:, None] * math.pi / 2 * np.array([1, 2, 4, 8, 16, 32, 64, 128])
-    np.testing.assert_allclose(made[1:, 32:40], np.sin(angles), atol=1e-12)
-    np.testing.assert_allclose(made[1:, 40:48], np.cos(angles), atol=1e-12)
-    np.testing.assert_array_equal(made[0, 32:], np.zeros(16))
+    np.testing.assert_allclose(token_array[1:, 32:40], np.sin(angles), atol=1e-12)
+    np.testing.assert_allclose(token_array[1:, 40:48], np.cos(angles), atol=1e-12)
+    np.testing.assert_array_equal(token_array[0, 32:], np.zeros(16))
 
 
 @pytest.mark.parametrize(
@@ -80,26 +80,26 @@ def test_every_number_of_an_arm():
     ],
 )
 def test_a_primitive_is_encoded_as_one_hot_and_sizes(geometry, numbers):
-    made = tokens(hinge(), {"b": Shape(geometry)})
-    np.testing.assert_allclose(field_of(made, "geometry")[1], numbers)
-    assert not field_of(made, "geometry")[0].any()
-    assert not field_of(made, "geometry pose")[0].any()
+    token_array = tokens(hinge(), {"b": Shape(geometry)})
+    np.testing.assert_allclose(field_of(token_array, "geometry")[1], numbers)
+    assert not field_of(token_array, "geometry")[0].any()
+    assert not field_of(token_array, "geometry pose")[0].any()
 
 
 def test_poses_have_quaternions_with_positive_w():
     turned = Pose((1.0, 2.0, 3.0), (-0.5, 0.5, -0.5, 0.5))
-    made = tokens(hinge(T_parent_joint=turned), {"b": Shape(Sphere(0.1), turned)})
+    token_array = tokens(hinge(T_parent_joint=turned), {"b": Shape(Sphere(0.1), turned)})
     for name in ("geometry pose", "joint origin"):
-        np.testing.assert_allclose(field_of(made, name)[1], [1, 2, 3, 0.5, -0.5, 0.5, -0.5])
+        np.testing.assert_allclose(field_of(token_array, name)[1], [1, 2, 3, 0.5, -0.5, 0.5, -0.5])
 
 
 def test_axes_have_unit_length_and_are_zero_for_fixed_joints():
-    made = tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(3, 0, 4)),)), {})
-    np.testing.assert_allclose(field_of(made, "joint axis"), [[0, 0, 0], [0.6, 0, 0.8]])
-    made = tokens(hinge("fixed"), {})
-    assert not field_of(made, "joint axis").any()
-    assert not field_of(made, "joint position").any()
-    np.testing.assert_array_equal(field_of(made, "joint type"), [[0, 0, 1]] * 2)
+    token_array = tokens(replace(hinge(), joints=(replace(hinge().joints[0], axis=(3, 0, 4)),)), {})
+    np.testing.assert_allclose(field_of(token_array, "joint axis"), [[0, 0, 0], [0.6, 0, 0.8]])
+    token_array = tokens(hinge("fixed"), {})
+    assert not field_of(token_array, "joint axis").any()
+    assert not field_of(token_array, "joint position").any()
+    np.testing.assert_array_equal(field_of(token_array, "joint type"), [[0, 0, 1]] * 2)
 
 
 def test_only_the_link_of_the_tool_frame_is_flagged():
@@ -111,9 +111,9 @@ def test_only_the_link_of_the_tool_frame_is_flagged():
 
 def test_indices_are_divided_by_the_largest_index():
     robot = arm()
-    made = tokens(robot, {}, max_links=6)
-    np.testing.assert_allclose(made[:, 0], [0, 0.2, 0.4, 0.6, 0.8, 1])
-    np.testing.assert_allclose(made[:, 1], [-0.2, 0, 0.2, 0.4, 0.6, 0.6])
+    token_array = tokens(robot, {}, max_links=6)
+    np.testing.assert_allclose(token_array[:, 0], [0, 0.2, 0.4, 0.6, 0.8, 1])
+    np.testing.assert_allclose(token_array[:, 1], [-0.2, 0, 0.2, 0.4, 0.6, 0.6])
 
 
 @pytest.mark.parametrize(
@@ -129,8 +129,8 @@ def test_indices_are_divided_by_the_largest_index():
     ],
 )
 def test_q_is_normalized_by_the_joint_limits(robot, q, x):
-    found = normalize_positions(robot, np.array(q)[:, None])
-    np.testing.assert_allclose(found[:, 0], x, atol=1e-12)
+    normalized = normalize_positions(robot, np.array(q)[:, None])
+    np.testing.assert_allclose(normalized[:, 0], x, atol=1e-12)
 
 
 def test_mimic_joints_follow_their_leader():
@@ -152,19 +152,19 @@ def test_position_codes_are_unique():
 def test_tokens_are_batched_over_q():
     robot = arm()
     q = random_configurations(robot, 12, np.random.default_rng(0)).reshape(3, 4, 4)
-    made = tokens(robot, shapes_of(robot), q)
-    assert made.shape == (3, 4, 6, 48)
+    token_array = tokens(robot, shapes_of(robot), q)
+    assert token_array.shape == (3, 4, 6, 48)
     assert encode_joint_positions(robot, q).shape == (3, 4, 6, 16)
-    np.testing.assert_array_equal(made[..., 32:], encode_joint_positions(robot, q))
-    np.testing.assert_array_equal(made[2, 1], tokens(robot, shapes_of(robot), q[2, 1]))
+    np.testing.assert_array_equal(token_array[..., 32:], encode_joint_positions(robot, q))
+    np.testing.assert_array_equal(token_array[2, 1], tokens(robot, shapes_of(robot), q[2, 1]))
     np.testing.assert_array_equal(arm_tokens(), tokens(robot, shapes_of(robot), robot.home))
     assert tokens(robot, {}, np.zeros((0, 4))).shape == (0, 6, 48)
 
 
 def test_a_robot_of_one_link_has_one_token():
-    made = tokens(Robot("r", (Link("a"),)), {"a": Shape(Sphere(0.1))})
-    assert made.shape == (1, 48)
-    back, shapes = robot_from_tokens(made, "r")
+    token_array = tokens(Robot("r", (Link("a"),)), {"a": Shape(Sphere(0.1))})
+    assert token_array.shape == (1, 48)
+    back, shapes = robot_from_tokens(token_array, "r")
     assert (back.dof, shapes) == (0, {"link0": Shape(Sphere(0.1))})
 
 
@@ -219,14 +219,14 @@ def test_a_zero_axis_and_a_q_of_the_wrong_length_are_errors():
 
 
 def test_padding_adds_rows_of_zeros_and_a_mask():
-    made = np.stack([arm_tokens()] * 3)
-    all_, mask = pad_tokens(made, 9)
+    batch = np.stack([arm_tokens()] * 3)
+    all_, mask = pad_tokens(batch, 9)
     assert all_.shape == (3, 9, 48)
     assert mask.tolist() == [True] * 6 + [False] * 3
-    np.testing.assert_array_equal(all_[:, mask], made)
+    np.testing.assert_array_equal(all_[:, mask], batch)
     assert not all_[:, ~mask].any()
     with pytest.raises(BenchmarkError, match="has 6 links, more than max_links 5"):
-        pad_tokens(made, 5)
+        pad_tokens(batch, 5)
 
 
 def test_token_files_are_reproducible_and_need_no_pickle():

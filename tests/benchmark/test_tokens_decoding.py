@@ -147,15 +147,15 @@ def test_decoded_robots_move_in_normalized_positions():
 
 
 def test_single_precision_tokens_are_decoded():
-    made = arm_tokens()
-    back, shapes = robot_from_tokens(made.astype(np.float32), "back")
-    np.testing.assert_allclose(tokens(back, shapes), made, atol=2e-5)
+    token_array = arm_tokens()
+    back, shapes = robot_from_tokens(token_array.astype(np.float32), "back")
+    np.testing.assert_allclose(tokens(back, shapes), token_array, atol=2e-5)
 
 
 def spoilt(row, column, value):
-    made = arm_tokens()
-    made[row, column] = value
-    return made
+    token_array = arm_tokens()
+    token_array[row, column] = value
+    return token_array
 
 
 @pytest.mark.parametrize(
@@ -231,14 +231,14 @@ def test_invalid_tokens_are_errors_that_name_link_and_field(made, message):
 
 
 def test_a_movable_base_is_an_error():
-    made = arm_tokens()
-    made[0, 19:] = made[1, 19:]
+    token_array = arm_tokens()
+    token_array[0, 19:] = token_array[1, 19:]
     with pytest.raises(BenchmarkError, match="link 0: joint type: revolute, but the base is fixed"):
-        robot_from_tokens(made, "x")
+        robot_from_tokens(token_array, "x")
 
 
 def test_tokens_of_another_max_links_are_an_error():
-    made = tokens(arm(), {}, max_links=30)
-    assert_read_back(made, max_links=30)
+    token_array = tokens(arm(), {}, max_links=30)
+    assert_read_back(token_array, max_links=30)
     with pytest.raises(BenchmarkError, match="made with another max_links than 23"):
-        robot_from_tokens(made, "x")
+        robot_from_tokens(token_array, "x")

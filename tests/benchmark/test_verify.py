@@ -51,9 +51,9 @@ def summed(folder):
 
 
 def test_an_unchanged_file_passes(tmp_path):
-    made = combined()
-    seen = verify(written(tmp_path, made), LIBRARY)
-    assert (seen.split, seen.id, seen.differences) == (made, split_id(made), ())
+    example_split = combined()
+    seen = verify(written(tmp_path, example_split), LIBRARY)
+    assert (seen.split, seen.id, seen.differences) == (example_split, split_id(example_split), ())
 
 
 def test_a_shipped_split_can_be_verified_by_name():
@@ -118,8 +118,8 @@ def test_a_moved_split_folder_passes(whole, tmp_path):
 @pytest.mark.slow
 def test_the_number_of_processes_does_not_matter(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
-    made = split(cubes, ["base=planar ee=plane"])
-    folder = build_split(made, tmp_path / "data", LIBRARY, settings=LIGHT).folder
+    example_split = split(cubes, ["base=planar ee=plane"])
+    folder = build_split(example_split, tmp_path / "data", LIBRARY, settings=LIGHT).folder
     (folder / "robots" / "cube-3" / "robot.urdf").unlink()
     assert [where for where, _ in found(folder)] == ["cube-3"]
     assert found(folder, jobs=2) == found(folder)
@@ -144,11 +144,11 @@ def test_a_damaged_file_is_reported(whole, path, where, change):
             (whole / path).write_bytes(data + b"\n")
         case "gone":
             (whole / path).unlink()
-    told = found(whole)
+    findings = found(whole)
     why = "is missing, but SHA256SUMS names it" if change == "gone" else "is not what SHA256SUMS"
     file = path.rpartition("/")[2]
-    assert (where, True) in [(place, f"file {file} {why}" in text) for place, text in told]
-    assert {place for place, _ in told} <= {where, "gantry-plane"}
+    assert (where, True) in [(place, f"file {file} {why}" in text) for place, text in findings]
+    assert {place for place, _ in findings} <= {where, "gantry-plane"}
 
 
 def test_an_extra_file_is_reported(whole):
@@ -193,8 +193,8 @@ def test_a_card_may_differ_in_the_last_digits(bundles):
 
 
 def test_meshes_are_verified(tmp_path):
-    made = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
-    folder = build_split(made, tmp_path / "data", LIBRARY).folder
+    example_split = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
+    folder = build_split(example_split, tmp_path / "data", LIBRARY).folder
     assert found(folder) == []
     mesh = next((folder / "robots" / "ur5-plane" / "meshes").iterdir())
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"\x01")
@@ -274,9 +274,9 @@ def test_an_exchanged_split_file_is_reported(whole):
     other = combined(test=["base=planar ee=cylinder"])
     (whole / "split.yaml").write_text(split_text(other))
     summed(whole)
-    told = found(whole)
-    assert ("build.json", f"it is of split {split_id(combined())}, not of split.yaml") in told
-    assert ("planar-cylinder", "its folder is missing") in told
+    findings = found(whole)
+    assert ("build.json", f"it is of split {split_id(combined())}, not of split.yaml") in findings
+    assert ("planar-cylinder", "its folder is missing") in findings
 
 
 @pytest.mark.parametrize(

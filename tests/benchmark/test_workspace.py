@@ -77,10 +77,10 @@ def test_disjoint_workspaces_have_no_overlap():
 
 
 def test_the_workspace_of_a_revolute_joint_is_a_circle():
-    found = workspace(chain(("revolute", (0, 0, 1), (0, 0, 1)), tool=(0.5, 0.0, 0.2)))
-    assert found.shoulder == pytest.approx((0, 0, 1.2))
-    assert found.reach == pytest.approx(0.5)
-    nodes = (np.argwhere(found.density > 0) - 10) / 10
+    result = workspace(chain(("revolute", (0, 0, 1), (0, 0, 1)), tool=(0.5, 0.0, 0.2)))
+    assert result.shoulder == pytest.approx((0, 0, 1.2))
+    assert result.reach == pytest.approx(0.5)
+    nodes = (np.argwhere(result.density > 0) - 10) / 10
     assert (np.abs(np.linalg.norm(nodes, axis=1) - 1) < 0.15).all()
     assert set(nodes[:, 2]) == {0.0}
     assert nodes[:, 0].min() > 0.4  # limits of one radian
@@ -141,9 +141,9 @@ def test_the_shoulder_of_prismatic_robots_is_the_middle_of_their_travel():
     slide = ("prismatic", (0.3, 0, 0), (1, 0, 0))
     far = replace(chain(slide, tool=(0, 0, 0)).joints[0], limits=(0.0, 3.0))
     robot = replace(chain(slide, tool=(0, 0, 0)), joints=(far,))
-    found = workspace(robot)
-    assert found.shoulder == pytest.approx((1.8, 0, 0))
-    assert found.reach == pytest.approx(1.5, rel=1e-3)
+    result = workspace(robot)
+    assert result.shoulder == pytest.approx((1.8, 0, 0))
+    assert result.reach == pytest.approx(1.5, rel=1e-3)
 
 
 def test_the_samples_of_an_arm_do_not_depend_on_its_gripper():

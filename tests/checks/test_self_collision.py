@@ -53,10 +53,10 @@ def chain(*links, kind="revolute"):
 
 def test_depths_are_those_of_spheres():
     robot = slides(0.0, 0.3)
-    found = penetrations(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
-    assert found[0] == {}
-    assert found[1] == {("ball0", "ball1"): pytest.approx(0.02, abs=1e-6)}
-    assert found[2] == {("ball0", "ball1"): pytest.approx(0.05, abs=1e-6)}
+    depths = penetrations(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
+    assert depths[0] == {}
+    assert depths[1] == {("ball0", "ball1"): pytest.approx(0.02, abs=1e-6)}
+    assert depths[2] == {("ball0", "ball1"): pytest.approx(0.05, abs=1e-6)}
 
 
 def test_touching_faces_do_not_collide():

@@ -22,13 +22,15 @@ def turned(geometry, rotation, position=(0.1, -0.05, 0.02)):
 def test_canonicalization_preserves_the_solid_and_is_idempotent(geometry):
     for rotation in Rotation.random(20, random_state=1):
         shape = turned(geometry, rotation)
-        found = canonical(shape)
-        assert signed_distance([found], POINTS) == pytest.approx(
+        canonical_shape = canonical(shape)
+        assert signed_distance([canonical_shape], POINTS) == pytest.approx(
             signed_distance([shape], POINTS), abs=1e-9
         )
-        again = canonical(found)
-        assert again.geometry == found.geometry
-        assert again.T_link_shape.matrix == pytest.approx(found.T_link_shape.matrix, abs=1e-9)
+        again = canonical(canonical_shape)
+        assert again.geometry == canonical_shape.geometry
+        assert again.T_link_shape.matrix == pytest.approx(
+            canonical_shape.T_link_shape.matrix, abs=1e-9
+        )
 
 
 def test_equivalent_boxes_have_one_canonical_form():

@@ -42,8 +42,8 @@ def overlap(shapes, *found):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_fit_overlaps_at_least_as_well_as_any_primitive_of_the_link(seed):
     shapes = drawn(seed)
-    own = max(overlap(shapes, shape) for shape in shapes)
-    assert overlap(shapes, fitted(seed)) > own - 0.01
+    best_overlap = max(overlap(shapes, shape) for shape in shapes)
+    assert overlap(shapes, fitted(seed)) > best_overlap - 0.01
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -59,19 +59,19 @@ def test_two_rails_are_fitted_by_one_of_them():
 def test_the_sides_of_the_fit_are_flush_with_the_link():
     prongs = [Shape(Box((0.02, 0.01, 0.04)), Pose((0.0, y, 0.02))) for y in (0.02, -0.02)]
     bridge = Shape(Box((0.02, 0.03, 0.01)), Pose((0.0, 0.0, 0.035)))
-    found = fit_composite([*prongs, bridge])
-    assert found == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
+    fit = fit_composite([*prongs, bridge])
+    assert fit == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
 
 
 def test_two_collinear_rods_are_fitted_by_one_rod():
     turned = Pose.from_xyz_rpy((0.1, 0.0, 0.0), (0.0, math.pi / 2, 0.0))
     rod = Shape(Cylinder(0.02, 0.2), turned)
-    found = fit_composite(
+    fit = fit_composite(
         [rod, replace(rod, T_link_shape=replace(turned, position=(0.25, 0.0, 0.0)))]
     )
-    assert found.geometry == Cylinder(0.02, pytest.approx(0.35, abs=1e-5))
-    assert found.T_link_shape.position == pytest.approx((0.175, 0.0, 0.0), abs=1e-5)
-    assert np.abs(found.T_link_shape.matrix[:3, 2]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
+    assert fit.geometry == Cylinder(0.02, pytest.approx(0.35, abs=1e-5))
+    assert fit.T_link_shape.position == pytest.approx((0.175, 0.0, 0.0), abs=1e-5)
+    assert np.abs(fit.T_link_shape.matrix[:3, 2]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_mirrored_fingers_have_mirrored_primitives():

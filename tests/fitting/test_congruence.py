@@ -72,9 +72,9 @@ def test_motions_and_reflections_of_a_link_are_recovered(base, seed, mirrored):
 def test_equal_meshes_give_the_identity_and_shifted_meshes_a_translation(base):
     assert np.array_equal(congruence(base, base.copy()), np.eye(4))
     shift = trimesh.transformations.translation_matrix([0.1, 0.2, 0.3])
-    found = congruence(base, shuffled(base, shift))
-    assert np.array_equal(found[:3, :3], np.eye(3))
-    np.testing.assert_allclose(found, shift, atol=1e-7)
+    transform = congruence(base, shuffled(base, shift))
+    assert np.array_equal(transform[:3, :3], np.eye(3))
+    np.testing.assert_allclose(transform, shift, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -91,9 +91,9 @@ def test_equal_meshes_give_the_identity_and_shifted_meshes_a_translation(base):
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_symmetric_meshes_are_matched_by_a_rotation(mesh, mirrored):
     other = shuffled(mesh, motion(5, mirrored))
-    found = congruence(mesh, other)
-    assert farthest(mesh, other, found) < 1e-6
-    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+    transform = congruence(mesh, other)
+    assert farthest(mesh, other, transform) < 1e-6
+    assert np.linalg.det(transform[:3, :3]) == pytest.approx(1)
 
 
 def test_noise_within_the_tolerance_is_averaged_out(base):
@@ -173,8 +173,8 @@ def test_landmarks_closer_than_the_tolerance_are_distinguished():
 
     cross, line = np.arange(4) * math.pi / 2, np.array([1, 1, 5, 5]) * math.pi / 4
     tolerance = 0.0101 / (2 * 0.667)
-    found = congruence(needle(cross), shuffled(needle(cross), motion(2)), tolerance)
-    assert np.linalg.det(found[:3, :3]) == pytest.approx(1)
+    transform = congruence(needle(cross), shuffled(needle(cross), motion(2)), tolerance)
+    assert np.linalg.det(transform[:3, :3]) == pytest.approx(1)
     assert congruence(needle(cross), shuffled(needle(line), motion(2)), tolerance) is None
 
 
@@ -213,19 +213,19 @@ def test_representatives_are_the_first_of_each_congruence_class(base):
         shuffled(base, moves[1]),
         shuffled(box, moves[0]),
     ]
-    found = representatives(meshes)
-    assert [first for first, _ in found] == [0, 1, 0, 0, 1]
-    for mesh, (first, T) in zip(meshes, found, strict=True):
+    indices = representatives(meshes)
+    assert [first for first, _ in indices] == [0, 1, 0, 0, 1]
+    for mesh, (first, T) in zip(meshes, indices, strict=True):
         assert farthest(meshes[first], mesh, T) < 1e-6
-    np.testing.assert_allclose(found[3][1], moves[1], atol=1e-6)
+    np.testing.assert_allclose(indices[3][1], moves[1], atol=1e-6)
     assert representatives([]) == []
 
 
 def test_the_arms_of_yumi_have_congruent_links():
     left, right = links("yumi_left"), links("yumi_right")
-    found = representatives([*left.values(), *right.values()])
-    assert [first for first, _ in found] == 2 * list(range(8))
-    assert all(np.array_equal(T, np.eye(4)) for _, T in found)
+    indices = representatives([*left.values(), *right.values()])
+    assert [first for first, _ in indices] == 2 * list(range(8))
+    assert all(np.array_equal(T, np.eye(4)) for _, T in indices)
 
 
 def test_jaco_has_congruent_halves_and_wrists_and_ur5_has_no_congruent_wrists():

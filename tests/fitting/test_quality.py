@@ -54,14 +54,14 @@ def assert_perfect(found: Quality) -> None:
 )
 @pytest.mark.parametrize("pose", [Pose(), TILTED])
 def test_signed_distances_of_one_primitive_are_exact(geometry, point, expected, pose):
-    found = signed_distance([Shape(geometry, pose)], np.array([pose.apply(point)]))
-    assert found == pytest.approx([expected], abs=1e-12)
+    distances = signed_distance([Shape(geometry, pose)], np.array([pose.apply(point)]))
+    assert distances == pytest.approx([expected], abs=1e-12)
 
 
 def test_the_signed_distance_of_a_union_is_that_of_the_nearest_primitive():
     pair = [Shape(Box((2, 2, 2)), at(-0.5)), Shape(Box((2, 2, 2)), at(0.5))]
-    found = signed_distance(pair, np.array([[3, 0, 0], [-4.5, 0, 5], [0, 0, 0], [0, 0, 0.9]]))
-    np.testing.assert_allclose(found, [1.5, 5, -0.5, -0.1], atol=1e-12)
+    distances = signed_distance(pair, np.array([[3, 0, 0], [-4.5, 0, 5], [0, 0, 0], [0, 0, 0.9]]))
+    np.testing.assert_allclose(distances, [1.5, 5, -0.5, -0.1], atol=1e-12)
     crossed = [Shape(Box((2, 2, 2)), at(-0.8)), Shape(Box((2, 2, 2)), at(0.8))]
     assert signed_distance(crossed, np.zeros((1, 3))) == pytest.approx([-0.2])
 
@@ -72,46 +72,46 @@ def test_a_box_is_a_perfect_fit_of_itself(shape):
 
 
 def test_a_box_a_tenth_too_long_protrudes_by_the_excess():
-    found = quality(solid_of([BLOCK]), [Shape(Box((0.44, 0.2, 0.1)), at(0.02))])
-    assert found.iou == pytest.approx(1 / 1.1, abs=1e-4)
-    assert found.coverage == 1
-    assert found.volume_ratio == pytest.approx(1.1, abs=1e-4)
+    measures = quality(solid_of([BLOCK]), [Shape(Box((0.44, 0.2, 0.1)), at(0.02))])
+    assert measures.iou == pytest.approx(1 / 1.1, abs=1e-4)
+    assert measures.coverage == 1
+    assert measures.volume_ratio == pytest.approx(1.1, abs=1e-4)
     area = 2 * (0.44 * 0.2 + 0.2 * 0.1 + 0.1 * 0.44)
     end, strips = 0.2 * 0.1 * 0.04, 2 * (0.2 + 0.1) * 0.04 * 0.02
-    assert found.protrusion_mean == pytest.approx((end + strips) / area, rel=5e-3)
-    assert found.protrusion_p95 == pytest.approx(0.04, abs=1e-9)
-    assert found.gap_mean == found.gap_p95 == 0
-    assert found.hausdorff == pytest.approx(0.04, abs=1e-9)
+    assert measures.protrusion_mean == pytest.approx((end + strips) / area, rel=5e-3)
+    assert measures.protrusion_p95 == pytest.approx(0.04, abs=1e-9)
+    assert measures.gap_mean == measures.gap_p95 == 0
+    assert measures.hausdorff == pytest.approx(0.04, abs=1e-9)
 
 
 def test_a_sphere_in_a_cube_does_not_cover_the_corners():
-    found = quality(solid_of([CUBE]), [Shape(Sphere(0.1))])
-    assert found.iou == found.coverage == found.volume_ratio
-    assert found.iou == pytest.approx(math.pi / 6, abs=1e-3)
-    assert found.protrusion_mean == pytest.approx(0, abs=1e-9)
+    measures = quality(solid_of([CUBE]), [Shape(Sphere(0.1))])
+    assert measures.iou == measures.coverage == measures.volume_ratio
+    assert measures.iou == pytest.approx(math.pi / 6, abs=1e-3)
+    assert measures.protrusion_mean == pytest.approx(0, abs=1e-9)
     away, _ = dblquad(lambda y, x: math.sqrt(1 + x * x + y * y), 0, 1, 0, 1)
-    assert found.gap_mean == pytest.approx(0.1 * (away - 1), rel=0.02)
-    assert found.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-9)
+    assert measures.gap_mean == pytest.approx(0.1 * (away - 1), rel=0.02)
+    assert measures.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-9)
 
 
 def test_a_cube_around_a_ball_protrudes_at_the_corners():
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
-    found = quality(Solid(ball, "watertight"), [CUBE])
-    assert found.coverage == 1
-    assert found.iou == pytest.approx(math.pi / 6, abs=2e-3)
-    assert found.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-4)
-    assert found.gap_p95 == 0
+    measures = quality(Solid(ball, "watertight"), [CUBE])
+    assert measures.coverage == 1
+    assert measures.iou == pytest.approx(math.pi / 6, abs=2e-3)
+    assert measures.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-4)
+    assert measures.gap_p95 == 0
 
 
 def test_a_cylinder_fits_its_tessellation_up_to_the_sagitta():
     shape = Shape(Cylinder(0.05, 0.2), TILTED)
-    found = quality(solid_of([shape]), [shape])
-    assert found.iou == pytest.approx(48 / math.tau * math.sin(math.tau / 48), abs=5e-4)
-    assert found.coverage == pytest.approx(1, abs=1e-4)
+    measures = quality(solid_of([shape]), [shape])
+    assert measures.iou == pytest.approx(48 / math.tau * math.sin(math.tau / 48), abs=5e-4)
+    assert measures.coverage == pytest.approx(1, abs=1e-4)
     sagitta = 0.05 * (1 - math.cos(math.pi / 48))
-    assert found.hausdorff == pytest.approx(sagitta, rel=0.02)
-    assert 0 < found.protrusion_p95 <= sagitta + 1e-9
-    assert found.gap_mean < 1e-9
+    assert measures.hausdorff == pytest.approx(sagitta, rel=0.02)
+    assert 0 < measures.protrusion_p95 <= sagitta + 1e-9
+    assert measures.gap_mean < 1e-9
 
 
 @pytest.mark.parametrize("shift", [0.05, 0.1])
@@ -129,9 +129,9 @@ def test_a_primitive_inside_another_changes_nothing(idle):
     small = solid((Box((0.04, 0.04, 0.04)), at(0, 0, -0.06)))
     once = quality(small, [CUBE])
     for both in ([CUBE, idle], [idle, CUBE]):
-        found = quality(small, both)
+        measures = quality(small, both)
         for name in SHARES + DISTANCES:
-            assert getattr(found, name) == pytest.approx(getattr(once, name), rel=5e-3, abs=1e-9)
+            assert getattr(measures, name) == pytest.approx(getattr(once, name), rel=5e-3, abs=1e-9)
 
 
 def test_protrusion_of_a_thin_skin_equals_its_thickness():
@@ -140,18 +140,18 @@ def test_protrusion_of_a_thin_skin_equals_its_thickness():
         Shape(Box((0.3 + skin, 0.2 + 2 * skin, 0.1 + 2 * skin)), at(sign * (0.05 + skin / 2)))
         for sign in (-1, 1)
     ]
-    found = quality(solid_of([BLOCK]), pair)
-    assert found.coverage == 1
-    assert found.protrusion_mean == pytest.approx(skin, rel=0.01)
-    assert found.hausdorff == pytest.approx(math.sqrt(3) * skin, rel=1e-6)
+    measures = quality(solid_of([BLOCK]), pair)
+    assert measures.coverage == 1
+    assert measures.protrusion_mean == pytest.approx(skin, rel=0.01)
+    assert measures.hausdorff == pytest.approx(math.sqrt(3) * skin, rel=1e-6)
 
 
 def test_disjoint_shapes_have_no_overlap():
-    found = quality(solid_of([CUBE]), [Shape(CUBE.geometry, at(0.5))])
-    assert found.iou == found.coverage == 0
-    assert found.volume_ratio == pytest.approx(1, rel=1e-3)
-    assert found.hausdorff == pytest.approx(0.5, abs=1e-9)
-    assert 0.3 < found.gap_mean == pytest.approx(found.protrusion_mean, rel=0.02)
+    measures = quality(solid_of([CUBE]), [Shape(CUBE.geometry, at(0.5))])
+    assert measures.iou == measures.coverage == 0
+    assert measures.volume_ratio == pytest.approx(1, rel=1e-3)
+    assert measures.hausdorff == pytest.approx(0.5, abs=1e-9)
+    assert 0.3 < measures.gap_mean == pytest.approx(measures.protrusion_mean, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -167,27 +167,27 @@ def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
         (Box((0.096, 0.2, 0.2)), at(0.052)),
         (Box((0.2, 0.2, 0.02)), at(0, 0, -0.09)),
     )
-    found = quality(slotted, primitives)
-    assert found.iou == pytest.approx(1 - 0.008 * 0.18 / 0.04, abs=1e-3)
-    assert found.protrusion_p95 < 1e-9
-    assert found.protrusion_mean < 1e-4
-    assert found.hausdorff == pytest.approx(0.096, abs=2e-4)
+    measures = quality(slotted, primitives)
+    assert measures.iou == pytest.approx(1 - 0.008 * 0.18 / 0.04, abs=1e-3)
+    assert measures.protrusion_p95 < 1e-9
+    assert measures.protrusion_mean < 1e-4
+    assert measures.hausdorff == pytest.approx(0.096, abs=2e-4)
 
 
 @pytest.mark.parametrize("geometry", KINDS)
 def test_surfaces_are_sampled_uniformly(geometry):
     kernel = Shape(Box((0.02, 0.05, 0.01)), TILTED @ at(0.05, 0.02, 0.03))
     small = solid_of([kernel])
-    found = quality(small, [Shape(geometry, TILTED)])
+    measures = quality(small, [Shape(geometry, TILTED)])
     mesh = solid_mesh(geometry).copy()
     for _ in range(2 if isinstance(geometry, Sphere) else 0):
         mesh = mesh.subdivide()
     mesh.apply_transform(TILTED.matrix)
     points, _ = trimesh.sample.sample_surface(mesh, 40_000, seed=3)
     distance = small.distance(np.asarray(points))
-    assert found.protrusion_mean == pytest.approx(distance.mean(), rel=0.01)
-    assert found.protrusion_p95 == pytest.approx(np.percentile(distance, 95), rel=0.01)
-    assert found.coverage == 1
+    assert measures.protrusion_mean == pytest.approx(distance.mean(), rel=0.01)
+    assert measures.protrusion_p95 == pytest.approx(np.percentile(distance, 95), rel=0.01)
+    assert measures.coverage == 1
 
 
 def test_measures_are_invariant_under_rigid_motion():
@@ -207,10 +207,10 @@ def test_measures_are_invariant_under_rigid_motion():
 def test_measures_are_reproducible_and_sampling_errors_are_small():
     ball = [Shape(Sphere(0.1))]
     cube = solid_of([CUBE])
-    found = [quality(cube, ball, seed=seed) for seed in range(8)]
-    assert quality(cube, ball, seed=3) == found[3]
-    assert len({each.gap_mean for each in found}) == len(found)
-    error = np.array([each.iou for each in found]) - math.pi / 6
+    measures = [quality(cube, ball, seed=seed) for seed in range(8)]
+    assert quality(cube, ball, seed=3) == measures[3]
+    assert len({each.gap_mean for each in measures}) == len(measures)
+    error = np.array([each.iou for each in measures]) - math.pi / 6
     assert np.abs(error).max() < 2e-3
     assert quality(cube, ball, volume_points=1000) == quality(cube, ball, volume_points=1024)
 

@@ -84,8 +84,8 @@ def test_a_flat_link_gets_no_primitive_and_a_finding(tmp_path, wedge):
     assert [row.link for row in report.links] == ["l1"]
     (finding,) = report.findings
     assert (finding.code, finding.where) == ("no-primitive", "link l0")
-    made = with_primitives(robot, {row.link: row.fit.primitives for row in report.links})
-    assert made.links[0].collisions == ()
+    primitive_robot = with_primitives(robot, {row.link: row.fit.primitives for row in report.links})
+    assert primitive_robot.links[0].collisions == ()
 
 
 def test_existing_primitives_are_unchanged():
@@ -150,15 +150,21 @@ def test_options_out_of_range_are_errors(options, message):
 
 def test_replacing_collisions_preserves_masses_and_joints():
     meshes = morphgen.compose("arm=ur5 ee=plane")
-    made = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
+    primitive_robot = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
     written = as_written(meshes)
-    assert made.joints == written.joints
-    assert [link.inertial for link in made.links] == [link.inertial for link in written.links]
-    assert [link.visuals for link in made.links] == [link.visuals for link in meshes.links]
-    assert not any(isinstance(s.geometry, Mesh) for link in made.links for s in link.collisions)
+    assert primitive_robot.joints == written.joints
+    assert [link.inertial for link in primitive_robot.links] == [
+        link.inertial for link in written.links
+    ]
+    assert [link.visuals for link in primitive_robot.links] == [
+        link.visuals for link in meshes.links
+    ]
+    assert not any(
+        isinstance(s.geometry, Mesh) for link in primitive_robot.links for s in link.collisions
+    )
     assert any(isinstance(s.geometry, Mesh) for link in meshes.links for s in link.collisions)
-    assert list(SelfCollisionChecker(made).penetrations([made.home])) == [{}]
-    assert morphgen.check(made) == morphgen.check(meshes)
+    assert list(SelfCollisionChecker(primitive_robot).penetrations([primitive_robot.home])) == [{}]
+    assert morphgen.check(primitive_robot) == morphgen.check(meshes)
 
 
 def test_visuals_are_replaced_on_request(tmp_path, wedge):
@@ -177,8 +183,8 @@ def test_visuals_are_replaced_on_request(tmp_path, wedge):
 def test_links_without_stored_fits_are_fitted(tmp_path):
     robot = arm([mesh_shape(tmp_path, trimesh.creation.box((0.1, 0.2, 0.3)))])
     assert stored_primitives(robot, read_stored_fits(LIBRARY.folders)) == ({}, ["l0"])
-    made = as_primitives(robot, LIBRARY.folders)
-    worth = quality(solid_of(robot.links[0].collisions), made.links[0].collisions)
+    primitive_robot = as_primitives(robot, LIBRARY.folders)
+    worth = quality(solid_of(robot.links[0].collisions), primitive_robot.links[0].collisions)
     assert worth.iou > 0.95
 
 

@@ -32,8 +32,8 @@ def target_of(*shapes, seed=0):
 def fitted(geometry, pose=TILTED, seed=0):
     """The best single primitive of a primitive, its score, and the solid."""
     target = target_of(Shape(geometry, pose), seed=seed)
-    found = best_single(target)
-    (shape,), score = found.shapes, found.iou
+    fit = best_single(target)
+    (shape,), score = fit.shapes, fit.iou
     return shape, score, target.solid
 
 
@@ -253,8 +253,8 @@ def test_pieces_give_three_reproducible_guesses_per_clustering():
     assert first.kinds[2::3].tolist() == [[cylinder, cylinder]] * 2
     for name in ("kinds", "centres", "quaternions", "halves"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    found = overlaps(first, target.points, target.inside, target.weights)
-    assert found.max() > 0.6
+    scores = overlaps(first, target.points, target.inside, target.weights)
+    assert scores.max() > 0.6
 
 
 def test_a_solid_with_few_points_is_not_split():
@@ -275,11 +275,11 @@ def test_an_added_primitive_starts_at_the_uncovered_part_of_the_solid():
     arms = [Shape(Box((0.5, 0.1, 0.1)), Pose((0.0, y, 0.0))) for y in (-0.4, 0.0, 0.4)]
     spine = Shape(Box((0.1, 0.9, 0.1)), Pose((-0.2, 0.0, 0.0)))
     target = target_of(spine, *arms)
-    found = best_single(target)
+    fit = best_single(target)
     for _ in range(3):
-        found = best_several(target, found, 0)
-    assert len(found.shapes) == 4
-    assert quality(target.solid, found.shapes).iou > 0.93
+        fit = best_several(target, fit, 0)
+    assert len(fit.shapes) == 4
+    assert quality(target.solid, fit.shapes).iou > 0.93
 
 
 def test_a_fully_covered_solid_gives_no_further_guess():
@@ -294,6 +294,6 @@ def test_thin_tilted_solids_are_sampled_and_fitted(seed):
     rod = Shape(Cylinder(0.005, 0.3), TILTED)
     plate = Shape(Box((0.3, 0.3, 0.006)), TILTED)
     for shape in (rod, plate):
-        found = best_single(target_of(shape, seed=seed))
-        assert found.iou > 0.85
-        assert type(found.shapes[0].geometry) is type(shape.geometry)
+        fit = best_single(target_of(shape, seed=seed))
+        assert fit.iou > 0.85
+        assert type(fit.shapes[0].geometry) is type(shape.geometry)

@@ -86,13 +86,13 @@ def test_a_box_rotated_by_90_degrees_has_swapped_edges():
 
 def test_the_overlap_of_concentric_primitives_is_their_volume_ratio():
     ball = within(SPHERE, GRID, (0.45,))
-    found = overlaps(primitive(SPHERE, halves=(0.36, 1, 1)), GRID, ball)
-    assert found == pytest.approx(0.8**3, rel=0.02)
+    scores = overlaps(primitive(SPHERE, halves=(0.36, 1, 1)), GRID, ball)
+    assert scores == pytest.approx(0.8**3, rel=0.02)
     can = within(CYLINDER, GRID, (0.4, 0.4, 0.4))
-    found = overlaps(primitive(CYLINDER, halves=(0.3, 9.0, 0.2)), GRID, can)
-    assert found == pytest.approx((0.3 / 0.4) ** 2 / 2, rel=0.03)
-    found = overlaps(primitive(CYLINDER, (0, 0, 0.1), halves=(0.4, 9.0, 0.4)), GRID, can)
-    assert found == pytest.approx(0.7 / 0.9, abs=1e-6)
+    scores = overlaps(primitive(CYLINDER, halves=(0.3, 9.0, 0.2)), GRID, can)
+    assert scores == pytest.approx((0.3 / 0.4) ** 2 / 2, rel=0.03)
+    scores = overlaps(primitive(CYLINDER, (0, 0, 0.1), halves=(0.4, 9.0, 0.4)), GRID, can)
+    assert scores == pytest.approx(0.7 / 0.9, abs=1e-6)
 
 
 def test_disjoint_primitives_and_empty_targets_have_zero_overlap():

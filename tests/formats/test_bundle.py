@@ -129,8 +129,8 @@ def test_changed_and_missing_files_are_reported(tmp_path):
     assert file_findings(folder) == ()
     (folder / "robot.urdf").write_text((folder / "robot.urdf").read_text() + "<!-- mine -->")
     (folder / "robot.xml").unlink()
-    found = {finding.code: finding.where for finding in file_findings(folder)}
-    assert found == {"file-changed": "file robot.urdf", "file-missing": "file robot.xml"}
+    location_by_code = {finding.code: finding.where for finding in file_findings(folder)}
+    assert location_by_code == {"file-changed": "file robot.urdf", "file-missing": "file robot.xml"}
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../other", "meshes/../../x"])

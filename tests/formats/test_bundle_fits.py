@@ -51,9 +51,9 @@ def test_a_bundle_contains_the_fits_of_its_parts(folder):
 
 def test_token_shapes_do_not_depend_on_the_collision_geometry(tmp_path):
     robot = morphgen.compose(WORDS)
-    made = morphgen.compose(WORDS, geometry="primitive")
-    back = read_bundle(write_bundle(made, tmp_path / "prims", picture=False))
-    assert token_shapes(made) == token_shapes(back) == token_shapes(robot)
+    primitive_robot = morphgen.compose(WORDS, geometry="primitive")
+    back = read_bundle(write_bundle(primitive_robot, tmp_path / "prims", picture=False))
+    assert token_shapes(primitive_robot) == token_shapes(back) == token_shapes(robot)
     assert token_shapes(robot)["arm_upper_arm_link"].geometry.radius == pytest.approx(
         0.0545, abs=1e-4
     )

@@ -270,9 +270,9 @@ def test_uniformly_scaled_shapes_share_a_key_and_their_fit_scales(mesh):
     assert shapes_key([larger[0], shapes[1]]) != shapes_key(shapes)
     stored = {shapes_key(shapes): ARM}
     assert stored_fit(shapes, stored) == ARM
-    found = stored_fit(larger, stored)
-    assert found.token == scale_shape(ARM.token, 1.3)
-    assert found.collision == tuple(scale_shape(shape, 1.3) for shape in ARM.collision)
+    fit = stored_fit(larger, stored)
+    assert fit.token == scale_shape(ARM.token, 1.3)
+    assert fit.collision == tuple(scale_shape(shape, 1.3) for shape in ARM.collision)
     assert stored_fit([Shape(Sphere(0.1))], stored) is None
 
 

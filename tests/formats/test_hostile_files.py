@@ -255,10 +255,10 @@ def test_hostile_urdfs_use_bounded_memory_and_time(name, tmp_path):
         "import sys, re; from morphgen.cli import main; main(sys.argv[1:]);"
         "print(re.search(r'VmHWM:\\s+(\\d+) kB', open('/proc/self/status').read())[1])"
     )
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code, "show", str(path)], capture_output=True, text=True, timeout=30
     )
 
-    assert done.returncode == 0, done.stderr
+    assert result.returncode == 0, result.stderr
     # Not ru_maxrss: it begins with that of the process that started this one.
-    assert int(done.stdout.split()[-1]) < 2**20  # KiB
+    assert int(result.stdout.split()[-1]) < 2**20  # KiB

@@ -18,16 +18,16 @@ mujoco.mj_step(model, data)
 
 
 def test_a_warning_is_logged_and_writes_no_file(tmp_path):
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=tmp_path
     )
-    assert done.stdout.startswith("morphgen.mujoco WARNING Nan, Inf or huge value in QVEL")
+    assert result.stdout.startswith("morphgen.mujoco WARNING Nan, Inf or huge value in QVEL")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_warning_callback_of_the_user_is_kept(tmp_path):
     code = "import mujoco; mujoco.set_mju_user_warning(lambda text: print('mine', text))\n" + CODE
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
     )
-    assert done.stdout.startswith("mine Nan, Inf or huge value in QVEL")
+    assert result.stdout.startswith("mine Nan, Inf or huge value in QVEL")

@@ -20,6 +20,8 @@ libc.fflush(None)
 
 @pytest.mark.skipif(os.name != "posix", reason="C's buffers are reached by POSIX's names")
 def test_buffered_c_output_is_not_printed_at_exit():
-    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
-    assert done.stdout == "after\n"
-    assert done.stderr == ""
+    result = subprocess.run(
+        [sys.executable, "-c", CODE], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "after\n"
+    assert result.stderr == ""

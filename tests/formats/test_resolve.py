@@ -105,12 +105,12 @@ def test_names_are_case_sensitive_and_a_near_match_is_suggested(urdf: Path) -> N
 def test_relative_paths_start_at_the_folder_of_the_description(
     urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = touch(urdf.parent / "a.stl")
+    own_file = touch(urdf.parent / "a.stl")
     beside = touch(urdf.parent.parent / "meshes" / "b.stl")
     touch(tmp_path / "elsewhere" / "a.stl")
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert resolve_uri("a.stl", urdf, NOWHERE) == here
-    assert resolve_uri("file://a.stl", urdf, NOWHERE) == here
+    assert resolve_uri("a.stl", urdf, NOWHERE) == own_file
+    assert resolve_uri("file://a.stl", urdf, NOWHERE) == own_file
     assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
 
 
@@ -144,11 +144,11 @@ def test_without_a_package_a_path_may_leave_one_folder(tmp_path: Path) -> None:
 def test_absolute_paths_are_limited_to_own_folder_packages_and_roots(
     tmp_path: Path, urdf: Path
 ) -> None:
-    own = touch(urdf.parent.parent / "meshes" / "a.stl")
+    own_file = touch(urdf.parent.parent / "meshes" / "a.stl")
     packaged = touch(tmp_path / "opt" / "hand_description" / "a.stl")
     private = touch(tmp_path / "private" / "a.stl")
-    assert resolve_uri(str(own), urdf, NOWHERE) == own
-    assert resolve_uri(own.as_uri(), urdf, NOWHERE) == own
+    assert resolve_uri(str(own_file), urdf, NOWHERE) == own_file
+    assert resolve_uri(own_file.as_uri(), urdf, NOWHERE) == own_file
     assert resolve_uri(packaged.as_uri(), urdf, NOWHERE) == packaged
     assert "leaves" in failure(private.as_uri(), urdf)
     assert resolve_uri(str(private), urdf, PackageFinder((private.parent,))) == private
@@ -269,12 +269,12 @@ def test_text_files_are_limited_to_own_folder_packages_and_roots(tmp_path: Path)
     download = touch(tmp_path / "home" / "downloads" / "x.xacro")
     nested = touch(tmp_path / "home" / "downloads" / "urdf" / "x.xacro")
     near = touch(tmp_path / "home" / "secret.yaml")
-    own = touch(tmp_path / "home" / "downloads" / "config" / "a.yaml")
+    own_file = touch(tmp_path / "home" / "downloads" / "config" / "a.yaml")
     package = touch(tmp_path / "ws" / "arm" / "config" / "a.yaml")
     touch(tmp_path / "ws" / "arm" / "package.xml", "<package><name>arm</name></package>")
     described = touch(tmp_path / "home" / "hand_description" / "a.yaml")
-    assert not refused_text(own, download)
-    assert not refused_text(own, nested)
+    assert not refused_text(own_file, download)
+    assert not refused_text(own_file, nested)
     assert not refused_text(package, download)
     assert refused_text(near, download)
     assert refused_text(near, nested)

@@ -73,12 +73,12 @@ def odd_robot(seed):
 
 @pytest.mark.parametrize("robot", [arm(), *map(odd_robot, range(10))])
 def test_rounded_robots_round_trip_through_a_file(tmp_path, robot):
-    here = as_written(robot)
+    rounded = as_written(robot)
     there = as_written(read_bundle(write_bundle(robot, tmp_path / "r", picture=False)))
-    assert as_written(here).joints == here.joints
+    assert as_written(rounded).joints == rounded.joints
     for name in ("joints", "frames", "home"):
-        assert getattr(there, name) == getattr(here, name)
-    for link, other in zip(here.links, there.links, strict=True):
+        assert getattr(there, name) == getattr(rounded, name)
+    for link, other in zip(rounded.links, there.links, strict=True):
         bare = replace(other, visuals=link.visuals)
         assert bare == replace(link, collisions=bare.collisions)
         shapes = [[replace(s, rgba=None) for s in each.collisions] for each in (link, other)]

@@ -137,12 +137,12 @@ def test_a_valid_document_has_no_findings_and_loads():
 
 @pytest.mark.parametrize(("code", "change", "line"), FAULTS)
 def test_faults_are_reported_with_their_line(code, change, line):
-    found = [finding for finding in findings(changed(change)) if finding.code == code]
-    assert found, findings(changed(change))
-    assert found[0].severity == "error"
-    assert found[0].where.startswith(f"r.urdf:{line} ")
-    assert found[0].fix
-    assert "\n" not in found[0].why + found[0].fix
+    faults = [finding for finding in findings(changed(change)) if finding.code == code]
+    assert faults, findings(changed(change))
+    assert faults[0].severity == "error"
+    assert faults[0].where.startswith(f"r.urdf:{line} ")
+    assert faults[0].fix
+    assert "\n" not in faults[0].why + faults[0].fix
 
 
 @pytest.mark.parametrize(("code", "change"), SUSPICIOUS)
@@ -177,8 +177,8 @@ def test_every_cycle_is_reported_once():
         f'<joint name="{p}{c}" type="fixed"><parent link="{p}"/><child link="{c}"/></joint>'
         for p, c in pairs
     )
-    found = findings(f'<robot name="r">{links}{joints}</robot>')
-    cycles = [finding.why for finding in found if finding.code == "cycle"]
+    faults = findings(f'<robot name="r">{links}{joints}</robot>')
+    cycles = [finding.why for finding in faults if finding.code == "cycle"]
     assert [why.partition(": ")[2] for why in cycles] == ["b -> c -> b", "f -> d -> e -> f"]
 
 

@@ -203,5 +203,7 @@ def test_suspicious_expressions_print_no_python_warning():
         "from morphgen.formats.xacro import evaluate; "
         r"print(evaluate('${2if 1 else 3}', {}), evaluate('${len(\'\\d\')}', {}))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("2.0 2.0\n", "")
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert (result.stdout, result.stderr) == ("2.0 2.0\n", "")

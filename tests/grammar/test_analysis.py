@@ -57,18 +57,18 @@ def test_shipped_grammars_are_sound(name):
     ],
 )
 def test_a_fault_is_reported_with_line_and_column(lines, message):
-    found = check_grammar(grammar(*lines), LIBRARY)
-    assert found
-    assert any(message in fault for fault in found)
-    assert all(fault.startswith("g:") and "\n" not in fault for fault in found)
+    faults = check_grammar(grammar(*lines), LIBRARY)
+    assert faults
+    assert any(message in fault for fault in faults)
+    assert all(fault.startswith("g:") and "\n" not in fault for fault in faults)
 
 
 def test_all_faults_are_reported_together():
-    found = check_grammar(
+    faults = check_grammar(
         grammar("let r = 1", "robot -> gantri plane(sise=1)", "a -> ur55"),
         LIBRARY,
     )
-    assert [fault.split(": ")[0] for fault in found] == [
+    assert [fault.split(": ")[0] for fault in faults] == [
         "g:2:10",
         "g:2:28",
         "g:3:6",
@@ -109,28 +109,30 @@ def test_a_terminating_recursion_has_no_faults():
     ],
 )
 def test_the_structure_count_equals_the_number_of_distinct_listed_structures(lines, number):
-    found = grammar(*lines)
-    listed = structures(found)
-    assert count_structures(found) == number == len(listed) == len(set(listed))
+    robot_grammar = grammar(*lines)
+    listed = structures(robot_grammar)
+    assert count_structures(robot_grammar) == number == len(listed) == len(set(listed))
 
 
 def test_the_list_contains_exactly_the_structures_that_sampling_draws():
-    found = grammar("robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw")
+    robot_grammar = grammar(
+        "robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw"
+    )
     rng = np.random.default_rng(0)
-    drawn = {str(derive(found, LIBRARY, RandomChooser(rng))) for _ in range(600)}
-    assert drawn == set(structures(found))
+    drawn = {str(derive(robot_grammar, LIBRARY, RandomChooser(rng))) for _ in range(600)}
+    assert drawn == set(structures(robot_grammar))
 
 
 def test_duplicate_alternatives_are_listed_once():
-    found = grammar("robot -> gantry ee", "ee -> plane | plane | cube")
-    assert count_structures(found) == 3
-    assert len(structures(found)) == 2
+    robot_grammar = grammar("robot -> gantry ee", "ee -> plane | plane | cube")
+    assert count_structures(robot_grammar) == 3
+    assert len(structures(robot_grammar)) == 2
 
 
 def test_structures_of_a_recursive_grammar_are_listed_by_size():
-    found = grammar("robot -> slides tail", "tail -> bead | beam tail")
-    assert math.isinf(count_structures(found))
-    listed = structures(found, 6)
+    robot_grammar = grammar("robot -> slides tail", "tail -> bead | beam tail")
+    assert math.isinf(count_structures(robot_grammar))
+    listed = structures(robot_grammar, 6)
     assert [text.count("=bead") + text.count("=beam") for text in listed] == [1, 2, 3, 4, 5, 6]
     assert len(set(listed)) == 6
 
@@ -154,7 +156,7 @@ def test_shipped_grammars_have_the_documented_number_of_structures():
 
 
 def test_every_random_choice_is_listed_with_its_distribution():
-    found = variables(
+    random_choices = variables(
         grammar(
             "let r = uniform(1cm, 2cm)",
             "let n = 3",
@@ -162,9 +164,9 @@ def test_every_random_choice_is_listed_with_its_distribution():
             "link -> bead(radius=r, rod=choice(2cm, r) + uniform(0, 5*r))",
         )
     )
-    assert [(v.location, v.text, v.distribution.is_continuous) for v in found] == [
+    assert [(v.location, v.text, v.distribution.is_continuous) for v in random_choices] == [
         ("let r", "uniform(1cm, 2cm)", True),
         ("link: bead.rod", "choice(2cm, r)", False),
         ("link: bead.rod", "uniform(0, (5 * r))", True),
     ]
-    assert found[2].distribution.bounds == pytest.approx((0, 0.075))
+    assert random_choices[2].distribution.bounds == pytest.approx((0, 0.075))

@@ -22,25 +22,25 @@ def troubles(drawn: Sample, category):
     """What is wrong with a robot of a category."""
     robot = drawn.robot
     counts = (len(robot.links), len(robot.movable_joints))
-    found = unphysical(robot)
+    faults = unphysical(robot)
     if counts != benchmark_counts(category, drawn.derivation):
-        found.append(f"{counts} links and movable joints: {drawn.derivation}")
+        faults.append(f"{counts} links and movable joints: {drawn.derivation}")
     if category in RANGES:
-        found += [
+        faults += [
             f"{n} not in {ok}"
             for n, ok in zip(counts, RANGES[category], strict=True)
             if n not in ok
         ]
-    found += [f"{f.code} {f.where}" for f in check(robot) if f.severity != "info"]
+    faults += [f"{f.code} {f.where}" for f in check(robot) if f.severity != "info"]
     if [frame.name for frame in robot.frames] != ["tool"]:
-        found.append(f"frames {robot.frames}")
-    return found
+        faults.append(f"frames {robot.frames}")
+    return faults
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_robots_have_the_counts_of_the_benchmark_and_all_loaders_agree(category, tmp_path):
-    found = shipped(category)
-    drawn = [sample_robot(found, LIBRARY, index, seed=11) for index in range(3)]
+    grammar = shipped(category)
+    drawn = [sample_robot(grammar, LIBRARY, index, seed=11) for index in range(3)]
     assert [trouble for one in drawn for trouble in troubles(one, category)] == []
     folder = write_bundle(drawn[0].robot, tmp_path / "robot", picture=False)
     report = conformance(folder, 20)
@@ -51,9 +51,9 @@ def test_robots_have_the_counts_of_the_benchmark_and_all_loaders_agree(category,
 @pytest.mark.slow
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_a_hundred_robots_have_no_errors_and_all_loaders_agree(category, tmp_path):
-    found = shipped(category)
+    grammar = shipped(category)
     for index in range(100):
-        drawn = sample_robot(found, LIBRARY, index, seed=12)
+        drawn = sample_robot(grammar, LIBRARY, index, seed=12)
         assert troubles(drawn, category) == []
         folder = write_bundle(drawn.robot, tmp_path / "robot", picture=False)
         report = conformance(folder, 20)

@@ -127,13 +127,17 @@ def test_joints_keep_axis_limits_effort_velocity_damping_and_mimic():
     robot = joined(text)
     for label, here in load_parts(derive(text), LIBRARY).items():
         for joint in here.part.fragment.joints:
-            found = robot.joints[robot.joint_index[f"{label}_{joint.name}"]]
+            robot_joint = robot.joints[robot.joint_index[f"{label}_{joint.name}"]]
             kept = ("kind", "axis", "limits", "effort", "velocity", "damping", "friction")
-            assert [getattr(found, key) for key in kept] == [getattr(joint, key) for key in kept]
+            assert [getattr(robot_joint, key) for key in kept] == [
+                getattr(joint, key) for key in kept
+            ]
             if joint.mimic is None:
-                assert found.mimic is None
+                assert robot_joint.mimic is None
             else:
-                assert found.mimic == replace(joint.mimic, joint=f"{label}_{joint.mimic.joint}")
+                assert robot_joint.mimic == replace(
+                    joint.mimic, joint=f"{label}_{joint.mimic.joint}"
+                )
 
 
 def test_mimic_joints_follow_the_leader_of_the_same_gripper():
@@ -382,8 +386,8 @@ def conforms(arm, ee, tmp_path, samples):
     derivation = derive(f"arm={arm} ee={ee}")
     robot = compose(derivation, LIBRARY, default_name(derivation, LIBRARY))
     findings = check(robot)
-    told = {finding.code for finding in findings if finding.severity != "info"}
-    assert told == ({"self-collision"} if (arm, ee) in OVERLAPPING else set())
+    codes = {finding.code for finding in findings if finding.severity != "info"}
+    assert codes == ({"self-collision"} if (arm, ee) in OVERLAPPING else set())
     report = conformance(
         write_bundle(robot, tmp_path / robot.name, findings, picture=False), samples
     )

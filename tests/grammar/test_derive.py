@@ -103,16 +103,16 @@ def test_a_mount_yaw_of_360_degrees_is_in_range_after_rounding():
 
 def test_a_let_is_drawn_once_and_an_argument_once_per_copy():
     shared = draw(grammar("let r = uniform(0.1, 0.5)", "robot -> post beam(length=r){4}"))
-    own = draw(grammar("robot -> post beam(length=uniform(0.1, 0.5)){4}"))
-    lengths = [[n.parameters[0][1] for n in tree.walk()][1:] for tree in (shared, own)]
+    per_copy = draw(grammar("robot -> post beam(length=uniform(0.1, 0.5)){4}"))
+    lengths = [[n.parameters[0][1] for n in tree.walk()][1:] for tree in (shared, per_copy)]
     assert len(set(lengths[0])) == 1
     assert len(set(lengths[1])) == 4
 
 
 def test_two_distributions_in_one_expression_are_drawn_independently():
     recorded = RecordedChooser(RandomChooser(np.random.default_rng(0)))
-    found = grammar("robot -> gantry plane(size=uniform(0.1, 0.2) + uniform(0.1, 0.2))")
-    derive(found, LIBRARY, recorded)
+    robot_grammar = grammar("robot -> gantry plane(size=uniform(0.1, 0.2) + uniform(0.1, 0.2))")
+    derive(robot_grammar, LIBRARY, recorded)
     assert list(recorded.choices) == ["robot/1.plane.size", "robot/1.plane.size~2"]
 
 
@@ -128,57 +128,61 @@ def test_the_first_chooser_takes_the_first_possible_alternative_and_the_smallest
 
 
 def test_weights_are_relative_probabilities():
-    found = grammar(
+    robot_grammar = grammar(
         "robot -> @weight(3) cubes | @weight(2*0.5) cartpole | @weight(0) gantry | post"
     )
     rng = np.random.default_rng(0)
-    parts = [derive(found, LIBRARY, RandomChooser(rng)).part for _ in range(2000)]
+    parts = [derive(robot_grammar, LIBRARY, RandomChooser(rng)).part for _ in range(2000)]
     shares = [parts.count(part) / 2000 for part in ("cubes", "cartpole", "gantry", "post")]
     assert shares == pytest.approx([0.6, 0.2, 0, 0.2], abs=0.04)
     assert shares[2] == 0
 
 
 def test_a_weight_may_be_random():
-    found = grammar(
+    robot_grammar = grammar(
         "let w = choice(0, 1)",
         "robot -> @weight(w) cubes | @weight(1 - w) cartpole | @weight(0) post",
     )
     for seed in range(20):
         recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
-        part = derive(found, LIBRARY, recorded).part
+        part = derive(robot_grammar, LIBRARY, recorded).part
         assert part == ("cubes" if recorded.choices["let w"] else "cartpole")
 
 
 def test_repetition_counts_are_uniform():
-    found = grammar("robot -> post beam{2,4}")
+    robot_grammar = grammar("robot -> post beam{2,4}")
     rng = np.random.default_rng(0)
-    counts = [len(labels(derive(found, LIBRARY, RandomChooser(rng)))) - 1 for _ in range(900)]
+    counts = [
+        len(labels(derive(robot_grammar, LIBRARY, RandomChooser(rng)))) - 1 for _ in range(900)
+    ]
     assert [counts.count(n) / 900 for n in (2, 3, 4)] == pytest.approx([1 / 3] * 3, abs=0.05)
 
 
 @pytest.mark.parametrize("name", CATEGORIES)
 def test_recorded_choices_reproduce_the_derivation(name):
-    found = shipped(name)
+    grammar = shipped(name)
     for seed in range(5):
         recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
-        tree = derive(found, LIBRARY, recorded)
+        tree = derive(grammar, LIBRARY, recorded)
         written = {key: float(f"{value:.12g}") for key, value in recorded.choices.items()}
         again = RecordedChooser(FirstChooser(), written)
-        assert derive(found, LIBRARY, again) == tree
+        assert derive(grammar, LIBRARY, again) == tree
         assert again.choices == recorded.choices
 
 
 def test_invalid_recorded_choices_fall_back_to_the_other_chooser():
-    found = grammar("robot -> post links", "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw")
+    robot_grammar = grammar(
+        "robot -> post links", "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw"
+    )
     given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
-    assert derive(found, LIBRARY, RecordedChooser(FirstChooser(), given)) == derive(
-        found, LIBRARY, FirstChooser()
+    assert derive(robot_grammar, LIBRARY, RecordedChooser(FirstChooser(), given)) == derive(
+        robot_grammar, LIBRARY, FirstChooser()
     )
 
 
 def test_a_recursion_may_terminate():
-    found = grammar("robot -> slides tail", "tail -> bead | bead tail")
-    sizes = {sum(1 for _ in draw(found, seed).walk()) for seed in range(30)}
+    robot_grammar = grammar("robot -> slides tail", "tail -> bead | bead tail")
+    sizes = {sum(1 for _ in draw(robot_grammar, seed).walk()) for seed in range(30)}
     assert {2, 3, 4} <= sizes
 
 
@@ -196,12 +200,12 @@ def test_an_endless_recursion_is_an_error(lines):
 
 
 def test_no_robot_has_more_parts_than_allowed():
-    found = grammar("robot -> slides bead{99}")
-    assert sum(1 for _ in derive(found, LIBRARY, FirstChooser()).walk()) == MAX_PARTS == 100
+    robot_grammar = grammar("robot -> slides bead{99}")
+    assert sum(1 for _ in derive(robot_grammar, LIBRARY, FirstChooser()).walk()) == MAX_PARTS == 100
     with pytest.raises(TooManyPartsError, match="more than 100 parts: does it end"):
         first("robot -> slides bead{100}")
     with pytest.raises(TooManyPartsError, match="more than 3 parts"):
-        derive(found, LIBRARY, FirstChooser(), max_parts=3)
+        derive(robot_grammar, LIBRARY, FirstChooser(), max_parts=3)
 
 
 @pytest.mark.parametrize(
@@ -247,12 +251,12 @@ def test_derivation_errors_have_a_position(lines, message):
 
 
 def test_labels_are_unique_for_random_derivations():
-    found = grammar(
+    robot_grammar = grammar(
         "robot -> pedestal left:limb right:limb limb",
         "limb -> beam{1,3} | beam2 beam1 | limb beam",
         "beam1 -> beam",
         "beam2 -> beam",
     )
     for seed in itertools.islice(itertools.count(), 50):
-        names = labels(draw(found, seed))
+        names = labels(draw(robot_grammar, seed))
         assert len(set(names)) == len(names)

@@ -73,10 +73,10 @@ def test_printing_preserves_every_language_feature():
 def test_the_start_symbol_is_the_first_symbol_of_the_main_file(write):
     write("limbs", "limb -> arm plane", "arm -> ur5 | panda")
     path = write("mine", "include limbs", "include limbs", "robot -> fixed limb")
-    found = load_grammar(path, [path.parent])
-    assert (found.name, found.start) == ("mine", "robot")
-    assert grammar_text(found).startswith("robot -> ")
-    assert "arm=ur5" in first(found)
+    grammar = load_grammar(path, [path.parent])
+    assert (grammar.name, grammar.start) == ("mine", "robot")
+    assert grammar_text(grammar).startswith("robot -> ")
+    assert "arm=ur5" in first(grammar)
 
 
 def test_a_file_of_includes_only_has_the_start_symbol_of_the_included_file(write):
@@ -87,8 +87,8 @@ def test_a_file_of_includes_only_has_the_start_symbol_of_the_included_file(write
 def test_a_file_overrides_included_definitions(write):
     write("body", "let r = 5cm", "robot -> gantry ee", "ee -> plane(size=r)", "where dof > 2")
     path = write("mine", 'include "body.grammar"', "let r = 8cm", "ee -> cube(size=r)")
-    found = load_grammar(path)
-    assert grammar_text(found).splitlines() == [
+    grammar = load_grammar(path)
+    assert grammar_text(grammar).splitlines() == [
         "let r = 8cm",
         "ee -> cube(size=r)",
         "robot -> gantry ee",
@@ -102,9 +102,9 @@ def test_shipped_grammars_can_be_included_by_name(write):
 
 
 def test_user_libraries_take_precedence_over_shipped_grammars(write, tmp_path):
-    own = write("cubes", "robot -> cartpole")
-    assert find_grammar("cubes", [tmp_path]) == own
-    assert find_grammar("cubes") != own
+    user_grammar = write("cubes", "robot -> cartpole")
+    assert find_grammar("cubes", [tmp_path]) == user_grammar
+    assert find_grammar("cubes") != user_grammar
     with pytest.raises(GrammarError, match="unknown grammar 'kubes'; did you mean 'cubes'"):
         find_grammar("kubes", [tmp_path])
 

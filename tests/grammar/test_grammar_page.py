@@ -42,9 +42,9 @@ def test_there_are_five_examples():
 
 @pytest.mark.parametrize("text", EXAMPLES)
 def test_examples_have_no_faults_and_can_be_sampled(load, text):
-    found = load(text)
-    assert check_grammar(found, LIBRARY) == []
-    for drawn in sample_robots(found, LIBRARY, 3):
+    grammar = load(text)
+    assert check_grammar(grammar, LIBRARY) == []
+    for drawn in sample_robots(grammar, LIBRARY, 3):
         assert unphysical(drawn.robot) == []
         assert any(frame.name == "tool" for frame in drawn.robot.frames)
 
@@ -74,12 +74,12 @@ def test_the_page_shows_mistakes_of_many_kinds():
 def test_each_mistake_raises_the_documented_message(load, lines, message):
     text = "\n".join(re.findall("`(.*?)`", lines)) + "\n"
     try:
-        found = check_grammar(load(text), LIBRARY)
+        faults = check_grammar(load(text), LIBRARY)
     except GrammarError as error:
-        found = [str(error)]
+        faults = [str(error)]
     if message.endswith("..."):
-        found = [told[: len(message) - 3] + "..." for told in found]
-    assert message in found
+        faults = [fault[: len(message) - 3] + "..." for fault in faults]
+    assert message in faults
 
 
 def test_an_unsatisfiable_condition_raises_the_documented_message(monkeypatch):

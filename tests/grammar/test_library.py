@@ -144,8 +144,8 @@ def test_duplicate_folders_are_merged(tmp_path, monkeypatch):
 
 
 def test_duplicate_part_names_are_errors(tmp_path):
-    own = write_part(tmp_path, name="ur5", kind="arm")
-    message = rf"part 'ur5' is in \S*/robots_real/ur5\.yaml and in {re.escape(str(own))}"
+    user_part = write_part(tmp_path, name="ur5", kind="arm")
+    message = rf"part 'ur5' is in \S*/robots_real/ur5\.yaml and in {re.escape(str(user_part))}"
     with pytest.raises(PartError, match=message):
         default_library([tmp_path]).names()
 

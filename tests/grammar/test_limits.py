@@ -56,9 +56,9 @@ def test_exceeding_a_limit_is_an_error_that_names_the_limit(lines, message):
 
 def test_grammars_within_the_limits_are_read():
     x = "+".join(["1"] * MAX_NESTING)
-    found = grammar(f"let x = {x}", "robot -> " + "|".join(["@weight(x) cubes"] * 1000))
-    assert count_structures(found) == 1000
-    assert check_grammar(found, LIBRARY) == []
+    robot_grammar = grammar(f"let x = {x}", "robot -> " + "|".join(["@weight(x) cubes"] * 1000))
+    assert count_structures(robot_grammar) == 1000
+    assert check_grammar(robot_grammar, LIBRARY) == []
     brackets = "(" * 20_000
     assert (
         count_structures(
@@ -89,38 +89,38 @@ def test_conditions_have_the_same_limits():
     ],
 )
 def test_huge_numbers_of_structures_are_counted_quickly(lines, number):
-    found = count_structures(grammar(*lines))
-    assert found == number
-    assert found != math.inf
+    count = count_structures(grammar(*lines))
+    assert count == number
+    assert count != math.inf
 
 
 @pytest.mark.parametrize("last", ["a64 -> bead", "a64 -> bead | beam"])
 def test_a_grammar_with_only_too_large_robots_has_a_fault(last):
-    found = grammar("robot -> slides a0", *DOUBLING, last)
-    assert check_grammar(found, LIBRARY) == [
+    robot_grammar = grammar("robot -> slides a0", *DOUBLING, last)
+    assert check_grammar(robot_grammar, LIBRARY) == [
         f"g:1:1: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
     ]
-    assert list(enumerate_structures(found, LIBRARY)) == []
+    assert list(enumerate_structures(robot_grammar, LIBRARY)) == []
 
 
 def test_alternatives_with_too_large_robots_are_not_listed():
-    found = grammar("robot -> slides a0 | slides cube", *DOUBLING, "a64 -> bead | beam")
-    (only,) = enumerate_structures(found, LIBRARY)
+    robot_grammar = grammar("robot -> slides a0 | slides cube", *DOUBLING, "a64 -> bead | beam")
+    (only,) = enumerate_structures(robot_grammar, LIBRARY)
     assert [node.part for node in only.walk()] == ["slides", "cube"]
-    assert check_grammar(found, LIBRARY) == []
+    assert check_grammar(robot_grammar, LIBRARY) == []
 
 
 def test_an_infinite_grammar_is_listed_from_the_smallest_structure():
     many = "|".join(["bead", "beam"] * 400)
-    found = grammar("robot -> slides a", "a -> b a | a a bead | bead", f"b -> {many}")
-    listed = itertools.islice(enumerate_structures(found, LIBRARY), 3)
+    robot_grammar = grammar("robot -> slides a", "a -> b a | a a bead | bead", f"b -> {many}")
+    listed = itertools.islice(enumerate_structures(robot_grammar, LIBRARY), 3)
     assert [sum(1 for _ in each.walk()) for each in listed] == [2, 3, 3]
-    assert check_grammar(found, LIBRARY) == []
+    assert check_grammar(robot_grammar, LIBRARY) == []
 
 
 def test_the_search_for_the_next_structure_is_bounded():
-    found = grammar("robot -> slides a{1,20}", "a -> " + "|".join(["bead"] * 200))
-    listed = enumerate_structures(found, LIBRARY)
+    robot_grammar = grammar("robot -> slides a{1,20}", "a -> " + "|".join(["bead"] * 200))
+    listed = enumerate_structures(robot_grammar, LIBRARY)
     next(listed)
     with pytest.raises(SearchError, match="g: no new structure in the last 20,0"):
         list(listed)
@@ -144,9 +144,9 @@ def test_numbers_that_are_not_finite_are_faults(line, message):
 
 
 def test_weights_with_an_infinite_sum_are_errors():
-    found = grammar("robot -> @weight(1e308) cubes | @weight(1e308) cartpole")
+    robot_grammar = grammar("robot -> @weight(1e308) cubes | @weight(1e308) cartpole")
     with pytest.raises(GrammarError, match="g:1:1: the sum of weights of 'robot' is infinite"):
-        derive(found, LIBRARY, FirstChooser())
+        derive(robot_grammar, LIBRARY, FirstChooser())
 
 
 def test_the_smallest_positive_weight_is_respected():
@@ -154,21 +154,21 @@ def test_the_smallest_positive_weight_is_respected():
         def random(self):
             return 1 - 2**-53
 
-    found = grammar("robot -> @weight(5e-324) cubes | @weight(0) cartpole")
-    assert derive(found, LIBRARY, RandomChooser(Last())).part == "cubes"
+    robot_grammar = grammar("robot -> @weight(5e-324) cubes | @weight(0) cartpole")
+    assert derive(robot_grammar, LIBRARY, RandomChooser(Last())).part == "cubes"
 
 
 def test_at_most_20_faults_are_reported():
-    found = check_grammar(
+    faults = check_grammar(
         grammar("robot -> fixed " + " ".join(f"u{i}" for i in range(9000))), LIBRARY
     )
-    assert len(found) == 20
+    assert len(faults) == 20
 
 
 def test_a_grammar_whose_text_exceeds_the_limits_is_not_printed():
-    found = grammar("robot -> cubes", "where " + "<".join(["mass"] * 12_000))
+    robot_grammar = grammar("robot -> cubes", "where " + "<".join(["mass"] * 12_000))
     with pytest.raises(GrammarError, match="216,001 characters as one text; expected at most"):
-        grammar_text(found)
+        grammar_text(robot_grammar)
 
 
 @pytest.mark.parametrize("target", ["/etc/passwd", "../outside.grammar", "link.grammar"])

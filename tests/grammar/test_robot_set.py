@@ -31,16 +31,16 @@ from morphgen.grammar.workers import make_in_processes
 
 def plan(folder, category="cubes", **changes):
     text = grammar_text(shipped(category))
-    made = SetConfig(folder, category, text, 0, (), light=True, picture=False, library=())
-    return replace(made, **changes)
+    config = SetConfig(folder, category, text, 0, (), light=True, picture=False, library=())
+    return replace(config, **changes)
 
 
 @pytest.fixture
 def whole(tmp_path):
     """A set of eight cubes."""
-    made = plan(tmp_path / "whole")
-    make_set(made, 8, make_serially)
-    return made.folder
+    config = plan(tmp_path / "whole")
+    make_set(config, 8, make_serially)
+    return config.folder
 
 
 def interrupted(plan, n, done):
@@ -117,23 +117,23 @@ def test_the_order_of_generation_does_not_matter(tmp_path, whole):
 
 
 def test_a_larger_set_contains_the_smaller_one(tmp_path, whole):
-    own = plan(tmp_path / "s")
-    assert make_set(own, 3, make_serially).made == 3
-    report = make_set(own, 8, make_serially)
+    config = plan(tmp_path / "s")
+    assert make_set(config, 3, make_serially).made == 3
+    report = make_set(config, 8, make_serially)
     assert (report.made, report.kept) == (5, 3)
-    assert tree(own.folder) == tree(whole)
-    assert make_set(own, 2, make_serially).made == 0
-    assert tree(own.folder) == tree(whole)
+    assert tree(config.folder) == tree(whole)
+    assert make_set(config, 2, make_serially).made == 0
+    assert tree(config.folder) == tree(whole)
 
 
 @pytest.mark.parametrize("done", [0, 1, 7, 8])
 def test_robots_written_before_an_interruption_are_kept(tmp_path, whole, done):
-    own = plan(tmp_path / "s")
-    interrupted(own, 8, done)
-    assert not (own.folder / INDEX).exists()
-    report = make_set(own, 8, make_serially)
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, done)
+    assert not (config.folder / INDEX).exists()
+    report = make_set(config, 8, make_serially)
     assert (report.made, report.kept) == (8 - done, done)
-    assert tree(own.folder) == tree(whole)
+    assert tree(config.folder) == tree(whole)
 
 
 def test_deleted_robots_are_regenerated(tmp_path, whole):
@@ -154,40 +154,42 @@ def test_without_journal_or_index_everything_is_regenerated(tmp_path, whole):
 
 @pytest.mark.parametrize("cut", [1, 40, -1])
 def test_a_truncated_journal_regenerates_one_robot(tmp_path, whole, cut):
-    own = plan(tmp_path / "s")
-    interrupted(own, 8, 5)
-    lines = (own.folder / JOURNAL).read_text().splitlines()
-    (own.folder / JOURNAL).write_text("".join(f"{line}\n" for line in lines[:4]) + lines[4][:cut])
-    interrupted(own, 8, 2)
-    report = make_set(own, 8, make_serially)
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, 5)
+    lines = (config.folder / JOURNAL).read_text().splitlines()
+    (config.folder / JOURNAL).write_text(
+        "".join(f"{line}\n" for line in lines[:4]) + lines[4][:cut]
+    )
+    interrupted(config, 8, 2)
+    report = make_set(config, 8, make_serially)
     assert report.made in (2, 3)
-    assert tree(own.folder) == tree(whole)
+    assert tree(config.folder) == tree(whole)
 
 
 def test_partially_written_robots_are_removed(tmp_path, whole):
-    own = plan(tmp_path / "s")
-    interrupted(own, 8, 2)
-    (own.folder / ".cubes-000002.x1y2").mkdir()
-    (own.folder / ".cubes-000002.x1y2" / "robot.urdf").write_text("<robot")
-    make_set(own, 8, make_serially)
-    assert tree(own.folder) == tree(whole)
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, 2)
+    (config.folder / ".cubes-000002.x1y2").mkdir()
+    (config.folder / ".cubes-000002.x1y2" / "robot.urdf").write_text("<robot")
+    make_set(config, 8, make_serially)
+    assert tree(config.folder) == tree(whole)
 
 
 @pytest.mark.parametrize("left", [[], [f".{GRAMMAR}.partial"], [GRAMMAR, f".{SETTINGS}.partial"]])
 def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, whole, left):
-    own = plan(tmp_path / "s")
-    own.folder.mkdir()
+    config = plan(tmp_path / "s")
+    config.folder.mkdir()
     for name in left:
-        (own.folder / name).write_text(own.grammar_text if name == GRAMMAR else "{")
-    make_set(own, 8, make_serially)
-    assert tree(own.folder) == tree(whole)
+        (config.folder / name).write_text(config.grammar_text if name == GRAMMAR else "{")
+    make_set(config, 8, make_serially)
+    assert tree(config.folder) == tree(whole)
 
 
 def test_the_index_is_written_atomically(tmp_path, whole):
-    own = plan(tmp_path / "s")
-    interrupted(own, 8, 3)
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, 3)
     with pytest.raises(FormatError, match=r"is not a finished set: it has no index\.jsonl"):
-        read_index(own.folder)
+        read_index(config.folder)
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -258,10 +260,10 @@ def test_a_broken_settings_file_is_an_error(whole):
 
 
 def test_duplicate_robots_are_reported(tmp_path):
-    made = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
-    report = make_set(made, 3, make_serially)
+    config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
+    report = make_set(config, 3, make_serially)
     assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
-    hashes = {record["hash"] for record in read_index(made.folder)}
+    hashes = {record["hash"] for record in read_index(config.folder)}
     assert len(hashes) == 1
 
 
@@ -270,12 +272,12 @@ def test_different_robots_are_not_reported_as_duplicates(whole):
 
 
 def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
-    own = plan(tmp_path / "s", where=("mass < 0.5 and dof == 2",))
-    report = make_set(own, 8, make_serially)
-    counted = sum(sum(record["rejected"].values()) for record in read_index(own.folder))
+    config = plan(tmp_path / "s", where=("mass < 0.5 and dof == 2",))
+    report = make_set(config, 8, make_serially)
+    counted = sum(sum(record["rejected"].values()) for record in read_index(config.folder))
     assert report.rejected == {"where (mass < 0.5)": counted}
     assert counted > 0
-    assert make_set(own, 8, make_serially).rejected == report.rejected
+    assert make_set(config, 8, make_serially).rejected == report.rejected
 
 
 @pytest.mark.parametrize("work", [make_serially, make_in_processes(2)], ids=["1 job", "2 jobs"])
@@ -285,23 +287,23 @@ def test_an_unsatisfiable_condition_stops_the_run(tmp_path, work):
 
 
 def test_a_light_robot_references_meshes_in_their_packages(tmp_path):
-    made = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
-    make_set(made, 1, make_serially)
-    text = (made.folder / "g-000000" / "robot.urdf").read_text()
+    config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
+    make_set(config, 1, make_serially)
+    text = (config.folder / "g-000000" / "robot.urdf").read_text()
     assert 'filename="package://' in text
     assert str(Path.home()) not in text
 
 
 def test_a_concurrent_run_in_the_same_folder_is_an_error(tmp_path):
-    made = plan(tmp_path / "set")
+    config = plan(tmp_path / "set")
 
     def work(plan, indices):
         with pytest.raises(FormatError, match="is being written by another run"):
             make_set(plan, 8, make_serially)
         yield from make_serially(plan, indices)
 
-    make_set(made, 2, work)
-    assert len(read_index(made.folder)) == 2
+    make_set(config, 2, work)
+    assert len(read_index(config.folder)) == 2
 
 
 @pytest.mark.parametrize(

@@ -67,8 +67,10 @@ def test_a_rejected_draw_does_not_change_other_robots():
 
 
 def test_conditions_in_the_grammar_apply():
-    found = grammar("robot -> cubes(size=choice(0.05, 0.1))", "where mass < 0.1")
-    sizes = {dict(d.derivation.parameters)["size"] for d in sample_robots(found, LIBRARY, 8)}
+    robot_grammar = grammar("robot -> cubes(size=choice(0.05, 0.1))", "where mass < 0.1")
+    sizes = {
+        dict(d.derivation.parameters)["size"] for d in sample_robots(robot_grammar, LIBRARY, 8)
+    }
     assert sizes == {0.05}
 
 
@@ -87,16 +89,16 @@ def test_an_unsatisfiable_condition_is_named(condition, message):
 
 def test_the_most_frequent_reason_of_rejection_is_named(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 40)
-    found = grammar("robot -> @weight(3) cubes | cartpole", "where mass > 900 or links > 3")
+    robot_grammar = grammar("robot -> @weight(3) cubes | cartpole", "where mass > 900 or links > 3")
     with pytest.raises(SamplingError, match=r"40 failed at: where \(\(mass > 900\) or \(links > 3"):
-        sample_robot(found, LIBRARY, 0)
+        sample_robot(robot_grammar, LIBRARY, 0)
 
 
 def test_robots_with_overlapping_links_at_home_are_redrawn(monkeypatch):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 5)
-    found = grammar("robot -> pedestal(spread=0.05) left:arm3 right:arm3")
+    robot_grammar = grammar("robot -> pedestal(spread=0.05) left:arm3 right:arm3")
     with pytest.raises(SamplingError, match="5 failed at: links overlap at home"):
-        sample_robot(found, LIBRARY, 0)
+        sample_robot(robot_grammar, LIBRARY, 0)
 
 
 def test_robots_that_fail_a_check_are_redrawn(monkeypatch):
@@ -106,10 +108,10 @@ def test_robots_that_fail_a_check_are_redrawn(monkeypatch):
 
 
 def test_too_deep_recursions_are_redrawn():
-    found = grammar(
+    robot_grammar = grammar(
         "robot -> slides tail", "tail -> @weight(30) bead tail | jaw", "where links < 20"
     )
-    drawn = list(sample_robots(found, LIBRARY, 3))
+    drawn = list(sample_robots(robot_grammar, LIBRARY, 3))
     assert sum(d.rejected.get("more than 100 parts", 0) for d in drawn) > 0
 
 
@@ -140,10 +142,10 @@ TEXTS = st.builds(
 @given(TEXTS)
 def test_random_small_grammars_yield_valid_robots_or_an_error(monkeypatch, text):
     monkeypatch.setattr(sampling, "MAX_ATTEMPTS", 2)
-    found = grammar_from_text(text, "g")
+    grammar = grammar_from_text(text, "g")
     drawn, why = [], ""
     try:
-        drawn = list(sample_robots(found, LIBRARY, 2))
+        drawn = list(sample_robots(grammar, LIBRARY, 2))
     except MorphgenError as error:
         why = str(error)
     assert bool(drawn) != bool(why)
@@ -157,11 +159,11 @@ def test_random_small_grammars_yield_valid_robots_or_an_error(monkeypatch, text)
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(TEXTS, st.integers(0, 3))
 def test_grammars_without_faults_can_be_derived(text, seed):
-    found = grammar_from_text(text, "g")
-    assume(count_structures(found) <= 100)
-    wrong = [f for f in check_grammar(found, LIBRARY) if "cannot be reached" not in f]
+    grammar = grammar_from_text(text, "g")
+    assume(count_structures(grammar) <= 100)
+    wrong = [f for f in check_grammar(grammar, LIBRARY) if "cannot be reached" not in f]
     assume(all("never used" in fault for fault in wrong))
-    derive(found, LIBRARY, RandomChooser(np.random.default_rng(seed)))
+    derive(grammar, LIBRARY, RandomChooser(np.random.default_rng(seed)))
 
 
 @given(TEXTS)

@@ -49,8 +49,8 @@ def test_a_step_solves_the_damped_normal_equations(kinematics):
     expected = np.linalg.solve(
         J.swapaxes(1, 2) @ J + 0.09 * np.eye(7), (J.swapaxes(1, 2) @ error[..., None])
     )
-    found = kinematics.dls_step(J, error, 0.3)
-    np.testing.assert_allclose(found, expected[..., 0], atol=10 * kinematics.tolerance)
+    step = kinematics.dls_step(J, error, 0.3)
+    np.testing.assert_allclose(step, expected[..., 0], atol=10 * kinematics.tolerance)
 
 
 @pytest.mark.parametrize("index", range(len(ROBOTS)))
@@ -99,10 +99,10 @@ def test_a_near_pose_is_reached(seed):
 def test_a_pose_out_of_reach_is_approached_within_the_limits():
     goal = np.eye(4)
     goal[:3, 3] = (0.0, 0.0, 5.0)
-    found = solve_pose_ik(arm(), goal, arm().home, rotation_weight=0.0)
+    solution = solve_pose_ik(arm(), goal, arm().home, rotation_weight=0.0)
     low, high = joint_limits(arm()).T
-    assert ((low <= found) & (found <= high)).all()
-    assert frame_pose(arm(), found)[2, 3] > frame_pose(arm(), arm().home)[2, 3]
+    assert ((low <= solution) & (solution <= high)).all()
+    assert frame_pose(arm(), solution)[2, 3] > frame_pose(arm(), arm().home)[2, 3]
 
 
 class Stepper:
@@ -178,22 +178,22 @@ def test_rotation_vectors_are_the_logarithms_of_rotations(angle):
     axes[:3] = np.eye(3)
     wanted = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
     R = torch.from_numpy(Rotation.from_rotvec(wanted).as_matrix()).float()
-    found = rotvec_from_matrix(R).double().numpy()
+    rotation_vectors = rotvec_from_matrix(R).double().numpy()
     if angle > 3.1415:  # there are two, and which it is depends on the last bit
-        found *= np.sign((found * wanted).sum(axis=1, keepdims=True))
-    assert np.abs(found - wanted).max() < 3e-6 * max(angle, 1e-3)
+        rotation_vectors *= np.sign((rotation_vectors * wanted).sum(axis=1, keepdims=True))
+    assert np.abs(rotation_vectors - wanted).max() < 3e-6 * max(angle, 1e-3)
 
 
 def test_quaternions_agree_with_scipy_in_both_directions():
     turns = Rotation.random(200, rng=np.random.default_rng(0))
     R = torch.from_numpy(turns.as_matrix())
     expected = turns.as_quat(canonical=True, scalar_first=True)
-    found = quaternion_from_matrix(R)
-    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
-    torch.testing.assert_close(matrix_from_quaternion(found), R, atol=1e-12, rtol=0)
+    quaternions = quaternion_from_matrix(R)
+    np.testing.assert_allclose(quaternions.numpy(), expected, atol=1e-12)
+    torch.testing.assert_close(matrix_from_quaternion(quaternions), R, atol=1e-12, rtol=0)
 
 
 def test_quaternions_of_half_turns():
     turns = np.array([np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1]), np.diag([-1, -1, 1])])
-    found = quaternion_from_matrix(torch.from_numpy(turns.astype(float))).numpy()
-    assert np.abs(found) == pytest.approx(np.eye(4), abs=1e-9)
+    quaternions = quaternion_from_matrix(torch.from_numpy(turns.astype(float))).numpy()
+    assert np.abs(quaternions) == pytest.approx(np.eye(4), abs=1e-9)

@@ -112,14 +112,14 @@ def test_unwrapped_configurations_are_nearest_to_the_reference():
     body = compose("arm=ur5 ee=plane")
     rng = np.random.default_rng(0)
     start, ends = rng.uniform(-6, 6, 6), random_configurations(body, 200, rng)
-    found = unwrap_joints(body, start, ends)
-    assert forward_kinematics(body, found) == pytest.approx(forward_kinematics(body, ends))
+    unwrapped = unwrap_joints(body, start, ends)
+    assert forward_kinematics(body, unwrapped) == pytest.approx(forward_kinematics(body, ends))
     lower, upper = joint_limits(body).T
-    assert (lower <= found).all()
-    assert (found <= upper).all()
-    apart = np.abs(found - start)
+    assert (lower <= unwrapped).all()
+    assert (unwrapped <= upper).all()
+    apart = np.abs(unwrapped - start)
     assert (apart <= np.abs(ends - start) + 1e-9).all()
-    others = [found + turn for turn in (-2 * np.pi, 2 * np.pi)]
+    others = [unwrapped + turn for turn in (-2 * np.pi, 2 * np.pi)]
     nearer = [
         (np.abs(each - start) < apart - 1e-9) & (lower <= each) & (each <= upper) for each in others
     ]

@@ -143,10 +143,10 @@ def test_tool_jacobians_agree_with_pinocchio(kinematics, index):
         v = np.zeros(model.nv)
         v[columns] = positions
         configuration = pinocchio.integrate(model, pinocchio.neutral(model), v)
-        own = pinocchio.computeFrameJacobian(
+        pinocchio_jacobian = pinocchio.computeFrameJacobian(
             model, data, configuration, frame, pinocchio.LOCAL_WORLD_ALIGNED
         )
-        folded = own[:, columns] @ robot.mimic_map[0]
+        folded = pinocchio_jacobian[:, columns] @ robot.mimic_map[0]
         np.testing.assert_allclose(T[i], data.oMf[frame].homogeneous, atol=kinematics.tolerance)
         np.testing.assert_allclose(J[i], folded, atol=kinematics.tolerance)
 
