@@ -23,7 +23,6 @@ from morphgen.rl.rollouts import Controller, Episode, run_episodes
 from morphgen.rl.runs import Interface, RunConfig, read_checkpoint
 from morphgen.rl.scores import Score
 from morphgen.rl.training import checkpoint_files
-from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import GoalConfig, default_configs
 from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
@@ -35,45 +34,38 @@ EVAL_SEED_OFFSET = 0x5C0_4E5
 """Mixed into the seed, so that evaluation episodes differ from training ones with the same seed."""
 
 MakeController = Callable[[], Controller]
-"""Builds a controller."""
+"""Function that returns a new controller."""
 Progress = Callable[[float, int], None]
-"""Callback with the number of episodes done, fractions included, and their total number."""
-StartProgress = Callable[[str], Progress]
-"""Called with the name of an evaluation when it starts; returns the callback for its progress."""
+"""Callback with the number of episodes done, where running ones are fractions, and their total."""
 
 
 def no_progress(done: float, total: int) -> None:
-    """UpdateMetrics the progress to nobody."""
-
-
-def no_progress_of(name: str) -> Progress:
-    """Return a callback that reports to nobody."""
-    return no_progress
+    """Ignore the progress."""
 
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Constants of an evaluation."""
+    """Configuration of an evaluation."""
 
     episodes: int = 34
-    """Least number of episodes per robot; all episodes count, from start to end."""
+    """Minimum number of complete episodes per robot."""
     sim: str = field(default_factory=default_simulator)
-    """Simulator."""
+    """Name of the simulator."""
     seed: int = 0
     """Seed of the episodes."""
     workers: int = 1
-    """Number of processes of PyBullet, or threads of MuJoCo; scores do not depend on it."""
+    """Number of PyBullet processes, or of MuJoCo threads; scores do not depend on it."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
-    """Constants of tasks; others have their defaults."""
+    """Configs of tasks; other tasks have their defaults."""
 
     def as_data(self) -> dict[str, Any]:
-        """Return plain data for JSON, with the constants of each task under its name."""
+        """Return JSON values, with the config of each task under its name."""
         data = asdict(self)
         del data["tasks"]
         return data | GoalConfig(tasks=self.tasks).as_data()
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check the numbers.
 
         Raises:
             TaskError: If the number of episodes or the seed is out of its range.
@@ -86,7 +78,11 @@ class EvalConfig:
 
 
 def episodes_for(steps: int, longest: int) -> int:
-    """Return how many episodes of full length have so many control steps.
+    """Return the number of episodes of full length that contain a number of control steps.
+
+    Args:
+        steps: Number of control steps.
+        longest: Length of a full episode [control steps].
 
     Raises:
         TaskError: If ``steps`` is below 1.
@@ -110,10 +106,10 @@ def evaluate_run(
     Args:
         path: A checkpoint, or a run's folder.
         side: Side of the split.
-        config: Constants of the evaluation.
+        config: Configuration of the evaluation.
         mode: Whether policies act by the mean of their actions, or sample them.
         device: Device of the networks.
-        progress: Callback for the progress; for ``se`` robot by robot.
+        progress: Callback for the progress; for agents of single robots it starts again per robot.
 
     Raises:
         TaskError: If there is no checkpoint, or no such side.
@@ -134,9 +130,9 @@ def evaluate_checkpoints(
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
 
-    Policies of single robots (``se``) are each evaluated on their own robot if ``source`` has the
-    robots that they were trained on. On other robots all of them are evaluated, and their episodes
-    count alike.
+    Policies of single robots (``se``) are evaluated on their own robot each if ``source`` has the
+    robots that they were trained on. On other robots all of them are evaluated, and the scores are
+    means over the episodes of all policies.
 
     Raises:
         TaskError: If a file is not a checkpoint, or its observations or actions differ from
@@ -145,14 +141,12 @@ def evaluate_checkpoints(
     """
     trained = [read_checkpoint(path) for path in paths]
     sources = [run.source for run, _ in trained]
-    if all(own.member for own in sources) and _of_same(sources[0], source):
-        per_robot = (
-            _evaluate_together(
-                [one], replace(source, member=own.member), config, mode, device, progress
-            )
-            for one, own in zip(trained, sources, strict=True)
-        )
-        return [score for scores in per_robot for score in scores]
+    if all(trained_on.member for trained_on in sources) and _is_member(sources[0], source):
+        scores: list[Score] = []
+        for policy, trained_on in zip(trained, sources, strict=True):
+            robot = replace(source, member=trained_on.member)
+            scores += _evaluate_together([policy], robot, config, mode, device, progress)
+        return scores
     _require_same_interface(paths, [run for run, _ in trained])
     return _evaluate_together(trained, source, config, mode, device, progress)
 
@@ -164,23 +158,23 @@ def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) ->
         TaskError: If one does not; the message lists the differences.
     """
     interfaces = [asdict(run.interface) for run in runs]
-    first, *others = [{**each.pop("channels"), **each} for each in interfaces]
+    first, *others = [{**entries.pop("channels"), **entries} for entries in interfaces]
     for path, other in zip(paths[1:], others, strict=True):
-        wrong = [
+        differences = [
             f"{key} {other[key]}, not {first[key]}" for key in first if other[key] != first[key]
         ]
-        if wrong:
+        if differences:
             raise TaskError(
                 f"{path}: its policy is for other observations or actions than that of "
-                f"{paths[0]}: {'; '.join(wrong)}; evaluate it on its own"
+                f"{paths[0]}: {'; '.join(differences)}; evaluate it on its own"
             )
 
 
-def _of_same(one: RobotSource, whole: RobotSource) -> bool:
-    """Return whether a single robot belongs to a split's whole side."""
-    if not whole.split or whole.member is not None or one.side != whole.side:
+def _is_member(robot: RobotSource, side: RobotSource) -> bool:
+    """Return whether one source is a single robot of the other, a whole side of a split."""
+    if not side.split or side.member is not None or robot.side != side.side:
         return False
-    return members(replace(one, member=None)) == members(whole)
+    return members(replace(robot, member=None)) == members(side)
 
 
 def _evaluate_together(
@@ -191,7 +185,7 @@ def _evaluate_together(
     device: str,
     progress: Progress,
 ) -> list[Score]:
-    """Evaluate policies on the same robots; their episodes count together."""
+    """Evaluate policies on the same robots; scores are means over the episodes of all policies."""
 
     def make(learner: dict[str, Any]) -> Controller:
         return PolicyController(Policy(learner, mode, config.seed, device))
@@ -207,7 +201,7 @@ def evaluate_baseline(
     """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out.
 
     Raises:
-        TaskError: If it is unknown, or can do none of the robots' tasks.
+        TaskError: If the baseline is unknown, or can do none of the robots' tasks.
     """
     baseline = BASELINES[name]
     make = partial(baseline.make, config.seed)
@@ -225,18 +219,18 @@ def evaluate(
 ) -> list[Score]:
     """Return the scores of the robots of a source, in order.
 
-    The random policy, which scores are relative to, has the same episodes.
+    Scores may be relative to the random policy; its episodes have the same starts and goals.
 
     Args:
-        controllers: Controllers; each has its own episodes, and the episodes of all count.
+        controllers: Controllers; each runs all episodes, and a score is the mean over all of them.
         source: The robots.
-        config: Constants of the evaluation.
+        config: Configuration of the evaluation.
         interface: Actions and observations of the controllers.
-        tasks: Tasks to evaluate, robots with others are left out; None for all.
+        tasks: Tasks to evaluate; robots with other tasks are left out. None for all tasks.
         progress: Callback for the progress of the controllers, without the random policy.
 
     Raises:
-        TaskError: If no robot is left.
+        TaskError: If no robot has one of the tasks.
         MorphgenError: If a robot or simulator cannot be built.
     """
     specs = specs_of(source, GoalConfig(tasks=config.tasks))
@@ -248,38 +242,26 @@ def evaluate(
     episodes: list[list[Episode]] = [[] for _ in specs]
     for i, make in enumerate(controllers):
 
-        def add(done: float, total: int, before: int = i) -> None:
-            progress(before * total + done, len(controllers) * total)
+        def show(done: float, total: int, num_before: int = i) -> None:
+            progress(num_before * total + done, len(controllers) * total)
 
-        more = _run_all(make, specs, config, interface, library, add)
-        for of_robot, more_of_robot in zip(episodes, more, strict=True):
-            of_robot.extend(more_of_robot)
-    random = _random_episodes(
-        source, config, None if tasks is None else tuple(tasks), specs, library
-    )
+        new_episodes = _run_all(make, specs, config, interface, library, show)
+        for robot_episodes, new in zip(episodes, new_episodes, strict=True):
+            robot_episodes.extend(new)
+    key = (source, replace(config, workers=1), None if tasks is None else tuple(tasks))
+    if key not in _random_cache:
+        make_random = partial(Random, config.seed)
+        _random_cache[key] = _run_all(make_random, specs, config, Interface(), library)
     return [
-        _score(spec, source.side, own, other)
-        for spec, own, other in zip(specs, episodes, random, strict=True)
+        _score(spec, source.side, robot_episodes, random_episodes)
+        for spec, robot_episodes, random_episodes in zip(
+            specs, episodes, _random_cache[key], strict=True
+        )
     ]
 
 
 _random_cache: dict[object, list[list[Episode]]] = {}
-
-
-def _random_episodes(
-    source: RobotSource,
-    config: EvalConfig,
-    tasks: tuple[str, ...] | None,
-    specs: Sequence[EnvSpec],
-    library: tuple[Path, ...],
-) -> list[list[Episode]]:
-    """Return the episodes of the random policy by robot; they are run once per process."""
-    key = (source, replace(config, workers=1), tasks)
-    if key not in _random_cache:
-        _random_cache[key] = _run_all(
-            partial(Random, config.seed), specs, config, Interface(), library
-        )
-    return _random_cache[key]
+"""Episodes of the random policy by robot, run once per process."""
 
 
 def _run_all(
@@ -290,84 +272,75 @@ def _run_all(
     library: tuple[Path, ...],
     progress: Progress = no_progress,
 ) -> list[list[Episode]]:
-    """Return episodes by robot, run in as many batches as needed by one controller."""
+    """Return episodes by robot, from as many batches as the simulator's limit makes necessary."""
     rounds = -(-config.episodes // MAX_ENVS_PER_ROBOT)
     envs_per_robot = -(-config.episodes // rounds)
-    at_once = max(SIMULATORS[config.sim].max_envs // len(specs), 1)
+    batch_envs = max(SIMULATORS[config.sim].max_envs // len(specs), 1)  # per robot
+    seed = int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0])
     episodes: list[list[Episode]] = [[] for _ in specs]
     controller: Controller | None = None
     total = envs_per_robot * rounds * len(specs)
-    for begin in range(0, envs_per_robot, at_once):
-        envs = range(begin, min(begin + at_once, envs_per_robot))
-        batch = _batch(envs, specs, config, interface, library)
+    for first in range(0, envs_per_robot, batch_envs):
+        batch = batch_from_specs(
+            specs,
+            min(batch_envs, envs_per_robot - first) * len(specs),
+            first=first * len(specs),
+            sim=config.sim,
+            seed=seed,
+            kind=interface.kind,
+            observe=interface.channels,
+            workers=config.workers,
+            max_links=interface.max_links,
+            library=library,
+        )
 
-        def add(done: float, before: int = begin * rounds * len(specs)) -> None:
-            progress(before + done, total)
+        def show(done: float, num_before: int = first * rounds * len(specs)) -> None:
+            progress(num_before + done, total)
 
         try:
             controller = controller or make()
-            for episode in run_episodes(batch, controller, rounds, add):
+            for episode in run_episodes(batch, controller, rounds, show):
                 episodes[episode.robot_index].append(episode)
         finally:
             batch.close()
     return episodes
 
 
-def _batch(
-    envs: range,
-    specs: Sequence[EnvSpec],
-    config: EvalConfig,
-    interface: Interface,
-    library: tuple[Path, ...],
-) -> TaskBatch:
-    """Build some of the environments of each robot; ``envs`` counts them per robot."""
-    return batch_from_specs(
-        specs,
-        len(envs) * len(specs),
-        first=envs.start * len(specs),
-        sim=config.sim,
-        seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
-        kind=interface.kind,
-        observe=interface.channels,
-        workers=config.workers,
-        max_links=interface.max_links,
-        library=library,
-    )
-
-
-def _score(spec: EnvSpec, side: Side, own: Sequence[Episode], random: Sequence[Episode]) -> Score:
-    raw, random_raw = (np.array([each.score for each in episodes]) for episodes in (own, random))
+def _score(
+    spec: EnvSpec, side: Side, episodes: Sequence[Episode], random_episodes: Sequence[Episode]
+) -> Score:
+    """Return the score of a robot from its episodes and those of the random policy."""
+    raw = np.array([episode.score for episode in episodes])
+    random_raw = np.array([episode.score for episode in random_episodes])
     task = TASKS[spec.task]
     relative = raw - np.resize(random_raw, len(raw)) if task.relative_to_random else raw
     interval = mean_interval(relative)
-    distance = float(np.mean([episode.distance for episode in own]))
+    distance = float(np.mean([episode.distance for episode in episodes]))
     return Score(
         robot=spec.robot.name,
         side=side,
         task=spec.task,
-        episodes=len(own),
-        steps=sum(episode.steps for episode in own),
+        episodes=len(episodes),
+        steps=sum(episode.steps for episode in episodes),
         score=interval.value,
         low=interval.low,
         high=interval.high,
         raw=float(raw.mean()),
         random=float(random_raw.mean()),
-        success=float(np.mean([episode.success for episode in own])),
-        random_success=float(np.mean([episode.success for episode in random])),
+        success=float(np.mean([episode.success for episode in episodes])),
+        random_success=float(np.mean([episode.success for episode in random_episodes])),
         distance=distance,
         relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,
-        unstable=sum(episode.unstable for episode in own),
+        unstable=sum(episode.unstable for episode in episodes),
     )
 
 
 def eval_config_of(
     config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1
 ) -> EvalConfig:
-    """Return an evaluation in the simulator and tasks of a run, with as many goals as usual."""
-    return EvalConfig(
-        episodes,
-        config.sim,
-        seed,
-        workers,
-        tuple(replace(each, num_goals=type(each)().num_goals) for each in config.tasks),
-    )
+    """Return the config to evaluate a run in its simulator and tasks.
+
+    The number of goals per robot is the tasks' default, whatever the run was trained with.
+    """
+    tasks = tuple(replace(task, num_goals=type(task)().num_goals) for task in config.tasks)
+    return EvalConfig(episodes, config.sim, seed, workers, tasks)

@@ -18,6 +18,7 @@ from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import write_atomic
 from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.runs import RunConfig
+from morphgen.rl.scores import finite_or_none
 
 METRICS, EVENTS = "metrics.jsonl", "events"
 
@@ -67,7 +68,7 @@ class Metrics:
 
     def record(self, report: UpdateMetrics) -> None:
         """Write a line."""
-        self._file.write(json.dumps(_finite(asdict(report))) + "\n")
+        self._file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
         self._file.flush()
 
     def close(self) -> None:
@@ -174,11 +175,3 @@ def scalars(report: UpdateMetrics) -> Iterator[tuple[str, float]]:
             yield from ((f"{name}/{i}", float(each)) for i, each in enumerate(value))
         elif math.isfinite(value):
             yield name, float(value)
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, tuple):
-        return [_finite(each) for each in value]
-    return value if not isinstance(value, float) or math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Run a controller in a batch of environments, and record its episodes."""
+"""Run a controller in a batch of environments, and record the results of its episodes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 
 class Controller(Protocol):
-    """Acts in a batch: a baseline, or a policy (``inference.PolicyController``)."""
+    """Source of actions for a batch: a baseline, or a policy (``inference.PolicyController``)."""
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return actions of all environments, shape (n, L)."""
@@ -51,16 +51,17 @@ def run_episodes(
     count: int,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Episode]:
-    """Return the first episodes of every environment, as many of each.
+    """Return the first episodes of every environment, the same number of each.
 
     Args:
         batch: Environments; they are reset first.
         controller: The controller.
         count: Episodes per environment.
-        progress: Called after every step with the episodes done so far, fractions included.
+        progress: Called after every step with the number of episodes done; running ones count as
+            fractions.
 
     Returns:
-        Episodes by environment, in their order.
+        Episodes, ordered by environment and then by time.
 
     Raises:
         SimulationError: If the simulator fails.
@@ -96,4 +97,4 @@ def run_episodes(
                 done += 1
         total[ended], steps[ended] = 0, 0
         progress(done + float((steps / batch.max_episode_steps)[left > 0].sum()))
-    return [episode for own in episodes for episode in own]
+    return [episode for env_episodes in episodes for episode in env_episodes]

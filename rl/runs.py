@@ -26,56 +26,56 @@ from morphgen.tasks.task import TaskConfig
 
 CONFIG, CHECKPOINT = "config.json", "checkpoint.pt"
 FORMAT = 3
-"""Version of config and checkpoint. Format 2 has other names of keys; see ``aliases``."""
+"""Version of the files' format. Format 2 has other names of keys; see ``aliases``."""
 READABLE = (2, FORMAT)
-"""Formats that are read. In format 1 every agent had a scale of logits, and none by default."""
+"""Versions that can be read. Format 1 had other defaults of the networks' logit scale."""
 
 
 @dataclass(frozen=True)
 class Interface:
-    """Actions and observations of a policy; its environments are made accordingly."""
+    """Actions and observations that a policy needs from its environments."""
 
     kind: ActionKind = "continuous"
     """Kind of the actions."""
     max_links: int | None = None
-    """Links that observations and actions are padded to; None for those of the largest robot."""
+    """Links that observations and actions are padded to; None: those of the largest robot."""
     channels: ObservationConfig = field(default_factory=ObservationConfig)
     """Channels of the observations."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that determines the weights of a run, except for the machine."""
+    """Configuration of a run; together with the machine it determines the weights."""
 
     source: RobotSource
     """Robots and their tasks."""
     policy: PolicyConfig
     """Agent and networks."""
     ppo: PPOConfig
-    """Constants of the algorithm."""
+    """Hyperparameters of PPO."""
     seed: int = 0
     """Seed of weights, actions, minibatches and episodes."""
     sim: str = field(default_factory=default_simulator)
-    """Simulator."""
+    """Name of the simulator."""
     num_envs: int = 128
-    """Number of parallel environments, which the robots share."""
+    """Number of parallel environments of all robots together."""
     device: str = "cpu"
     """Device of networks and rollouts."""
     initial_checkpoint: str = ""
-    """Path of a checkpoint whose networks the run begins with; empty for random weights."""
+    """Path of a checkpoint with the initial networks; empty for random initial weights."""
     full_budget: bool = False
-    """Give an agent of single robots all environments and timesteps for each robot of a split
-    (paper); otherwise the robots share them, as they do with an agent of many robots."""
+    """For an agent of single robots on a split: train each robot with all environments and
+    timesteps (as in the paper), instead of an equal share of them."""
     max_links: int = MAX_LINKS
-    """Links that observations and actions are padded to; no robot may have more."""
+    """Number of links that observations and actions are padded to; no robot may have more."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
-    """Constants of tasks; in files each has an entry of its own, under the name of its task."""
+    """Configs of the tasks; a file has an entry for each, under the name of the task."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
 
         Raises:
-            TaskError: If the seed, the number of environments or of links is out of its range.
+            TaskError: If a number is out of its range, or the simulator is unknown.
         """
         if self.seed < 0:
             raise TaskError(f"--seed {self.seed}: expected 0 or more")
@@ -88,7 +88,7 @@ class RunConfig:
 
     @property
     def num_updates(self) -> int:
-        """Number of updates of the whole run."""
+        """Number of updates until the end of the run."""
         return self.ppo.num_updates(self.num_envs)
 
     @property
@@ -99,24 +99,24 @@ class RunConfig:
         return Interface(self.policy.kind, self.max_links, channels)
 
     def as_data(self) -> dict[str, Any]:
-        """Return plain data for JSON, which ``config_from`` reads."""
+        """Return the config as JSON values, which ``config_from`` reads."""
         data = asdict(self)
         del data["tasks"]
         return data | GoalConfig(tasks=self.tasks).as_data()
 
 
 def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
-    """Create a run's folder, or check that an existing one is of this run.
+    """Create the folder of a run, or check that an existing one has the same run.
 
-    A run without a checkpoint has nothing to continue from, and is overwritten.
+    A run without a checkpoint is overwritten: it has nothing to continue from.
 
     Raises:
-        TaskError: As ``require_open``.
-        FormatError: If it cannot be written.
+        TaskError: If the folder has another run, or a run that is not to be resumed.
+        FormatError: If the config cannot be written.
     """
     require_open(folder, config, resume=resume)
     path = folder / CONFIG
-    if _has_learned(folder):
+    if _has_checkpoint(folder):
         return
     data = {"format": FORMAT, "morphgen": version("morphgen"), **config.as_data()}
     try:
@@ -127,21 +127,21 @@ def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:
 
 
 def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
-    """Require that a folder can hold a run, before anything is written.
+    """Require that ``open_run`` can create or resume a run in a folder; write nothing.
 
     Raises:
-        TaskError: If it has a run that is not to be resumed, or another run, or other files.
+        TaskError: If the folder has a run that is not to be resumed, another run, or other files.
     """
     path = folder / CONFIG
-    if _has_learned(folder):
+    if _has_checkpoint(folder):
         if not resume:
             raise TaskError(f"{folder} has a run: pass --resume to continue it, or another --out")
         _require_same(folder, read_config(folder), config)
     elif path.is_file():
         read_config(folder)
     elif folder.is_dir():
-        own = (LOCK, partial_path(path).name)
-        if any(each.name not in own for each in folder.iterdir()):
+        leftovers = (LOCK, partial_path(path).name)  # of a run that was killed at its start
+        if any(entry.name not in leftovers for entry in folder.iterdir()):
             raise TaskError(
                 f"{folder} exists and is not the folder of a run: name another with --out"
             )
@@ -149,8 +149,8 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
         raise TaskError(f"{folder} is a file: name a folder with --out")
 
 
-def _has_learned(folder: Path) -> bool:
-    """Return whether a run's folder has a checkpoint, or one of its robots has."""
+def _has_checkpoint(folder: Path) -> bool:
+    """Return whether a run, or its part for any single robot, has a checkpoint."""
     return (folder / CONFIG).is_file() and next(folder.rglob(CHECKPOINT), None) is not None
 
 
@@ -158,7 +158,7 @@ def read_config(folder: Path) -> RunConfig:
     """Return the config of a run.
 
     Raises:
-        TaskError: If the folder has none, or an invalid one.
+        TaskError: If the folder has no config, or an invalid one.
     """
     path = folder / CONFIG
     try:
@@ -175,39 +175,39 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def config_from(data: object) -> RunConfig:
-    """Return the config that is stored in JSON or in a checkpoint, with earlier names or today's.
+    """Return the run config of a JSON file or a checkpoint; earlier names of keys are read, too.
 
     Raises:
         TaskError: If an entry is missing, unknown, of another type or out of its range.
     """
     if not isinstance(data, Mapping):
         raise TaskError(f"run: invalid value {shown(data)}; expected keys and values")
-    own = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
-    constants = {name: own.pop(name) for name in list(own) if name in TASKS}
-    if "tasks" in own:  # a field, but in files each task has an entry of its own
+    entries = {k: v for k, v in current_run(data).items() if k not in ("format", "morphgen")}
+    tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
+    if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")
     for name in TASKS.builtin:
-        if name not in constants:
+        if name not in tasks:
             raise TaskError(f"run: missing key {name!r}")
-    for name, values in constants.items():
+    for name, values in tasks.items():
         read_fields(config_fields(name, values), TASKS[name].config_type, f"run: {name}")
-    stored = {name: own.pop(name) for name in ("source", "policy", "ppo") if name in own}
-    values = read_fields(own, RunConfig, "run", given=stored)
+    nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
+    values = read_fields(entries, RunConfig, "run", given=nested)
     return RunConfig(
-        RobotSource(**read_fields(stored["source"], RobotSource, "run: source")),
-        policy_from(stored["policy"], "run: policy"),
-        PPOConfig(**read_fields(stored["ppo"], PPOConfig, "run: ppo")),
-        tasks=task_configs(constants),
+        RobotSource(**read_fields(nested["source"], RobotSource, "run: source")),
+        policy_from(nested["policy"], "run: policy"),
+        PPOConfig(**read_fields(nested["ppo"], PPOConfig, "run: ppo")),
+        tasks=task_configs(tasks),
         **values,
     )
 
 
 def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]) -> None:
-    """Replace the checkpoint of a run.
+    """Write the checkpoint of a run, in place of its last one.
 
     Raises:
-        FormatError: If it cannot be written.
-        TaskError: If a number is not finite; the last checkpoint stays.
+        FormatError: If the file cannot be written.
+        TaskError: If a number is not finite; the last checkpoint is kept.
     """
     path = folder / CHECKPOINT
     data = {"format": FORMAT, "run": config.as_data(), "learner": dict(learner)}
@@ -219,11 +219,10 @@ def write_checkpoint(folder: Path, config: RunConfig, learner: Mapping[str, Any]
 
 
 def read_checkpoint(path: Path) -> tuple[RunConfig, dict[str, Any]]:
-    """Return the config of a checkpoint's run, and the state of its learner.
+    """Return the run config and the learner's state of a checkpoint; nothing in it is executed.
 
     Args:
-        path: The file, or the run's folder. Nothing in it is executed. Earlier names of keys are
-            replaced by today's.
+        path: The checkpoint, or the folder of its run.
 
     Raises:
         TaskError: If there is no checkpoint, or it is damaged, incomplete or beyond a limit, or a
@@ -255,27 +254,24 @@ def _require_format(path: Path, data: Mapping[str, Any]) -> None:
         )
 
 
-def _require_same(folder: Path, stored: RunConfig, asked: RunConfig) -> None:
-    theirs, ours = _flat(stored.as_data()), _flat(asked.as_data())
-    for each in (theirs, ours):  # which GPU it is makes no other run
-        each["device"] = each["device"].partition(":")[0]
-    wrong = [
-        f"{name} {_short(theirs.get(name))}, not {_short(ours[name])}"
-        for name in ours
-        if theirs.get(name) != ours[name]
+def _require_same(folder: Path, stored: RunConfig, config: RunConfig) -> None:
+    theirs, ours = _flat(stored), _flat(config)
+    differences = [
+        f"{name} {_short(theirs.get(name))}, not {_short(value)}"
+        for name, value in ours.items()
+        if theirs.get(name) != value
     ]
-    if wrong:
-        raise TaskError(f"{folder} has another run: {'; '.join(wrong)}")
+    if differences:
+        raise TaskError(f"{folder} has another run: {'; '.join(differences)}")
 
 
-def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
+def _flat(config: RunConfig) -> dict[str, Any]:
+    """Return the entries of a config by dotted name; a run may continue on another GPU."""
     flat: dict[str, Any] = {}
-    for name, value in data.items():
-        if isinstance(value, dict):
-            flat.update({f"{name}.{key}": each for key, each in value.items()})
-        else:
-            flat[name] = value
-    return flat
+    for name, value in config.as_data().items():
+        nested = value if isinstance(value, dict) else {"": value}
+        flat.update({f"{name}.{key}".rstrip("."): entry for key, entry in nested.items()})
+    return flat | {"device": config.device.partition(":")[0]}
 
 
 def _short(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Scores of robots in an evaluation, and how files hold them."""
+"""Scores of robots in an evaluation, and their JSON form."""
 
 from __future__ import annotations
 
@@ -17,48 +17,54 @@ class Score:
     robot: str
     """Name of the robot."""
     side: Side
-    """Side of the split."""
+    """Side of the split that the robot is on."""
     task: str
     """Task of the robot."""
     episodes: int
     """Number of episodes."""
     steps: int
-    """Control steps of all episodes together."""
+    """Total length of the episodes [control steps]."""
     score: float
-    """``raw``, for some tasks minus that of the random policy; see ``Task.relative_to_random``."""
+    """``raw``, or ``raw - random`` for tasks with ``Task.relative_to_random``."""
     low: float
-    """Lower end of the score's 95% bootstrap interval over episodes; nan if there is only one."""
+    """Lower end of the 95% bootstrap interval of ``score`` over episodes; nan for one episode."""
     high: float
-    """Upper end of that interval."""
+    """Upper end of the 95% bootstrap interval of ``score`` over episodes; nan for one episode."""
     raw: float
     """Mean score of the episodes; see ``Task.episode_score``."""
     random: float
-    """``raw`` of the random policy."""
+    """Mean score of the random policy's episodes."""
     success: float
-    """Share of the episodes that end in success."""
+    """Success rate of the episodes, 0 to 1."""
     random_success: float
-    """``success`` of the random policy."""
+    """Success rate of the random policy's episodes, 0 to 1."""
     distance: float
     """Mean distance from success at the end of an episode [m]."""
     relative_distance: float
-    """``distance`` divided by the robot's reach; nan for tasks where it means nothing."""
+    """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
     unstable: int = 0
     """Number of episodes that ended because the simulation diverged."""
 
 
 def scores_to_json(scores: Sequence[Score]) -> list[dict[str, Any]]:
-    """Return scores for JSON, with None instead of nan."""
-    return [
-        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(each).items()}
-        for each in scores
-    ]
+    """Return scores as JSON values, with null instead of nan."""
+    return [finite_or_none(asdict(score)) for score in scores]
+
+
+def finite_or_none(value: Any) -> Any:  # noqa: ANN401
+    """Return nested dictionaries and sequences for JSON, with None for numbers not finite."""
+    if isinstance(value, Mapping):
+        return {key: finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [finite_or_none(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def score_from_json(data: Mapping[str, Any]) -> Score:
-    """Return the score of an entry of ``scores_to_json``.
+    """Return the score that ``scores_to_json`` made a dictionary of.
 
     Raises:
-        TypeError: If an entry is missing or unknown.
+        TypeError: If a field is missing or unknown.
     """
     values: dict[str, Any] = {k: math.nan if v is None else v for k, v in data.items()}
     return Score(**values)

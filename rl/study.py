@@ -8,7 +8,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,10 @@ from morphgen.rl.aliases import renamed
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
     EvalConfig,
-    StartProgress,
+    Progress,
     evaluate_baseline,
     evaluate_run,
-    no_progress_of,
+    no_progress,
 )
 from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.robot_source import RobotSource, members, other_side, tasks_of
@@ -37,12 +37,12 @@ from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
 
 SCORES = "scores.json"
 POLL = 2.0
-"""Seconds between two checks of cells that another process works on."""
+"""Time between two checks of cells that another process works on [s]."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One agent, seed and split, or a baseline; done when its scores are there."""
+    """An agent with a seed on a split, or a baseline on a split; done when it has scores."""
 
     folder: Path
     """Folder of the run and its scores."""
@@ -53,44 +53,40 @@ class Cell:
     seed: int | None
     """Seed of the run; None for a baseline."""
     source: RobotSource
-    """Robots that the agent is trained on; for a baseline, those of the split."""
+    """Robots that the agent is trained on; for a baseline, a side of the split."""
     eval_config: EvalConfig
-    """Constants of the evaluation."""
+    """Configuration of the evaluation."""
     config: RunConfig | None = None
     """Config of the run; None for a baseline."""
 
     @property
     def sides(self) -> tuple[Side, ...]:
-        """Sides that the cell is evaluated on: the test side alone, if it is trained there."""
+        """Sides that the cell is evaluated on; an agent trained on the test side only on that."""
         return ("test",) if self.source.side == "test" else ("train", "test")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of the work on a cell."""
+    """Success or failure of a cell."""
 
     cell: Cell
-    """The cell."""
+    """The finished or failed cell."""
     error: str = ""
-    """Why it failed; empty if it did not."""
+    """Error message; empty after success."""
 
 
 Work = Callable[[Sequence[Cell], ExecutionConfig], Iterator[Outcome]]
-"""Does cells, and yields the outcome of each when it is done."""
+"""Function that trains and evaluates cells, and yields their outcomes as they finish."""
+StartProgress = Callable[[str], Progress]
+"""Called with the name of an evaluation when it starts; returns the callback for its progress."""
 
 
 def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -> list[Cell]:
     """Return the cells of the baselines for the tasks of a split."""
     tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
+    eval_config = replace(eval_config, workers=1)  # scores do not depend on it
     return [
-        Cell(
-            folder / source.name / name,
-            source.name,
-            name,
-            None,
-            source,
-            replace(eval_config, workers=1),
-        )
+        Cell(folder / source.name / name, source.name, name, None, source, eval_config)
         for name in BASELINES
         if BASELINES[name].suits(tasks)
     ]
@@ -98,31 +94,31 @@ def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -
 
 def agent_cell(folder: Path, agent: str, config: RunConfig, eval_config: EvalConfig) -> Cell:
     """Return the cell of a run."""
-    source = config.source
-    own = folder / source.name / agent / f"seed{config.seed}"
-    return Cell(
-        own, source.name, agent, config.seed, source, replace(eval_config, workers=1), config
-    )
+    source, eval_config = config.source, replace(eval_config, workers=1)
+    run_folder = folder / source.name / agent / f"seed{config.seed}"
+    return Cell(run_folder, source.name, agent, config.seed, source, eval_config, config)
 
 
 def matched_budget(config: RunConfig) -> RunConfig:
-    """Give a run on test robots the environments and timesteps per robot of one on train robots.
+    """Return a run on test robots with the budget per robot of the same run on train robots.
 
-    Other runs stay as they are, and so do those with the full budget for each robot.
+    The budget is the number of environments and timesteps. Runs on train robots do not change, nor
+    do runs with ``full_budget``.
     """
     if config.source.side == "train" or config.full_budget:
         return config
-    own, trained = len(members(config.source)), len(members(other_side(config.source, "train")))
-    total_timesteps = -(-config.ppo.total_timesteps * own // trained)
+    num_test = len(members(config.source))
+    num_train = len(members(other_side(config.source, "train")))
+    total_timesteps = -(-config.ppo.total_timesteps * num_test // num_train)
     ppo = replace(config.ppo, total_timesteps=total_timesteps)
-    return replace(config, ppo=ppo, num_envs=-(-config.num_envs * own // trained))
+    return replace(config, ppo=ppo, num_envs=-(-config.num_envs * num_test // num_train))
 
 
 def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
     """Return the scores of a cell by mode, or by the baseline's name; None if it is not done.
 
     Raises:
-        TaskError: If they are of another evaluation, or of other robots or goals.
+        TaskError: If the scores are of another evaluation, or of other robots or goals.
         FormatError: If the file is malformed.
     """
     path = cell.folder / SCORES
@@ -131,20 +127,21 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
     try:
         data = renamed("scores", read_json(path))
         scores = {
-            mode: [score_from_json(each) for each in own] for mode, own in data["scores"].items()
+            mode: [score_from_json(record) for record in records]
+            for mode, records in data["scores"].items()
         }
-        made_with = data["eval"], renamed("source", data["source"])
+        stored = data["eval"], renamed("source", data["source"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: not the scores of a cell: {error}") from error
-    wanted = json.loads(json.dumps([cell.eval_config.as_data(), asdict(cell.source)]))
-    for what, theirs, ours in zip(("evaluation", "set of robots"), made_with, wanted, strict=True):
+    expected = json.loads(json.dumps([cell.eval_config.as_data(), asdict(cell.source)]))
+    for what, theirs, ours in zip(("evaluation", "set of robots"), stored, expected, strict=True):
         if theirs != ours:
             raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
     return scores
 
 
 def require_cells(cells: Sequence[Cell]) -> None:
-    """Require that the folders of cells have no other runs or scores, before anything is done.
+    """Require that the folders of cells have no other runs or scores; write nothing.
 
     Raises:
         TaskError: If a cell's folder has another run or evaluation.
@@ -160,9 +157,9 @@ def do_cell(
     cell: Cell,
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None = None,
-    progress: StartProgress = no_progress_of,
+    progress: StartProgress = lambda name: no_progress,
 ) -> None:
-    """Train and evaluate a cell, as far as it is not done. No other process may work on it.
+    """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
     Raises:
         MorphgenError: As ``train`` and ``evaluate``.
@@ -173,14 +170,21 @@ def do_cell(
     if cell.config is None:
         scores = {cell.agent: _baseline_scores(cell, eval_config, progress)}
     else:
-        train(cell.folder, cell.config, resume=True, execution=execution, show=show, hold=_locked)
+        train(
+            cell.folder,
+            cell.config,
+            resume=True,
+            execution=execution,
+            show=show,
+            hold=lambda folder: nullcontext(),  # the caller has locked the cell's folder
+        )
         scores = {
             mode: _policy_scores(cell, cell.config, eval_config, mode, progress) for mode in MODES
         }
     data = {
         "eval": cell.eval_config.as_data(),
         "source": asdict(cell.source),
-        "scores": {mode: scores_to_json(own) for mode, own in scores.items()},
+        "scores": {mode: scores_to_json(records) for mode, records in scores.items()},
     }
     write_atomic(cell.folder / SCORES, json.dumps(data, indent=2) + "\n")
 
@@ -189,12 +193,12 @@ def run_cells(
     cells: Sequence[Cell],
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None = None,
-    progress: StartProgress = no_progress_of,
+    progress: StartProgress = lambda name: no_progress,
 ) -> Iterator[Outcome]:
-    """Do cells one after another, and yield their outcomes.
+    """Train and evaluate cells one after another, and yield their outcomes.
 
-    Other processes may work on the same cells: each cell is done by one process, and this one waits
-    at the end for the cells of the others.
+    Other processes may work on the same cells. Each cell is done by one process; this one waits at
+    the end for the cells of the others.
     """
     waiting = deque(cells)
     skipped = 0
@@ -213,12 +217,12 @@ def run_cells(
 
 
 def run_cells_on_ray(address: str | None, *, gpus: float = 0.0) -> Work:
-    """Return work on the Ray cluster at an address, a task per cell; without one, on a local Ray.
+    """Return a function that does cells as tasks of a Ray cluster.
 
     Its machines have morphgen installed and share the study's folder.
 
     Args:
-        address: Address of the cluster.
+        address: Address of the cluster; None for a local one.
         gpus: GPUs per cell; a fraction if below 1.
 
     Raises:
@@ -255,7 +259,7 @@ def _do_locked(
     show: Callable[[Subrun], ShowMetrics] | None,
     progress: StartProgress,
 ) -> Outcome | None:
-    """Do a cell and return its outcome; None if another process works on it."""
+    """Train and evaluate a cell and return its outcome; None if another process works on it."""
     try:
         cell.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(cell.folder / LOCK, timeout=0):
@@ -272,11 +276,6 @@ def _do_locked(
     return Outcome(cell)
 
 
-def _locked(folder: Path) -> AbstractContextManager[None]:
-    """Lock nothing: ``_do_locked`` holds the lock of the cell's folder."""
-    return nullcontext()
-
-
 def _policy_scores(
     cell: Cell, config: RunConfig, eval_config: EvalConfig, mode: Mode, progress: StartProgress
 ) -> list[Score]:
@@ -291,7 +290,7 @@ def _policy_scores(
 
 
 def _baseline_scores(cell: Cell, eval_config: EvalConfig, progress: StartProgress) -> list[Score]:
-    """Return the scores of a baseline on both sides, as far as their robots do its tasks."""
+    """Return the scores of a baseline on the sides that have a robot with one of its tasks."""
     scores = []
     for side in cell.sides:
         source = other_side(cell.source, side)

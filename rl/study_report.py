@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tabulate import tabulate
@@ -21,7 +20,7 @@ from morphgen.rl.eval_report import UNSTABLE
 from morphgen.rl.intervals import Interval, iqm_interval
 from morphgen.rl.recorders import read_metrics
 from morphgen.rl.robot_source import tasks_of
-from morphgen.rl.scores import Score, scores_to_json
+from morphgen.rl.scores import Score, finite_or_none, scores_to_json
 from morphgen.rl.study import Cell, as_record
 from morphgen.rl.training import subruns_of
 
@@ -40,31 +39,31 @@ HEADERS = (
 )
 
 Results = Mapping[Cell, Mapping[str, Sequence[Score]] | None]
-"""Scores of every cell by mode; None for missing ones."""
+"""Scores by cell and mode; None for a cell that is not done."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Scores of one side over seeds and robots."""
+    """Averages over seeds and over the robots of one side of a split."""
 
     mean: float
     """Mean score."""
     iqm: Interval
-    """Interquartile mean, with its interval."""
+    """Interquartile mean of the scores, with its bootstrap interval."""
     success: float
-    """Mean success rate."""
+    """Mean success rate, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Training curve of a run, by update."""
+    """Training curve of a run, a point per update."""
 
     timesteps: list[float]
-    """Control steps of all environments so far."""
+    """Number of control steps of all environments up to each update."""
     scores: list[float]
-    """Mean score of a control step."""
+    """Mean score of the control steps of each update."""
     complete: bool
-    """Whether the run came to its end."""
+    """Whether all updates of the run have been made."""
 
 
 @dataclass(frozen=True)
@@ -74,19 +73,19 @@ class Row:
     split: str
     """Name of the split."""
     task: str
-    """The task."""
+    """Name of the task."""
     agent: str
-    """Label of the agent."""
+    """Label of the agent, or name of the baseline."""
     mode: str
     """Mode of the policies; empty if all scores are missing."""
     seeds: tuple[int | None, ...]
-    """Seeds that are done."""
+    """Seeds with scores; None for a baseline."""
     missing: tuple[int | None, ...]
-    """Seeds that are missing."""
+    """Seeds without scores yet; None for a baseline."""
     groups: Mapping[Side, Group]
-    """Scores of the sides that are evaluated."""
+    """Averages by side, for sides with scores."""
     sides: tuple[Side, ...]
-    """Sides that the agent is, or will be, evaluated on."""
+    """Sides that the agent is evaluated on, now or later."""
     unstable: int = 0
     """Number of episodes that ended because the simulation diverged."""
 
@@ -94,31 +93,25 @@ class Row:
 def rows(results: Results) -> list[Row]:
     """Return a row for every split, task, agent and mode, in the order of the cells."""
     table: list[Row] = []
-    lines = dict.fromkeys((cell.split, cell.agent) for cell in results)
-    for split, agent in lines:
-        own = {c: s for c, s in results.items() if (c.split, c.agent) == (split, agent)}
-        there = {cell: scores for cell, scores in own.items() if scores is not None}
-        missing = tuple(cell.seed for cell in own if cell not in there)
-        first = next(iter(own))
-        every = [s for scores in there.values() for each in scores.values() for s in each]
-        modes = dict.fromkeys(mode for scores in there.values() for mode in scores)
-        tasks: list[str] = list(dict.fromkeys(score.task for score in every))
-        if not there:
-            task = next(iter(tasks_of(first.source)), "")
-            table.append(Row(split, task, agent, "", (), missing, {}, first.sides))
+    for split, agent in dict.fromkeys((cell.split, cell.agent) for cell in results):
+        cells = [cell for cell in results if (cell.split, cell.agent) == (split, agent)]
+        done = {cell: results[cell] or {} for cell in cells if results[cell] is not None}
+        seeds = tuple(cell.seed for cell in done)
+        missing = tuple(cell.seed for cell in cells if cell not in done)
+        source, sides = cells[0].source, cells[0].sides
+        if not done:
+            task = next(iter(tasks_of(source)), "")
+            table.append(Row(split, task, agent, "", (), missing, {}, sides))
+        by_mode: dict[str, list[Score]] = {}
+        for cell_scores in done.values():
+            for mode, mode_scores in cell_scores.items():
+                by_mode.setdefault(mode, []).extend(mode_scores)
+        tasks = dict.fromkeys(score.task for scores in by_mode.values() for score in scores)
         for task in tasks:
-            for mode in modes:
-                groups = _groups(there, task, mode)
-                seeds = tuple(cell.seed for cell in there)
-                lost = sum(
-                    each.unstable
-                    for scores in there.values()
-                    for each in scores[mode]
-                    if each.task == task
-                )
-                table.append(
-                    Row(split, task, agent, mode, seeds, missing, groups, first.sides, lost)
-                )
+            for mode, scores in by_mode.items():
+                groups = _groups(done, task, mode)
+                unstable = sum(score.unstable for score in scores if score.task == task)
+                table.append(Row(split, task, agent, mode, seeds, missing, groups, sides, unstable))
     return table
 
 
@@ -130,7 +123,12 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
     """
     table = rows(results)
     write_file(folder / TABLE, table_text(table))
-    data = {"rows": [_finite(asdict(row)) for row in table], "cells": _cells(results)}
+    cells = [
+        as_record(cell)
+        | {"scores": None if scores is None else {m: scores_to_json(s) for m, s in scores.items()}}
+        for cell, scores in results.items()
+    ]
+    data = {"rows": [finite_or_none(asdict(row)) for row in table], "cells": cells}
     write_file(folder / DATA, json.dumps(data, indent=2) + "\n")
     write_file(folder / ROBOTS, _csv(results))
     write_file(folder / CURVES, curves(results))
@@ -207,24 +205,24 @@ def _curve(cell: Cell) -> Curve | None:
 
 
 def _groups(
-    there: Mapping[Cell, Mapping[str, Sequence[Score]]], task: str, mode: str
+    done: Mapping[Cell, Mapping[str, Sequence[Score]]], task: str, mode: str
 ) -> dict[Side, Group]:
+    """Return averages by side over the cells (seeds) of one agent, for one task and mode."""
+    cell = next(iter(done))
+    per_robot = cell.config is not None and AGENTS[cell.config.policy.agent].per_robot
     groups: dict[Side, Group] = {}
     for side in SIDES:
         table = [
-            [each for each in scores[mode] if (each.side, each.task) == (side, task)]
-            for scores in there.values()
+            [score for score in scores[mode] if (score.side, score.task) == (side, task)]
+            for scores in done.values()
         ]
         if not table[0]:
             continue
-        scores = np.array([[each.score for each in seed] for seed in table])
-        success = float(np.mean([each.success for seed in table for each in seed]))
-        first = next(iter(there))
-        apart = first.config is not None and AGENTS[first.config.policy.agent].per_robot
+        values = np.array([[score.score for score in seed] for seed in table])
+        success = float(np.mean([score.success for seed in table for score in seed]))
         # Policies of single robots are independent samples on the robots that they learned.
-        apart = apart and side == first.source.side
-        iqm = iqm_interval(scores, together=not apart)
-        groups[side] = Group(float(scores.mean()), iqm, success)
+        iqm = iqm_interval(values, together=not (per_robot and side == cell.source.side))
+        groups[side] = Group(float(values.mean()), iqm, success)
     return groups
 
 
@@ -257,33 +255,17 @@ def _interval(interval: Interval) -> str:
     return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
-def _cells(results: Results) -> list[dict[str, Any]]:
-    return [
-        as_record(cell)
-        | {"scores": None if scores is None else {m: scores_to_json(s) for m, s in scores.items()}}
-        for cell, scores in results.items()
-    ]
-
-
 def _csv(results: Results) -> str:
-    """Return a CSV line for every split, agent, seed, mode and robot, also for missing ones."""
+    """Return CSV text with a line per cell, mode and robot, or one per missing cell."""
     text = io.StringIO()
-    names = ["split", "agent", "seed", "status", "mode", *(each.name for each in fields(Score))]
+    names = ["split", "agent", "seed", "status", "mode", *(field.name for field in fields(Score))]
     writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     for cell, scores in results.items():
         if scores is None:
             writer.writerow(as_record(cell) | {"status": MISSING})
             continue
-        for mode, own in scores.items():
-            for each in scores_to_json(own):
-                writer.writerow(as_record(cell) | {"status": "done", "mode": mode} | each)
+        for mode, mode_scores in scores.items():
+            for record in scores_to_json(mode_scores):
+                writer.writerow(as_record(cell) | {"status": "done", "mode": mode} | record)
     return text.getvalue()
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, Mapping):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and math.isnan(value) else value

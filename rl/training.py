@@ -1,4 +1,4 @@
-"""Train runs: create the folder, learn, and write checkpoints that training resumes from."""
+"""Train runs: create the run's folder, learn, and write the checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -32,36 +32,35 @@ from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.make import batch_from_specs
 
 MIN_CHECKPOINT_STEPS, MAX_CHECKPOINT_STEPS = 1500, 3000
-"""Control steps per environment between checkpoints: five and ten episodes of the tasks.
+"""Bounds of the interval between checkpoints [control steps per environment]: 5 and 10 episodes.
 
-A checkpoint has no state of the simulator, so that all episodes begin anew after it: few
-checkpoints cut few episodes short."""
+A checkpoint has no simulator state, so that it cuts all running episodes short: it must be rare."""
 CHECKPOINTS, MIN_CHECKPOINTS = 10, 4
-"""Checkpoints per run within these bounds, and their least number in a run too short for them."""
+"""Intended number of checkpoints, and the minimum for runs that are short for these bounds."""
 ROBOTS = "robots"
-"""Subfolder with the runs of single robots, in a run of ``se`` on a split."""
+"""Subfolder with a run per robot, in the folder of a run of ``se`` on a split."""
 
 ShowMetrics = Callable[[UpdateMetrics, int], None]
-"""Callback for every report, with the number of updates of the run."""
+"""Callback with the metrics of an update, and the number of updates of the run."""
 
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """Execution of a run; the weights do not depend on it."""
+    """How a run is executed; the weights do not depend on it."""
 
     workers: int = 1
-    """Number of processes of PyBullet, or threads of MuJoCo."""
+    """Number of PyBullet processes, or of MuJoCo threads."""
     tensorboard: bool = True
     """Write TensorBoard events."""
     wandb: bool = False
     """Send metrics to Weights & Biases."""
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check the values.
 
         Raises:
             TaskError: If the number of workers is below 1.
-            MissingDependencyError: If Weights & Biases is asked for and not installed.
+            MissingDependencyError: If ``wandb`` is set and the package is not installed.
         """
         if self.wandb:
             require_wandb()
@@ -71,18 +70,19 @@ class ExecutionConfig:
 
 @dataclass(frozen=True)
 class Subrun:
-    """A run that trains one set of weights."""
+    """A part of a run that trains one set of weights."""
 
     folder: Path
-    """Folder of config, metrics and checkpoint."""
+    """Folder of the part's config, metrics and checkpoint."""
     config: RunConfig
-    """Config of this run alone."""
+    """Config with the part's share of robots, environments, timesteps and its own seed."""
 
 
 def subruns_of(folder: Path, config: RunConfig) -> list[Subrun]:
-    """Return the parts of a run: itself, or one per robot for an agent of single robots.
+    """Return the parts of a run: the run itself, or one per robot for an agent of single robots.
 
-    Each part has its own seed, and its share of environments and timesteps, rounded up.
+    A part per robot has a seed of its own, and an equal share of the environments and timesteps,
+    rounded up.
     """
     per_robot = AGENTS[config.policy.agent].per_robot
     if not per_robot or not config.source.split or config.source.member:
@@ -94,8 +94,8 @@ def subruns_of(folder: Path, config: RunConfig) -> list[Subrun]:
     parts = []
     for i, source in enumerate(sources):
         seed = int(np.random.SeedSequence([config.seed, i]).generate_state(1)[0])
-        own = replace(config, source=source, ppo=ppo, seed=seed, num_envs=num_envs)
-        parts.append(Subrun(folder / ROBOTS / str(source.member), own))
+        part = replace(config, source=source, ppo=ppo, seed=seed, num_envs=num_envs)
+        parts.append(Subrun(folder / ROBOTS / str(source.member), part))
     return parts
 
 
@@ -108,22 +108,22 @@ def train(
     show: Callable[[Subrun], ShowMetrics] | None = None,
     hold: Callable[[Path], AbstractContextManager[None]] = locked_folder,
 ) -> list[Subrun]:
-    """Train a run to its end; see ``subruns_of``.
+    """Train all parts of a run to their end; see ``subruns_of``.
 
-    It may be interrupted or killed at any time. Resumed, it continues from its last checkpoint and
-    ends with the same weights as an uninterrupted run. Nothing is written before learning can
-    begin.
+    Training may be interrupted or killed at any time. A resumed run continues from its last
+    checkpoint and ends with the same weights as an uninterrupted one. Nothing is written before all
+    robots and networks are built.
 
     Args:
         folder: Folder of the run.
         config: Config of the run.
         resume: Whether to continue a run that is already in the folder.
         execution: How the run is executed.
-        show: Called at the start of every part; returns the callback for its reports.
+        show: Called at the start of every part; returns the callback for its updates.
         hold: Context manager that locks the folder against other runs.
 
     Returns:
-        All parts of the run, trained.
+        The trained parts.
 
     Raises:
         TaskError: If the folder has another run, or a metric is not finite.
@@ -149,36 +149,37 @@ def train(
                     open_run(folder, config, resume=resume)
                     holds = True
                 open_run(part.folder, part.config, resume=True)
-                _learn(learner, part, execution, show(part) if show else _ignore)
+                _learn(learner, part, execution, show(part) if show else None)
     return parts
 
 
 def require_runnable(config: RunConfig) -> None:
-    """Require that a run has at least one update, and every robot an environment.
+    """Require timesteps for at least one update, and an environment for every robot.
 
     Raises:
-        TaskError: If not.
+        TaskError: If there are fewer, or a rollout cannot be split into equal minibatches.
     """
     robots = len(members(config.source))
     if config.num_envs < robots:
         raise TaskError(
             f"--envs {config.num_envs}: fewer than the {robots} robots, each of which has one"
         )
-    one = config.ppo.num_steps * config.num_envs
-    if config.ppo.total_timesteps < one:
+    update_timesteps = config.ppo.num_steps * config.num_envs
+    if config.ppo.total_timesteps < update_timesteps:
         share = f", the share of {config.source.member}" if config.source.member else ""
         raise TaskError(
             f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}{share}: an update "
-            f"takes {one:,} transitions ({config.ppo.num_steps} steps of every environment)"
+            f"takes {update_timesteps:,} transitions ({config.ppo.num_steps} steps of every "
+            "environment)"
         )
     config.ppo.minibatch_size(config.num_envs)
 
 
 def require_device(name: str) -> None:
-    """Require that a device exists.
+    """Require a device that torch can use: ``cpu``, ``cuda``, or such as ``cuda:1``.
 
     Raises:
-        TaskError: If it is unknown or missing.
+        TaskError: If the name is invalid, or this machine has no such device.
     """
     kind, _, number = name.partition(":")
     if name != "cpu" and (kind != "cuda" or not (number or "0").isdecimal()):
@@ -190,7 +191,10 @@ def require_device(name: str) -> None:
 
 
 def checkpoint_files(path: Path) -> Iterator[Path]:
-    """Yield the checkpoints of a path: a file, or the folder of a run, with one or many parts.
+    """Yield the checkpoint files of a run.
+
+    Args:
+        path: A checkpoint file, or the folder of a run.
 
     Raises:
         TaskError: If there is no checkpoint, or some robots of the run have none yet.
@@ -212,7 +216,7 @@ def checkpoint_files(path: Path) -> Iterator[Path]:
 
 
 def is_done(part: Subrun) -> bool:
-    """Return whether all updates of a part have been made."""
+    """Return whether the checkpoint of a part is its last one."""
     if not (part.folder / CHECKPOINT).is_file():
         return False
     return bool(read_checkpoint(part.folder)[1]["update"] >= part.config.num_updates)
@@ -220,10 +224,10 @@ def is_done(part: Subrun) -> bool:
 
 def updates_between(config: RunConfig) -> int:
     """Return the number of updates between two checkpoints of a run."""
-    steps = config.ppo.num_steps
-    even = config.num_updates * steps // CHECKPOINTS
-    span = min(max(even, MIN_CHECKPOINT_STEPS), MAX_CHECKPOINT_STEPS)
-    return max(min(-(-span // steps), config.num_updates // MIN_CHECKPOINTS), 1)
+    num_steps = config.ppo.num_steps
+    interval = config.num_updates * num_steps // CHECKPOINTS
+    interval = min(max(interval, MIN_CHECKPOINT_STEPS), MAX_CHECKPOINT_STEPS)
+    return max(min(-(-interval // num_steps), config.num_updates // MIN_CHECKPOINTS), 1)
 
 
 @contextmanager
@@ -253,27 +257,26 @@ def _learner(part: Subrun, execution: ExecutionConfig) -> Iterator[Learner]:
         batch.close()
 
 
-def _learn(learner: Learner, part: Subrun, execution: ExecutionConfig, show: ShowMetrics) -> None:
+def _learn(
+    learner: Learner, part: Subrun, execution: ExecutionConfig, show: ShowMetrics | None
+) -> None:
+    """Make the remaining updates of a part; record their metrics and write its checkpoints."""
     interval = updates_between(part.config)
-    recorders = recording(
+    with recording(
         part.folder,
         part.config,
         learner.update,
         tensorboard=execution.tensorboard,
         wandb=execution.wandb,
-    )
-    with recorders as opened:
+    ) as recorders:
         while not learner.done:
-            report = learner.iterate()
-            for recorder in opened:
-                recorder.record(report)
+            metrics = learner.iterate()
+            for recorder in recorders:
+                recorder.record(metrics)
             left = learner.num_updates - learner.update
             if not left or (learner.update % interval == 0 and left >= interval):
                 write_checkpoint(part.folder, part.config, state_of(learner))
                 # A resumed run begins new episodes here, and must end with the same weights.
                 learner.restart_episodes()
-            show(report, learner.num_updates)
-
-
-def _ignore(report: UpdateMetrics, num_updates: int) -> None:
-    """ShowMetrics a report to nobody."""
+            if show:
+                show(metrics, learner.num_updates)
