@@ -80,7 +80,7 @@ def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
 
 def play(
     env: TaskEnv,
-    acting: Controller,
+    controller: Controller,
     episodes: int,
     seed: int,
     report: Callable[[Episode], None],
@@ -89,13 +89,13 @@ def play(
 
     Args:
         env: The environment, not wrapped.
-        acting: The controller.
+        controller: The controller.
         episodes: Number of episodes.
         seed: Seed of the episodes.
         report: Called with the result of each episode.
 
     Yields:
-        Frames, ``FPS`` per second of simulated time, with the first and the last of an episode.
+        Frames, ``FPS`` per second of simulated time, with the first and last frame of each episode.
 
     Raises:
         SimulationError: If the simulator fails.
@@ -107,7 +107,7 @@ def play(
         scores: list[float] = []
         over = False
         while not over:
-            action = acting.act(env.batch)[0, links].cpu().numpy()
+            action = controller.act(env.batch)[0, links].cpu().numpy()
             _, _, terminated, truncated, info = env.step(action)
             scores.append(info["score"])
             over = terminated or truncated

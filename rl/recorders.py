@@ -24,17 +24,17 @@ METRICS, EVENTS = "metrics.jsonl", "events"
 
 
 class Recorder(Protocol):
-    """Stores reports."""
+    """Destination of the metrics of a run."""
 
     def record(self, report: UpdateMetrics) -> None:
-        """Store a report."""
+        """Record the metrics of an update."""
 
     def close(self) -> None:
-        """Finish the record."""
+        """Write what is buffered, and close the destination."""
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Return the reports of a run, one per update, oldest first.
+    """Return the recorded metrics of a run, a dictionary per update, oldest first.
 
     An unfinished last line of a killed run is ignored.
 
@@ -57,13 +57,13 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 
 
 class Metrics:
-    """``metrics.jsonl``: a line per report, with null for numbers that are not finite."""
+    """Recorder to ``metrics.jsonl``: a line per update, with null for numbers not finite."""
 
     def __init__(self, folder: Path, update: int) -> None:
-        """Continue after an update; reports of later updates are removed."""
-        kept = [each for each in read_metrics(folder) if each["update"] <= update]
+        """Open the file to continue after an update; lines of later updates are removed."""
+        kept = [report for report in read_metrics(folder) if report["update"] <= update]
         path = folder / METRICS
-        write_atomic(path, "".join(json.dumps(each) + "\n" for each in kept))
+        write_atomic(path, "".join(json.dumps(report) + "\n" for report in kept))
         self._file = path.open("a", encoding="utf-8")
 
     def record(self, report: UpdateMetrics) -> None:

@@ -1,4 +1,4 @@
-"""Registry of baselines: controllers that learn nothing, and show that a task can be done.
+"""Registry of baselines: controllers without learning, which show that tasks can be solved.
 
 Importing the registry loads no simulator and no torch, so that the command line starts quickly.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Baseline:
-    """A row of the registry: the tasks of a baseline, and its controller."""
+    """Entry of the registry: a baseline's controller and its tasks."""
 
     name: str
     """Name in ``BASELINES``."""
@@ -57,5 +57,5 @@ BASELINES: Registry[Baseline] = Registry(
 
 
 def baselines_for(task: str) -> tuple[str, ...]:
-    """Return the names of the baselines for a task; if one solves it, that is the first."""
+    """Return the names of a task's baselines; one that solves the task comes first."""
     return tuple(name for name in reversed(tuple(BASELINES)) if BASELINES[name].suits((task,)))

@@ -22,12 +22,13 @@ from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
 STARTS = 16
-"""Configurations from which inverse kinematics is tried for every goal."""
+"""Number of start configurations of inverse kinematics per goal."""
 ATTEMPTS = 4
-"""Most attempts per goal, each with other starts, until a free path is found."""
+"""Maximum number of attempts per goal, each with other starts."""
 TREE_ITERATIONS = 200
-"""Random configurations of the tree that is grown where inverse kinematics has no solution."""
+"""Number of random configurations of a tree, grown if inverse kinematics has no solution."""
 ITERATIONS = 60
+"""Iterations of inverse kinematics."""
 DAMPING = 0.05
 """Damping of the least squares [joint units per metre]."""
 MAX_STEP = 0.5
@@ -37,10 +38,10 @@ CLOSE = 0.003
 
 
 class InverseKinematics:
-    """Plans to a configuration with the tool at the goal when an episode begins, and goes there.
+    """Plans a path to a configuration with the tool at the goal at the start of each episode.
 
-    Inverse kinematics is damped least squares (Wampler 1986) from several starts. Of its solutions
-    the nearest with a free path is taken; if there is none, the nearest, in a straight line.
+    Inverse kinematics is damped least squares (Wampler 1986) from several starts. The robot goes to
+    the nearest solution with a collision-free path; without such a path, straight to the nearest.
     """
 
     def __init__(self, seed: int) -> None:
@@ -90,9 +91,9 @@ class InverseKinematics:
     def _solve(
         self, task: TaskBatch, envs: torch.Tensor, trees: dict[int, Tree | None]
     ) -> list[Array]:
-        """Return the solutions of each environment, nearest first; if there is none, the best try.
+        """Return solutions of each environment, nearest first, or the attempt with the least error.
 
-        With a tree of reachable configurations, its nodes are the starts.
+        In environments with a tree of reachable configurations, its nodes are the starts.
         """
         robots, now = task.env_robot_index[envs], task.targets[envs]
         starts = random_starts(task, envs, self._generator)
@@ -126,7 +127,7 @@ class InverseKinematics:
     def _path(
         self, task: TaskBatch, env: int, goals: Array, attempt: int
     ) -> tuple[Path | None, Tree | None]:
-        """Return a free path to one of the goals, and the tree of RRT-Connect if it was needed."""
+        """Return a free path to one of the goals or None, and the tree of RRT-Connect if it ran."""
         robot = int(task.env_robot_index[env])
         planner, goals = self._planners[robot], goals[self._spaces[robot].free(goals)]
         start = _array(task.targets[env, : task.specs[robot].robot.dof])
@@ -139,7 +140,7 @@ class InverseKinematics:
 
 
 def random_starts(task: TaskBatch, envs: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Return starts of inverse kinematics, shape (STARTS, n, J): the targets, and random ones.
+    """Return starts of inverse kinematics, shape (STARTS, n, J): joint targets and random ones.
 
     Joints that do not move the tool, such as fingers, keep their targets.
     """

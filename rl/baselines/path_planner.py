@@ -23,16 +23,16 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.typing import Array
 
 FreeFraction = Callable[[Array, Array], float]
-"""Fraction of the straight line between two configurations (dof,) that is free; 1 if all is."""
+"""Return the collision-free fraction of the line between two configurations, each (dof,)."""
 
 ITERATIONS = 2500
-"""Random configurations that RRT-Connect extends its trees towards before it gives up."""
+"""Maximum number of random configurations of RRT-Connect."""
 MIN_EDGE, MAX_EDGE = 1.0, 12.0
 """Length of a tree's edges [control steps]."""
 SHORTCUTS = 60
-"""Random pairs of waypoints of a path that are tried as shortcuts."""
+"""Number of random pairs of waypoints that are tried as shortcuts of a path."""
 COMPARED = 6
-"""Free paths along a tree whose costs are compared; the candidates come cheapest first."""
+"""Number of free paths along a tree of which the cheapest is taken."""
 RESOLUTION = 0.05
 """Largest change of a joint between tested configurations of a line [rad or m]."""
 LATE_COST, MAX_LATE_COST = 20.0, 400.0
@@ -56,7 +56,7 @@ class PathCost:
     """Cost of paths to n goals, in control steps."""
 
     goal_cost: Array
-    """Cost of what comes after each goal, shape (n,)."""
+    """Cost of the motion that follows at each goal, shape (n,)."""
     deadline: Array
     """Control steps within which a path should reach each goal, shape (n,)."""
 
@@ -67,10 +67,10 @@ class PathCost:
 
 
 class Tree:
-    """Configurations, each reached from another one by a free straight line."""
+    """Configurations that are connected to roots by collision-free straight lines."""
 
     def __init__(self, roots: Array, step: Array, free_fraction: FreeFraction) -> None:
-        """Start with roots of shape (n, dof); other arguments as of ``rrt_connect``."""
+        """Start with roots, shape (n, dof); ``rrt_connect`` describes the other arguments."""
         self._step, self._free_fraction = step, free_fraction
         self.nodes = [*roots]
         self._parents = [-1] * len(roots)
@@ -80,10 +80,10 @@ class Tree:
         return int((np.abs(np.array(self.nodes) - q) / self._step).max(axis=1).argmin())
 
     def extend(self, near: int, q: Array) -> int | None:
-        """Add a node from a node towards q, as far as the line is free; None if that is too short.
+        """Add a node on the line from the node ``near`` to q, as far as the line is free.
 
         Returns:
-            Index of the new node.
+            Index of the new node; None if the free part is shorter than ``MIN_EDGE``.
         """
         origin = self.nodes[near]
         length = float((np.abs(q - origin) / self._step).max())
@@ -96,7 +96,7 @@ class Tree:
         return len(self.nodes) - 1
 
     def connect(self, q: Array) -> int | None:
-        """Extend the tree until it reaches q; None if it cannot."""
+        """Extend the tree to q; return the index of q's node, None if q cannot be reached."""
         node: int | None = self.nearest(q)
         while node is not None and not np.array_equal(self.nodes[node], q):
             node = self.extend(node, q)
@@ -172,7 +172,7 @@ class PathPlanner:
     def __init__(
         self, space: FreeSpace, step: Array, seed: int, movable: NDArray[np.bool_] | None = None
     ) -> None:
-        """Set up.
+        """Set up the planner.
 
         Args:
             space: Collision test of configurations.
@@ -210,10 +210,10 @@ class PathPlanner:
             goals: Configurations, shape (n, dof).
             vias: A configuration from which each goal may be approached, shape (n, dof).
             cost: Cost of paths; by default their lengths.
-            block: Pose of the block, shape (7,); without it the block is nowhere.
-            tree: Tree from the start: a path follows it to the node nearest to the goal, goes
-                straight from there, and is shortened. Of the first free paths, cheapest first, the
-                one that is cheapest after that is returned.
+            block: Pose of the block, shape (7,); None for a scene without block.
+            tree: Tree from the start. A path follows it to the node nearest to the goal, goes
+                straight from there, and is shortened. Of the first ``COMPARED`` free paths the
+                cheapest after shortening is returned.
 
         Returns:
             None if no path is free.
@@ -257,12 +257,12 @@ class PathPlanner:
         Args:
             start: Configuration, shape (dof,).
             goals: Configurations, shape (n, dof); n may be 0.
-            block: Pose of the block, shape (7,); without it the block is nowhere.
+            block: Pose of the block, shape (7,); None for a scene without block.
             attempt: Selects the random configurations, together with the planner's seed.
             iterations: Number of random configurations.
 
         Returns:
-            The shortened path, None if none was found; and the tree of the start.
+            The shortened path, None if the search failed; and the tree of the start.
         """
         free_fraction = partial(self._free_fraction, block=block)
         rng = np.random.default_rng([self._seed, attempt])
@@ -286,7 +286,7 @@ class PathFollower:
     """Waypoints that the robots of a batch go through, one after the other."""
 
     def __init__(self, task: TaskBatch) -> None:
-        """Let all robots stay where they are."""
+        """Set each robot's current targets as its only waypoint."""
         self._task = task
         self._waypoints = task.targets[:, None].clone()
         self._index, self._last = torch.zeros(2, task.num_envs, dtype=torch.int64).to(task.device)
@@ -308,7 +308,7 @@ class PathFollower:
         return waypoints
 
     def advance(self) -> torch.Tensor:
-        """Go on to the next waypoint where one is reached; return where the last one is, (n,)."""
+        """Switch arrived robots to their next waypoint; return who is at the last, (n,), bool."""
         task = self._task
         step = task.robot_tables.max_step[task.env_robot_index].clamp(min=1e-9)
         arrived = ((self.waypoint - task.targets) / step).abs().amax(dim=1) < ARRIVED
@@ -318,10 +318,10 @@ class PathFollower:
 
 
 def fractions_towards(task: TaskBatch, targets: torch.Tensor) -> torch.Tensor:
-    """Return fractions of the joints' steps that move targets straight to others (n, J).
+    """Return actions that move the joint targets in a straight line to others (n, J).
 
     Returns:
-        A number per link, shape (n, L): all joints arrive at the same time.
+        Fractions of the joints' largest steps by link, shape (n, L): all joints arrive together.
     """
     step = task.robot_tables.max_step[task.env_robot_index]
     change = targets - task.targets

@@ -18,15 +18,15 @@ BISECTIONS = 5
 OFFSETS = np.linspace(-1.0, 1.0, 9)
 """Offsets of the block along x at which the width of the contact is tested."""
 BELOW, ABOVE = -0.5, 0.15
-"""Shifts of the block along z: lowered by half an edge, only what is below its middle touches it;
-raised, what is just above it touches it as well."""
+"""Shifts of the block along z: a block lowered by half an edge is touched only below its middle; a
+raised one also slightly above it."""
 PRESSED = 0.1
 """Distance that the block is pressed against the robot when the width is tested."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreContact:
-    """Configurations behind the block that touch it if they move along y, a row each."""
+    """Configurations behind the block that touch it if they move along y; one per row."""
 
     q: Array
     """Configurations, shape (n, dof) [rad or m]."""
@@ -37,7 +37,7 @@ class PreContact:
     width: Array
     """Fraction of ``OFFSETS`` at which the block is touched, shape (n,)."""
     overhang: Array
-    """See the function ``overhang``, shape (n,)."""
+    """Overhang over the block as the function ``overhang`` returns it, shape (n,) [edges]."""
 
 
 def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreContact:
@@ -62,10 +62,11 @@ def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreC
 
 
 def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
-    """Return how much a robot leans over the block that it touches if it moves along y.
+    """Return the overhang of a robot over the block that it touches if it moves along y.
 
-    That is how much earlier the robot touches what is above the block's middle than what is below
-    it, from 0 to 1 edges. A robot that leans over presses the block to the ground, or tips it over.
+    The overhang is the lead along y with which the robot touches the block above its middle before
+    it touches it below, from 0 to 1 edges. With overhang, a push presses the block to the ground or
+    tips it over.
 
     Args:
         space: Collision test with the block.
@@ -106,9 +107,9 @@ def touches(
 
 
 def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, dz: float) -> Array:
-    """Return how far blocks (n, 7), shifted along z, move to the robot until they touch it [m].
+    """Return distances along y from blocks (n, 7) to the robot, (n,) [m]; inf without contact.
 
-    It is infinite where they never do.
+    The blocks are shifted along z by ``dz`` [m].
     """
     shifts, zero = SHIFTS * edge, np.zeros(1)
     touched = touches(space, q, blocks, zero, -shifts, dz)

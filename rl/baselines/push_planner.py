@@ -42,14 +42,14 @@ _MIN_HEIGHT, _MAX_HEIGHT = 0.2, 0.45
 _CANDIDATES = 24
 """Pre-contacts, the cheapest first, to which straight paths are tried."""
 _SIMULATED, _OVERHANG_EVERY = 12, 3
-"""Points of a push where it is tested, and every how many of them the overhang is tested."""
+"""Number of points at which a push is tested; the overhang is tested at every third of them."""
 _TOLERANCE = 0.02
 """Distance from a point that counts as reached."""
 _NEARER, _FARTHER = 0.3, 0.4
-"""During a push, the robot has to touch a block that is nearer by the one, and none that is farther
-by the other."""
+"""In a simulated push, the robot must touch a block that is nearer by the one distance, and not
+touch one that is farther by the other."""
 _LIFT = 1.4
-"""Height above a pre-contact from which the tool may come down to it."""
+"""Height of the waypoint above a pre-contact, from which the tool comes down."""
 _RETREAT_STEP, _RETREAT_STEPS = 0.15, 8
 """Motion of the tool in a step away from the block, and the largest number of such steps."""
 _RETREAT_DIRECTIONS = (
@@ -60,16 +60,16 @@ _RETREAT_DIRECTIONS = (
     (-1.0, 0.0, 0.0),
 )
 _UNFINISHED_COST, _NARROW_COST = 400.0, 120.0
-"""Cost of a push that moves the block by nothing, and of contact on a front without width."""
+"""Cost of a push that does not move the block, and of a contact of width zero."""
 _OVERHANG_COST, _MAX_OVERHANG = 3000.0, 0.1
-"""Cost per edge of overhang, and the overhang from which more costs the same."""
+"""Cost per edge of overhang, and the overhang at which the cost is capped."""
 _COMPLIANCE_COST = 3000.0
-"""Cost per metre by which the tool yields to the block's friction."""
+"""Cost per metre of the tool's deflection by the block's friction."""
 _ACCELERATION_STEPS = 25
-"""Control steps that a push takes until arm and block are at speed."""
+"""Time until arm and block have the speed of the push [control steps]."""
 _EXPENSIVE, _TREE_ITERATIONS = 350.0, 1500
-"""Cost of a plan from which a tree of reachable configurations is grown to find a cheaper one, and
-the random configurations of that tree."""
+"""Cost of a plan above which a tree of reachable configurations is grown to find a cheaper one, and
+the number of random configurations of that tree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +134,11 @@ class ToolKinematics:
             iterations: Number of iterations.
         """
         robots, rows = self._rows(q)
-        goal, rotations = (torch.from_numpy(each).to(rows) for each in (position, rotation))
+        goals = torch.from_numpy(position).to(rows)
+        rotations = torch.from_numpy(rotation).to(rows)
         limits = self._tables.lower[robots], self._tables.upper[robots]
         for _ in range(iterations):
-            target = pose_ik_step(self._tables.tool_chain, robots, rows, goal, rotations, limits)
+            target = pose_ik_step(self._tables.tool_chain, robots, rows, goals, rotations, limits)
             rows = rows + (target - rows).clamp(-MAX_STEP, MAX_STEP)
         return rows[:, : self._dof].double().cpu().numpy()
 
@@ -158,13 +159,13 @@ class PushPlanner:
         """Collect free configurations with a low tool in the region of the push.
 
         Args:
-            spec: Environment of a robot that pushes.
-            tables: Robots of the batch.
-            robot: Index of the robot in it.
+            spec: Robot, scene and starts of the task push.
+            tables: Kinematics of the robots of a batch.
+            robot: Index of the robot in the batch.
             rng: Source of random configurations.
 
         Raises:
-            ValueError: If the robot does not push.
+            ValueError: If the environment's task is not push.
         """
         starts, self._robot = spec.goals, spec.robot
         if not isinstance(starts, PushStartSet):
@@ -183,13 +184,13 @@ class PushPlanner:
         self._bank, self._bank_tools = sample_tools_in_box(self._space, low, high, rng)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
-        """Return whether configurations (n, dof) are free of all but the block, shape (n,)."""
+        """Return whether configurations (n, dof) are free of collisions without the block, (n,)."""
         return self._space.free(q)
 
     def plan(
         self, q: Array, block: Array, attempt: int = 0, steps_left: float = np.inf
     ) -> Plan | None:
-        """Return the cheapest plan that is found.
+        """Return the cheapest plan of a push.
 
         Args:
             q: Configuration of the robot, shape (dof,).
@@ -198,25 +199,25 @@ class PushPlanner:
             steps_left: Control steps until the episode ends. Plans that take longer cost more.
 
         Returns:
-            None if no plan was found, or no block gets across in the time that is left.
+            None if there is no plan, or too little time to push the block across the line.
         """
         if steps_left < (self._line - block[1]) / SPEED:
             return None
         start = self._retreat(q, block)
         plans = [self._plan_straight(start, self._candidates_near(q, block), block, steps_left)]
         if plans[0] is None or plans[0][0] > _EXPENSIVE:
-            # Links that are in each other's way divide free space: look for pre-contacts near
-            # configurations that can be reached.
-            nowhere = np.zeros((0, len(q)))
+            # Self-collisions may divide free space: look for pre-contacts near configurations that
+            # can be reached.
+            no_goals = np.zeros((0, len(q)))
             _, tree = self._planner.plan_rrt(
-                start, nowhere, block=block, attempt=attempt, iterations=_TREE_ITERATIONS
+                start, no_goals, block=block, attempt=attempt, iterations=_TREE_ITERATIONS
             )
             candidates = self._candidates_on(tree, block)
             plans.append(self._plan_straight(start, candidates, block, steps_left, tree))
-        found = [plan for plan in plans if plan is not None]
-        if not found:
+        valid_plans = [plan for plan in plans if plan is not None]
+        if not valid_plans:
             return None
-        _, path, candidates = min(found, key=lambda plan: plan[0])
+        _, path, candidates = min(valid_plans, key=lambda plan: plan[0])
         i = path.goal
         return Plan(
             path=path.waypoints if start is q else (start, *path.waypoints),
@@ -234,7 +235,10 @@ class PushPlanner:
         steps_left: float,
         tree: Tree | None = None,
     ) -> tuple[float, Path, _Candidates] | None:
-        """Return the cheapest path to the candidates, after its cost; see ``plan_straight``."""
+        """Return cost, path and candidates of the cheapest path; None if no path is free.
+
+        The index of the path's goal is that of its candidate; see ``PathPlanner.plan_straight``.
+        """
         cost = PathCost(candidates.cost, steps_left - candidates.steps)
         if tree is None:
             order = np.argsort(cost.of(self._planner.steps(start, candidates.q)), kind="stable")
@@ -249,7 +253,7 @@ class PushPlanner:
         return value, path, candidates
 
     def _candidates_near(self, q: Array, block: Array) -> _Candidates:
-        """Return candidates found from random free configurations."""
+        """Return candidates from inverse kinematics that starts at random free configurations."""
         bank = unwrap_joints(self._robot, q, self._bank)
         quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
         starts, goals = self._behind(bank, self._bank_tools, block, quickest)
@@ -259,7 +263,7 @@ class PushPlanner:
         return self._evaluate(unwrap_joints(self._robot, q, free), block)
 
     def _candidates_on(self, tree: Tree, block: Array) -> _Candidates:
-        """Return candidates found from the nodes of a tree."""
+        """Return candidates from inverse kinematics that starts at the nodes of a tree."""
         nodes = np.array(tree.nodes)
         tools, _ = self._tool.poses(nodes)
         starts, goals = self._behind(nodes, tools, block, np.zeros(0, dtype=np.intp))
@@ -290,14 +294,20 @@ class PushPlanner:
         return np.concatenate(starts), np.concatenate(goals)
 
     def _solve(self, starts: Array, goals: Array, block: Array) -> Array:
-        """Return free configurations with the tool at goals (n, 3), as far as they are solved."""
+        """Return collision-free solutions of inverse kinematics, shape (k, dof), k <= n.
+
+        Args:
+            starts: Configurations to start from, shape (n, dof).
+            goals: Positions of the tool, shape (n, 3) [m].
+            block: Pose of the block, shape (7,).
+        """
         q, error = solve_position_ik(self._robot, starts, goals)
         solved = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
         q = q[solved & (np.abs(error[:, 2]) < self._edge / 2)]
         return q[self._space.free(q, np.tile(block, (len(q), 1)))]
 
     def _evaluate(self, q: Array, block: Array) -> _Candidates:
-        """Return the configurations behind the block (n, dof) that begin a push, with its cost."""
+        """Return those configurations behind the block (n, dof) that can begin a push."""
         contacts = find_contacts(self._space, q, block, self._edge)
         position, rotation = self._tool.poses(contacts.q)
         offset = position[:, 0] - block[0] - contacts.offset
@@ -312,10 +322,10 @@ class PushPlanner:
     def _simulate(
         self, contacts: PreContact, position: Array, rotation: Array, offset: Array, block: Array
     ) -> tuple[Array, Array]:
-        """Move the tools along their pushes, in kinematics alone.
+        """Simulate the pushes by kinematics, without dynamics.
 
-        At each point the arm has to be free, and to touch a block that is slightly nearer than the
-        pushed one, and not one that is slightly farther.
+        At each point the arm must be free of collisions, and stay in contact: it must touch a block
+        slightly nearer than the pushed one, and not touch one slightly farther.
 
         Returns:
             Fraction of each push that succeeds, and the largest overhang, each (n,).
@@ -346,12 +356,12 @@ class PushPlanner:
         return np.where(begun, fraction, 0.0), over
 
     def _compliance(self, q: Array) -> Array:
-        """Return how far tools yield along y to the friction of the block, shape (n,) [m]."""
+        """Return the deflection of the tools along y by the block's friction, shape (n,) [m]."""
         _, J = frame_jacobian(self._robot, q)
         return np.asarray(self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1))
 
     def _lift(self, candidates: _Candidates) -> Array:
-        """Return configurations with the tool above the candidates, or as high as it gets."""
+        """Return configurations (n, dof) with the tool above the candidates, if possible."""
         goal, q = candidates.position.copy(), candidates.q
         for _ in range(5):
             goal[:, 2] += _LIFT * self._edge / 5
@@ -359,7 +369,7 @@ class PushPlanner:
         return q
 
     def _retreat(self, q: Array, block: Array) -> Array:
-        """Return q if it is free of the block, else a configuration near it that is, if any."""
+        """Return q if it is free of the block, else a free one near it, else q."""
         if self._space.free(q[None], block[None])[0]:
             return q
         position, rotation = self._tool.poses(q[None])

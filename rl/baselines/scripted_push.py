@@ -1,4 +1,4 @@
-"""The baseline ``scripted`` of push: go behind the block by a planned path, push, and steer."""
+"""The baseline ``scripted`` of push: follow a planned path behind the block, push, and steer."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import EnvSpec
 
 MAX_PLANS = 8
-"""Most plans in an episode."""
+"""Maximum number of plans per episode."""
 GAIN = 0.2
 """Fraction of the lateral error between tool and block that is corrected in a control step."""
 LEAD, LEAD_STEP, MAX_LEAD = 0.05, 0.004, 0.3
-"""Distance by which the commanded tool may be ahead of the tool: at first, its growth with every
-control step in which the block stands still, and its maximum [m]. A slender arm yields by that."""
+"""Lead of the commanded tool before the actual one: initial value, growth per control step in which
+the block does not move, and maximum [m]. A slender arm needs it to build up force."""
 MOVING = 0.03
 """Speed of the block from which it counts as moving [m/s]."""
 ARRIVED, SETTLE_STEPS = 0.02, 15
-"""A push begins when the joints are this near to their targets [rad or m], or after so many control
-steps at the last waypoint."""
+"""A push begins when the joints are ``ARRIVED`` from their targets [rad or m], or ``SETTLE_STEPS``
+control steps after the last waypoint."""
 PATIENCE = 40
-"""Control steps in which the block has to move by ``PROGRESS``; else a new plan is made."""
+"""Time in which the block must move by ``PROGRESS``; else a new plan is made [control steps]."""
 PROGRESS = MOVING * PATIENCE * CONTROL_PERIOD
-"""Distance [m]."""
+"""Distance that the block must move within ``PATIENCE`` [m]."""
 LOST, ASTRAY = 0.7, 1.5
-"""Lateral distance of tool and block at which the block is lost, and lateral distance of the block
-from its start at which a new plan is made [edges of the block]."""
+"""Lateral distances that lead to a new plan: of the tool from the block, and of the block from its
+position at the start of the push [edges of the block]."""
 MIN_PUSH_STEPS = 10
-"""Control steps of a push before it can be lost or blocked."""
+"""Time of a push before its block can count as lost or its arm as stuck [control steps]."""
 RISE = 0.003
 """Rise of the tool in a control step in which the arm collides with anything but the block [m]."""
 
@@ -51,7 +51,7 @@ class ScriptedPush:
     """
 
     def __init__(self, seed: int) -> None:
-        """Set up; plans depend on the seed, the robot, its starts, and the state of the episode."""
+        """Set up; plans depend on the seed, the robot, its starts and the state of the episode."""
         self._seed = seed
         self._specs: Sequence[EnvSpec] = ()
         self._planners: dict[int, PushPlanner] = {}
@@ -82,7 +82,9 @@ class ScriptedPush:
         self._task, self._follower = task, PathFollower(task)
         n, device = task.num_envs, task.device
         starts = [task.specs[i].goals for i in task.env_robot_index.tolist()]
-        edges = [each.block.size[0] if isinstance(each, PushStartSet) else 1.0 for each in starts]
+        edges = [
+            start.block.size[0] if isinstance(start, PushStartSet) else 1.0 for start in starts
+        ]
         self._edge = torch.tensor(edges, device=device)
         # A plan is active; its path is done, and the tool pushes.
         self._active, self.pushing = torch.zeros(2, n, dtype=torch.bool, device=device)
@@ -120,7 +122,7 @@ class ScriptedPush:
         self._settling[env], self._still[env], self._stuck[env] = 0, 0, 0
 
     def _advance(self, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
-        """Go on to the next waypoint, or from the path to the push; return failed pushes, (n,)."""
+        """Switch to the next waypoint or to the push; return where pushes failed, (n,), bool."""
         at_end = self._active & ~self.pushing & self._follower.advance()
         self._settling = torch.where(at_end, self._settling + 1, self._settling)
         arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED

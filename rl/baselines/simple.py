@@ -1,4 +1,4 @@
-"""The baselines that ignore the observation: no action, and random actions."""
+"""Baselines that ignore the observation: zero and random actions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Zero:
 
 
 class Random:
-    """Draws every action uniformly, from a random stream of its own."""
+    """Draws every action from a uniform distribution."""
 
     def __init__(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
