@@ -16,7 +16,7 @@ ActionKind = Literal["continuous", "discrete"]
 BINS = (-1.0, -1 / 2, -1 / 4, -1 / 8, -1 / 16, 0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Normalized actions that the discrete ones index, exponentially spaced about zero (AnyBody)."""
 _TOLERANCE = 1e-6
-"""How far a bin may exceed the normalized action that it encodes: float32 rounding."""
+"""Excess of a bin over the normalized action that it encodes which float32 rounding allows."""
 
 
 def decode_actions(
@@ -85,7 +85,7 @@ class JointTargets:
         They start from the previous targets, not from the measured positions.
 
         Args:
-            targets: Previous targets of the independent joints, shape (n, J), rad or m.
+            targets: Previous targets of the independent joints, shape (n, J) [rad or m].
             normalized: Normalized actions, shape (n, L).
         """
         change = torch.gather(normalized, 1, self._link) * self._max_step

@@ -43,8 +43,8 @@ class Step:
     truncated: torch.Tensor
     """Whether the time limit or a diverged simulation ended the episode, shape (n,), bool."""
     diverged: torch.Tensor
-    """Whether the simulation diverged, shape (n,), bool. Robot and block are then put back to
-    where they were before the step, and the episode is truncated."""
+    """Whether the simulation diverged, shape (n,), bool. The step is then undone and the episode
+    truncated."""
     final_observation: Observation
     """Observation after the action, also where an episode ended: to bootstrap the value there."""
     success: torch.Tensor
@@ -76,7 +76,7 @@ class TaskBatch:
         action_mask: Links whose joint obeys actions, shape (n, L), bool.
         max_episode_steps: Time limit of episodes, shape (n,) [control steps].
         episode_step: Control steps since the episode began, shape (n,), int64.
-        targets: JointTargets of the independent joints, shape (n, J) [rad or m].
+        targets: Targets of the independent joints, shape (n, J) [rad or m].
         device: Device of all tensors.
     """
 
@@ -92,7 +92,7 @@ class TaskBatch:
         seed: int = 0,
         first: int = 0,
     ) -> None:
-        """Set up; ``reset`` begins the episodes.
+        """Gather the tables of all environments; ``reset`` begins the episodes.
 
         Args:
             robot_tables: The robots.
@@ -275,13 +275,14 @@ class TaskBatch:
         self.simulation.close()
 
     def _act(self, actions: torch.Tensor) -> None:
+        """Advance the joint targets by the decoded actions."""
         shape = (self.num_envs, self.robot_tables.max_links)
         normalized = decode_actions(actions, self.action_kind, shape, self.device)
         self._previous_action = normalized * self.action_mask
         self.targets = self._joint_targets(self.targets, self._previous_action)
 
     def _simulate(self) -> torch.Tensor:
-        """Step the simulation; restore the previous state where it diverged, (n,) bool."""
+        """Step the simulation, undo the step where it diverged; return where, shape (n,), bool."""
         diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
         try:
@@ -294,6 +295,7 @@ class TaskBatch:
         return diverged
 
     def _evaluate(self, diverged: torch.Tensor) -> BatchResult:
+        """Let the tasks evaluate the step that was simulated."""
         q, qd = self._q, self._padded(self.simulation.qd)
         state = TaskState(
             tool=self._tool_positions(q),
@@ -306,7 +308,7 @@ class TaskBatch:
         return self.groups.evaluate(state)
 
     def _begin(self, envs: torch.Tensor) -> None:
-        """Begin an episode in some environments, shape (k,), int64."""
+        """Begin episodes in the environments with these indices, shape (k,), int64."""
         q = torch.zeros(len(envs), self.robot_tables.max_joints, device=self.device)
         block_pose = torch.zeros(len(envs), 7, device=self.device)
         for rows, (task_q, task_block_pose) in self.groups.begin(envs, self._streams["random"]):
@@ -336,7 +338,7 @@ def _copied(observation: Observation) -> Observation:
 
 
 def _random_streams(seed: int, env_numbers: Sequence[int]) -> dict[str, list[np.random.Generator]]:
-    """Return a stream for episodes and one for points per environment, by its number only."""
+    """Return random streams of episodes and of points, one of each for every environment number."""
     return {
         name: [
             np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, *suffix)))

@@ -76,7 +76,7 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
         pairs_of[driving_joints(robot, chains)].append((a, b))
     tool_joints = {*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))}
     planes = [
-        _plane(robot, checker, joints, pairs)
+        _joint_plane(robot, checker, joints, pairs)
         for joints, pairs in pairs_of.items()
         if 0 < len(joints) <= 2 and {*joints} <= tool_joints
     ]
@@ -110,18 +110,19 @@ def _is_outside(plane: JointPlane, q: Array) -> bool:
     return True
 
 
-def _plane(
+def _joint_plane(
     robot: Robot, checker: SelfCollisionChecker, joints: tuple[int, ...], pairs: Sequence[Pair]
 ) -> JointPlane | None:
+    """Return the plane of one or two joints; None if its free cells form one component."""
     columns = [*joints]
     lower, upper = joint_limits(robot).T[:, columns]
     count = np.clip(np.ceil((upper - lower) / CELL), FEWEST, MOST).astype(int)
-    middles = [
+    cell_centres = [
         lo + (np.arange(n) + 0.5) / n * (up - lo)
         for lo, up, n in zip(lower, upper, count, strict=True)
     ]
     q = np.tile(robot.home, (int(count.prod()), 1))
-    q[:, columns] = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(len(q), -1)
+    q[:, columns] = np.stack(np.meshgrid(*cell_centres, indexing="ij"), axis=-1).reshape(len(q), -1)
     free = np.array([not contacts.keys() & {*pairs} for contacts in checker.penetrations(q)])
     free = free.reshape(count)
     continuous = [robot.joints[robot.independent_joints[j]].kind == "continuous" for j in joints]
@@ -130,19 +131,19 @@ def _plane(
         return None
     largest = int(np.bincount(components[components > 0]).argmax())
     nearest = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
-    turns = np.where(periodic_joints(robot)[columns], 2 * np.pi, 0.0)
+    periods = np.where(periodic_joints(robot)[columns], 2 * np.pi, 0.0)
     main = components[tuple(nearest)] == largest
-    return JointPlane(tuple(pairs), joints, lower, upper, main, tuple(turns.tolist()))
+    return JointPlane(tuple(pairs), joints, lower, upper, main, tuple(periods.tolist()))
 
 
 def _components(free: NDArray[np.bool_], continuous: Sequence[bool]) -> NDArray[np.int64]:
     """Label the component of each free cell, from 1; continuous joints wrap around."""
     labels, count = ndimage.label(free, np.ones((3,) * free.ndim))
-    same = np.arange(count + 1)
+    merged_label = np.arange(count + 1)
     for axis, wraps in enumerate(continuous):
         if wraps:
             first, last = (np.take(labels, i, axis=axis) for i in (0, -1))
             for a, b in zip(np.ravel(first).tolist(), np.ravel(last).tolist(), strict=True):
                 if a and b:
-                    same[same == same[b]] = same[a]
-    return np.asarray(np.unique(same, return_inverse=True)[1][labels], dtype=np.int64)
+                    merged_label[merged_label == merged_label[b]] = merged_label[a]
+    return np.asarray(np.unique(merged_label, return_inverse=True)[1][labels], dtype=np.int64)

@@ -39,7 +39,7 @@ _MOTIONS: tuple[tuple[JointKind, Vec3], ...] = (
 )
 """Kinds and axes of the block's virtual joints: x, y, z, then yaw, pitch and roll."""
 _AWAY = (0.0, 0.0, 1e4, 0.0, 0.0, 0.0)
-"""Positions of the block's virtual joints when there is no pose of it: far above everything."""
+"""Positions of the block's virtual joints without a pose of the block: far above everything."""
 
 
 class FreeSpace:
@@ -53,7 +53,7 @@ class FreeSpace:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Compile.
+        """Compile the scene into a collision checker.
 
         Args:
             scene: Robot with the pose of its root, ground, obstacles and block.
@@ -63,10 +63,12 @@ class FreeSpace:
             RobotError: If MuJoCo refuses a shape.
         """
         self.scene = scene
-        taken = {link.name for link in scene.robot.links}
-        self._obstacles = [_unused(f"obstacle{k}", taken) for k in range(len(scene.obstacles))]
-        self._block = _unused("block", taken)
-        self._tested = SelfCollisionChecker(_with_surroundings(scene, self._obstacles, self._block))
+        link_names = {link.name for link in scene.robot.links}
+        self._obstacles = [_unused(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))]
+        self._block = _unused("block", link_names)
+        self._checker = SelfCollisionChecker(
+            _with_surroundings(scene, self._obstacles, self._block)
+        )
 
     def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
         """Return which configurations are free.
@@ -100,10 +102,10 @@ class FreeSpace:
             ValueError: If ``blocks`` has another shape or is not finite, or the scene has no block.
         """
         robot = self.scene.robot
-        still = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
+        fixed_names = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
         home = np.tile(robot.home, (len(np.asarray(blocks)), 1))
         clear = [
-            not any(self._block in pair and still & {*pair} for pair in contacts)
+            not any(self._block in pair and fixed_names & {*pair} for pair in contacts)
             for contacts in self._penetrations(home, blocks)
         ]
         return np.array(clear, dtype=np.bool_)
@@ -146,51 +148,55 @@ class FreeSpace:
             BenchmarkError: If ``TRIES`` times n configurations do not suffice.
             ValueError: If the limits of a joint are not a range.
         """
-        kept: list[Array] = []
+        accepted: list[Array] = []
         collisions: Counter[Pair] = Counter()
-        tried = passed = 0
-        while len(kept) < n:
+        tried = num_refused = 0
+        while len(accepted) < n:
             if tried >= n * TRIES:
-                raise self._too_few(len(kept), passed, n, tried, collisions)
+                raise self._too_few(len(accepted), num_refused, n, tried, collisions)
             q = random_configurations(self.scene.robot, _CHUNK, rng)[: n * TRIES - tried]
             for row, contacts in zip(q, self._penetrations(q), strict=True):
                 tried += 1
                 collisions.update(contacts.keys())
                 if not contacts and accept(row):
-                    kept.append(row)
-                    if len(kept) == n:
+                    accepted.append(row)
+                    if len(accepted) == n:
                         break
                 elif not contacts:
-                    passed += 1
-        return np.array(kept).reshape(n, self.scene.robot.dof), tried
+                    num_refused += 1
+        return np.array(accepted).reshape(n, self.scene.robot.dof), tried
 
     def _too_few(
-        self, found: int, passed: int, n: int, tried: int, collisions: Counter[Pair]
+        self, num_accepted: int, num_refused: int, n: int, tried: int, collisions: Counter[Pair]
     ) -> BenchmarkError:
-        ((a, b), times), *_ = collisions.most_common(1)
-        more = f" and {passed:,} more are, but cut off by links that touch" if passed else ""
+        ((a, b), count), *_ = collisions.most_common(1)
+        more = ""
+        if num_refused:
+            more = f" and {num_refused:,} more are, but cut off by links that touch"
         return BenchmarkError(
-            f"robot {self.scene.robot.name!r}: only {found} of {tried:,} random configurations are "
-            f"free of collisions{more} (acceptance rate {found / tried:.2g}), {n} are needed; "
-            f"most often {a!r} and {b!r} collide, in {times / tried:.0%}: lift the robot off the "
-            "ground, by a base or its place in the world, or narrow the limits of its joints"
+            f"robot {self.scene.robot.name!r}: only {num_accepted} of {tried:,} random "
+            f"configurations are free of collisions{more} (acceptance rate "
+            f"{num_accepted / tried:.2g}), {n} are needed; most often {a!r} and {b!r} collide, in "
+            f"{count / tried:.0%}: lift the robot off the ground, by a base or its place in the "
+            "world, or narrow the limits of its joints"
         )
 
     def _penetrations(
         self, q: ArrayLike, blocks: ArrayLike | None = None
     ) -> Iterator[dict[Pair, float]]:
+        """Yield the penetration depths [m] by pair of links at each configuration."""
         q = np.asarray(q, dtype=np.float64)
         robot = self.scene.robot
         if q.ndim != 2 or q.shape[1] != robot.dof:
             raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
         if not np.isfinite(q).all():  # nothing collides there, which is not to be free
             raise ValueError(f"q of {robot.name} is not finite")
-        held = np.zeros((len(q), len(self._obstacles)))
-        return self._tested.penetrations(
-            np.concatenate([q, held, self._placed(blocks, len(q))], axis=1)
+        slides = np.zeros((len(q), len(self._obstacles)))
+        return self._checker.penetrations(
+            np.concatenate([q, slides, self._block_joints(blocks, len(q))], axis=1)
         )
 
-    def _placed(self, blocks: ArrayLike | None, n: int) -> Array:
+    def _block_joints(self, blocks: ArrayLike | None, n: int) -> Array:
         """Return the block's virtual joint positions, shape (n, 6), or (n, 0) without a block."""
         if blocks is None:
             return np.tile(_AWAY, (n, 1)) if self.scene.block else np.zeros((n, 0))
@@ -220,60 +226,68 @@ def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
 
 
 def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Robot:
-    """Return the robot with ground, obstacles and block as further links, to be tested alike.
+    """Return the robot with ground, obstacles, block and tool point as further links.
 
     The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles
     must be tested against the root too, so each is on a virtual slide that stays at zero. The block
     has virtual joints for every direction.
     """
     robot = scene.robot
-    links = {link.name for link in robot.links}
-    joints = {joint.name for joint in robot.joints}
-    world = Link(_unused("world", links))
-    to_root = Joint(
-        _unused("to_root", joints), "fixed", world.name, robot.root.name, scene.T_world_root
-    )
-    still: list[Link] = []
-    attached: list[Joint] = []
+    link_names = {link.name for link in robot.links}
+    joint_names = {joint.name for joint in robot.joints}
+    world = Link(_unused("world", link_names))
+
+    def joint_name(child: str) -> str:
+        return _unused(f"to_{child}", joint_names)
+
+    root = robot.root.name
+    to_root = Joint(joint_name("root"), "fixed", world.name, root, scene.T_world_root)
+    static_links: list[Link] = []
+    new_joints: list[Joint] = []
     if scene.ground is not None:
         slab = Shape(Box(_GROUND_SIZE), Pose((0.0, 0.0, scene.ground - _GROUND_SIZE[2] / 2)))
-        still.append(Link(_unused("ground", links), collisions=(slab,)))
-        attached.append(Joint(_unused("to_ground", joints), "fixed", world.name, still[-1].name))
-    for name, box in zip(obstacles, scene.obstacles, strict=True):
-        still.append(Link(name, collisions=(Shape(Box(box.size), box.pose),)))
-        attached.append(
-            Joint(_unused(f"to_{name}", joints), "prismatic", world.name, name, limits=(0.0, 0.0))
-        )
-    ignored = [*untested_pairs(robot), *combinations([link.name for link in still], 2)]
-    moved: list[Link] = []
+        ground = Link(_unused("ground", link_names), collisions=(slab,))
+        static_links.append(ground)
+        new_joints.append(Joint(joint_name("ground"), "fixed", world.name, ground.name))
+    for name, obstacle in zip(obstacles, scene.obstacles, strict=True):
+        static_links.append(Link(name, collisions=(Shape(Box(obstacle.size), obstacle.pose),)))
+        slide = Joint(joint_name(name), "prismatic", world.name, name, limits=(0.0, 0.0))
+        new_joints.append(slide)
+    ignored = [*untested_pairs(robot), *combinations([link.name for link in static_links], 2)]
+    block_links: list[Link] = []
     if scene.block is not None:
         if scene.ground is not None:
-            ignored.append((block, still[0].name))
+            ignored.append((block, static_links[0].name))
         for kind, axis in _MOTIONS:
-            last = len(moved) == len(_MOTIONS) - 1
-            name = block if last else _unused(f"carrier{len(moved)}", links)
-            cube = (Shape(Box(scene.block.size)),) if last else ()
-            parent = moved[-1].name if moved else world.name
-            moved.append(Link(name, collisions=cube))
-            attached.append(Joint(_unused(f"to_{name}", joints), kind, parent, name, axis=axis))
-    point: list[Link] = []
+            is_last = len(block_links) == len(_MOTIONS) - 1
+            name = block if is_last else _unused(f"carrier{len(block_links)}", link_names)
+            cube = (Shape(Box(scene.block.size)),) if is_last else ()
+            parent = block_links[-1].name if block_links else world.name
+            block_links.append(Link(name, collisions=cube))
+            new_joints.append(Joint(joint_name(name), kind, parent, name, axis=axis))
+    tool_links: list[Link] = []
     for frame in robot.frames:
-        if frame.name == TOOL and (obstacles or moved):
+        if frame.name == TOOL and (obstacles or block_links):
             ball = Shape(Sphere(_POINT), frame.T_link_frame)
-            point.append(Link(_unused("point", links), collisions=(ball,)))
-            attached.append(Joint(_unused("to_point", joints), "fixed", frame.link, point[-1].name))
-            others = [link.name for link in (*robot.links, *still) if link.name not in obstacles]
-            ignored += [(point[-1].name, other) for other in others]
+            point = Link(_unused("point", link_names), collisions=(ball,))
+            tool_links.append(point)
+            new_joints.append(Joint(joint_name("point"), "fixed", frame.link, point.name))
+            ignored += [
+                (point.name, link.name)
+                for link in (*robot.links, *static_links)
+                if link.name not in obstacles
+            ]
     return replace(
         robot,
-        links=(world, *robot.links, *still, *moved, *point),
-        joints=(to_root, *robot.joints, *attached),
-        home=(*robot.home, *(0.0 for _ in obstacles), *(_AWAY if moved else ())),
+        links=(world, *robot.links, *static_links, *block_links, *tool_links),
+        joints=(to_root, *robot.joints, *new_joints),
+        home=(*robot.home, *(0.0 for _ in obstacles), *(_AWAY if block_links else ())),
         ignore_pairs=tuple(ignored),
     )
 
 
 def _unused(name: str, taken: set[str]) -> str:
+    """Return the name with as many underscores appended as make it differ from the taken ones."""
     while name in taken:
         name += "_"
     return name

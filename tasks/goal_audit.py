@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +125,7 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
 
 
 @dataclass(frozen=True)
-class _Examined:
+class _Examination:
     """A member's goal set, compared with the same set sampled anew."""
 
     key: str = ""
@@ -151,7 +150,7 @@ class _MemberExaminer:
     def library(self) -> Library:
         return Library(self.folders)
 
-    def __call__(self, sided_member: tuple[Side, Member]) -> _Examined:
+    def __call__(self, sided_member: tuple[Side, Member]) -> _Examination:
         side, member = sided_member
         result = self.goals.sets.get((side, member.name))
         try:
@@ -167,32 +166,33 @@ class _MemberExaminer:
                 )
             key = spec.goals.key
             if result is None or result.goals is None:
-                return _Examined(key, digest)
+                return _Examination(key, digest)
             errors = certify_goal_set(result.goals, spec) if result.robot_hash == digest else ()
-            return _Examined(key, digest, "", _same(result.goals, spec.goals), errors)
+            is_same = _are_equal(result.goals, spec.goals)
+            return _Examination(key, digest, "", is_same, errors)
         except MorphgenError as error:
-            return _Examined(error=str(error))
+            return _Examination(error=str(error))
 
 
-def _same(a: GoalSet, b: GoalSet) -> bool:
+def _are_equal(a: GoalSet, b: GoalSet) -> bool:
     """Return whether two sets are equal up to rounding, in the fields that are compared."""
     if type(a) is not type(b):
         return False
-    ours, theirs = arrays_of(a), arrays_of(b)
-    return all(_close(ours[name], theirs[name]) for name in ours.keys() - a.not_compared)
-
-
-def _close(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    if a.shape != b.shape or a.dtype.kind != b.dtype.kind:
-        return False
-    return bool(np.allclose(a, b, 0, EXACT) if a.dtype.kind == "f" else (a == b).all())
+    arrays_a, arrays_b = arrays_of(a), arrays_of(b)
+    for name in arrays_a.keys() - a.not_compared:
+        x, y = arrays_a[name], arrays_b[name]
+        if x.shape != y.shape or x.dtype.kind != y.dtype.kind:
+            return False
+        if not (np.allclose(x, y, 0, EXACT) if x.dtype.kind == "f" else (x == y).all()):
+            return False
+    return True
 
 
 def _set_findings(
     split: Split,
     goals: SplitGoals,
     members: Sequence[tuple[Side, Member]],
-    examined: Sequence[_Examined],
+    examined: Sequence[_Examination],
 ) -> Iterator[Finding]:
     """Yield findings about sets that are missing, of another robot or config, or uncertified."""
     owners = {
@@ -203,8 +203,8 @@ def _set_findings(
     for (side, member), one in zip(members, examined, strict=True):
         result = goals.sets.get((side, member.name))
         if one.error or result is None or result.goals is None:
-            why = one.error or "it has no goal set"
-            yield _finding("goals-missing", side, member.name, why)
+            reason = one.error or "it has no goal set"
+            yield _finding("goals-missing", side, member.name, reason)
             continue
         mismatch = _mismatch(result, result.goals, member, one, owners, goals.config)
         if mismatch:
@@ -212,8 +212,8 @@ def _set_findings(
         if errors := one.certificate_errors:
             more = f" (and {len(errors) - 1} more)" if errors[1:] else ""
             yield _finding("goals-unproven", side, member.name, errors[0] + more)
-    known = {(side, member.name) for side, member in members}
-    for side, name in sorted(goals.sets.keys() - known):
+    members_of_split = {(side, member.name) for side, member in members}
+    for side, name in sorted(goals.sets.keys() - members_of_split):
         yield _finding("goals-unknown", side, name, f"split {split.name} has no such robot")
 
 
@@ -221,26 +221,26 @@ def _mismatch(
     result: GoalResult,
     goals: GoalSet,
     member: Member,
-    examined: _Examined,
+    examined: _Examination,
     owners: Mapping[str, str],
     config: GoalConfig,
 ) -> tuple[str, str] | None:
     """Return the code and reason if a set is not the one that is sampled for its member."""
     if goals.key == examined.key and result.robot_hash == examined.robot_hash:
-        why = f"its goals are not those that seed {config.seed} gives"
-        return None if examined.is_same else ("goals-changed", why)
+        reason = f"its goals are not those that seed {config.seed} gives"
+        return None if examined.is_same else ("goals-changed", reason)
     if goals.key != examined.key and goals.key in owners:
         return "goals-body", f"its set is that of {owners[goals.key]}"
     if result.robot_hash != examined.robot_hash:
-        why = f"its set is of body {result.robot_hash}, not of {examined.robot_hash}"
-        return "goals-body", why
+        reason = f"its set is of body {result.robot_hash}, not of {examined.robot_hash}"
+        return "goals-body", reason
     if goals.seed != config.seed:
-        why = f"its set was made with seed {goals.seed}, the split's with {config.seed}"
-        return "goals-seed", why
+        reason = f"its set was made with seed {goals.seed}, the split's with {config.seed}"
+        return "goals-seed", reason
     made_for = _task_text(result.task, bool(goals.obstacles))
-    wanted = _task_text(member.task, member.obstacles)
-    if made_for != wanted:
-        return "goals-config", f"its set is for {made_for}, not {wanted}"
+    expected = _task_text(member.task, member.obstacles)
+    if made_for != expected:
+        return "goals-config", f"its set is for {made_for}, not {expected}"
     return "goals-config", (
         f"its set, of {len(goals.q)} goals, was made with other constants or another version: its "
         f"key is {goals.key[:8]}, not {examined.key[:8]}"
@@ -251,8 +251,10 @@ def _task_text(task: str, obstacles: bool) -> str:
     return f"{task} with obstacles" if obstacles else task
 
 
-def _finding(code: str, side: Side, name: str, why: str, severity: Severity = "error") -> Finding:
-    return Finding(code, severity, f"{side} robot {name}", why, _FIXES[code])
+def _finding(
+    code: str, side: Side, name: str, reason: str, severity: Severity = "error"
+) -> Finding:
+    return Finding(code, severity, f"{side} robot {name}", reason, _FIXES[code])
 
 
 def shared_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
@@ -268,8 +270,8 @@ def shared_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
         if test is not None and leaks:
             count, noun, name = max(leaks, key=lambda leak: leak[0])
             more = f" (and {len(leaks) - 1} more)" if leaks[1:] else ""
-            why = f"train robot {name}{more} has {count} of its {len(test.q)} {noun}"
-            yield "test", member.name, why
+            reason = f"train robot {name}{more} has {count} of its {len(test.q)} {noun}"
+            yield "test", member.name, reason
 
 
 def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, str]:
@@ -290,17 +292,17 @@ def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, s
 def _repeated(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
     """Yield robots whose set has a goal twice."""
     for side, member in sided_members(split):
-        one = goals.get(side, member.name)
-        if one is None:
+        goal_set = goals.get(side, member.name)
+        if goal_set is None:
             continue
-        same = _near(one.goal_poses, one.goal_poses)
-        if one.start_belongs_to_goal:
-            same &= _near_joints(one.q, one.q)
+        same = _near(goal_set.goal_poses, goal_set.goal_poses)
+        if goal_set.start_belongs_to_goal:
+            same &= _near_joints(goal_set.q, goal_set.q)
         pairs = np.argwhere(np.triu(same, 1)).tolist()
         if pairs:
             more = f" (and {len(pairs) - 1} more pairs)" if pairs[1:] else ""
-            why = f"goals {pairs[0][0]} and {pairs[0][1]} of its set are the same{more}"
-            yield side, member.name, why
+            reason = f"goals {pairs[0][0]} and {pairs[0][1]} of its set are the same{more}"
+            yield side, member.name, reason
 
 
 def _near(a: Array, b: Array) -> Mask:

@@ -144,7 +144,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         )
         self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
         self._running = self._closed = self._was_reset = False
-        self._last: RenderState | None = None
+        self._final_state: RenderState | None = None
         first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
             gym.Space[NumpyObservation],
@@ -161,9 +161,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         if seed is None and not self._was_reset:
             seed = int(self.np_random.integers(2**63))
         # Where an episode has ended, the batch has begun the next one already.
-        next_has_begun = self._last is not None and seed is None
+        next_has_begun = self._final_state is not None and seed is None
         observation = self.batch.observe() if next_has_begun else self.batch.reset(seed)
-        self._running, self._last, self._was_reset = True, None, True
+        self._running, self._final_state, self._was_reset = True, None, True
         info = {"self_collision": self._contacts.self_collision}
         return self._without_padding(observation), info
 
@@ -185,7 +185,10 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         if terminated or truncated:
             self._running = False
-            self._last = _final_state(before, step)
+            # The batch has begun the next episode, so the state to render comes from the step.
+            block = None if before.block is None else step.block_pose[0].cpu().numpy()
+            q = step.q[0, : len(before.q)].cpu().numpy()
+            self._final_state = replace(before, q=q, block=block)
         observation = self._without_padding(step.final_observation)
         return observation, float(step.reward[0]), terminated, truncated, self._info(step)
 
@@ -199,7 +202,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             return None
         if self._renderer is None:
             self._renderer = Renderer.of_spec(self.env_spec, self._size)
-        return self._renderer.frame(self._last or render_state(self.batch))
+        return self._renderer.frame(self._final_state or render_state(self.batch))
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
@@ -244,9 +247,3 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             "terms": {name: float(term[0]) for name, term in step.terms.items()},
             "self_collision": self._contacts.self_collision,
         }
-
-
-def _final_state(before: RenderState, step: Step) -> RenderState:
-    """Return the state after an episode's last step, before the next one began."""
-    block = None if before.block is None else step.block_pose[0].cpu().numpy()
-    return replace(before, q=step.q[0, : len(before.q)].cpu().numpy(), block=block)

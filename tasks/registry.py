@@ -69,8 +69,7 @@ class Registry(Generic[T]):
 
     def __contains__(self, name: object) -> bool:
         """Return whether there is an object of this name."""
-        known = name in self._builtin or name in self._loaded
-        return known or name in self._entry_points
+        return name in self._builtin or name in self._loaded or name in self._entry_points
 
     def __getitem__(self, name: str) -> T:
         """Return the object of a name.
@@ -83,6 +82,7 @@ class Registry(Generic[T]):
         return self._loaded[name]
 
     def _load(self, name: str) -> T:
+        """Import the object of a name from its module; see ``__getitem__``."""
         path = self._builtin.get(name) or self._entry_points.get(name)
         if path is None:
             raise TaskError(f"unknown {self.kind} {name!r}{nearest(name, self)}")

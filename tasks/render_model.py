@@ -16,7 +16,7 @@ from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 
@@ -27,7 +27,7 @@ BLOCK = "block"
 _BLOCK, _OBSTACLE = (0.90, 0.55, 0.15, 1.0), (0.55, 0.25, 0.25, 1.0)
 _FRAME_MARKER, _BOX_MARKER = (0.10, 0.65, 0.25, 0.45), (0.10, 0.65, 0.25, 0.9)
 _AXES = ((0.85, 0.15, 0.15, 1.0), (0.15, 0.70, 0.15, 1.0), (0.15, 0.30, 0.90, 1.0))
-_BODY = (0.65, 0.67, 0.70, 1.0)
+_GREY = (0.65, 0.67, 0.70, 1.0)
 _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
 """Corners of a cube of edge 1."""
 
@@ -60,7 +60,10 @@ def render_model(
         MeshError: If a mesh cannot be read.
     """
     robot = scene.robot
-    corners = [_corners(block) for block in scene.obstacles]
+    corners = []
+    for obstacle in scene.obstacles:
+        T = obstacle.pose.matrix
+        corners.append(_SIGNS * obstacle.size @ T[:3, :3].T + T[:3, 3])
     points = np.concatenate(
         [np.zeros((1, 3)), *corners, points, _robot_corners(robot, configurations)]
     )
@@ -81,20 +84,14 @@ def render_model(
 
 
 def _visible(robot: Robot) -> Robot:
-    """Return the robot with visuals only; collision shapes where a link has no visuals."""
+    """Return the robot with visuals only: grey without colour, collision shapes without visuals."""
     coloured = split_colours(robot)
-    links = tuple(
-        replace(link, visuals=link.visuals or link.collisions, collisions=())
-        for link in coloured.links
-    )
-    grey = tuple(
-        replace(
-            link,
-            visuals=tuple(replace(shape, rgba=shape.rgba or _BODY) for shape in link.visuals),
-        )
-        for link in links
-    )
-    return replace(coloured, links=grey, ignore_pairs=())
+    links = []
+    for link in coloured.links:
+        shapes = link.visuals or link.collisions
+        visuals = tuple(replace(shape, rgba=shape.rgba or _GREY) for shape in shapes)
+        links.append(replace(link, visuals=visuals, collisions=()))
+    return replace(coloured, links=tuple(links), ignore_pairs=())
 
 
 def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
@@ -180,8 +177,3 @@ def _robot_corners(robot: Robot, q: Array) -> Array:
             at = corners @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
             points.append(at.reshape(-1, 3))
     return np.concatenate(points)
-
-
-def _corners(block: Block) -> Array:
-    T = block.pose.matrix
-    return np.asarray(_SIGNS * block.size @ T[:3, :3].T + T[:3, 3])

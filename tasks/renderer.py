@@ -45,7 +45,7 @@ _SHADOW_SIZE = 2048
 the time; smoothed edges would take as long again, and are hardly visible in a video."""
 _AWAY = (0.0, 0.0, -1e4, 1.0, 0.0, 0.0, 0.0)
 """Pose of bodies that must not be visible."""
-_STARTS = 32
+_NUM_STARTS = 32
 """Number of configurations of a goal set that must be in view."""
 
 
@@ -114,7 +114,7 @@ class Renderer:
     def of_spec(cls, spec: EnvSpec, size: tuple[int, int] = SIZE) -> Renderer:
         """Return a renderer with a view of the robot at home and at starts, and of all goals."""
         task = TASKS[spec.task]
-        configurations = np.concatenate([[spec.robot.home], spec.goals.q[:_STARTS]])
+        configurations = np.concatenate([[spec.robot.home], spec.goals.q[:_NUM_STARTS]])
         markers = task.markers(spec.config, spec.goals)
         return cls(spec.scene, markers, configurations, task.points_in_view(spec.goals), size)
 
@@ -153,6 +153,7 @@ class Renderer:
             self._context.free()
 
     def _pixels(self) -> Frame:
+        """Render the scene; return its pixels with the top row first."""
         width, height = self.size
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         rectangle = mujoco.MjrRect(0, 0, width, height)
@@ -207,7 +208,7 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
         with replacing_file(path) as partial:
             # In memory, a GIF's writer cannot fail again when Python deletes it.
             image = io.BytesIO() if path.suffix == ".gif" else None
-            writer: Any = imageio.get_writer(image or partial, **_writing(path.suffix, fps))
+            writer: Any = imageio.get_writer(image or partial, **_writer_options(path.suffix, fps))
             with writer:
                 for frame in frames:
                     _append(writer, frame)
@@ -260,7 +261,8 @@ def _require_complete(video: Path, frames: int) -> None:
         )
 
 
-def _writing(suffix: str, fps: float) -> dict[str, Any]:
+def _writer_options(suffix: str, fps: float) -> dict[str, Any]:
+    """Return the arguments of ``imageio.get_writer`` for a GIF or an MP4."""
     if suffix == ".gif":
         return {"format": "GIF", "mode": "I", "duration": 1000 / fps, "loop": 0}
     return {
@@ -283,17 +285,18 @@ def _camera(points: NDArray[np.float64], aspect: float) -> mujoco.MjvCamera:
     view's width t at 1 m. So ``d >= p - c / t`` and ``d >= n + c / t`` for the largest
     p = v / t - a and n = -v / t - a.
     """
-    turn = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True).as_matrix()
-    across, ahead, up = (points @ turn).T
+    rotation = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True)
+    R_world_camera = rotation.as_matrix()
+    across, ahead, up = (points @ R_world_camera).T
     half = _MARGIN * math.tan(math.radians(_FOV / 2))
     centres, distances = [], []
     for v, t in ((across, half * aspect), (up, half)):
         p, n = (v / t - ahead).max(), (-v / t - ahead).max()
         centres.append(t * (p - n) / 2)
         distances.append((p + n) / 2)
-    middle = (ahead.min() + ahead.max()) / 2
+    mid_depth = (ahead.min() + ahead.max()) / 2
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = turn @ (centres[0], middle, centres[1])
-    camera.distance = max(distances) + middle
+    camera.lookat[:] = R_world_camera @ (centres[0], mid_depth, centres[1])
+    camera.distance = max(distances) + mid_depth
     camera.azimuth, camera.elevation = _AZIMUTH, _ELEVATION
     return camera

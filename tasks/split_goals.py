@@ -99,7 +99,7 @@ class SplitGoals:
     @classmethod
     def from_results(cls, results: Sequence[GoalResult], config: GoalConfig) -> SplitGoals:
         """Collect the results that have a goal set."""
-        return cls(config, {(one.side, one.robot): one for one in results if one.side if one.goals})
+        return cls(config, {(r.side, r.robot): r for r in results if r.side and r.goals})
 
     def get(self, side: Side, name: str) -> GoalSet | None:
         """Return a member's goal set, or None."""
@@ -237,9 +237,11 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
                 for name, content in files.items():
                     (partial / name).parent.mkdir(exist_ok=True)
                     (partial / name).write_bytes(content)
-            kept = {name: value for name, value in sums.items() if not name.startswith(f"{GOALS}/")}
-            added = {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
-            write_atomic(home / SUMS_FILE, sums_text(kept | added))
+            other_sums = {
+                name: value for name, value in sums.items() if not name.startswith(f"{GOALS}/")
+            }
+            goal_sums = {f"{GOALS}/{name}": _sha256(content) for name, content in files.items()}
+            write_atomic(home / SUMS_FILE, sums_text(other_sums | goal_sums))
     except OSError as error:
         path = error.filename or home
         raise BenchmarkError(f"cannot write {path}: {error.strerror}") from error
@@ -254,8 +256,8 @@ def require_goal_sets(results: Sequence[GoalResult]) -> None:
     """
     failed = [result for result in results if result.goals is None]
     if failed:
-        first, *others = failed
-        more = f"; nor has {', '.join(one.robot for one in others)}" if others else ""
+        first, *rest = failed
+        more = f"; nor has {', '.join(result.robot for result in rest)}" if rest else ""
         raise BenchmarkError(
             f"{first.side} robot {first.robot} has no goal set: {first.error}{more}"
         )
@@ -277,7 +279,11 @@ def read_goals(folder: str | Path, side: Side) -> dict[str, GoalSet]:
         BenchmarkError: If it was built without goals, or a file is broken; the message names it.
     """
     sets = read_split_goals(folder).sets
-    return {name: one.goals for (of, name), one in sets.items() if of == side and one.goals}
+    return {
+        name: result.goals
+        for (result_side, name), result in sets.items()
+        if result_side == side and result.goals
+    }
 
 
 def shipped_goal_set(
@@ -302,7 +308,7 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
     folder = Path(folder) / GOALS
     path = folder / INDEX
     try:
-        return _parsed(read_json(path), folder)
+        return _parse_index(read_json(path), folder)
     except FileNotFoundError as error:
         raise BenchmarkError(
             f"{error.filename}: no such file; morphgen split build --goals makes goal sets"
@@ -315,7 +321,8 @@ def read_split_goals(folder: str | Path) -> SplitGoals:
         raise BenchmarkError(f"{path}: not an index of goal sets: {error!r}") from error
 
 
-def _parsed(index: Mapping[str, Any], folder: Path) -> SplitGoals:
+def _parse_index(index: Mapping[str, Any], folder: Path) -> SplitGoals:
+    """Return the goal sets that the index of a folder lists."""
     if index["format"] != FORMAT:
         raise BenchmarkError(
             f"{folder / INDEX}: format {index['format']!r}; this version reads {FORMAT}"
@@ -328,6 +335,7 @@ def _parsed(index: Mapping[str, Any], folder: Path) -> SplitGoals:
 
 
 def _read_set(folder: Path, record: Mapping[str, Any]) -> GoalResult:
+    """Read the goal set of a record in the index, and compare its checksum."""
     path = folder / record["file"]
     content = path.read_bytes()
     if _sha256(content) != record["sha256"]:
@@ -347,12 +355,13 @@ def _files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tuple[
         content = set_npz(result.goals)
         records.append(goal_record(result) | {"file": name, "sha256": _sha256(content)})
         yield name, content
-    used = [result.task for result in results]
-    constants = {"format": FORMAT, "seed": config.seed, **config.as_data(used)}
-    head = json.dumps(constants, indent=2).removesuffix("\n}")
+    task_names = [result.task for result in results]
+    constants = {"format": FORMAT, "seed": config.seed, **config.as_data(task_names)}
+    head_text = json.dumps(constants, indent=2).removesuffix("\n}")
     lines = ",\n".join(f"    {json.dumps(record)}" for record in records)
-    yield INDEX, f'{head},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
-    arrays = "".join(TASKS[n].goal_files_readme for n in dict.fromkeys((*TASKS.builtin, *used)))
+    yield INDEX, f'{head_text},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
+    documented = dict.fromkeys((*TASKS.builtin, *task_names))
+    arrays = "".join(TASKS[name].goal_files_readme for name in documented)
     yield README_FILE, _README.format(index=INDEX, tasks=arrays).encode()
 
 

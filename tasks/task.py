@@ -131,7 +131,7 @@ class EnvSpec:
 
 
 BOUND = 1000.0
-"""Largest magnitude of an observed number [m, rad, m/s or rad/s]; no episode gets there."""
+"""Largest magnitude of an observed number [m, rad, m/s or rad/s]; episodes stay far below it."""
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ class ObservationField:
 GOAL = ObservationField("goal", 7, "goal_mask")
 """Wanted pose of the tool in the root frame: x, y, z, qw, qx, qy, qz."""
 OBJECT = ObservationField("object", 13, "object_mask")
-"""The block, as ``observation.box_tokens`` has it."""
+"""Token of the block, see ``observation.box_tokens``."""
 LINE = ObservationField("line", 1, "object_mask")
-"""y that the block must cross, metres."""
+"""y coordinate that the block must cross [m]."""
 STANDARD_FIELDS = (GOAL, OBJECT, LINE)
 """Fields that every observation has, so that a policy fits batches of all tasks that use them."""
 
@@ -168,7 +168,7 @@ class Marker:
     shape: Literal["frame", "box"]
     """``frame``: axes inside a translucent ball. ``box``: a box."""
     size: Vec3
-    """Edges of the box, or diameters of the ball, metres."""
+    """Edge lengths of the box, or diameters of the ball [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,13 +297,13 @@ class Task(ABC, Generic[C, G]):
             robot: The robot, with a tool.
             config: Constants of the task.
             obstacles: Whether there are obstacles.
-            ground: Height of the ground in the root frame, metres.
+            ground: Height of the ground in the root frame [m].
             seeds: Source of all random numbers.
             identity: The fields ``robot``, ``key`` and ``seed`` of the set.
 
         Raises:
             BenchmarkError: If the robot cannot have such a set; the message says why.
-            TaskError: Likewise.
+            TaskError: If the robot does not suit the task; the message says why.
         """
 
     @abstractmethod

@@ -64,29 +64,29 @@ class TaskGroups:
             TaskError: If a task is unknown or has different constants in the batch.
         """
         n, device = len(env_robot_index), env_robot_index.device
-        used = [specs[i] for i in env_robot_index.tolist()]
+        env_specs = [specs[i] for i in env_robot_index.tolist()]
         self._groups: dict[str, _Group] = {}
         self._row = torch.zeros(n, dtype=torch.int64, device=device)
         """Row of each environment in its group."""
         self.max_episode_steps = torch.zeros(n, dtype=torch.int64, device=device)
         self.moves_fingers = torch.zeros(n, dtype=torch.bool, device=device)
-        for name in dict.fromkeys(spec.task for spec in used):
-            own = [i for i, spec in enumerate(specs) if spec.task == name]
-            task, config = TASKS[name], specs[own[0]].config
-            if any(specs[i].config != config for i in own):
+        for name in dict.fromkeys(spec.task for spec in env_specs):
+            members = [i for i, spec in enumerate(specs) if spec.task == name]
+            task, config = TASKS[name], specs[members[0]].config
+            if any(specs[i].config != config for i in members):
                 raise TaskError(f"environments at {name} have different constants; expected one")
-            of_spec = torch.zeros(len(specs), dtype=torch.int64)
-            of_spec[own] = torch.arange(len(own))
-            is_at_task = torch.tensor([spec.task == name for spec in used], device=device)
+            row_of_spec = torch.zeros(len(specs), dtype=torch.int64)
+            row_of_spec[members] = torch.arange(len(members))
+            is_at_task = torch.tensor([spec.task == name for spec in env_specs], device=device)
             rows = torch.nonzero(is_at_task)[:, 0]
-            spec = of_spec.to(device)[env_robot_index[rows]]
-            envs = task.make_envs([specs[i] for i in own], spec, num_joints)
+            member_index = row_of_spec.to(device)[env_robot_index[rows]]
+            envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
             self.max_episode_steps[rows] = config.max_episode_steps
             self.moves_fingers[rows] = task.moves_fingers
-        every = (field for group in self._groups.values() for field in group.task.fields)
-        self.observation_fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *every)))
+        task_fields = (field for group in self._groups.values() for field in group.task.fields)
+        self.observation_fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *task_fields)))
         self.masks = {
             mask: torch.zeros(n, dtype=torch.bool, device=device)
             for mask in dict.fromkeys(field.mask for field in self.observation_fields)
@@ -121,35 +121,39 @@ class TaskGroups:
         for name, group in self._groups.items():
             rows = torch.nonzero(self.task_mask(name)[envs])[:, 0]
             if len(rows):
-                own = envs[rows]
-                streams = [random[i] for i in own.tolist()]
-                yield rows, group.envs.begin(self._row[own], streams)
+                task_envs = envs[rows]
+                streams = [random[i] for i in task_envs.tolist()]
+                yield rows, group.envs.begin(self._row[task_envs], streams)
 
     def evaluate(self, state: TaskState) -> BatchResult:
         """Evaluate a step of all environments."""
         results = [
-            (group.rows, group.envs.evaluate(self._of(group, state)))
+            (group.rows, group.envs.evaluate(self._group_state(group, state)))
             for group in self._groups.values()
         ]
-        rewards = [torch.stack(list(each.terms.values())).sum(dim=0) for _, each in results]
+        rewards = [torch.stack(list(result.terms.values())).sum(dim=0) for _, result in results]
         if len(results) == 1:
             return BatchResult(**vars(results[0][1]), reward=rewards[0])
         rows = [rows for rows, _ in results]
-        each = [result for _, result in results]
-        names = dict.fromkeys(name for result in each for name in result.terms)
-        none = [torch.zeros_like(result.distance) for result in each]
+        group_results = [result for _, result in results]
+        names = dict.fromkeys(name for result in group_results for name in result.terms)
+        zeros = [torch.zeros_like(result.distance) for result in group_results]
         return BatchResult(
-            success=self._scattered(rows, [result.success for result in each]),
-            terminated=self._scattered(rows, [result.terminated for result in each]),
-            distance=self._scattered(rows, [result.distance for result in each]),
-            score=self._scattered(rows, [result.score for result in each]),
+            success=self._scatter(rows, [result.success for result in group_results]),
+            terminated=self._scatter(rows, [result.terminated for result in group_results]),
+            distance=self._scatter(rows, [result.distance for result in group_results]),
+            score=self._scatter(rows, [result.score for result in group_results]),
             terms={
-                name: self._scattered(
-                    rows, [r.terms.get(name, zero) for r, zero in zip(each, none, strict=True)]
+                name: self._scatter(
+                    rows,
+                    [
+                        result.terms.get(name, zero)
+                        for result, zero in zip(group_results, zeros, strict=True)
+                    ],
                 )
                 for name in names
             },
-            reward=self._scattered(rows, rewards),
+            reward=self._scatter(rows, rewards),
         )
 
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -195,25 +199,25 @@ class TaskGroups:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""
         for group in self._groups.values():
-            own = {
+            group_state = {
                 name: state[name].to(self._row.device)[group.rows]
                 for name in group.envs.state_dict()
             }
-            group.envs.load_state_dict(own)
+            group.envs.load_state_dict(group_state)
 
-    def _of(self, group: _Group, state: TaskState) -> TaskState:
-        """Return the rows of a group."""
+    def _group_state(self, group: _Group, state: TaskState) -> TaskState:
+        """Return the rows of a step's state that belong to a group."""
         if len(self._groups) == 1:
             return state
         return TaskState(
-            **{each.name: getattr(state, each.name)[group.rows] for each in fields(state)}
+            **{field.name: getattr(state, field.name)[group.rows] for field in fields(state)}
         )
 
-    def _scattered(
+    def _scatter(
         self, rows: Sequence[torch.Tensor], values: Sequence[torch.Tensor]
     ) -> torch.Tensor:
         """Put values of the groups into the rows of the batch, shape (n,)."""
-        whole = values[0].new_empty(len(self._row))
-        for own, value in zip(rows, values, strict=True):
-            whole[own] = value
-        return whole
+        batch_values = values[0].new_empty(len(self._row))
+        for group_rows, value in zip(rows, values, strict=True):
+            batch_values[group_rows] = value
+        return batch_values

@@ -1,4 +1,4 @@
-"""Which requests the viewer answers, decided by their ``Host`` and ``Origin`` headers.
+"""Access policy: the viewer answers a request by its ``Host`` and ``Origin`` headers.
 
 Threat: the viewer has no password and listens on this machine, but any web page that the user has
 open in the same browser can send requests to ``localhost`` too, and can point a host name of its
@@ -48,8 +48,12 @@ def access_policy(host: str, origins: Sequence[str] = ()) -> AccessPolicy:
     Raises:
         MorphgenError: If an origin is malformed.
     """
-    names = {*LOCAL_NAMES, host.strip("[]").lower()}
-    any_address = _is_unspecified(host)
+    address = host.strip("[]")
+    names = {*LOCAL_NAMES, address.lower()}
+    # Binding "", 0.0.0.0 or :: listens on all addresses.
+    any_address = not host or (
+        _is_ip_address(address) and ipaddress.ip_address(address).is_unspecified
+    )
     if any_address:
         names |= {name.lower() for name in (socket.gethostname(), socket.getfqdn()) if name}
     return AccessPolicy(frozenset(names), any_address, frozenset(map(_parse_origin, origins)))
@@ -138,6 +142,7 @@ def _normalized(url: SplitResult) -> str:
 
 
 def _parse_origin(text: str) -> str:
+    """Return an origin from the command line in its normalized spelling."""
     url = _split_url(text.strip())
     plain = url is not None and not (url.path.strip("/") or url.query or url.fragment)
     if url is None or not plain or url.scheme not in _PORTS or not url.hostname or "@" in text:
@@ -159,14 +164,9 @@ def _split_url(url: str) -> SplitResult | None:
 
 
 def _is_ip_address(name: str) -> bool:
+    """Return whether a host name is an IP address without a zone (``%eth0``)."""
     try:
         ipaddress.ip_address(name)
     except ValueError:
         return False
     return "%" not in name
-
-
-def _is_unspecified(host: str) -> bool:
-    """Return whether binding a host means to listen on all addresses (``0.0.0.0``, ``::``)."""
-    address = host.strip("[]")
-    return not host or (_is_ip_address(address) and ipaddress.ip_address(address).is_unspecified)

@@ -22,7 +22,7 @@ from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.viewer import markup
 from morphgen.viewer.access import access_policy
 from morphgen.viewer.address import Address, parse_address
-from morphgen.viewer.messages import filter_messages
+from morphgen.viewer.messages import MessageFilter
 from morphgen.viewer.pages import load_page
 from morphgen.viewer.robot_uri import (
     CHECKPOINT,
@@ -93,13 +93,16 @@ def serve(
     Raises:
         MorphgenError: If the target does not exist, or the address does not belong to this machine.
     """
-    files = FileAccess(default_library(library).folders, _roots(words), Path("/nowhere"))
+    targets = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
+    folders = [path.parent if path.is_file() else path for path in targets]
+    roots = tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
+    files = FileAccess(default_library(library).folders, roots, Path("/nowhere"))
     files.library.names()  # reports a missing folder or a broken part before the server starts
     start = start_address(words, files)
     policy = access_policy(host, origins)
     _require_local_address(host)
     uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
-    files = FileAccess(files.library_folders, files.roots, Path(uploads.name).resolve())
+    files = FileAccess(files.library_folders, roots, Path(uploads.name).resolve())
     server = start_server(host, port, policy)
     # Work that ends after its browser has disconnected still writes to the page; that is harmless.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
@@ -108,7 +111,7 @@ def serve(
     async def connect(client: viser.ClientHandle) -> None:
         session = Session(client, files, viewer.workers, start, viewer.cache)
         viewer.sessions[client.client_id] = session
-        filter_messages(client, session.report_error)
+        MessageFilter(client, session.report_error)
         session.enqueue(lambda: open_page(session))
 
     async def disconnect(client: viser.ClientHandle) -> None:
@@ -189,18 +192,12 @@ def open_page(session: Session) -> None:
 
 
 def _show_fault(session: Session, title: str, html: str) -> None:
+    """Replace the page by a panel that says why it cannot be shown."""
     gui = session.client.gui
     gui.reset()
     session.client.scene.reset()
     session.open_panel(FAULT_WIDTH, markup.breadcrumbs((session.address.page, None)), left=True)
     gui.add_html(markup.framed(f"<h3>{escape(title)}</h3>{html}"))
-
-
-def _roots(words: Sequence[str]) -> tuple[Path, ...]:
-    """Return the folders below which files may be read: the current one, and the target's."""
-    targets = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
-    folders = [path.parent if path.is_file() else path for path in targets]
-    return tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
 
 
 def _require_local_address(host: str) -> None:

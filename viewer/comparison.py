@@ -48,14 +48,14 @@ def joint_roles(robot: Robot) -> list[str]:
     """
     on_path: list[int] = []
     if has_tool(robot):
-        row = {k: i for i, k in enumerate(robot.movable_joints)}
+        row_of_joint = {k: i for i, k in enumerate(robot.movable_joints)}
         gains, _ = robot.mimic_map
-        path = [k for k in robot.joint_chain(robot.frame(TOOL).link) if k in row]
-        on_path = [int(column) for k in path for column in gains[row[k]].nonzero()[0]]
+        path = [k for k in robot.joint_chain(robot.frame(TOOL).link) if k in row_of_joint]
+        on_path = [int(column) for k in path for column in gains[row_of_joint[k]].nonzero()[0]]
     on_path = list(dict.fromkeys(on_path))
-    others = [i for i in range(robot.dof) if i not in on_path]
+    off_path = [i for i in range(robot.dof) if i not in on_path]
     roles = {i: f"joint {n}" for n, i in enumerate(on_path, 1)}
-    roles |= {i: f"finger {n}" for n, i in enumerate(others, 1)}
+    roles |= {i: f"finger {n}" for n, i in enumerate(off_path, 1)}
     return [roles[i] for i in range(robot.dof)]
 
 
@@ -84,11 +84,11 @@ def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
         The configuration clipped to the limits, shape (dof,).
     """
     low, high = joint_limits(robot).T
-    moved = np.array(q, dtype=np.float64)
+    target = np.array(q, dtype=np.float64)
     for i, role in enumerate(joint_roles(robot)):
         if role in values:
-            moved[i] = (low[i] + high[i]) / 2 + values[role] * (high[i] - low[i]) / 2
-    return np.asarray(np.clip(moved, low, high))
+            target[i] = (low[i] + high[i]) / 2 + values[role] * (high[i] - low[i]) / 2
+    return np.asarray(np.clip(target, low, high))
 
 
 def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> Comparison:
@@ -103,11 +103,11 @@ def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> Comparis
     # Splits fix the number of links; here the largest robot does.
     max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
     pairs = list(zip(robots, shapes, strict=True))
-    known = [features(robot, shape, max_links=max_links) for robot, shape in pairs]
+    all_features = [features(robot, shape, max_links=max_links) for robot, shape in pairs]
     return Comparison(
         tuple(tokens(robot, shape, max_links=max_links) for robot, shape in pairs),
         {
-            name: np.array([[measure.function(a, b) for b in known] for a in known])
+            name: np.array([[measure.function(a, b) for b in all_features] for a in all_features])
             for name, measure in MEASURES.items()
         },
     )

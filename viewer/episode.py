@@ -73,9 +73,9 @@ class Track:
     q: list[Array] = field(default_factory=list)
     """Independent joint positions at the start and after every step, shape (J,) each."""
     block: list[Array] = field(default_factory=list)
-    """Poses of the block at the same moments; empty if there is no block."""
+    """Poses of the block at the start and after every step; empty if there is no block."""
     marker_poses: dict[str, list[Array]] = field(default_factory=dict)
-    """Poses of each marker at the same moments, by name."""
+    """Poses of each marker at the start and after every step, by name."""
     score: list[float] = field(default_factory=list)
     distance: list[float] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
@@ -204,6 +204,7 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
 
 
 def _about(track: Track) -> dict[str, Any]:
+    """Return the entry of a robot in ``about``."""
     return {
         "name": track.robot.name,
         "place": track.uri,
@@ -219,6 +220,7 @@ def _about(track: Track) -> dict[str, Any]:
 
 
 def _arrays(track: Track) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a robot by name."""
     n = track.num_steps
     q = np.array(track.q[: n + 1], dtype=np.float32)
     tool_poses = [Pose.from_matrix(T) for T in frame_pose(track.robot, q)]
@@ -239,6 +241,7 @@ def _arrays(track: Track) -> dict[str, NDArray[Any]]:
 def _parse_track(
     row: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], files: FileAccess
 ) -> Track:
+    """Return a robot's track from its entry in ``about`` and its arrays."""
     robot = split_colours(read_robot_uri(str(row["place"]), files))
     if robot_hash(robot) != row["body"]:
         raise EpisodeError(

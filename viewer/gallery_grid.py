@@ -236,11 +236,11 @@ def _draw_missing(gallery: Gallery) -> None:
 
 def _request_missing(gallery: Gallery) -> None:
     session, rows, workers = gallery.session, gallery.page_rows, gallery.session.workers
-    known = gallery.thumbnails.keys() | gallery.faults.keys()
+    finished_uris = gallery.thumbnails.keys() | gallery.faults.keys()
     pending = {
         row.uri: workers.submit(make_thumbnail, row.uri, session.files)
         for row in rows
-        if row.uri not in known
+        if row.uri not in finished_uris
     }
     total = len(pending)
     # Another page of the gallery replaces ``page_rows``; then these thumbnails can wait.

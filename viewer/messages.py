@@ -3,7 +3,7 @@
 Threat: viser sets whatever attribute a message names on whatever control it names, with any value.
 Everybody who can connect can write such messages by hand, so a page's code may rely on a control's
 value only because it was validated here. Two layers: ``message_fault`` rejects messages that no
-page of the viewer sends (the connection is closed), and ``filter_messages`` rejects values that a
+page of the viewer sends (the connection is closed), and ``MessageFilter`` rejects values that a
 control cannot have and uploads that are too large (the page shows why).
 """
 
@@ -78,20 +78,16 @@ def message_fault(data: object) -> str:
     return ""
 
 
-def filter_messages(client: viser.ClientHandle, report: Callable[[str], object]) -> None:
-    """Validate values for controls and uploads of a browser before viser applies them.
-
-    Args:
-        client: The browser; its page has no controls yet.
-        report: Called with the reason when a value or upload is rejected.
-    """
-    _MessageFilter(client, report)
-
-
-class _MessageFilter:
+class MessageFilter:
     """Handlers that validate one browser's messages and pass valid ones on to viser."""
 
     def __init__(self, client: viser.ClientHandle, report: Callable[[str], object]) -> None:
+        """Replace viser's handlers of values for controls and of uploads.
+
+        Args:
+            client: The browser; its page has no controls yet.
+            report: Called with the reason when a value or upload is rejected.
+        """
         self._client, self._report = client, report
         self._upload: _Upload | None = None
         self._viser = replace_handlers(

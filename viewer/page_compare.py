@@ -124,9 +124,23 @@ def _add_robots_tab(page: ComparePage) -> None:
 
 
 def _add_move_tab(page: ComparePage) -> None:
+    """Add a slider for each role of joints, and buttons that move all of them."""
     gui, session = page.session.client.gui, page.session
     buttons = gui.add_button_group("Go to", ("home", "middle"))
-    session.on_change(buttons, lambda: _go_to(page, buttons.value))
+
+    def go_to_target() -> None:
+        page.moved = {} if buttons.value == "home" else dict.fromkeys(page.sliders, 0.0)
+        for role, slider in page.sliders.items():
+            set_value(slider, page.moved.get(role, _home_value(page, role)))
+        _move(page)
+
+    def read_sliders() -> None:
+        for role, slider in page.sliders.items():
+            if role in page.moved or slider.value != _home_value(page, role):
+                page.moved[role] = slider.value
+        _move(page)
+
+    session.on_change(buttons, go_to_target)
     for role in comparison.all_roles(page.robots):
         names = ", ".join(
             robot.name for robot in page.robots if role in comparison.joint_roles(robot)
@@ -134,7 +148,7 @@ def _add_move_tab(page: ComparePage) -> None:
         value = _home_value(page, role)
         slider = gui.add_slider(role, -1.0, 1.0, 0.01, value, hint=f"of {names}")
         page.sliders[role] = slider
-        session.on_change(slider, lambda: _read_sliders(page), "move")
+        session.on_change(slider, read_sliders, "move")
 
 
 def _home_value(page: ComparePage, role: str) -> float:
@@ -144,21 +158,8 @@ def _home_value(page: ComparePage, role: str) -> float:
     return float(np.clip(home[comparison.joint_roles(robot).index(role)], -1, 1))
 
 
-def _read_sliders(page: ComparePage) -> None:
-    for role, slider in page.sliders.items():
-        if role in page.moved or slider.value != _home_value(page, role):
-            page.moved[role] = slider.value
-    _move(page)
-
-
-def _go_to(page: ComparePage, target: str) -> None:
-    page.moved = {} if target == "home" else dict.fromkeys(page.sliders, 0.0)
-    for role, slider in page.sliders.items():
-        set_value(slider, page.moved.get(role, _home_value(page, role)))
-    _move(page)
-
-
 def _move(page: ComparePage) -> None:
+    """Move every robot: moved roles to their positions, other joints to their home."""
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
             view.set_configuration(comparison.with_roles(robot, np.array(robot.home), page.moved))

@@ -121,11 +121,12 @@ def show_robot(
 
 
 def _check(page: ComposePage) -> None:
+    """Check the current robot, and show the findings unless another robot has replaced it."""
     robot = page.robot
     if robot is None or page.findings is None:
         return
     findings = check(robot, tool_required=has_tool(robot))
-    if robot is page.robot:  # another robot may have been composed meanwhile
+    if robot is page.robot:
         table = markup.findings_table(findings, page.session.files.redact)
         page.findings.content = markup.framed(table)
 
@@ -253,6 +254,7 @@ def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
 
 
 def _choose_part(tab: PartsTab, slot: str, part: str) -> None:
+    """Put a part into a slot, and show its controls and the robot."""
     tab.choice = part_choice.with_part(tab.choice, slot, part, tab.page.session.files.library)
     _add_slots(tab)
     _show_choice(tab)

@@ -47,7 +47,7 @@ class GrammarTab:
     text: viser.GuiTextHandle
     fault: viser.GuiHtmlHandle
     too_long: viser.GuiHtmlHandle
-    """Says if the edited text does not fit into the address."""
+    """Message that the edited text does not fit into the address; else empty."""
     seed: viser.GuiNumberHandle[int]
     number: viser.GuiNumberHandle[int]
     num_parts: viser.GuiSliderHandle[int]
@@ -154,6 +154,7 @@ def show_grammar(tab: GrammarTab, *, drawn: bool) -> None:
 
 
 def _load(tab: GrammarTab, source: str) -> None:
+    """Replace the text by that of another grammar, and show its typical robot."""
     tab.source = source
     tab.original = grammar_text(resolve_grammar(source, tab.session.files))
     set_value(tab.text, tab.original)
@@ -191,13 +192,14 @@ def _check_grammar(tab: GrammarTab) -> bool:
 
 
 def _draw(tab: GrammarTab, action: str) -> None:
+    """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
     if action == "next":
         set_value(tab.number, tab.number.value + 1)
     show_grammar(tab, drawn=action != "typical")
 
 
 def _show_parts(tab: GrammarTab) -> None:
-    """Show the robot with as many of its parts as the slider says."""
+    """Show the robot with the number of parts that the slider gives."""
     if tab.derivation is None:
         return
     n = tab.num_parts.value
@@ -210,5 +212,5 @@ def _show_parts(tab: GrammarTab) -> None:
 def _show_tree(tab: GrammarTab, derivation: Derivation, n: int) -> None:
     """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
     lines = [escape(line) for line in outline(derivation).splitlines()]
-    shown = [line if i < n else f'<span class="dim">{line}</span>' for i, line in enumerate(lines)]
-    tab.tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(shown)}</pre>")
+    lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
+    tab.tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")

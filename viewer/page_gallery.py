@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import viser
 
 from morphgen.benchmark.split import REGIMES, Member
@@ -21,19 +19,6 @@ from morphgen.viewer.gallery_grid import (
 from morphgen.viewer.robot_rows import Row, folder_rows, robot_subfolders
 from morphgen.viewer.session import Session
 from morphgen.viewer.splits import make_member, save_split
-
-
-@dataclass(frozen=True, eq=False)
-class _SplitForm:
-    """Controls of a new split."""
-
-    name: viser.GuiTextHandle
-    regime: viser.GuiDropdownHandle[str]
-    task: viser.GuiDropdownHandle[str]
-    obstacles: viser.GuiCheckboxHandle
-    num_train: viser.GuiNumberHandle[int]
-    num_test: viser.GuiNumberHandle[int]
-    text: viser.GuiHtmlHandle
 
 
 def show(session: Session) -> None:
@@ -61,47 +46,43 @@ def choose_sides(
         BenchmarkError: If there are too few of either.
     """
     uris = {row.uri for row in passing}
-    others = [row for row in rows if row.uri not in uris]
-    if len(passing) < num_train or len(others) < num_test:
+    failing = [row for row in rows if row.uri not in uris]
+    if len(passing) < num_train or len(failing) < num_test:
         raise BenchmarkError(
-            f"{len(passing)} robots pass the filter and {len(others)} do not: too few for "
+            f"{len(passing)} robots pass the filter and {len(failing)} do not: too few for "
             f"{num_train} to train on and {num_test} to test on"
         )
-    return passing[:num_train], others[:num_test]
+    return passing[:num_train], failing[:num_test]
 
 
 def _add_split_form(gallery: Gallery) -> None:
+    """Add controls that make a new split of the robots that pass the filter and the others."""
     gui, session = gallery.session.client.gui, gallery.session
     with gui.add_folder("New split", expand_by_default=False):
         gui.add_html(markup.framed(markup.dim("train: pass the filter; test: do not")))
-        form = _SplitForm(
-            gui.add_text("split name", ""),
-            gui.add_dropdown("regime", REGIMES),
-            gui.add_dropdown("task", tuple(TASKS)),
-            gui.add_checkbox("obstacles", False),
-            gui.add_number("to train on", 10, min=1, step=1),
-            gui.add_number("to test on", 1, min=1, step=1),
-            gui.add_html(""),
-        )
+        name = gui.add_text("split name", "")
+        regime = gui.add_dropdown("regime", REGIMES)
+        task = gui.add_dropdown("task", tuple(TASKS))
+        obstacles = gui.add_checkbox("obstacles", False)
+        num_train = gui.add_number("to train on", 10, min=1, step=1)
+        num_test = gui.add_number("to test on", 1, min=1, step=1)
+        text = gui.add_html("")
         button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-    session.on_change(button, lambda: session.run_in_background(lambda: _save(gallery, form)))
+
+    def save() -> None:
+        """Compose the robots in the worker processes, and write the split."""
+        passing = passing_rows(gallery)
+        sides = choose_sides(gallery.rows, passing, num_train.value, num_test.value)
+        train, test = (_make_members(session, rows, task.value, obstacles.value) for rows in sides)
+        session.set_status("")
+        path = save_split(name.value, regime.value, train, test, session.files)
+        show_saved(session, path, text)
+
+    session.on_change(button, lambda: session.run_in_background(save))
 
 
-def _save(gallery: Gallery, form: _SplitForm) -> None:
-    """Compose the robots in the worker processes, and write the split."""
-    session = gallery.session
-    sides = choose_sides(
-        gallery.rows, passing_rows(gallery), form.num_train.value, form.num_test.value
-    )
-    train, test = (_make_members(session, rows, form) for rows in sides)
-    session.set_status("")
-    regime = next(regime for regime in REGIMES if regime == form.regime.value)
-    path = save_split(form.name.value, regime, train, test, session.files)
-    show_saved(session, path, form.text)
-
-
-def _make_members(session: Session, rows: list[Row], form: _SplitForm) -> list[Member]:
-    task, obstacles = form.task.value, form.obstacles.value
+def _make_members(session: Session, rows: list[Row], task: str, obstacles: bool) -> list[Member]:
+    """Compose the robots of rows in the worker processes; return them as members of a split."""
     futures = [
         session.workers.submit(make_member, row.uri, row.category, task, obstacles, session.files)
         for row in rows

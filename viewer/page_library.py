@@ -25,15 +25,15 @@ def show(session: Session) -> None:
 
     async def uploaded(event: viser.GuiEvent[viser.GuiUploadButtonHandle]) -> None:
         file = event.target.value
-        session.enqueue(lambda: _open_upload(session, file.name, file.content))
+
+        def open_upload() -> None:
+            uri = store_upload(file.name, file.content, session.files)
+            session.open_address(Address("robot", (uri,)))
+
+        session.enqueue(open_upload)
 
     upload.on_upload(uploaded)
     add_controls(gallery)
-
-
-def _open_upload(session: Session, name: str, content: bytes) -> None:
-    uri = store_upload(name, content, session.files)
-    session.open_address(Address("robot", (uri,)))
 
 
 def library_links(files: FileAccess) -> str:

@@ -119,7 +119,13 @@ def show(session: Session) -> None:
         trained_on = complete_address(session)
         config = parse_rollout(session.address, trained_on)
         page, player = _add_player(session)
-        start = functools.partial(_start_rollout, session, player)
+
+        def start(config: RolloutConfig) -> None:
+            """Show a rollout's address, and let the player simulate it."""
+            session.address = rollout_address(config)
+            session.show_address(f"{config.task} {uri_name(config.robots[0])}")
+            player.load(lambda: Rollout(config, session.files, session.set_status))
+
         add_rollout_controls(RolloutControls(session, config, trained_on, start))
         start(config)
     with gui.add_folder("Get"):
@@ -142,14 +148,6 @@ def score_table(episode: Episode, step: int) -> str:
     header = ("", "score so far", f"m from {TASKS[episode.task].target}", "now")
     head = markup.dim(f"{seconds:.2f} s; simulated: {simulated:.2f} s")
     return head + markup.table(header, rows, (1, 2))
-
-
-def _start_rollout(session: Session, player: Player, config: RolloutConfig) -> None:
-    """Show a rollout's address, and let the player simulate it."""
-    session.address = rollout_address(config)
-    session.show_address(f"{config.task} {uri_name(config.robots[0])}")
-    progress = session.set_status
-    player.load(lambda: Rollout(config, session.files, progress))
 
 
 def _add_player(session: Session) -> tuple[PlayPage, Player]:

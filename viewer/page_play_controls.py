@@ -159,9 +159,9 @@ def label_robots(robots: Robots, current: Sequence[str]) -> dict[str, str]:
         robots: Names and URIs.
         current: URIs of the rollout; those that are not among the robots come first.
     """
-    known = {uri for _, uri in robots}
+    listed_uris = {uri for _, uri in robots}
     labels: dict[str, str] = {}
-    for name, uri in [*((uri, uri) for uri in current if uri not in known), *robots]:
+    for name, uri in [*((uri, uri) for uri in current if uri not in listed_uris), *robots]:
         label = name
         while label in labels:
             label += "'"
@@ -198,7 +198,7 @@ def _split_robots(split: str, files: FileAccess) -> Robots:
 
 
 def _policies(files: FileAccess, config: RolloutConfig) -> tuple[str, ...]:
-    """Return the baselines of the task, the checkpoints of this folder, and the current policy."""
+    """Return the task's baselines, the checkpoints in this folder, and the current policy."""
     names = (*baselines_for(config.task), *list_checkpoints(files), config.policy)
     return tuple(dict.fromkeys(names))
 
@@ -213,7 +213,7 @@ def _list_robots(controls: RolloutControls) -> None:
 
 
 def _use_robot(controls: RolloutControls, action: str) -> None:
-    """Use the robot that was named or chosen, see ``ACTIONS``."""
+    """Apply one of ``ACTIONS`` to the robot that the user named or chose."""
     robots, text = controls.config.robots, controls.handles["words"].value.strip()
     uri = controls.choices[controls.handles["robot"].value]
     if text:

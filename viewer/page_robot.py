@@ -71,7 +71,11 @@ def show(session: Session) -> None:
     scene_robot.look_at(session.client, low, high)
     view = scene_robot.add_robot(session.client.scene, robot, "/robot")
     page = RobotPage(session, uri, robot, view, Overlays(view), np.array(robot.home))
-    gui.add_html(summary(robot, _task_links(robot, uri)))
+    rollouts = ""
+    if has_tool(robot) and robot.dof:
+        links = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
+        rollouts = f"<br>see it {' · '.join(links)}"
+    gui.add_html(summary(robot, rollouts))
     tabs = gui.add_tab_group()
     with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
         _add_move_tab(page)
@@ -123,15 +127,8 @@ def _location(session: Session, uri: str) -> str:
     return markup.breadcrumbs(*steps, (uri_name(uri), None)) + markup.framed(neighbours)
 
 
-def _task_links(robot: Robot, uri: str) -> str:
-    """Return links to rollouts of the robot; empty if it has no tool to do tasks with."""
-    if not (has_tool(robot) and robot.dof):
-        return ""
-    links = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
-    return f"<br>see it {' · '.join(links)}"
-
-
 def _add_move_tab(page: RobotPage) -> None:
+    """Add a slider for each joint, by part, and buttons for special configurations."""
     gui, session, robot = page.session.client.gui, page.session, page.robot
     buttons = gui.add_button_group("Go to", ("home", "zero", "random free"))
     session.on_change(buttons, lambda: _go_to(page, buttons.value))
@@ -158,6 +155,7 @@ def _add_move_tab(page: RobotPage) -> None:
 
 
 def _go_to(page: RobotPage, target: str) -> None:
+    """Move the robot to a configuration: ``home``, ``zero`` or ``random free``."""
     if target == "random free":
         if page.checker is None:
             page.checker = SelfCollisionChecker(page.robot)
@@ -279,5 +277,6 @@ def _send_screenshot(page: RobotPage) -> None:
 
 
 def _send(page: RobotPage, suffix: str, content: bytes) -> None:
+    """Send a file to the browser, named after the robot."""
     name = f"{page.robot.name or 'robot'}{suffix}"
     page.session.client.send_file_download(name, content, save_immediately=True)

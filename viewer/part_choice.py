@@ -112,7 +112,7 @@ def part_options(slot: str, library: Library) -> list[str]:
 
 
 def parameters_of(slot: str, manifest: Manifest) -> dict[str, Parameter]:
-    """The parameters of a part in a slot: its own, and the turn of its mount."""
+    """Return the parameters of a part in a slot: its own, and the rotation of its mount."""
     is_base = kind_of(slot) == "base"
     return dict(manifest.parameters if is_base else manifest.attached_parameters)
 
@@ -164,10 +164,10 @@ def with_value(choice: PartChoice, control: Control, value: float) -> PartChoice
 
 def first_parts(derivation: Derivation, n: int) -> Derivation:
     """Return a derivation of only the first ``n`` parts (at least 1), in order of attachment."""
-    kept = {id(node) for node in list(derivation.walk())[: max(n, 1)]}
+    kept_ids = {id(node) for node in list(derivation.walk())[: max(n, 1)]}
 
     def prune(node: Derivation) -> Derivation:
-        children = ((port, prune(child)) for port, child in node.children if id(child) in kept)
+        children = ((port, prune(child)) for port, child in node.children if id(child) in kept_ids)
         return replace(node, children=tuple(children))
 
     return prune(derivation)

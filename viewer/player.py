@@ -29,10 +29,10 @@ class Display(Protocol):
         """Show the episode after a number of control steps."""
 
     def show_stopped(self) -> None:
-        """The episode has ended or is paused."""
+        """Show that the episode has ended or is paused."""
 
     def show_failure(self, reason: str) -> None:
-        """A command has failed."""
+        """Show why a command has failed."""
 
 
 class Player:
@@ -114,6 +114,7 @@ class Player:
         return commands or [self._tick]
 
     def _call(self, work: Callable[[], object]) -> None:
+        """Run work; show a failure, and ignore errors after the browser has disconnected."""
         try:
             work()
         except MorphgenError as error:
@@ -179,11 +180,9 @@ class Player:
         now = time.monotonic()
         elapsed = (now - self._clock_start) * self._speed
         due = int(self._step_start + elapsed / source.episode.period)
-        more = True
-        while (
-            more and source.episode.num_steps < due and time.monotonic() - now < MAX_SIMULATION_TIME
-        ):
-            more = source.advance()
+        is_running, deadline = True, now + MAX_SIMULATION_TIME
+        while is_running and source.episode.num_steps < due and time.monotonic() < deadline:
+            is_running = source.advance()
         last = source.episode.num_steps
         step = min(due, last)
         if step != self.step:
@@ -191,6 +190,6 @@ class Player:
             self._display.show_step(step)
         if due > last:
             self._restart_clock()
-            if not more:
+            if not is_running:
                 self.is_playing = False
                 self._display.show_stopped()

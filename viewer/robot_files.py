@@ -28,9 +28,9 @@ from morphgen.viewer.robot_uri import FileAccess, content_hash, read_robot_uri
 SIZE = (240, 180)
 """Largest width and height of a thumbnail [pixels]."""
 _JPEG_QUALITY = 82
-"""Tuned by eye at the size of a card."""
+"""JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card."""
 _CACHE_FORMAT = 1
-"""Raised when a thumbnail or its facts change for the same robot."""
+"""Version of the cache; increase it when a thumbnail or its facts change for the same robot."""
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every file in a zip, so that the same robot gives the same bytes."""
 
@@ -44,7 +44,7 @@ class Thumbnail:
     facts: dict[str, object]
     """Values of ``Row`` fields."""
     error: str = ""
-    """Why the robot cannot be read; empty if it can."""
+    """Reason why the robot cannot be read; empty if it can."""
 
 
 def make_thumbnail(uri: str, files: FileAccess) -> Thumbnail:

@@ -106,9 +106,9 @@ def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
         return len(fact) if name == "findings" and fact is not None else fact
 
     rows = sorted(rows, key=lambda row: row.order)
-    known = [row for row in rows if value(row) is not None]
-    unknown = [row for row in rows if value(row) is None]
-    return [*sorted(known, key=value, reverse=key.startswith("-")), *unknown]
+    rows_with_fact = [row for row in rows if value(row) is not None]
+    rows_without = [row for row in rows if value(row) is None]
+    return [*sorted(rows_with_fact, key=value, reverse=key.startswith("-")), *rows_without]
 
 
 def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int, int]:
@@ -237,6 +237,7 @@ def neighbour_uris(uri: str, files: FileAccess) -> tuple[str, str]:
 
 
 def _set_rows(uri: str, folder: Path) -> Iterator[Row]:
+    """Yield the rows of a robot set from its index."""
     try:
         grammar = str(read_settings(folder)["grammar"])
     except FormatError:
@@ -267,11 +268,16 @@ def _read_index(folder: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], .
 
 
 def _bundle_row(uri: str, folder: Path, order: int) -> Row:
+    """Return the row of a bundle from its card; ``UNREADABLE`` if the card is broken."""
     if not (folder / CARD).is_file():
         return Row(folder.name, uri, "light", order=order)
     try:
         card = read_json(folder / CARD)
-        loud = [f for f in card["findings"] if f["severity"] in ("error", "warning")]
+        problems = {
+            finding["code"]
+            for finding in card["findings"]
+            if finding["severity"] in ("error", "warning")
+        }
         return Row(
             folder.name,
             uri,
@@ -280,7 +286,7 @@ def _bundle_row(uri: str, folder: Path, order: int) -> Row:
             links=card["links"],
             reach=card["reach"],
             mass=card["mass"],
-            findings=tuple(sorted({finding["code"] for finding in loud})),
+            findings=tuple(sorted(problems)),
             order=order,
         )
     except (FormatError, OSError, KeyError, TypeError):

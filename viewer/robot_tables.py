@@ -91,6 +91,9 @@ def link_table(robot: Robot) -> str:
     rows = []
     tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
     for i, link in enumerate(robot.links):
+        shapes = link.collisions or link.visuals
+        kinds = Counter(type(shape.geometry).__name__.lower() for shape in shapes)
+        counts = ", ".join(kind if n == 1 else f"{n} {kind}" for kind, n in kinds.items())
         joint = robot.joints[i - 1] if i else None
         if joint is not None:
             depth[i] = depth[robot.parents[i]] + 1
@@ -101,7 +104,7 @@ def link_table(robot: Robot) -> str:
                 f"{escape(link.name)}</span>{mark}",
                 "root" if joint is None else joint.kind + (" (mimic)" if joint.mimic else ""),
                 f"{link.inertial.mass:.3g}" if link.inertial else "–",  # noqa: RUF001
-                escape(_shape_counts(link.collisions or link.visuals)),
+                escape(counts),
             )
         )
     return markup.table(("link", "joint", "kg", "shapes"), rows, numbers=(2,))
@@ -148,11 +151,6 @@ def _inertial_rows(link: Link) -> list[tuple[str, str]]:
         ("centre of mass", _numbers(link.inertial.com) + " m"),
         ("principal moments", _numbers(moments.tolist()) + " kg m²"),
     ]
-
-
-def _shape_counts(shapes: Sequence[Shape]) -> str:
-    kinds = Counter(type(shape.geometry).__name__.lower() for shape in shapes)
-    return ", ".join(kind if n == 1 else f"{n} {kind}" for kind, n in kinds.items())
 
 
 def _shape_text(shape: Shape) -> str:

@@ -248,7 +248,7 @@ def with_library_meshes(robot: Robot, library: Library) -> Robot:
         composed = compose(parse_derivation(str(text)), library, robot.name)
     except (MorphgenError, RecursionError):
         return robot  # the library lacks its parts, so it has no fits of them either
-    texts = [urdf_text(split_colours(each), lambda mesh: "") for each in (composed, robot)]
+    texts = [urdf_text(split_colours(variant), lambda mesh: "") for variant in (composed, robot)]
     return composed if texts[0] == texts[1] else robot
 
 

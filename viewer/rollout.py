@@ -60,7 +60,7 @@ class RolloutConfig:
 
 
 class EpisodeSource(Protocol):
-    """Where an episode comes from: a simulation or a file."""
+    """Source of an episode: a simulation or a file."""
 
     episode: Episode
     max_steps: int
@@ -231,6 +231,7 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
 def _start_robot(
     config: RolloutConfig, uri: str, policy: str, interface: Interface, files: FileAccess
 ) -> _SimulatedRobot:
+    """Begin the episode of a robot in an environment of its own."""
     robot = read_robot_uri(uri, files)
     env = TaskEnv(
         config.task,

@@ -62,10 +62,11 @@ def add_episode(scene: viser.SceneApi, episode: Episode) -> RolloutScene:
         _add_track(scene, f"{NODE}/{i}", track, position, labelled=len(positions) > 1)
         for i, (track, position) in enumerate(zip(episode.tracks, positions, strict=True))
     ]
-    low = np.min([area[0] + at for area, at in zip(areas, positions, strict=True)], axis=0)
-    high = np.max([area[1] + at for area, at in zip(areas, positions, strict=True)], axis=0)
+    corners = np.array(areas) + np.array(positions)[:, None]
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
     # A grid at the lowest ground, about 1 m wider than the robots on each side.
-    ground = min((t.ground for t in episode.tracks if t.ground is not None), default=0.0)
+    heights = [track.ground for track in episode.tracks if track.ground is not None]
+    ground = min(heights, default=0.0)
     x, y, _ = ((low + high) / 2).tolist()
     scene.add_grid(
         f"{NODE}/ground",
@@ -110,8 +111,9 @@ def grid_positions(areas: Sequence[tuple[Array, Array]]) -> list[Position]:
     columns = math.ceil(math.sqrt(len(areas)))
     reach = np.max([np.maximum(np.abs(low), np.abs(high))[:2] for low, high in areas], axis=0)
     dx, dy = (2 * reach + GAP).tolist()
-    middle = (columns - 1) / 2
-    return [(-(i // columns) * dx, (middle - i % columns) * dy, 0.0) for i in range(len(areas))]
+    centre_column = (columns - 1) / 2
+    cells = (divmod(i, columns) for i in range(len(areas)))
+    return [(-row * dx, (centre_column - column) * dy, 0.0) for row, column in cells]
 
 
 def _add_track(

@@ -93,13 +93,16 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
     if suffix not in (".urdf", ".zip"):
         raise UploadError(f"{file}: expected a .urdf, or a .zip of a folder with one")
     unpacked = _unzip(file, content) if suffix == ".zip" else {file: content}
-    kept = {path: data for path, data in unpacked.items() if _is_kept(path, data)}
-    main = _main_urdf(file, unpacked, kept)
-    for path, data in kept.items():
+    stored = {path: data for path, data in unpacked.items() if _is_kept(path, data)}
+    main_urdf = _main_urdf(file, unpacked, stored)
+    for path, data in stored.items():
         _require_inner_paths(path, data)
-    folder = _write_upload(kept, files.uploads)
-    is_bundle = PurePosixPath(main).name == URDF and str(PurePosixPath(main).parent / CARD) in kept
-    target = str(PurePosixPath(main).parent) if is_bundle else main
+    folder = _write_upload(stored, files.uploads)
+    is_bundle = (
+        PurePosixPath(main_urdf).name == URDF
+        and str(PurePosixPath(main_urdf).parent / CARD) in stored
+    )
+    target = str(PurePosixPath(main_urdf).parent) if is_bundle else main_urdf
     return f"{UPLOAD}{folder}/{target}".removesuffix("/.")
 
 
@@ -156,13 +159,13 @@ def _require_distinct(name: str, paths: list[str]) -> None:
 
     Case is ignored, because some file systems ignore it.
     """
-    seen: set[str] = set()
+    known_paths: set[str] = set()
     for path in paths:
-        if path.casefold() in seen:
+        if path.casefold() in known_paths:
             raise UploadError(f"{name}: {shorten(path)!r} is there twice; nothing was kept")
-        seen.add(path.casefold())
+        known_paths.add(path.casefold())
     for path in paths:
-        if not seen.isdisjoint(map(str, PurePosixPath(path.casefold()).parents)):
+        if not known_paths.isdisjoint(map(str, PurePosixPath(path.casefold()).parents)):
             raise UploadError(
                 f"{name}: {shorten(path)!r} is in a folder that is a file; nothing was kept"
             )
@@ -199,9 +202,9 @@ def _is_mjcf(data: bytes) -> bool:
         return False
 
 
-def _main_urdf(name: str, unpacked: dict[str, bytes], kept: dict[str, bytes]) -> str:
+def _main_urdf(name: str, unpacked: dict[str, bytes], stored: dict[str, bytes]) -> str:
     """Return the URDF with the shortest path, which in a bundle is the bundle's own."""
-    urdfs = [path for path in kept if path.endswith(".urdf")]
+    urdfs = [path for path in stored if path.endswith(".urdf")]
     if urdfs:
         return min(urdfs, key=lambda path: (path.count("/"), path))
     hint = ""
@@ -261,8 +264,8 @@ def _require_inner_uri(path: str, uri: str) -> None:
         raise UploadError(
             f"{path}: {shorten(uri)!r}: only relative paths and package:// are accepted"
         )
-    below = name if name != uri else str(PurePosixPath(path).parent / name)
-    if name.startswith(("/", "\\")) or not _stays_inside(below):
+    joined = name if name != uri else str(PurePosixPath(path).parent / name)
+    if name.startswith(("/", "\\")) or not _stays_inside(joined):
         raise UploadError(f"{path}: {shorten(uri)!r} leads out of its folder; nothing was kept")
 
 

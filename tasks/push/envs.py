@@ -24,7 +24,7 @@ class PushEnvs(TaskEnvs):
     ) -> None:
         """Set up with the line at its final position; arguments as of ``Task.make_envs``."""
         self._config: PushConfig = specs[0].config  # type: ignore[assignment]  # its own type
-        sets: list[PushStartSet] = [each.goals for each in specs]  # type: ignore[misc]
+        sets: list[PushStartSet] = [spec.goals for spec in specs]  # type: ignore[misc]
         device = env_spec_index.device
         self._env_spec_index = env_spec_index
         self._count = [len(pushes.q) for pushes in sets]
@@ -36,7 +36,11 @@ class PushEnvs(TaskEnvs):
         self._size = torch.tensor([pushes.block.size for pushes in sets], device=device)[
             env_spec_index
         ]
-        self._middle = [(np.ptp(s.blocks[:, 0]) / 2 + s.blocks[:, 0].min(), s.ground) for s in sets]
+        # Centre of the line along x, and height of the ground, of each set [m].
+        self._line_centres = [
+            (np.ptp(pushes.blocks[:, 0]) / 2 + pushes.blocks[:, 0].min(), pushes.ground)
+            for pushes in sets
+        ]
         self.line = self._final_line.clone()
         """Current y that the block must cross, shape (k,) [m]."""
 
@@ -72,7 +76,7 @@ class PushEnvs(TaskEnvs):
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the line."""
-        x, ground = self._middle[int(self._env_spec_index[row])]
+        x, ground = self._line_centres[int(self._env_spec_index[row])]
         pose = (x, float(self.line[row]), ground, 1.0, 0.0, 0.0, 0.0)
         return {"line": np.array(pose, dtype=np.float32)}
 

@@ -72,7 +72,7 @@ class FeasibilityTest:
         edge = region.edge
         low = np.array([region.x[0] - edge, region.y[0] - 2 * edge, self._ground])
         high = np.array([region.x[1] + edge, region.line + edge, self._ground + 1.5 * edge])
-        self._bank, self._tools = sample_tools_in_box(space, low, high, rng)
+        self._bank_q, self._bank_tools = sample_tools_in_box(space, low, high, rng)
 
     def __call__(self, blocks: Array) -> Feasibility:
         """Find certificates for blocks.
@@ -83,11 +83,13 @@ class FeasibilityTest:
         n, edge = len(blocks), self._region.edge
         clear = path_is_clear(self._space, self._region, blocks)
         behind, across = (np.full((n, self._robot.dof), np.nan) for _ in range(2))
-        if len(self._bank):
+        if len(self._bank_q):
             at_line = blocks[:, :2].copy()
             at_line[:, 1] = self._region.line
             self._fill(across, clear, at_line, None)
-            rear_y = blocks[:, 1] - edge / 2 * _extents(blocks)
+            # A block that is turned by its yaw extends |cos| + |sin| edges along y.
+            yaw = _yaws(blocks)
+            rear_y = blocks[:, 1] - edge / 2 * (np.abs(np.cos(yaw)) + np.abs(np.sin(yaw)))
             for distance in BEHIND:
                 goals = np.stack([blocks[:, 0], rear_y - distance * edge], axis=1)
                 missing = np.isfinite(across[:, 0]) & ~np.isfinite(behind[:, 0])
@@ -101,24 +103,24 @@ class FeasibilityTest:
         rows = np.flatnonzero(mask)
         if not len(rows):
             return
-        near, edge = min(NEAREST, len(self._bank)), self._region.edge
-        distance = np.linalg.norm(tool_xy[rows, None] - self._tools[None, :, :2], axis=2)
-        start = np.argsort(distance, axis=1, kind="stable")[:, :near].ravel()
-        height = np.clip(self._tools[start, 2] - self._ground, _LOW * edge, _HIGH * edge)
+        num_near, edge = min(NEAREST, len(self._bank_q)), self._region.edge
+        distance = np.linalg.norm(tool_xy[rows, None] - self._bank_tools[None, :, :2], axis=2)
+        start = np.argsort(distance, axis=1, kind="stable")[:, :num_near].ravel()
+        height = np.clip(self._bank_tools[start, 2] - self._ground, _LOW * edge, _HIGH * edge)
         goals = np.concatenate(
-            [np.repeat(tool_xy[rows], near, axis=0), self._ground + height[:, None]], axis=1
+            [np.repeat(tool_xy[rows], num_near, axis=0), self._ground + height[:, None]], axis=1
         )
-        q, error = solve_position_ik(self._robot, self._bank[start], goals)
+        q, error = solve_position_ik(self._robot, self._bank_q[start], goals)
         tool_z = height - error[:, 2]
         is_close = (np.abs(error[:, :2]) < CLOSE).all(axis=1)
         reached = is_close & (tool_z > 0) & (tool_z < edge)
         is_free = np.zeros(len(q), dtype=np.bool_)
-        poses = None if blocks is None else np.repeat(blocks[rows], near, axis=0)[reached]
+        poses = None if blocks is None else np.repeat(blocks[rows], num_near, axis=0)[reached]
         is_free[reached] = self._space.free(q[reached], poses)
-        free = is_free.reshape(len(rows), near)
+        free = is_free.reshape(len(rows), num_near)
         first = free.argmax(axis=1)
-        good = free.any(axis=1)
-        q_out[rows[good]] = q.reshape(len(rows), near, -1)[good, first[good]]
+        has_free = free.any(axis=1)
+        q_out[rows[has_free]] = q.reshape(len(rows), num_near, -1)[has_free, first[has_free]]
 
 
 def path_is_clear(space: FreeSpace, region: Region, blocks: Array) -> NDArray[np.bool_]:
@@ -217,9 +219,3 @@ def sample_tools_in_box(
 def _yaws(blocks: Array) -> Array:
     """Return rotations of blocks (n, 7) about z, shape (n,) [rad]."""
     return np.asarray(2 * np.arctan2(blocks[:, 6], blocks[:, 3]))
-
-
-def _extents(blocks: Array) -> Array:
-    """Return extents of blocks (n, 7) along y, in block edges: from 1 to the square root of 2."""
-    yaw = _yaws(blocks)
-    return np.asarray(np.abs(np.cos(yaw)) + np.abs(np.sin(yaw)))

@@ -73,26 +73,26 @@ def push_region(
         TaskError: If the tool cannot get down to the block, or cannot move along y.
         BenchmarkError: If the robot has no tool that moves.
     """
-    space = workspace(robot)  # refuses a robot whose tool does not move
-    tools = _tools(robot)
+    arm_workspace = workspace(robot)  # refuses a robot whose tool does not move
+    tool_positions = _tool_positions(robot)
     size = float(rng.uniform(*config.block_size))
-    slides = _directions(robot)
+    slides = _num_slide_directions(robot)
     if slides:
-        reach = float(np.ptp(tools[1])) / 2 / (1.0 if slides == 2 else math.sqrt(2))
+        reach = float(np.ptp(tool_positions[1])) / 2 / (1.0 if slides == 2 else math.sqrt(2))
     else:
-        reach = effective_reach(space.reach, space.shoulder[2] - ground, size)
+        reach = effective_reach(arm_workspace.reach, arm_workspace.shoulder[2] - ground, size)
     if not reach > 0:
-        why = "does not move along y" if slides else "does not get down to the ground"
-        raise TaskError(f"robot {robot.name!r} cannot push: its tool {why}")
+        fault = "does not move along y" if slides else "does not get down to the ground"
+        raise TaskError(f"robot {robot.name!r} cannot push: its tool {fault}")
     scale = min(1.0, reach / FULL_REACH)
     edge = size * (scale if slides else reach)
     if slides == 2:
         x = (config.free_x[0] * scale, config.free_x[1] * scale)
-    elif not slides and np.ptp(tools[2]) > _LEVEL:
-        x0 = space.shoulder[0]
+    elif not slides and np.ptp(tool_positions[2]) > _LEVEL:
+        x0 = arm_workspace.shoulder[0]
         x = (x0 + config.arm_x[0] * reach, x0 + config.arm_x[1] * reach)
     else:
-        x = _sweep(robot, ground, edge)
+        x = _tool_x_range(robot, ground, edge)
     y = ((config.start - config.start_depth) * scale, config.start * scale)
     return Region(edge, scale, x, y, config.line * scale)
 
@@ -144,7 +144,7 @@ def effective_reach(reach: float, height: float, size: float) -> float:
     return max((b + math.sqrt(root)) / a, 0.0) if root >= 0 else 0.0
 
 
-def _tools(robot: Robot, *, sliding: bool = True) -> Array:
+def _tool_positions(robot: Robot, *, sliding: bool = True) -> Array:
     """Return positions of the tool at random configurations, in the root frame, shape (3, n)."""
     q = random_configurations(robot, _SAMPLES, np.random.default_rng(_SEED))
     if not sliding:
@@ -153,7 +153,7 @@ def _tools(robot: Robot, *, sliding: bool = True) -> Array:
     return frame_positions(robot, np.ascontiguousarray(q.T))
 
 
-def _directions(robot: Robot) -> int:
+def _num_slide_directions(robot: Robot) -> int:
     """Return the number of horizontal directions along which the tool slides, at home."""
     _, directions = joint_axes(robot, forward_kinematics(robot, np.array(robot.home)))
     axes = [
@@ -164,13 +164,13 @@ def _directions(robot: Robot) -> int:
     return int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) if axes else 0
 
 
-def _sweep(robot: Robot, ground: float, edge: float) -> tuple[float, float]:
+def _tool_x_range(robot: Robot, ground: float, edge: float) -> tuple[float, float]:
     """Return the range of x of the tool at the height of the block, its slides at home."""
-    tools = _tools(robot, sliding=False)
-    low = tools[0, (tools[2] > ground) & (tools[2] < ground + edge)]
-    if not len(low):
+    tool_positions = _tool_positions(robot, sliding=False)
+    x_low = tool_positions[0, (tool_positions[2] > ground) & (tool_positions[2] < ground + edge)]
+    if not len(x_low):
         raise TaskError(
             f"robot {robot.name!r} cannot push: its tool is never as low as a block of "
-            f"{edge:.3g} m, its height is {tools[2].min() - ground:.3g} m at least"
+            f"{edge:.3g} m, its height is {tool_positions[2].min() - ground:.3g} m at least"
         )
-    return float(low.min()), float(low.max())
+    return float(x_low.min()), float(x_low.max())

@@ -102,18 +102,19 @@ def sample_starts(
         boxes = clear_obstacles(robot, config, region, block, ground, obstacle_seeds)
     space = FreeSpace(Scene(robot, block=block, obstacles=boxes, ground=ground))
     test = FeasibilityTest(space, region, np.random.default_rng(test_seeds))
-    kept, tried = _feasible(robot, config.num_goals, region, test, ground, block_seeds)
-    blocks, behind, across = (np.array(column) for column in zip(*kept, strict=True))
+    starts, tried = _feasible(robot, config.num_goals, region, test, ground, block_seeds)
+    blocks, behind, across = (np.array(column) for column in zip(*starts, strict=True))
+    x, y, z, qw, qx, qy, qz = blocks[0].tolist()
     return PushStartSet(
         q=_starts(space, blocks, start_seeds),
         blocks=blocks,
-        block=replace(block, pose=_pose(blocks[0])),
+        block=replace(block, pose=Pose((x, y, z), (qw, qx, qy, qz))),
         line=region.line,
         scale=region.scale,
         ground=ground,
         obstacles=boxes,
         tried=tried,
-        accepted=len(kept),
+        accepted=len(starts),
         behind=behind,
         across=across,
         **identity,
@@ -130,8 +131,8 @@ def _feasible(
 ) -> tuple[list[tuple[Array, Array, Array]], int]:
     """Return feasible poses with their certificates, and the number of tested poses."""
     rng = np.random.default_rng(seeds)
-    kept: list[tuple[Array, Array, Array]] = []
-    refused: Counter[str] = Counter()
+    starts: list[tuple[Array, Array, Array]] = []
+    refusals: Counter[str] = Counter()
     tried = 0
     while tried < TRIES * needed:
         blocks = draw_blocks(region, ground, _CHUNK, rng)
@@ -141,21 +142,23 @@ def _feasible(
         ):
             tried += 1
             if not is_clear:
-                refused["something stands in the block's way"] += 1
+                refusals["something stands in the block's way"] += 1
             elif not np.isfinite(across).all():
-                refused["the tool does not get to the line at its height"] += 1
+                refusals["the tool does not get to the line at its height"] += 1
             elif not np.isfinite(behind).all():
-                refused["the tool does not get behind it"] += 1
+                refusals["the tool does not get behind it"] += 1
             else:
-                kept.append((block, behind, across))
-            if len(kept) == needed:
-                return kept, tried
-    reasons = ", ".join(f"{why} ({times / tried:.0%})" for why, times in refused.most_common())
+                starts.append((block, behind, across))
+            if len(starts) == needed:
+                return starts, tried
+    reasons = ", ".join(
+        f"{reason} ({count / tried:.0%})" for reason, count in refusals.most_common()
+    )
     raise TaskError(
-        f"robot {robot.name!r} can hardly push: only {len(kept)} of {tried:,} poses of a block of "
-        f"{region.edge:.3g} m with x in ({region.x[0]:.3g}, {region.x[1]:.3g}) and y in "
+        f"robot {robot.name!r} can hardly push: only {len(starts)} of {tried:,} poses of a block "
+        f"of {region.edge:.3g} m with x in ({region.x[0]:.3g}, {region.x[1]:.3g}) and y in "
         f"({region.y[0]:.3g}, {region.y[1]:.3g}) are feasible (acceptance rate "
-        f"{len(kept) / tried:.2g}), {needed} are needed; {reasons}"
+        f"{len(starts) / tried:.2g}), {needed} are needed; {reasons}"
     )
 
 
@@ -175,11 +178,6 @@ def _starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> A
                 f"penetrate the block at ({block[0]:.3g}, {block[1]:.3g}, {block[2]:.3g})"
             )
     return np.array(starts)
-
-
-def _pose(row: Array) -> Pose:
-    x, y, z, *quaternion = row.tolist()
-    return Pose((x, y, z), tuple(quaternion))
 
 
 def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str]:
@@ -219,7 +217,7 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
     if scene.obstacles != pushes.obstacles:
         faults.append("the obstacles of the scene are not those of the push set")
     for name, q in configurations.items():
-        faults += [f"start {i}: {name}: {why}" for i, why in outside_limits(robot, q)]
+        faults += [f"start {i}: {name}: {reason}" for i, reason in outside_limits(robot, q)]
     space = FreeSpace(replace(scene, robot=robot, block=pushes.block))
     faults += _misplaced_blocks(pushes, space)
     for name, q in configurations.items():
@@ -229,6 +227,7 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
 
 
 def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
+    """Yield a fault for each start whose block is not where a push may begin."""
     edge = pushes.block.size[2]
     above = pushes.blocks[:, 2] - edge / 2 - pushes.ground
     for i in np.flatnonzero(np.abs(above) > RESTS).tolist():
@@ -240,6 +239,7 @@ def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
 
 
 def _misplaced_tools(pushes: PushStartSet, robot: Robot) -> Iterator[str]:
+    """Yield a fault for each certificate whose tool is not behind its block or at the line."""
     tool = MujocoKinematics(robot)
     behind, across = (tool.frame_pose(q)[:, :3, 3] for q in (pushes.behind, pushes.across))
     for i, (back, front, block) in enumerate(zip(behind, across, pushes.blocks, strict=True)):

@@ -27,7 +27,7 @@ class ReachEnvs(TaskEnvs):
         """
         self._config: ReachConfig = specs[0].config  # type: ignore[assignment]  # its own type
         self._env_spec_index = env_spec_index
-        sets = [each.goals for each in specs]
+        sets = [spec.goals for spec in specs]
         for goals in sets:
             if len(goals.q) < 2:
                 raise TaskError(f"robot {goals.robot!r}: {len(goals.q)} goals; expected 2 or more")

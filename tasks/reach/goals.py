@@ -79,7 +79,7 @@ def sample_goals(
     q, tried = space.sample(
         config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
     )
-    poses = _vectors(frame_pose(robot, q, TOOL))
+    poses = _pose_rows(frame_pose(robot, q, TOOL))
     return ReachGoalSet(
         q=q, poses=poses, obstacles=blocks, tried=tried, accepted=len(q), **identity
     )
@@ -120,9 +120,12 @@ def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
         for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
             a, b = planes[k].pairs[0]
             faults.append(f"goal {i}: {a!r} and {b!r} touch on every path to most others")
-    tools = _vectors(MujocoKinematics(robot).frame_pose(goals.q[usable]))
+    tools = _pose_rows(MujocoKinematics(robot).frame_pose(goals.q[usable]))
     for i, tool in zip(usable.tolist(), tools, strict=True):
-        distance, rotation = _deviation(goals.poses[i], tool)
+        pose = goals.poses[i]
+        distance = float(np.linalg.norm(pose[:3] - tool[:3]))
+        # A quaternion and its negative are the same rotation.
+        rotation = min(float(np.linalg.norm(pose[3:] - sign * tool[3:])) for sign in (1, -1))
         if not (distance <= EXACT and rotation <= EXACT):
             faults.append(
                 f"goal {i}: the tool of its configuration is {distance:.2g} m away, and its "
@@ -131,13 +134,7 @@ def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
     return faults
 
 
-def _deviation(a: Array, b: Array) -> tuple[float, float]:
-    """Return the distance of two poses (7,), metres, and of their quaternions up to sign."""
-    turned = min(float(np.linalg.norm(a[3:] - sign * b[3:])) for sign in (1, -1))
-    return float(np.linalg.norm(a[:3] - b[:3])), turned
-
-
-def _vectors(T: Array) -> Array:
+def _pose_rows(T: Array) -> Array:
     """Return poses (n, 4, 4) as (x, y, z, qw, qx, qy, qz), shape (n, 7)."""
-    poses = [Pose.from_matrix(each) for each in T]
+    poses = [Pose.from_matrix(matrix) for matrix in T]
     return np.array([[*pose.position, *pose.quaternion] for pose in poses]).reshape(len(T), 7)

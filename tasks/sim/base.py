@@ -91,7 +91,7 @@ class Simulation(Protocol):
         """Linear and angular velocities of the blocks in the world, (n, 6); zeros without one."""
 
     def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
-        """Put some environments at rest; their past has no influence any more.
+        """Put some environments at rest; clear everything that earlier steps left behind.
 
         Args:
             envs: Indices of environments, shape (k,), int64.

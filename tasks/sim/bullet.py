@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from morphgen.errors import DivergedError, SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.tasks.sim.base import Contacts, Scene, Simulator
-from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32
+from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32, Share
 from morphgen.tasks.sim.bullet_workers import (
     STEP,
-    Share,
     SharedBuffers,
     Worker,
     end,
     gather,
-    load,
     send,
     start,
 )
@@ -79,8 +77,8 @@ class BulletSimulation:
         self._has_block = np.array([scene.block is not None for scene in scenes], bool)
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
         self._workers: list[Worker] = []
-        self._own: list[BulletBatch] = []
-        self._free = weakref.finalize(self, _free, self._workers, self._own, folder)
+        self._local_batches: list[BulletBatch] = []
+        self._free = weakref.finalize(self, _free, self._workers, self._local_batches, folder)
         try:
             exported = export_robots(scenes, Path(folder.name))
             first, *others = (
@@ -94,7 +92,7 @@ class BulletSimulation:
             )
             for number, share in enumerate(others, start=1):
                 self._workers.append(start(number, share, shared))
-            self._own.append(load(first, buffers))
+            self._local_batches.append(BulletBatch(first, buffers))
             self._envs = np.array(first.envs)
             failures = gather(self._workers)
             if failures:
@@ -104,7 +102,7 @@ class BulletSimulation:
             raise
 
     def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
-        """Put some environments at rest, without a past; see ``Simulation.reset``.
+        """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
             ValueError: If a shape is wrong, or a position is not finite.
@@ -114,13 +112,13 @@ class BulletSimulation:
         indices, positions, poses = self._checked_state(envs, q, block_pose)
         messages = []
         for worker in self._workers:
-            mine = np.isin(indices, worker.envs)
-            if mine.any():
-                message = pickle.dumps((indices[mine], positions[mine], poses[mine]))
+            rows = np.isin(indices, worker.envs)
+            if rows.any():
+                message = pickle.dumps((indices[rows], positions[rows], poses[rows]))
                 messages.append((worker, message))
-        mine = np.isin(indices, self._envs)
-        own = indices[mine], positions[mine], poses[mine]
-        self._run(messages, lambda batch: batch.reset(*own))
+        rows = np.isin(indices, self._envs)
+        local_state = indices[rows], positions[rows], poses[rows]
+        self._run(messages, lambda batch: batch.reset(*local_state))
 
     def step(self, targets: torch.Tensor) -> None:
         """Advance all environments by one control step; see ``Simulation.step``.
@@ -144,7 +142,7 @@ class BulletSimulation:
             raise SimulationError("the simulation is closed")
 
     def _run(
-        self, messages: Sequence[tuple[Worker, bytes]], own: Callable[[BulletBatch], None]
+        self, messages: Sequence[tuple[Worker, bytes]], work_here: Callable[[BulletBatch], None]
     ) -> None:
         """Send messages to workers, do this process's share, and wait for all answers.
 
@@ -155,7 +153,7 @@ class BulletSimulation:
             for worker, message in messages:
                 send(worker, message)
             try:
-                own(self._own[0])
+                work_here(self._local_batches[0])
             except (SimulationError, ValueError) as error:
                 failures.append(error)
             failures += gather([worker for worker, _ in messages])
@@ -178,7 +176,7 @@ class BulletSimulation:
         invalid = self._is_joint & ~np.isfinite(array)
         if invalid.any():
             env = int(invalid.any(axis=1).argmax())
-            raise ValueError(f"{self._name(env)}: targets {array[env].tolist()}")
+            raise ValueError(f"{self._label(env)}: targets {array[env].tolist()}")
         return array
 
     def _checked_state(
@@ -199,12 +197,12 @@ class BulletSimulation:
         if invalid.any():
             k = int(invalid.argmax())
             raise ValueError(
-                f"{self._name(int(indices[k]))}: reset to q {positions[k].tolist()}, "
+                f"{self._label(int(indices[k]))}: reset to q {positions[k].tolist()}, "
                 f"block {poses[k].tolist()}"
             )
         return indices, positions, poses
 
-    def _name(self, env: int) -> str:
+    def _label(self, env: int) -> str:
         return f"environment {env} ({self.scenes[env].robot.name!r})"
 
 
@@ -242,10 +240,12 @@ def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
 
 
 def _free(
-    workers: list[Worker], own: list[BulletBatch], folder: tempfile.TemporaryDirectory[str]
+    workers: list[Worker],
+    local_batches: list[BulletBatch],
+    folder: tempfile.TemporaryDirectory[str],
 ) -> None:
     end(workers)
-    for batch in own:
+    for batch in local_batches:
         batch.close()
     folder.cleanup()
 

@@ -42,6 +42,19 @@ class StateBuffers:
     """Linear and angular velocities of the blocks, shape (n, 6) [m/s, rad/s]."""
 
 
+@dataclass(frozen=True)
+class Share:
+    """Environments that one process simulates."""
+
+    scenes: Sequence[Scene]
+    contacts: Contacts
+    """Pairs of things that collide."""
+    exported: Sequence[ExportedRobot]
+    """Robot of each scene, as ``export_robots`` wrote it."""
+    envs: Sequence[int]
+    """Index of each scene's environment, which is its row in all buffers."""
+
+
 _FINAL_RESPONSE = 1 - (1 - VELOCITY_GAIN) ** SUBSTEPS
 """Fraction of a velocity change that motors have made at the end of a control step."""
 _MEAN_RESPONSE = 1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1)) / SUBSTEPS
@@ -51,29 +64,20 @@ _MEAN_RESPONSE = 1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1
 class BulletBatch:
     """Scenes that step one after the other and write their states into buffers."""
 
-    def __init__(
-        self,
-        scenes: Sequence[Scene],
-        contacts: Contacts,
-        exported: Sequence[ExportedRobot],
-        buffers: StateBuffers,
-        envs: Sequence[int],
-    ) -> None:
+    def __init__(self, share: Share, buffers: StateBuffers) -> None:
         """Load every scene, its robot at zero.
 
         Args:
-            scenes: Scenes of some environments.
-            contacts: Pairs of things that collide.
-            exported: The robot of each scene, as ``export_robots`` wrote it.
+            share: Environments to load.
             buffers: Buffers with rows for all environments; padding is not written.
-            envs: Environment, and thus row, of each of ``scenes``.
 
         Raises:
             SimulationError: If PyBullet cannot hold a scene.
         """
-        self._scenes, self._contacts, self._exported = scenes, contacts, exported
-        self._buffers, self._envs = buffers, list(envs)
-        self._index = {env: i for i, env in enumerate(envs)}
+        scenes = share.scenes
+        self._share, self._scenes = share, scenes
+        self._buffers, self._envs = buffers, list(share.envs)
+        self._index = {env: i for i, env in enumerate(self._envs)}
         self._steps = np.zeros(len(scenes), np.int64)
         self._diverged: dict[int, str] = {}
         self._loaded: list[BulletScene] = []
@@ -84,15 +88,15 @@ class BulletBatch:
             raise
         self._blocks = [i for i, scene in enumerate(scenes) if scene.block is not None]
         self._block_rows = [self._envs[i] for i in self._blocks]
-        self._plan()
+        self._index_joints()
         efforts = [effort for loaded in self._loaded for effort in loaded.efforts]
         self._forces = MotorForces([scene.robot for scene in scenes], efforts)
 
     def _load(self, i: int) -> BulletScene:
-        urdf, merged = self._exported[i]
-        return BulletScene(self._scenes[i], urdf, merged, self._contacts)
+        urdf, merged = self._share.exported[i]
+        return BulletScene(self._scenes[i], urdf, merged, self._share.contacts)
 
-    def _plan(self) -> None:
+    def _index_joints(self) -> None:
         """Index targets and states in flat arrays of all environments' joints.
 
         Every movable joint follows one independent joint, its leader, so its target is a product
@@ -127,7 +131,7 @@ class BulletBatch:
         self._measured = np.zeros(len(offset))
 
     def reset(self, envs: NDArray[np.int64], q: Float32, block_pose: Float32) -> None:
-        """Put some environments at rest, without a past; as ``Simulation.reset``.
+        """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
             SimulationError: If an environment that had diverged cannot be loaded again.
@@ -152,7 +156,7 @@ class BulletBatch:
             self._steps[i] = 0
 
     def step(self, targets: Float32) -> None:
-        """Advance the environments by one control step; as ``Simulation.step``.
+        """Advance the environments by one control step; see ``Simulation.step``.
 
         Args:
             targets: Targets of all environments, shape (n, J), contiguous and finite.
@@ -213,26 +217,24 @@ class BulletBatch:
         return q, v
 
     def _find_diverged(self) -> None:
+        """Record the environments that diverged, with their state as the reason."""
         buffers = self._buffers
         for i, env in enumerate(self._envs):
             q, qd, pose = buffers.q[env], buffers.qd[env], buffers.block_pose[env]
-            velocity = buffers.block_velocity[env]
+            velocity, name = buffers.block_velocity[env], self._scenes[i].robot.name
             joints = _is_sane(q, MAX_POSITION) and _is_sane(qd, MAX_VELOCITY)
             if not (joints and _is_sane(pose, MAX_VELOCITY) and _is_sane(velocity, MAX_VELOCITY)):
                 self._diverged[env] = (
-                    f"{self._name(i)} diverged in step {self._steps[i]} after its reset: "
-                    f"q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
+                    f"environment {env} ({name!r}) diverged in step {self._steps[i]} after its "
+                    f"reset: q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
                 )
 
     def _require_no_divergence(self) -> None:
         if self._diverged:
             raise DivergedError(self._diverged)
 
-    def _name(self, i: int) -> str:
-        return f"environment {self._envs[i]} ({self._scenes[i].robot.name!r})"
-
     def close(self) -> None:
-        """Free every scene; a second time does nothing."""
+        """Free every scene; a second call does nothing."""
         for loaded in self._loaded:
             loaded.close()
 

@@ -1,4 +1,4 @@
-"""One scene in a PyBullet client of its own."""
+"""A scene that PyBullet simulates in a client of its own."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class BulletScene:
     """
 
     def __init__(self, scene: Scene, urdf: Path, merged: Robot, contacts: Contacts) -> None:
-        """Load.
+        """Load the robot and its surroundings.
 
         Args:
             scene: The scene.
@@ -119,6 +119,7 @@ class BulletScene:
         self._load_surroundings()
 
     def _load_robot(self, urdf: Path, merged: Robot) -> None:
+        """Load the robot, and set its contacts, friction, damping and speed limit."""
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER
         if self._contacts.self_collision:
             flags |= pybullet.URDF_USE_SELF_COLLISION
@@ -148,7 +149,7 @@ class BulletScene:
             pybullet.changeDynamics(
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
             )
-        held = {link.name for link in rigid_groups(merged)[0].links}
+        root_links = {link.name for link in rigid_groups(merged)[0].links}
         level = ground_contact_links(merged, self._scene.T_world_root)
         self._level = [link for name, link in links.items() if name in level]
         for name, link in links.items():
@@ -161,7 +162,7 @@ class BulletScene:
                 jointDamping=0,
                 **self._client,
             )
-            self._assign(self.robot, link, _ROOT if name in held else _LINKS)
+            self._assign(self.robot, link, _ROOT if name in root_links else _LINKS)
         if self._contacts.self_collision:
             for a, b in merged.ignore_pairs:
                 pybullet.setCollisionFilterPair(
@@ -173,6 +174,7 @@ class BulletScene:
         }
 
     def _load_surroundings(self) -> None:
+        """Load ground, obstacles and block."""
         if self._scene.ground is not None:
             plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **self._client)
             at = (0.0, 0.0, self._scene.ground)
@@ -191,6 +193,7 @@ class BulletScene:
                 self._weight = (0.0, 0.0, -GRAVITY * block.mass)
 
     def _box(self, block: Block) -> int:
+        """Add a box; return PyBullet's body."""
         half = [edge / 2 for edge in block.size]
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._client)
         position, quaternion = _pose(block.pose)
@@ -204,6 +207,7 @@ class BulletScene:
         return body
 
     def _add(self, body: int, friction: float, group: int) -> int:
+        """Set a body's friction and collision group; return the body."""
         pybullet.changeDynamics(
             body, -1, lateralFriction=friction, linearDamping=0, angularDamping=0, **self._client
         )
@@ -211,6 +215,7 @@ class BulletScene:
         return body
 
     def _assign(self, body: int, link: int, group: int) -> None:
+        """Record a link's collision group and the groups it collides with, for ``reset``."""
         robot = _LINKS | _ROOT
         surroundings = _STATIC | _BLOCK if self._contacts.scene else 0
         mask = {
@@ -222,7 +227,7 @@ class BulletScene:
         self._groups.append((body, link, group, mask))
 
     def reset(self, positions: Sequence[float], block_pose: Sequence[float]) -> None:
-        """Put everything at rest, without a past.
+        """Put robot and block at rest, and clear the contact history.
 
         Args:
             positions: Positions of all movable joints [rad or m].
@@ -286,6 +291,7 @@ class BulletScene:
 
 
 def _pose(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    """Return position and quaternion in PyBullet's order, (x, y, z, w)."""
     w, x, y, z = pose.quaternion
     return pose.position, (x, y, z, w)
 

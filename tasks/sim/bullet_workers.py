@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
 from morphgen.processes import sigint_blocked
-from morphgen.tasks.sim.base import Contacts, Scene
-from morphgen.tasks.sim.bullet_batch import BulletBatch, ExportedRobot, Float32, StateBuffers
+from morphgen.tasks.sim.bullet_batch import BulletBatch, Float32, Share, StateBuffers
 
 if TYPE_CHECKING:
     from ctypes import Array, c_float
@@ -30,17 +29,6 @@ _DONE = b"done"
 _EXIT_CODE_WAIT = 0.5
 """Time for a worker whose pipe has ended to exit [s]."""
 _CONTEXT = multiprocessing.get_context("spawn")
-
-
-@dataclass(frozen=True)
-class Share:
-    """The environments of one process."""
-
-    scenes: Sequence[Scene]
-    contacts: Contacts
-    exported: Sequence[ExportedRobot]
-    envs: Sequence[int]
-    """Indices of the environments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +65,6 @@ class SharedBuffers:
         return StateBuffers(q, qd, pose, velocity), targets
 
 
-def load(share: Share, buffers: StateBuffers) -> BulletBatch:
-    """Load a share's scenes into this process; errors as of ``BulletBatch``."""
-    return BulletBatch(share.scenes, share.contacts, share.exported, buffers, share.envs)
-
-
 def start(number: int, share: Share, shared: SharedBuffers) -> Worker:
     """Start a worker, which loads its share and then answers.
 
@@ -93,13 +76,15 @@ def start(number: int, share: Share, shared: SharedBuffers) -> Worker:
     Raises:
         SimulationError: If the worker died already.
     """
-    ours, theirs = _CONTEXT.Pipe()
-    process = _CONTEXT.Process(target=_serve, args=(theirs, shared), name=str(number), daemon=True)
-    worker = Worker(process, ours, np.array(share.envs))
+    parent_end, worker_end = _CONTEXT.Pipe()
+    process = _CONTEXT.Process(
+        target=_serve, args=(worker_end, shared), name=str(number), daemon=True
+    )
+    worker = Worker(process, parent_end, np.array(share.envs))
     try:
         with sigint_blocked():
             process.start()
-        theirs.close()
+        worker_end.close()
         send(worker, pickle.dumps(share))
     except BaseException:
         end([worker])
@@ -149,6 +134,7 @@ def end(workers: Sequence[Worker]) -> None:
 
 
 def _death(worker: Worker) -> SimulationError:
+    """Return the error that reports a dead worker, with its exit code."""
     worker.process.join(_EXIT_CODE_WAIT)
     return SimulationError(
         f"{worker} died (exit code {worker.process.exitcode}); the simulation is closed"
@@ -165,7 +151,7 @@ def _serve(pipe: Connection, shared: SharedBuffers) -> None:
             message = pipe.recv_bytes()
             try:
                 if batch is None:
-                    batch = load(pickle.loads(message), buffers)
+                    batch = BulletBatch(pickle.loads(message), buffers)
                 elif message == STEP:
                     batch.step(targets)
                 else:

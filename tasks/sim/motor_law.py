@@ -50,18 +50,18 @@ class MotorForces:
             efforts: Largest force of each row [N m or N].
         """
         self._efforts = np.array(efforts, dtype=np.float64)
-        most = max((robot.dof for robot in robots), default=0)
-        self._pull = np.zeros((most, len(self._efforts)))
+        max_dof = max((robot.dof for robot in robots), default=0)
+        self._pull = np.zeros((max_dof, len(self._efforts)))
         """Force of each row per acceleration of each independent joint; padded with zeros."""
-        self._row = np.zeros((most, len(self._efforts)), np.intp)
+        self._row = np.zeros((max_dof, len(self._efforts)), np.intp)
         """Row of that independent joint."""
         farthest: list[float] = []
-        known: dict[int, Array] = {}
+        inertias: dict[int, Array] = {}
         for robot in robots:
-            if id(robot) not in known:
-                known[id(robot)] = _inertia(robot)
+            if id(robot) not in inertias:
+                inertias[id(robot)] = _inertia(robot)
             start, end = len(farthest), len(farthest) + len(robot.movable_joints)
-            self._pull[: robot.dof, start:end] = GAIN * known[id(robot)]
+            self._pull[: robot.dof, start:end] = GAIN * inertias[id(robot)]
             self._row[: robot.dof, start:end] = [
                 [start + robot.movable_joints.index(k)] for k in robot.independent_joints
             ]
@@ -79,11 +79,11 @@ class MotorForces:
         springs = [BANDWIDTH**2 * np.clip(e, -self._farthest, self._farthest) for e in errors]
         dampers = [2 * BANDWIDTH * v for v in velocities]
         begin, end = (np.abs(k - d) for k, d in zip(springs, dampers, strict=True))
-        wanted = np.maximum(begin, end) + SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
-        force = np.zeros_like(wanted)
+        accelerations = np.maximum(begin, end) + SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
+        force = np.zeros_like(accelerations)
         # Joint by joint: a sum over all at once would round differently in another batch.
         for pull, row in zip(self._pull, self._row, strict=True):
-            force += pull * wanted[row]
+            force += pull * accelerations[row]
         return np.minimum(force, self._efforts)
 
 

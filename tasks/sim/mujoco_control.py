@@ -57,8 +57,8 @@ class PositionControl:
             joints: Number of independent joints with padding, J.
         """
         self._shape = (len(worlds), joints)
-        self._bias = GatheredArrays([one.qfrc_bias for one in data])
-        self._weight = GatheredArrays([one.qfrc_gravcomp for one in data])
+        self._bias = GatheredArrays([env_data.qfrc_bias for env_data in data])
+        self._weight = GatheredArrays([env_data.qfrc_gravcomp for env_data in data])
         self._applied = np.zeros(len(self._bias.flat))
         self._acceleration = np.zeros(len(self._bias.flat))
         self._force = np.zeros(len(self._bias.flat))
@@ -68,10 +68,10 @@ class PositionControl:
         self._damping = GatheredArrays([world.model.dof_damping for world in worlds])
         self._damping.read()
         slots, leaders, gains = [], [], []
-        for i, (world, one) in enumerate(zip(worlds, data, strict=True)):
+        for i, (world, env_data) in enumerate(zip(worlds, data, strict=True)):
             begin, end = self._bias.begin[i : i + 2].tolist()
             force, acceleration = self._force[begin:end], self._acceleration[begin:end]
-            self._products.append((world.model, one, force, acceleration))
+            self._products.append((world.model, env_data, force, acceleration))
             self._compliance[i, : world.robot.dof] = 1 / world.model.actuator_gainprm[:, 0]
             self._farthest[i, : world.robot.dof] = [
                 LAG * speed_limit(world.robot.joints[k]) for k in world.robot.independent_joints
@@ -100,18 +100,18 @@ class PositionControl:
             out: Receives the controls, shape (n, J).
         """
         error = np.clip(targets - q, -self._farthest, self._farthest)
-        wanted = BY_ERROR * error + BY_VELOCITY * qd
-        self._acceleration[self._slots] = self._gains * wanted.ravel()[self._leaders]
+        mean_acceleration = BY_ERROR * error + BY_VELOCITY * qd
+        self._acceleration[self._slots] = self._gains * mean_acceleration.ravel()[self._leaders]
         for model, data, force, acceleration in self._products:
             mujoco.mj_mulM(model, data, force, acceleration)
         self._bias.read()
         self._weight.read()
         force = self._force + self._bias.flat - self._weight.flat
-        of_leaders = np.bincount(
-            self._leaders, self._gains * force[self._slots], minlength=wanted.size
+        leader_forces = np.bincount(
+            self._leaders, self._gains * force[self._slots], minlength=mean_acceleration.size
         )
-        np.multiply(of_leaders.reshape(self._shape), self._compliance, out=out)
-        out += q + error - PASSIVE * 2 / BANDWIDTH * qd - wanted / (GAIN * BANDWIDTH**2)
+        np.multiply(leader_forces.reshape(self._shape), self._compliance, out=out)
+        out += q + error - PASSIVE * 2 / BANDWIDTH * qd - mean_acceleration / (GAIN * BANDWIDTH**2)
         np.multiply(self._damping.flat, velocities, out=self._applied)
 
     def release(self) -> None:

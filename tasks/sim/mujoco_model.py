@@ -182,8 +182,9 @@ def _with_own_root(robot: Robot) -> Robot:
 
 
 def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
-    held = spec.body(robot.root.name)
-    held.pos, held.quat = scene.T_world_root.position, scene.T_world_root.quaternion
+    """Add ground, obstacles and block to a robot's spec, and compile it."""
+    root = spec.body(robot.root.name)
+    root.pos, root.quat = scene.T_world_root.position, scene.T_world_root.quaternion
     for name in ground_contact_links(robot, scene.T_world_root) - {robot.root.name}:
         for geom in spec.body(name).geoms:
             geom.conaffinity &= ~_BY_GROUND
@@ -210,6 +211,7 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
 
 
 def _add_block(spec: mujoco.MjSpec, block: Block) -> mujoco.MjsBody:
+    """Add the block: a free body, or a mocap body if it has no mass."""
     body = spec.worldbody.add_body(mocap=block.mass <= 0)
     if block.mass > 0:
         body.add_freejoint()

@@ -19,6 +19,8 @@ from morphgen.tasks.sim.mujoco_state import MujocoState
 from morphgen.typing import Array
 
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
+"""Environment with its model and data; views of its actuator controls in the data and in the batch,
+and of its applied forces in the data and in ``PositionControl``."""
 
 
 class MujocoSimulation:
@@ -76,14 +78,14 @@ class MujocoSimulation:
             pose = (*block.pose.position, *block.pose.quaternion) if block is not None else ()
             # In float32, as a reset to the values of the tensors would do.
             self._put(
-                i, *(np.array(each, np.float32).tolist() for each in (world.robot.home, pose))
+                i, *(np.array(values, np.float32).tolist() for values in (world.robot.home, pose))
             )
         self._state.read()
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
     def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
-        """Put some environments at rest, without a past; see ``Simulation.reset``.
+        """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
             ValueError: If a shape is wrong, an environment does not exist, or a position is not
@@ -119,7 +121,7 @@ class MujocoSimulation:
         np.copyto(self._targets, targets.numpy(), where=self._has_target)
         if not np.isfinite(self._targets).all():
             env = int(np.flatnonzero(~np.isfinite(self._targets).all(axis=1))[0])
-            raise ValueError(f"{self._where(env)}: a target is not finite")
+            raise ValueError(f"{self._label(env)}: a target is not finite")
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
         with np.errstate(invalid="ignore", over="ignore"), capture_mujoco_warnings():
             self._control.controls(
@@ -129,7 +131,7 @@ class MujocoSimulation:
             self._state.read()
         faults = self._state.faults() | refused
         if faults:
-            raise DivergedError({env: f"{self._where(env)}: {why}" for env, why in faults.items()})
+            raise DivergedError({env: f"{self._label(env)}: {why}" for env, why in faults.items()})
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
@@ -141,9 +143,10 @@ class MujocoSimulation:
         self._work, self._data, self._worlds = [], [], []
 
     def _put(self, env: int, q: Sequence[float], pose: Sequence[float]) -> None:
+        """Put an environment's robot and block at rest at joint positions and a pose."""
         world, data = self._worlds[env], self._data[env]
         if not np.isfinite(q).all() or (world.block is not None and not np.isfinite(pose).all()):
-            raise ValueError(f"{self._where(env)}: reset to q {list(q)}, block {list(pose)}")
+            raise ValueError(f"{self._label(env)}: reset to q {list(q)}, block {list(pose)}")
         mujoco.mj_resetData(world.model, data)
         data.qpos[world.movable_q_at] = movable_positions(world.robot, q)
         mujoco.mj_kinematics(world.model, data)
@@ -153,7 +156,7 @@ class MujocoSimulation:
             position, quaternion = world.block_pose_in(data)
             position[:], quaternion[:] = pose[:3], pose[3:]
             if mujoco.mju_normalize4(quaternion) < 0.5:
-                raise ValueError(f"{self._where(env)}: {list(pose)} is not a pose of a block")
+                raise ValueError(f"{self._label(env)}: {list(pose)} is not a pose of a block")
 
     def _advance(self) -> dict[int, str]:
         """Step all environments; return the ones that MuJoCo could not step, with its reasons."""
@@ -173,7 +176,7 @@ class MujocoSimulation:
         if not self._work:
             raise SimulationError("the simulation is closed")
 
-    def _where(self, env: int) -> str:
+    def _label(self, env: int) -> str:
         steps = round(self._data[env].time / (TIMESTEP * SUBSTEPS))
         name = self.scenes[env].robot.name
         return f"environment {env} (robot {name!r}, {steps} steps after its reset)"

@@ -56,9 +56,9 @@ class MujocoState:
         n, joints = len(worlds), max(world.robot.dof for world in worlds)
         blocks = [i for i, world in enumerate(worlds) if world.block is not None]
         poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
-        self._positions = GatheredArrays([*(one.qpos for one in data), *poses])
-        self._velocities = GatheredArrays([one.qvel for one in data])
-        self._warnings = [one.warning.number for one in data]
+        self._positions = GatheredArrays([*(env_data.qpos for env_data in data), *poses])
+        self._velocities = GatheredArrays([env_data.qvel for env_data in data])
+        self._warnings = [env_data.warning.number for env_data in data]
         self._q_at = np.full((n, joints), -1)
         self._qd_at = np.full((n, joints), -1)
         self._pose_at = np.full((n, 7), -1)
@@ -93,11 +93,14 @@ class MujocoState:
         if self._has_blocks:
             pose = self._positions.flat[self._pose_at]
             velocity = self._velocities.flat[self._velocity_at]
-            quaternion, spin = pose[:, 3:], velocity[:, 3:]
+            quaternion, angular = pose[:, 3:], velocity[:, 3:]
             quaternion[quaternion[:, 0] < 0] *= -1
             self.block_pose.numpy()[:] = pose
-            # MuJoCo has a free body's angular velocity in the axes of the body.
-            spin[:] = _rotated(quaternion, spin)
+            # MuJoCo has a free body's angular velocity in the axes of the body: rotate it to the
+            # world, v' = v + w t + u x t with t = 2 u x v and the quaternion (w, u).
+            w, axis = quaternion[:, :1], quaternion[:, 1:]
+            twice = 2 * np.cross(axis, angular)
+            angular[:] = angular + w * twice + np.cross(axis, twice)
             self.block_velocity.numpy()[:] = velocity
 
     def faults(self) -> dict[int, str]:
@@ -126,10 +129,3 @@ class MujocoState:
             GatheredArrays(()),
             [],
         )
-
-
-def _rotated(quaternions: Array, vectors: Array) -> Array:
-    """Return vectors (n, 3) rotated by quaternions (w, x, y, z), shape (n, 4)."""
-    w, axis = quaternions[:, :1], quaternions[:, 1:]
-    turn = 2 * np.cross(axis, vectors)
-    return np.asarray(vectors + w * turn + np.cross(axis, turn))

@@ -48,9 +48,12 @@ def merge_rigid_links(robot: Robot) -> Robot:
     for joint, link in zip(robot.joints, robot.links[1:], strict=True):
         parent = merged_name[joint.parent]
         T_merged_joint = T_merged_link[joint.parent] @ joint.T_parent_joint
-        others = [piece.name for _, piece in pieces[parent] if piece.collisions]
-        alike = not link.collisions or all(partners[link.name] == partners[o] for o in others)
-        if not joint.is_movable and alike:
+        colliding = [piece.name for _, piece in pieces[parent] if piece.collisions]
+        # A merged link has one set of ignored pairs, so all of its shapes must have the same.
+        same_partners = not link.collisions or all(
+            partners[link.name] == partners[name] for name in colliding
+        )
+        if not joint.is_movable and same_partners:
             merged_name[link.name], T_merged_link[link.name] = parent, T_merged_joint
             pieces[parent].append((T_merged_joint, link))
         else:

@@ -31,7 +31,7 @@ def reset(simulation, q=None, pose=None, envs=None):
 
 def client_of(simulation, env=0):
     """The PyBullet client of an environment."""
-    return simulation._own[0]._loaded[env]
+    return simulation._local_batches[0]._loaded[env]
 
 
 def state(simulation):
