@@ -18,9 +18,9 @@ from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
 
 
-def found(made, **options):
-    """Code and place of every finding."""
-    return [(each.code, each.where) for each in audit(made, LIBRARY, **options).findings]
+def finding_keys(example_split, **options):
+    """Return code and location of every finding."""
+    return [(each.code, each.where) for each in audit(example_split, LIBRARY, **options).findings]
 
 
 def test_a_valid_split_passes():
@@ -61,7 +61,7 @@ def test_the_same_robot_in_train_and_test_is_a_leak_under_any_name():
 
 def test_the_same_robot_with_another_task_is_not_a_leak():
     example_split = combined(train=[*TRAIN, member(TEST[0], task="reach", name="planar-reach")])
-    codes = {code for code, _ in found(example_split)}
+    codes = {code for code, _ in finding_keys(example_split)}
     assert "combination-seen" in codes
     assert not codes & {"body-shared", "body-near"}
 
@@ -72,7 +72,9 @@ def test_a_near_duplicate_of_a_train_robot_is_a_leak():
     (leak,) = [each for each in report.findings if each.code == "body-near"]
     assert leak.where == "test robot planar-plane"
     assert "train robot near is nearly the same: tree distance" in leak.why
-    assert "body-near" not in {code for code, _ in found(near, near=NearThresholds(0.0, 1.0))}
+    assert "body-near" not in {
+        code for code, _ in finding_keys(near, near=NearThresholds(0.0, 1.0))
+    }
 
 
 def test_a_near_duplicate_needs_both_measures():
@@ -84,12 +86,12 @@ def test_a_near_duplicate_needs_both_measures():
         (NearThresholds(tree, alike - 1e-12), False),
         (NearThresholds(tree * 1.01, alike), False),
     ):
-        codes = {code for code, _ in found(example_split, near=near)}
+        codes = {code for code, _ in finding_keys(example_split, near=near)}
         assert ("body-near" in codes) == expected
 
 
 def jittered(node, amount, rng):
-    """A derivation, every parameter but whole numbers and angles made larger or smaller."""
+    """Return the derivation with every length parameter increased or decreased."""
     known = LIBRARY.manifest(node.part).parameters
     values = tuple(
         (name, value * (1 + amount * rng.choice([-1, 1])))
@@ -121,7 +123,7 @@ def test_near_duplicates_differ_by_about_one_per_cent_in_size(category):
 
 def test_a_name_shared_by_two_robots_is_a_finding():
     example_split = combined(test=[*TEST, member("base=planar ee=cylinder", "gantry-plane")])
-    assert found(example_split) == [("name-shared", "test robot gantry-plane")]
+    assert finding_keys(example_split) == [("name-shared", "test robot gantry-plane")]
 
 
 def test_an_unknown_part_is_reported_with_the_nearest():
@@ -162,7 +164,7 @@ def test_an_invalid_test_robot_has_no_neighbours():
 
 def test_a_split_without_valid_train_robots_can_be_audited():
     wrong = [replace(member(words), derivation="base=nothing") for words in TRAIN]
-    assert {code for code, _ in found(combined(train=wrong))} == {"part-missing"}
+    assert {code for code, _ in finding_keys(combined(train=wrong))} == {"part-missing"}
 
 
 def test_a_changed_robot_hash_is_reported():
@@ -186,12 +188,12 @@ def test_a_duplicate_robot_is_a_warning():
 
 def test_violations_of_regime_rules_are_reported():
     unseen = combined(test=["base=planar ee=sphere"])
-    assert found(unseen) == [("part-unseen", "test robot planar-sphere")]
+    assert finding_keys(unseen) == [("part-unseen", "test robot planar-sphere")]
     large = member("base=planar ee=cube ee.size=0.3", "large-cube")
     seen = combined(regime="extrapolation", test=[large])
-    assert found(seen) == [("structure-seen", "test robot large-cube")]
+    assert finding_keys(seen) == [("structure-seen", "test robot large-cube")]
     other = combined(regime="interpolation")
-    assert found(other) == [("structure-unseen", "test robot planar-plane")]
+    assert finding_keys(other) == [("structure-unseen", "test robot planar-plane")]
 
 
 def drawn(category, n, seed, **changes):
@@ -219,20 +221,20 @@ def test_a_declared_hull_is_checked():
     assert outside
     for hull, wrong in (("inside", outside), ("outside", inside), ("any", [])):
         example_split = split(train, tests, regime="interpolation", provenance={"hull": hull})
-        locations = {where for code, where in found(example_split) if code == "hull"}
+        locations = {where for code, where in finding_keys(example_split) if code == "hull"}
         assert locations == {f"test robot {m.name}" for m in wrong}
 
 
 def test_a_trained_category_is_not_extrapolation():
     example_split = split([*drawn("cubes", 2, 0)], [*drawn("cubes", 1, 1)], regime="extrapolation")
-    assert {code for code, _ in found(example_split)} >= {"category-seen", "structure-seen"}
+    assert {code for code, _ in finding_keys(example_split)} >= {"category-seen", "structure-seen"}
 
 
 def test_a_declared_similarity_bound_is_checked():
     likeness = survey_split(combined(), LIBRARY).by_measure("cosine").max()
     for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
         example_split = combined(provenance={"similarity": bound})
-        codes = {code for code, _ in found(example_split)}
+        codes = {code for code, _ in finding_keys(example_split)}
         assert codes == (set() if holds else {"similarity-bound"})
     assert 0.99 < likeness < 1
     with pytest.raises(BenchmarkError, match=r"split 'mine/some': made: .*'<'"):

@@ -22,7 +22,7 @@ def chosen(cells, n=1, left=1, seed=0):
 
 
 def is_fair(cells, test, left):
-    """Whether test cells may be tested, said once more from the definition."""
+    """Return whether the test cells are a valid selection, from the definition."""
     mixed = len({c.task for c in cells}) > 1
     train = [
         c

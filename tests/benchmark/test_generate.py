@@ -50,7 +50,7 @@ def names(members):
 
 
 def require_sound(split):
-    """Require that its robots can be made, and that the regime holds."""
+    """Assert that the robots can be composed and that the rules of the regime hold."""
     for member in (*split.train, *split.test):
         assert compose_member(member, LIBRARY).name == member.name
     assert regime_findings(split, LIBRARY) == ()
@@ -210,7 +210,7 @@ def test_extrapolation_never_tests_trained_structures():
 
 
 def cosines(split):
-    """Of every test robot to every train robot."""
+    """Return the cosine similarity of every test robot to every train robot."""
     rows = []
     for side in (split.test, split.train):
         robots = [compose_member(member, LIBRARY) for member in side]
@@ -424,7 +424,7 @@ def test_invalid_orders_are_errors(sizes, changes, message):
 
 
 def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
-    """The base's default has 16 digits; the hash is that of the robot that the text gives."""
+    """The default of the base has 16 digits; the hash is that of the printed derivation."""
     body = RobotFactory(LIBRARY.folders)(ComposedRecipe(("base=planar", "ee=cube")))
     assert "travel_yaw=3.14159265359" in str(body.derivation)
     assert dict(body.derivation.parameters)["travel_yaw"] == 3.14159265359

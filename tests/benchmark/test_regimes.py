@@ -33,8 +33,10 @@ def member(name, words, task="reach", category="composed"):
     return Member(name, category, str(derivation(words)), task, False, "0" * 32)
 
 
-def codes(regime, train, test, **made):
-    findings = regime_findings(Split("s", regime, "", tuple(train), tuple(test), made), LIBRARY)
+def codes(regime, train, test, **provenance):
+    findings = regime_findings(
+        Split("s", regime, "", tuple(train), tuple(test), provenance), LIBRARY
+    )
     assert all(each.severity == "error" and each.fix for each in findings)
     return [each.code for each in findings]
 

@@ -34,7 +34,7 @@ QUICK = ["composition/ee-task", "extrapolation/primitives"]
 
 
 def versionless(text):
-    """A file but for the version of the morphgen that wrote it."""
+    """Return the text of a split file without the version of morphgen that wrote it."""
     return re.sub(r"(?m)^morphgen: .*\n", "", text)
 
 

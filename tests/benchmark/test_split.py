@@ -21,7 +21,7 @@ LIBRARY = default_library()
 
 
 def member(words, name="", **changes):
-    """A member of some words of compose."""
+    """Return a split member for a request of ``compose``."""
     derivation, own = parse_words(words.split(), LIBRARY)
     body = robot_hash(compose(derivation, LIBRARY, "any"))
     return replace(Member(name or own, COMPOSED, str(derivation), "reach", False, body), **changes)
@@ -41,7 +41,7 @@ def with_mesh(path, **mesh):
 
 
 def jittered(robot, size, rng):
-    """The robot with noise on every pose, mass, inertia and limit; frames turned by nothing."""
+    """Return the robot with noise on every pose, mass, inertia and limit; rotations are kept."""
 
     def noisy(values):
         return tuple(float(v + size * rng.standard_normal() * max(1, abs(v))) for v in values)
@@ -111,7 +111,7 @@ def test_nonphysical_properties_do_not_change_the_hash(changed):
 
 
 def test_labels_do_not_change_the_hash():
-    """The same parts under other symbols are the same body, so nobody trains on it unseen."""
+    """The same parts under other symbols are the same robot, or it would leak into train."""
     links = [replace(link, name=f"x_{link.name}") for link in arm().links]
     joints = [
         replace(
@@ -216,7 +216,7 @@ def test_the_last_bits_of_numbers_do_not_change_the_hash(words):
 
 @pytest.mark.parametrize("part", [1, 2, 3, 4, 5, 6, 8, 10])
 def test_round_sizes_are_far_from_the_rounding_boundaries_of_the_hash(part):
-    """Also at the half, third and so on of the smallest step that counts."""
+    """This includes the half, third and so on of the rounding step."""
 
     def hashed(z):
         return robot_hash(with_joint(arm(), "elbow", T_parent_joint=Pose((0.0, 0.0, z))))

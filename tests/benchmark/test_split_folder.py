@@ -30,27 +30,27 @@ LIGHT = BuildSettings(light=True)
 
 
 @pytest.fixture
-def made():
+def example_split():
     return combined()
 
 
 @pytest.fixture
-def whole(tmp_path, made):
+def whole(tmp_path, example_split):
     """A built split."""
-    return build_split(made, tmp_path / "whole", LIBRARY).folder
+    return build_split(example_split, tmp_path / "whole", LIBRARY).folder
 
 
-def test_the_folder_has_the_name_of_the_split(tmp_path, made):
-    report = build_split(made, tmp_path / "data", LIBRARY)
+def test_the_folder_has_the_name_of_the_split(tmp_path, example_split):
+    report = build_split(example_split, tmp_path / "data", LIBRARY)
     assert report.folder == tmp_path / "data" / "mine" / "some"
     assert (report.num_written, report.num_kept) == (4, 0)
     names = ["README.md", "SHA256SUMS", "build.json", "robots", "robots.jsonl", "split.yaml"]
     assert sorted(path.name for path in report.folder.iterdir()) == [*names, "tokens.npz"]
-    assert read_split(report.folder / "split.yaml") == made
+    assert read_split(report.folder / "split.yaml") == example_split
 
 
-def test_every_robot_is_a_bundle(whole, made):
-    for one in (*made.train, *made.test):
+def test_every_robot_is_a_bundle(whole, example_split):
+    for one in (*example_split.train, *example_split.test):
         folder = whole / "robots" / one.name
         files = {path.name for path in folder.iterdir()}
         assert files == {"robot.urdf", "robot.xml", "card.json"}
@@ -58,9 +58,11 @@ def test_every_robot_is_a_bundle(whole, made):
         assert (read.name, read.home, len(read.links)) == (one.name, robot.home, len(robot.links))
 
 
-def test_each_robot_has_one_line_of_json(whole, made):
+def test_each_robot_has_one_line_of_json(whole, example_split):
     records = [json.loads(line) for line in (whole / "robots.jsonl").read_text().splitlines()]
-    assert [record["name"] for record in records] == [m.name for m in (*made.train, *made.test)]
+    assert [record["name"] for record in records] == [
+        m.name for m in (*example_split.train, *example_split.test)
+    ]
     assert [record["side"] for record in records] == ["train"] * 3 + ["test"]
     assert records[0] == {
         "name": "gantry-plane",
@@ -68,25 +70,25 @@ def test_each_robot_has_one_line_of_json(whole, made):
         "task": "push",
         "obstacles": False,
         "category": "composed",
-        "derivation": made.train[0].derivation,
-        "hash": made.train[0].robot_hash,
+        "derivation": example_split.train[0].derivation,
+        "hash": example_split.train[0].robot_hash,
         "links": 7,
         "movable": 5,
         "movable_to_tool": 5,
         "dof": 5,
         "reach": pytest.approx(1.167, abs=1e-3),
-        "mass": pytest.approx(compose_member(made.train[0], LIBRARY).mass),
+        "mass": pytest.approx(compose_member(example_split.train[0], LIBRARY).mass),
         "path": "robots/gantry-plane",
     }
     table = pandas.read_json(whole / "robots.jsonl", lines=True)
     assert table.groupby("side").size().to_dict() == {"test": 1, "train": 3}
 
 
-def test_tokens_match_the_robots(whole, made):
+def test_tokens_match_the_robots(whole, example_split):
     with np.load(whole / "tokens.npz", allow_pickle=False) as data:
         assert data["tokens"].shape == (4, 23, 48)
         assert data["columns"].tolist()[0] == [0, 1]
-        for i, one in enumerate((*made.train, *made.test)):
+        for i, one in enumerate((*example_split.train, *example_split.test)):
             robot = compose_member(one, LIBRARY)
             table, mask = pad_tokens(tokens(robot, token_shapes(robot)), 23)
             assert data["names"][i] == one.name
@@ -188,10 +190,14 @@ def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
     assert tree(one.folder) == tree(two.folder)
 
 
-def test_progress_counts_distinct_robots(tmp_path, made):
+def test_progress_counts_distinct_robots(tmp_path, example_split):
     seen = []
     build_split(
-        made, tmp_path, LIBRARY, settings=LIGHT, progress=lambda *counts: seen.append(counts)
+        example_split,
+        tmp_path,
+        LIBRARY,
+        settings=LIGHT,
+        progress=lambda *counts: seen.append(counts),
     )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
@@ -202,19 +208,19 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
 @pytest.mark.parametrize("done", [1, 3, 4])
-def test_files_written_before_an_interruption_are_kept(tmp_path, made, settings, done):
-    whole = build_split(made, tmp_path / "whole", LIBRARY, settings=settings).folder
+def test_files_written_before_an_interruption_are_kept(tmp_path, example_split, settings, done):
+    whole = build_split(example_split, tmp_path / "whole", LIBRARY, settings=settings).folder
 
     def stop(number, total):
         if number == done:
             raise Killed
 
     with pytest.raises(Killed):
-        build_split(made, tmp_path / "own", LIBRARY, settings=settings, progress=stop)
+        build_split(example_split, tmp_path / "own", LIBRARY, settings=settings, progress=stop)
     own = tmp_path / "own" / "mine" / "some"
     with pytest.raises(BenchmarkError, match="is not finished: it has no SHA256SUMS; build it"):
         load_split_folder(own)
-    report = build_split(made, tmp_path / "own", LIBRARY, settings=settings)
+    report = build_split(example_split, tmp_path / "own", LIBRARY, settings=settings)
     assert (report.num_written, report.num_kept) == (4 - done, done)
     assert tree(own) == tree(whole)
 
@@ -235,18 +241,18 @@ def test_files_written_before_an_interruption_are_kept(tmp_path, made, settings,
         ("robots/.planar-cube.x1y2/robot.urdf", b"<rob"),
     ],
 )
-def test_invalid_files_are_rebuilt(tmp_path, whole, made, path, content):
+def test_invalid_files_are_rebuilt(tmp_path, whole, example_split, path, content):
     before = tree(whole)
     if content is None:
         (whole / path).unlink()
     else:
         (whole / path).parent.mkdir(exist_ok=True)
         (whole / path).write_bytes(content)
-    build_split(made, tmp_path / "whole", LIBRARY)
+    build_split(example_split, tmp_path / "whole", LIBRARY)
     assert tree(whole) == before
 
 
-def test_a_robot_with_a_changed_card_and_file_is_rebuilt(tmp_path, whole, made):
+def test_a_robot_with_a_changed_card_and_file_is_rebuilt(tmp_path, whole, example_split):
     before = tree(whole)
     folder = whole / "robots" / "planar-cube"
     text = (folder / "robot.urdf").read_text().replace('effort="', 'effort="1')
@@ -254,15 +260,15 @@ def test_a_robot_with_a_changed_card_and_file_is_rebuilt(tmp_path, whole, made):
     card = json.loads((folder / "card.json").read_text())
     card["hashes"]["robot.urdf"] = hashlib.sha256(text.encode()).hexdigest()
     (folder / "card.json").write_text(json.dumps(card))
-    assert build_split(made, tmp_path / "whole", LIBRARY).num_written == 1
+    assert build_split(example_split, tmp_path / "whole", LIBRARY).num_written == 1
     assert tree(whole) == before
 
 
-def test_a_robot_of_another_version_is_rebuilt(tmp_path, whole, made):
+def test_a_robot_of_another_version_is_rebuilt(tmp_path, whole, example_split):
     before = tree(whole)
     path = whole / "robots" / "planar-cube" / "card.json"
     path.write_text(path.read_text().replace('"morphgen": "', '"morphgen": "0.0.'))
-    assert build_split(made, tmp_path / "whole", LIBRARY).num_written == 1
+    assert build_split(example_split, tmp_path / "whole", LIBRARY).num_written == 1
     assert tree(whole) == before
 
 
@@ -286,33 +292,33 @@ def test_a_killed_build_resumes_to_the_same_bytes(tmp_path):
     assert tree(robots.parent) == tree(whole)
 
 
-def test_a_folder_of_another_build_is_an_error(tmp_path, whole, made):
+def test_a_folder_of_another_build_is_an_error(tmp_path, whole, example_split):
     before = tree(whole)
     for other, settings, message in (
         (combined(test=["base=planar ee=cylinder"]), BUNDLED, "its split is '[0-9a-f]{32}', not"),
-        (made, LIGHT, "its light is False, not True; name another folder"),
-        (made, BuildSettings(picture=True), "its picture is False, not True"),
+        (example_split, LIGHT, "its light is False, not True; name another folder"),
+        (example_split, BuildSettings(picture=True), "its picture is False, not True"),
     ):
         with pytest.raises(BenchmarkError, match=message):
             build_split(other, tmp_path / "whole", LIBRARY, settings=settings)
     assert tree(whole) == before
 
 
-def test_a_folder_with_other_files_is_an_error(tmp_path, made):
+def test_a_folder_with_other_files_is_an_error(tmp_path, example_split):
     (tmp_path / "mine" / "some").mkdir(parents=True)
     (tmp_path / "mine" / "some" / "notes.txt").write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(BenchmarkError, match=r"is no built split \(no build.json\); name another"):
-        build_split(made, tmp_path, LIBRARY)
+        build_split(example_split, tmp_path, LIBRARY)
     assert tree(tmp_path) == before
 
 
 @pytest.mark.parametrize("place", ["mine", "mine/some"])
-def test_a_file_instead_of_a_folder_is_an_error(tmp_path, made, place):
+def test_a_file_instead_of_a_folder_is_an_error(tmp_path, example_split, place):
     (tmp_path / place).parent.mkdir(exist_ok=True)
     (tmp_path / place).write_text("mine")
     with pytest.raises(BenchmarkError, match=r"exists and is no built split|cannot write"):
-        build_split(made, tmp_path, LIBRARY)
+        build_split(example_split, tmp_path, LIBRARY)
     assert (tmp_path / place).read_text() == "mine"
 
 
@@ -330,16 +336,16 @@ def test_a_name_shared_by_two_robots_is_an_error(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_concurrent_build_in_the_same_folder_is_an_error(tmp_path, made):
+def test_a_concurrent_build_in_the_same_folder_is_an_error(tmp_path, example_split):
     def again(done, total):
         with pytest.raises(FormatError, match="is being written by another run"):
-            build_split(made, tmp_path, LIBRARY, settings=LIGHT)
+            build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
 
-    report = build_split(made, tmp_path, LIBRARY, settings=LIGHT, progress=again)
+    report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT, progress=again)
     assert len(load_split_folder(report.folder)) == 4
 
 
-def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, made, monkeypatch):
+def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, example_split, monkeypatch):
     written = Path.write_text
 
     def full(path, *args, **options):
@@ -349,15 +355,17 @@ def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path, made, monk
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(FormatError, match=r"cannot write .*No space left on device"):
-        build_split(made, tmp_path, LIBRARY)
+        build_split(example_split, tmp_path, LIBRARY)
     assert list((tmp_path / "mine" / "some" / "robots").iterdir()) == []
     monkeypatch.undo()
-    assert build_split(made, tmp_path, LIBRARY).num_written == 4
+    assert build_split(example_split, tmp_path, LIBRARY).num_written == 4
 
 
-def test_loading_returns_plain_records_with_tokens(whole, made):
+def test_loading_returns_plain_records_with_tokens(whole, example_split):
     built = load_split_folder(whole)
-    assert [robot["name"] for robot in built] == [m.name for m in (*made.train, *made.test)]
+    assert [robot["name"] for robot in built] == [
+        m.name for m in (*example_split.train, *example_split.test)
+    ]
     assert [len(each) for each in (built, built.train, built.test)] == [4, 3, 1]
     for i, robot in enumerate(built):
         assert type(robot) is dict

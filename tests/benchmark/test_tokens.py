@@ -62,7 +62,7 @@ def test_every_number_of_an_arm():
     slide, turn, fixed = np.eye(3)
     np.testing.assert_array_equal(token_array[:, 29:32], [fixed, turn, turn, slide, slide, slide])
     # The home (0.4, 0.5, 0.01, 0.02) within (-2, 2), (-2, 2), (0, 0.04), (0, 0.04); "right"
-    # mimics "left" and stands at -0.02 within (-0.04, 0).
+    # mimics "left" and is at -0.02 within (-0.04, 0).
     x = np.array([0.2, 0.25, -0.5, 0.0, 0.0])
     angles = x[:, None] * math.pi / 2 * np.array([1, 2, 4, 8, 16, 32, 64, 128])
     np.testing.assert_allclose(token_array[1:, 32:40], np.sin(angles), atol=1e-12)

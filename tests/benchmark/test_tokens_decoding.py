@@ -87,10 +87,10 @@ def bodies(draw):
     return robot, shapes, np.reshape(q, (2, dof))
 
 
-def assert_read_back(made, **options):
-    back, shapes = robot_from_tokens(made, "back", **options)
+def assert_read_back(token_array, **options):
+    back, shapes = robot_from_tokens(token_array, "back", **options)
     again = tokens(back, shapes, **options)
-    np.testing.assert_allclose(again, made, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(again, token_array, rtol=0, atol=1e-9)
     assert shapes == shapes_of(back)
     return back
 
@@ -99,14 +99,14 @@ def assert_read_back(made, **options):
 @given(bodies())
 def test_decoded_robots_have_the_same_tokens(body):
     robot, shapes, q = body
-    for made in tokens(robot, shapes, q):
-        back = assert_read_back(made)
+    for token_array in tokens(robot, shapes, q):
+        back = assert_read_back(token_array)
         assert back.parents == robot.parents
         assert back.movable_joints == robot.movable_joints
         assert {frame.link[4:] for frame in back.frames} == {f.link[1:] for f in robot.frames}
         assert {name[4:] for name in shapes_of(back)} == {name[1:] for name in shapes}
         for name in ("geometry pose", "joint origin"):
-            assert (field_of(made, name)[:, 3] >= 0).all()
+            assert (field_of(token_array, name)[:, 3] >= 0).all()
 
 
 @settings(deadline=None)
@@ -125,11 +125,14 @@ def test_composed_robots_are_decoded(request_):
     robot = morphgen.compose(request_)
     shapes = token_shapes(robot, default_library().folders)
     q = random_configurations(robot, 5, np.random.default_rng(0))
-    for made in (*tokens(robot, shapes, q, max_links=40), tokens(robot, shapes, max_links=40)):
-        back = assert_read_back(made, max_links=40)
+    for token_array in (
+        *tokens(robot, shapes, q, max_links=40),
+        tokens(robot, shapes, max_links=40),
+    ):
+        back = assert_read_back(token_array, max_links=40)
         assert back.dof == len(robot.movable_joints)
         assert len(back.frames) == 1
-    assert [tuple(value) for value in field_of(made, "joint axis")[1:]] == [
+    assert [tuple(value) for value in field_of(token_array, "joint axis")[1:]] == [
         pytest.approx(joint.unit_axis if joint.is_movable else (0, 0, 0)) for joint in robot.joints
     ]
 
@@ -159,7 +162,7 @@ def spoilt(row, column, value):
 
 
 @pytest.mark.parametrize(
-    ("made", "message"),
+    ("token_array", "message"),
     [
         (spoilt(2, 20, math.nan), "link 2: joint axis: [1, nan, 0] is not finite"),
         (spoilt(0, 0, math.inf), "link 0: link index: [inf] is not finite"),
@@ -224,9 +227,9 @@ def spoilt(row, column, value):
         (spoilt(1, 32, 2.0), "link 1: joint position: number "),
     ],
 )
-def test_invalid_tokens_are_errors_that_name_link_and_field(made, message):
+def test_invalid_tokens_are_errors_that_name_link_and_field(token_array, message):
     with pytest.raises(BenchmarkError, match=re.escape(message)) as refusal:
-        robot_from_tokens(made, "x")
+        robot_from_tokens(token_array, "x")
     assert str(refusal.value).startswith("tokens of 'x'")
 
 

@@ -20,14 +20,14 @@ from morphgen.errors import BenchmarkError
 LIGHT = BuildSettings(light=True)
 
 
-def found(path, **options):
-    """Where and why of every difference."""
+def difference_keys(path, **options):
+    """Return location and reason of every difference."""
     return [(each.where, each.why) for each in verify(path, LIBRARY, **options).differences]
 
 
-def written(folder, made):
+def written(folder, example_split):
     path = folder / "some.yaml"
-    path.write_text(split_text(made))
+    path.write_text(split_text(example_split))
     return path
 
 
@@ -41,8 +41,8 @@ def bundles(tmp_path):
     return build_split(combined(), tmp_path / "whole", LIBRARY).folder
 
 
-def summed(folder):
-    """Write the sums anew, so that they hide what was changed."""
+def rewrite_checksums(folder):
+    """Rewrite the checksums so that they match the changed files."""
     lines = (folder / "SHA256SUMS").read_text().splitlines()
     names = [line[66:] for line in lines]
     sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
@@ -58,13 +58,13 @@ def test_an_unchanged_file_passes(tmp_path):
 
 def test_a_shipped_split_can_be_verified_by_name():
     assert "composition/ee-task" in split_names()
-    assert found("composition/ee-task") == []
+    assert difference_keys("composition/ee-task") == []
 
 
 def test_a_changed_line_is_reported_for_the_robot_and_the_id(tmp_path):
     path = written(tmp_path, combined())
     path.write_text(path.read_text().replace("cube(size=0.1)", "cube(size=0.11)"))
-    (file, id_), (robot, why) = found(path)
+    (file, id_), (robot, why) = difference_keys(path)
     assert (file, id_.startswith(f"its id is {split_id(combined())}, but that of")) == (
         str(path),
         True,
@@ -77,14 +77,14 @@ def test_a_removed_robot_changes_the_id(tmp_path):
     path = written(tmp_path, combined())
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(line for line in lines if "gantry-plane" not in line))
-    ((where, why),) = found(path)
+    ((where, why),) = difference_keys(path)
     assert (where, "its id is" in why) == (str(path), True)
 
 
 def test_the_summary_of_a_split_may_change(tmp_path):
     path = written(tmp_path, combined())
     path.write_text(path.read_text().replace("a split of a test", "another summary"))
-    assert found(path) == []
+    assert difference_keys(path) == []
 
 
 @pytest.mark.parametrize(
@@ -98,20 +98,22 @@ def test_the_summary_of_a_split_may_change(tmp_path):
 def test_a_robot_that_cannot_be_composed_is_reported(tmp_path, derivation, why):
     wrong = replace(member(TRAIN[1]), derivation=derivation)
     path = written(tmp_path, combined(train=[TRAIN[0], wrong]))
-    ((where, told),) = found(path)
+    ((where, told),) = difference_keys(path)
     assert (where, why in told) == ("planar-cube", True)
 
 
 def test_every_member_with_a_wrong_derivation_is_reported(tmp_path):
     wrong = replace(member(TRAIN[0]), robot_hash="0" * 32)
     path = written(tmp_path, combined(train=[wrong, replace(wrong, name="again", task="reach")]))
-    assert [where for where, _ in found(path)] == ["gantry-plane", "again"]
+    assert [where for where, _ in difference_keys(path)] == ["gantry-plane", "again"]
 
 
 def test_a_moved_split_folder_passes(whole, tmp_path):
     whole.rename(tmp_path / "elsewhere")
     seen = []
-    assert found(tmp_path / "elsewhere", progress=lambda *counts: seen.append(counts)) == []
+    assert (
+        difference_keys(tmp_path / "elsewhere", progress=lambda *counts: seen.append(counts)) == []
+    )
     assert seen == [(i, 4) for i in (1, 2, 3, 4)]
 
 
@@ -121,8 +123,8 @@ def test_the_number_of_processes_does_not_matter(tmp_path):
     example_split = split(cubes, ["base=planar ee=plane"])
     folder = build_split(example_split, tmp_path / "data", LIBRARY, settings=LIGHT).folder
     (folder / "robots" / "cube-3" / "robot.urdf").unlink()
-    assert [where for where, _ in found(folder)] == ["cube-3"]
-    assert found(folder, jobs=2) == found(folder)
+    assert [where for where, _ in difference_keys(folder)] == ["cube-3"]
+    assert difference_keys(folder, jobs=2) == difference_keys(folder)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,7 @@ def test_a_damaged_file_is_reported(whole, path, where, change):
             (whole / path).write_bytes(data + b"\n")
         case "gone":
             (whole / path).unlink()
-    findings = found(whole)
+    findings = difference_keys(whole)
     why = "is missing, but SHA256SUMS names it" if change == "gone" else "is not what SHA256SUMS"
     file = path.rpartition("/")[2]
     assert (where, True) in [(place, f"file {file} {why}" in text) for place, text in findings]
@@ -155,7 +157,7 @@ def test_an_extra_file_is_reported(whole):
     (whole / "robots" / "planar-cube" / "notes.txt").write_text("mine")
     (whole / "robots" / "stranger").mkdir()
     (whole / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
-    assert found(whole) == [
+    assert difference_keys(whole) == [
         ("planar-cube", "file notes.txt is not named by SHA256SUMS"),
         ("stranger", "file robot.urdf is not named by SHA256SUMS"),
     ]
@@ -169,8 +171,8 @@ def test_a_urdf_changed_with_its_checksum_is_reported(whole):
         data = json.loads(card.read_text())
         data["hashes"]["robot.urdf"] = hashlib.sha256(path.read_bytes()).hexdigest()
         card.write_text(json.dumps(data))
-    summed(whole)
-    assert found(whole) == [("planar-cube", "file robot.urdf is not the robot's")]
+    rewrite_checksums(whole)
+    assert difference_keys(whole) == [("planar-cube", "file robot.urdf is not the robot's")]
 
 
 @pytest.mark.parametrize(
@@ -180,31 +182,33 @@ def test_a_card_changed_with_its_checksum_is_reported(bundles, key, value):
     path = bundles / "robots" / "planar-cube" / "card.json"
     card = json.loads(path.read_text())
     path.write_text(json.dumps(card | {key: value}))
-    summed(bundles)
-    assert found(bundles) == [("planar-cube", f"file card.json: its {key!r} is not the robot's")]
+    rewrite_checksums(bundles)
+    assert difference_keys(bundles) == [
+        ("planar-cube", f"file card.json: its {key!r} is not the robot's")
+    ]
 
 
 def test_a_card_may_differ_in_the_last_digits(bundles):
     path = bundles / "robots" / "planar-cube" / "card.json"
     card = json.loads(path.read_text())
     path.write_text(json.dumps(card | {"reach": card["reach"] * (1 + 1e-9)}))
-    summed(bundles)
-    assert found(bundles) == []
+    rewrite_checksums(bundles)
+    assert difference_keys(bundles) == []
 
 
 def test_meshes_are_verified(tmp_path):
     example_split = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
     folder = build_split(example_split, tmp_path / "data", LIBRARY).folder
-    assert found(folder) == []
+    assert difference_keys(folder) == []
     mesh = next((folder / "robots" / "ur5-plane" / "meshes").iterdir())
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"\x01")
-    ((where, why),) = found(folder)
+    ((where, why),) = difference_keys(folder)
     assert (where, why) == (
         "ur5-plane",
         f"file meshes/{mesh.name} is not what SHA256SUMS was written for",
     )
-    summed(folder)
-    ((where, why),) = found(folder)
+    rewrite_checksums(folder)
+    ((where, why),) = difference_keys(folder)
     assert (where, f"file meshes/{mesh.name}: its content differs" in why) == ("ur5-plane", True)
 
 
@@ -231,8 +235,8 @@ def test_a_record_changed_with_its_checksum_is_reported(whole, change, expected)
     records = [json.loads(line) for line in path.read_text().splitlines()]
     change(records)
     path.write_text("".join(json.dumps(record) + "\n" for record in records))
-    summed(whole)
-    ((where, why),) = found(whole)
+    rewrite_checksums(whole)
+    ((where, why),) = difference_keys(whole)
     assert (where, why.startswith(expected[1])) == (expected[0], True)
 
 
@@ -243,7 +247,7 @@ def changed_tokens(folder, change):
     content = io.BytesIO()
     np.savez(content, **arrays)
     (folder / "tokens.npz").write_bytes(content.getvalue())
-    summed(folder)
+    rewrite_checksums(folder)
 
 
 @pytest.mark.parametrize("field", [PARENT, ORIGIN, GEOMETRY])
@@ -253,28 +257,28 @@ def test_tokens_changed_with_their_checksum_are_reported(whole, field):
 
     changed_tokens(whole, change)
     why = f"tokens.npz: {field.name} of link 2 is not the robot's"
-    assert found(whole) == [("planar-cube", why)]
+    assert difference_keys(whole) == [("planar-cube", why)]
 
 
 def test_nan_tokens_are_reported(whole):
     changed_tokens(whole, lambda arrays: arrays["tokens"].__setitem__((0, 0, 5), np.nan))
-    assert [where for where, _ in found(whole)] == ["gantry-plane"]
+    assert [where for where, _ in difference_keys(whole)] == ["gantry-plane"]
 
 
 def test_changed_masks_and_names_of_tokens_are_reported(whole):
     changed_tokens(whole, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
-    assert found(whole) == [
+    assert difference_keys(whole) == [
         ("gantry-cylinder", "tokens.npz: its mask is not that of its links"),
     ]
     changed_tokens(whole, lambda arrays: arrays["names"].__setitem__(0, "other"))
-    assert found(whole) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
+    assert difference_keys(whole) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
 
 
 def test_an_exchanged_split_file_is_reported(whole):
     other = combined(test=["base=planar ee=cylinder"])
     (whole / "split.yaml").write_text(split_text(other))
-    summed(whole)
-    findings = found(whole)
+    rewrite_checksums(whole)
+    findings = difference_keys(whole)
     assert ("build.json", f"it is of split {split_id(combined())}, not of split.yaml") in findings
     assert ("planar-cylinder", "its folder is missing") in findings
 

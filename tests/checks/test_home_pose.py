@@ -33,7 +33,7 @@ def pair(parent, child, T_parent_child=Pose(), between=()):  # noqa: B008
     return Robot("pair", links, joints)
 
 
-def found(robot):
+def gap_findings(robot):
     return [(finding.where, finding.why) for finding in check_links_apart(robot)]
 
 
@@ -45,12 +45,12 @@ def mesh(folder: Path, name: str, made: trimesh.Trimesh) -> Mesh:
 @pytest.mark.parametrize("offset", [0.0, 0.05, 0.1, 0.1 + 0.9 * MAX_GAP])
 def test_links_that_touch_or_nearly_do_are_not_apart(offset):
     box = Box((0.1, 0.1, 0.1))
-    assert found(pair(box, box, Pose((0, 0, offset)))) == []
+    assert gap_findings(pair(box, box, Pose((0, 0, offset)))) == []
 
 
 def test_a_gap_is_reported_with_both_links_and_its_width():
     box = Box((0.1, 0.1, 0.1))
-    assert found(pair(box, box, Pose((0.0, 0.0, 0.1 + 1.2 * MAX_GAP)))) == [
+    assert gap_findings(pair(box, box, Pose((0.0, 0.0, 0.1 + 1.2 * MAX_GAP)))) == [
         ("links parent, child", "at home their visual shapes are 6 mm apart")
     ]
 
@@ -58,8 +58,8 @@ def test_a_gap_is_reported_with_both_links_and_its_width():
 def test_links_without_shapes_are_skipped():
     ball = Sphere(0.05)
     near, far = (Pose((z, 0.0, 0.0)) for z in (0.1, 0.2))
-    assert found(pair(ball, ball, near, between=("a", "b"))) == []
-    assert found(pair(ball, ball, far, between=("a", "b"))) == [
+    assert gap_findings(pair(ball, ball, near, between=("a", "b"))) == []
+    assert gap_findings(pair(ball, ball, far, between=("a", "b"))) == [
         ("links parent, child", "at home their visual shapes are 100 mm apart")
     ]
 
@@ -68,29 +68,29 @@ def test_a_robot_without_visual_shapes_has_no_gaps():
     box = Shape(Box((0.1, 0.1, 0.1)))
     robot = pair(box.geometry, box.geometry, Pose((1.0, 0.0, 0.0)))
     bare = replace(robot.links[0], visuals=(), collisions=(box,))
-    assert found(replace(robot, links=(bare, robot.links[1]))) == []
+    assert gap_findings(replace(robot, links=(bare, robot.links[1]))) == []
 
 
 def test_gaps_are_measured_at_home():
     reach = hinge("tip", axis=(0.0, 0.0, 1.0), kind="prismatic", limits=(0.0, 1.0))
     robot = with_end(Link("tip", visuals=(Shape(Box((0.1, 0.1, 0.1))),)), reach)
-    assert found(robot) == []
-    assert found(replace(robot, home=(*robot.home[:-1], 1.0))) != []
+    assert gap_findings(robot) == []
+    assert gap_findings(replace(robot, home=(*robot.home[:-1], 1.0))) != []
 
 
 def test_an_enclosed_solid_is_not_apart(tmp_path):
     shell = mesh(tmp_path, "shell.stl", trimesh.creation.box((0.4, 0.4, 0.4)))
     core = mesh(tmp_path, "core.stl", trimesh.creation.icosphere(radius=0.05))
     for small in (core, Sphere(0.05), Box((0.05, 0.05, 0.05))):
-        assert found(pair(shell, small)) == []
-        assert found(pair(small, shell)) == []
-    assert found(pair(shell, core, Pose((0.3, 0.0, 0.0)))) != []
+        assert gap_findings(pair(shell, small)) == []
+        assert gap_findings(pair(small, shell)) == []
+    assert gap_findings(pair(shell, core, Pose((0.3, 0.0, 0.0)))) != []
 
 
 def test_a_rod_in_the_opening_of_a_ring_is_apart_from_it(tmp_path):
     ring = mesh(tmp_path, "ring.stl", trimesh.creation.annulus(0.05, 0.06, 0.02))
     within = 1000 * (0.05 * np.cos(np.pi / 32) - 0.01)  # to the faces of the ring's 32 sides
-    assert found(pair(ring, Cylinder(0.01, 0.5))) == [
+    assert gap_findings(pair(ring, Cylinder(0.01, 0.5))) == [
         ("links parent, child", f"at home their visual shapes are {within:.3g} mm apart")
     ]
 
@@ -100,9 +100,9 @@ def test_distances_of_dense_meshes_do_not_depend_on_the_coarse_test(tmp_path, mo
     turned = Pose.from_xyz_rpy((0.0, 0.12, 0.16), (0.3, 0.2, 0.1))
     for few in (5, 500, 10**6):
         monkeypatch.setattr(home_pose, "_COARSE_TRIANGLES", few)
-        assert found(pair(ball, ball, Pose((0.0, 0.12, 0.16)))) == []
-        assert found(pair(ball, Sphere(0.1), turned)) == []
-        (where_why,) = found(pair(ball, ball, replace(turned, position=(0.0, 0.138, 0.184))))
+        assert gap_findings(pair(ball, ball, Pose((0.0, 0.12, 0.16)))) == []
+        assert gap_findings(pair(ball, Sphere(0.1), turned)) == []
+        (where_why,) = gap_findings(pair(ball, ball, replace(turned, position=(0.0, 0.138, 0.184))))
         assert "30.1 mm" in where_why[1] or "30 mm" in where_why[1]
 
 
@@ -117,7 +117,7 @@ def test_distances_of_primitives_agree_with_their_triangles(seed):
             direction[rng.integers(3)] = 1.0
             way = direction / np.linalg.norm(direction)
             touching = [
-                not found(pair(a, b, Pose.from_xyz_rpy(tuple(far * way), rpy)))
+                not gap_findings(pair(a, b, Pose.from_xyz_rpy(tuple(far * way), rpy)))
                 for far in (0.0, 0.02, 0.35)
             ]
             assert touching == [True, True, False]
@@ -131,7 +131,7 @@ def test_unreadable_shapes_and_invalid_joints_are_left_to_other_checks(tmp_path)
     scale = pair(Mesh(tmp_path / "bad.stl", (0.0, 1.0, 1.0)), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
     lost = replace(valid_robot(), home=(float("nan"), *valid_robot().home[1:]))
     for robot in (gone, broken, flat, scale, lost):
-        assert found(robot) == []
+        assert gap_findings(robot) == []
 
 
 @pytest.mark.parametrize("name", ["base", "upper"])

@@ -24,7 +24,7 @@ from morphgen.model.tree import rename
 
 
 def keys(robot: Robot) -> set[tuple[str, str]]:
-    """Return code and place of every finding."""
+    """Return code and location of every finding."""
     return {(finding.code, finding.where) for finding in check(robot)}
 
 

@@ -32,7 +32,7 @@ def penetrations(robot, q):
 
 
 def slides(*offsets):
-    """Balls on slides along x on an empty root, starting at the given offsets."""
+    """Return balls on prismatic joints along x on an empty root, at the given offsets."""
     joints = tuple(
         Joint(f"x{i}", "prismatic", "root", f"ball{i}", Pose((x, 0, 0)), limits=(-1.0, 1.0))
         for i, x in enumerate(offsets)

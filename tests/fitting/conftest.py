@@ -1,4 +1,4 @@
-"""One thread of torch a process: tests run beside each other."""
+"""Limit torch to one thread per process, because tests run in parallel."""
 
 import pytest
 import torch

@@ -42,7 +42,7 @@ def test_openness_in_a_cup_is_the_solid_angle_of_its_opening():
         ]
     )
     cup.apply_translation((0, 0, 0))
-    # From the bottom's other side, the mouth of the upper half: radius 0.49, 0.49 away.
+    # The opening of the upper half as seen from the bottom: radius 0.49 at distance 0.49.
     (openness,) = Cavities(cup).openness(np.array([(0.0, 0.0, 0.01)]))
     assert openness == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)
 

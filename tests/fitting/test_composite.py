@@ -17,7 +17,7 @@ SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 4
 
 
 def drawn(seed, noise=0.0):
-    """Two or three primitives that overlap, all at angles."""
+    """Return two or three overlapping rotated primitives."""
     rng = np.random.default_rng(seed)
     shapes = []
     for _ in range(2 + seed % 2):

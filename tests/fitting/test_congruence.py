@@ -50,7 +50,7 @@ def motion(seed: int, mirrored: bool = False) -> np.ndarray:
 
 
 def shuffled(mesh: trimesh.Trimesh, T: np.ndarray, seed: int = 0) -> trimesh.Trimesh:
-    """The mesh moved, its vertices and faces in another order, rounded as files round them."""
+    """Return the moved mesh with shuffled vertices and faces, rounded as in a file."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(mesh.vertices))
     vertices = trimesh.transform_points(mesh.vertices, T)[order].astype(np.float32)

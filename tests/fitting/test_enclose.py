@@ -171,7 +171,7 @@ def test_a_thin_rod_is_recovered_in_any_direction() -> None:
 
 
 def smallest_sphere(points: Array) -> float:
-    """Radius by trying every sphere through two to four points."""
+    """Return the radius by enumerating all spheres through two to four points."""
     radii = []
     for n in (2, 3, 4):
         for some in itertools.combinations(range(len(points)), n):

@@ -40,7 +40,7 @@ def mesh_shape(folder, mesh, name="part.stl", pose=IDENTITY):
 
 
 def arm(*links):
-    """A chain of links with those collision shapes, a hinge between each two."""
+    """Return a chain of links with the given collision shapes and revolute joints."""
     made = tuple(Link(f"l{i}", None, (), tuple(shapes)) for i, shapes in enumerate(links))
     joints = tuple(
         Joint(f"j{i}", "revolute", f"l{i}", f"l{i + 1}", Pose((0.0, 0.0, 0.5)), axis=(0, 0, 1))
@@ -51,7 +51,7 @@ def arm(*links):
 
 @pytest.fixture
 def wedge():
-    """A solid without any symmetry."""
+    """Return a mesh without any symmetry."""
     points = [(0, 0, 0), (0.3, 0, 0), (0, 0.2, 0), (0, 0, 0.1), (0.3, 0.05, 0.02), (0.1, 0.2, 0.1)]
     return trimesh.convex.convex_hull(np.array(points))
 
@@ -252,7 +252,7 @@ XACRO = """\
 
 @pytest.fixture
 def own_parts(tmp_path, monkeypatch):
-    """A folder with a part of one's own, a template with a mesh; no cache of fits."""
+    """Return a folder with a user part, a template with a mesh, and no cache of fits."""
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "my_wedge.yaml").write_text(TEMPLATE)
@@ -290,7 +290,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
     ],
 )
 def test_stored_fits_are_reproducible(name, options):
-    """To a hundredth: other processors round sums otherwise, and a search amplifies that."""
+    """The tolerance is 0.01: processors round sums differently, and the search amplifies that."""
     body = load_part(LIBRARY.manifest(name)).fragment
     stored = read_stored_fits(LIBRARY.folders)
     for row in fit_links(body, options).links:

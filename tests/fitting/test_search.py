@@ -30,7 +30,7 @@ def target_of(*shapes, seed=0):
 
 
 def fitted(geometry, pose=TILTED, seed=0):
-    """The best single primitive of a primitive, its score, and the solid."""
+    """Return the best single primitive of a primitive, its score, and the solid."""
     target = target_of(Shape(geometry, pose), seed=seed)
     fit = best_single(target)
     (shape,), score = fit.shapes, fit.iou
@@ -38,7 +38,7 @@ def fitted(geometry, pose=TILTED, seed=0):
 
 
 def assert_well_formed(shape):
-    """Positive and rounded dimensions, a quaternion of unit length, w >= 0, and no colour."""
+    """Assert positive rounded dimensions, a unit quaternion with w >= 0, and no colour."""
     pose = shape.T_link_shape
     sizes = dimensions(shape.geometry)
     assert min(sizes) > 0
@@ -85,7 +85,7 @@ def test_the_result_does_not_depend_on_size_or_position(size):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_thin_plate_is_recovered(seed):
-    """What a primitive holds beyond the points that are drawn must not be free."""
+    """Volume of a primitive outside the sampled region must count as an error."""
     shape, score, solid = fitted(Box((0.3, 0.2, 0.006)), Pose(), seed)
     iou = quality(solid, [shape]).iou
     assert score == pytest.approx(iou, abs=0.03)
@@ -171,7 +171,7 @@ def test_sample_points_cover_the_solid_and_its_surroundings():
 
 @pytest.mark.parametrize("count", [None, 4096])
 def test_sample_weights_are_volumes(count):
-    """Also over the first points alone, for they are in no order."""
+    """This includes the first points alone, because the points are shuffled."""
     target = target_of(Shape(Box((0.1, 0.2, 0.4))))
     points, inside, weights = (
         array[:count] for array in (target.points, target.inside, target.weights)
@@ -198,7 +198,7 @@ def test_a_solid_that_fills_almost_none_of_its_bounds_is_an_error():
 
 
 def cloud(n=2000):
-    """Points in a box of 0.4, 0.2, 0.1 (metres), turned, and its rotation."""
+    """Return points in a rotated box with edges 0.4, 0.2, 0.1 [m], and its rotation matrix."""
     R = TILTED.matrix[:3, :3]
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (n, 3)) * (0.4, 0.2, 0.1)
     return points @ R.T + (0.1, 0.0, 0.2), R

@@ -22,19 +22,19 @@ CLIMB = {"num_steps": 80, "tau": (0.03, 0.002), "rate": (0.01, 0.0005)}
 
 
 def primitive(kind, centre=(0.0, 0.0, 0.0), quaternion=UPRIGHT, halves=HALVES):
-    """One guess of one primitive."""
+    """Return candidates with one guess of one primitive."""
     arrays = (np.array(value, float)[None, None] for value in (centre, quaternion, halves))
     return Candidates(np.array([[kind]]), *arrays)
 
 
 def turned(points, quaternion):
-    """Points in the frame of a quaternion of unit length."""
+    """Return points in the frame of a unit quaternion."""
     w, *axis = quaternion
     return points - 2 * w * np.cross(axis, points) + 2 * np.cross(axis, np.cross(axis, points))
 
 
 def within(kind, points, halves):
-    """Which points lie in a primitive at the origin, by its definition."""
+    """Return which points are in a primitive at the origin, from its definition."""
     x, y, z = np.abs(points).T
     if kind == BOX:
         return (x <= halves[0]) & (y <= halves[1]) & (z <= halves[2])
@@ -235,7 +235,7 @@ def test_ascent_of_several_candidates_with_several_primitives():
 
 
 def test_points_with_zero_weight_are_ignored():
-    """A solid of two boxes: a candidate spans both, or holds the one that its weights leave."""
+    """The solid is two boxes; a candidate covers both, or the one with nonzero weights."""
     halves = (0.125, 0.3, 0.2)
     boxes = [within(BOX, POINTS - np.array((x, 0, 0)), halves) for x in (-0.25, 0.25)]
     starts = [primitive(BOX, (x, 0, 0), halves=(0.2, 0.2, 0.15)) for x in (-0.05, 0.05, 0.0)]

@@ -23,7 +23,7 @@ GRID = np.stack(np.meshgrid(AXIS, AXIS, AXIS, indexing="ij"), axis=-1).reshape(-
 
 
 def counted(solid):
-    """The volume by counting."""
+    """Return the volume by counting grid points."""
     return solid.contains(GRID).mean() * (2 * HALF) ** 3
 
 
@@ -36,7 +36,7 @@ def box(size=SIZE, at=(0.0, 0.0, 0.0), inverted=False):
 
 
 def without(mesh, dropped):
-    """The mesh less the triangles that the mask names."""
+    """Return the mesh without the masked triangles."""
     kept = mesh.copy()
     kept.update_faces(~dropped)
     kept.remove_unreferenced_vertices()

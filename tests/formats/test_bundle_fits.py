@@ -29,7 +29,7 @@ def no_search(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """The UR5's bundle."""
+    """Return the folder of a bundle of the UR5."""
     return write_bundle(
         morphgen.compose(WORDS), tmp_path_factory.mktemp("r") / "ur5", picture=False
     )

@@ -44,14 +44,14 @@ def write(folder, text, name="robot"):
 
 
 def changed(**changes):
-    """The file of the arm, keys of its link changed; those that become None are left out."""
+    """Return the fits file of the arm with changed keys of its link; None removes a key."""
     data = json.loads(fits_text({"key": ARM}))
     link = {k: v for k, v in (data["links"][0] | changes).items() if v is not None}
     return json.dumps(data | {"links": [link]})
 
 
 def shape(**changes):
-    """Plain data of the can, keys changed; those that become None are left out."""
+    """Return plain data of the can with changed keys; None removes a key."""
     return {k: v for k, v in (shape_to_data(CAN) | changes).items() if v is not None}
 
 

@@ -16,7 +16,7 @@ SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\
 
 
 def chain(links):
-    """A URDF of links one below the other."""
+    """Return a URDF of a chain of links."""
     names = "".join(f'<link name="l{i}"/>' for i in range(links))
     joints = "".join(
         f'<joint name="j{i}" type="fixed"><parent link="l{i}"/><child link="l{i + 1}"/></joint>'
@@ -26,7 +26,7 @@ def chain(links):
 
 
 def entities(depth):
-    """Entities that multiply twentyfold at each of ``depth`` levels."""
+    """Return entities that expand twentyfold at each of ``depth`` levels."""
     lines = [f'<!ENTITY e{n} "{f"&e{n - 1};" * 20 if n else "lol"}">' for n in range(depth)]
     return f"<!DOCTYPE r [{''.join(lines)}]>"
 
@@ -134,7 +134,7 @@ MESHES = {
 
 
 def refused(path, capsys, tmp_path, codes=(2,)):
-    """Require that the three commands say why not in one line each; return what check says."""
+    """Assert that the three commands fail with one line each; return the line of ``check``."""
     out = tmp_path / "out"
     for words in (["show", path], ["import", path, "--out", out, "--no-picture"], ["check", path]):
         code = main([str(word) for word in words])
@@ -260,5 +260,5 @@ def test_hostile_urdfs_use_bounded_memory_and_time(name, tmp_path):
     )
 
     assert result.returncode == 0, result.stderr
-    # Not ru_maxrss: it begins with that of the process that started this one.
+    # Not ru_maxrss: it starts at the value of the parent process.
     assert int(result.stdout.split()[-1]) < 2**20  # KiB

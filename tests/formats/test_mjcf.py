@@ -48,7 +48,7 @@ def single(shape, **kwargs):
 
 
 def hinged(link, joint=None):
-    """A link on a hinge on a massless root."""
+    """Return a link with a revolute joint on a massless root."""
     joint = joint or Joint("hinge", "revolute", "root", link.name, limits=(-1.0, 1.0))
     return Robot("hinged", (Link("root"), link), (joint,), home=(0.0,))
 

@@ -231,7 +231,7 @@ def test_links_between_packages_are_followed(tmp_path: Path, urdf: Path) -> None
 
 
 def test_a_symlinked_description_may_reference_files_beside_its_target(tmp_path: Path) -> None:
-    """Caches of downloads keep every file as a link into a folder of blobs."""
+    """Download caches store every file as a link into a folder of blobs."""
     store, shown = tmp_path / "store" / "blobs", tmp_path / "shown" / "snapshot"
     shown.mkdir(parents=True)
     for name in ("robot.urdf", "a.stl"):

@@ -28,7 +28,7 @@ RANDOM = RNG.uniform(-math.pi, math.pi, (200, 3)).tolist()
 
 
 def from_file(pose):
-    """A pose as a URDF gives it back."""
+    """Return the pose after writing it to a URDF and reading it."""
     xyz, rpy = (
         [float(format_number(value)) for value in triple] for triple in (pose.position, pose.rpy)
     )
@@ -50,7 +50,7 @@ def tilted(rng):
 
 
 def odd_robot(seed):
-    """A tree with all that a file says otherwise: joints half described, capsules, long numbers."""
+    """Return a tree with everything that a file changes: joint defaults, capsules, long numbers."""
     rng = np.random.default_rng(seed)
     limits = tuple(sorted(rng.normal(size=2)))
     can = Shape(Capsule(0.1 / 3, 0.7 / 3), tilted(rng))

@@ -191,7 +191,7 @@ def test_unknown_elements_are_ignored():
 
 
 def mutations() -> list[str]:
-    """The sound document, each attribute dropped, emptied or spoilt, each element dropped."""
+    """Return copies of the valid document with one attribute or element changed or removed."""
     texts = []
     total = len(list(etree.fromstring(SOUND).iter()))
     for i in range(total):

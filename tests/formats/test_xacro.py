@@ -21,7 +21,7 @@ HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
 
 
 def expand_text(text: str, args: Mapping[str, str], origin: Path, finder: PackageFinder) -> bytes:
-    """Expand a text that stands for a file, in this process."""
+    """Expand a text as if it were a file, in this process."""
     return Expansion(args, origin, finder).run(text.encode())
 
 
@@ -30,7 +30,7 @@ def robot(body: str) -> str:
 
 
 def expanded(body: str, origin: Path, **args: str) -> list[dict[str, str]]:
-    """Attributes of the links of a document."""
+    """Return the attributes of the links of an expanded document."""
     root = parse_xml(expand_text(robot(body), args, origin, NOWHERE), "out")
     return [dict(link.attrib) for link in root.findall("link")]
 

@@ -33,7 +33,7 @@ def write(tmp_path):
 
 
 def values_of(manifest, rng):
-    """Counts and numbers of a template, drawn from their ranges, as xacro arguments."""
+    """Return random integer and real parameters of a template as xacro arguments."""
     constants, numbers = {}, {}
     for name, parameter in manifest.parameters.items():
         if parameter.integer:

@@ -168,7 +168,7 @@ def test_expressions_have_bounded_time_and_size(text):
 
 
 def test_no_text_of_a_document_is_executed_by_python():
-    """The only ``exec`` is that of the package's own code; ``eval`` and ``compile`` are nowhere."""
+    """The only ``exec`` runs code of the package; ``eval`` and ``compile`` are never called."""
     folder = Path(morphgen.formats.__file__).parent
     calls = [
         f"{path.name}: {ast.unparse(node)}"

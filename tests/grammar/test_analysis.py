@@ -14,8 +14,8 @@ from morphgen.grammar.derive import derive
 from morphgen.grammar.structures import count_structures, enumerate_structures
 
 
-def structures(found, limit=None):
-    return [str(d) for d in itertools.islice(enumerate_structures(found, LIBRARY), limit)]
+def structures(robot_grammar, limit=None):
+    return [str(d) for d in itertools.islice(enumerate_structures(robot_grammar, LIBRARY), limit)]
 
 
 @pytest.mark.parametrize("name", CATEGORIES)

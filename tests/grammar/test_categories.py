@@ -18,8 +18,8 @@ RANGES = {
 """Links and movable joints that the benchmark's table names for categories of several sizes."""
 
 
-def troubles(drawn: Sample, category):
-    """What is wrong with a robot of a category."""
+def robot_faults(drawn: Sample, category):
+    """Return the faults of a robot of a category."""
     robot = drawn.robot
     counts = (len(robot.links), len(robot.movable_joints))
     faults = unphysical(robot)
@@ -41,7 +41,7 @@ def troubles(drawn: Sample, category):
 def test_robots_have_the_counts_of_the_benchmark_and_all_loaders_agree(category, tmp_path):
     grammar = shipped(category)
     drawn = [sample_robot(grammar, LIBRARY, index, seed=11) for index in range(3)]
-    assert [trouble for one in drawn for trouble in troubles(one, category)] == []
+    assert [trouble for one in drawn for trouble in robot_faults(one, category)] == []
     folder = write_bundle(drawn[0].robot, tmp_path / "robot", picture=False)
     report = conformance(folder, 20)
     assert report.passed, report
@@ -54,7 +54,7 @@ def test_a_hundred_robots_have_no_errors_and_all_loaders_agree(category, tmp_pat
     grammar = shipped(category)
     for index in range(100):
         drawn = sample_robot(grammar, LIBRARY, index, seed=12)
-        assert troubles(drawn, category) == []
+        assert robot_faults(drawn, category) == []
         folder = write_bundle(drawn.robot, tmp_path / "robot", picture=False)
         report = conformance(folder, 20)
         assert report.passed, report

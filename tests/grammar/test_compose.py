@@ -44,8 +44,8 @@ def joined(text):
     return join(derive(text), LIBRARY, "robot")
 
 
-class Situation:
-    """A robot in one configuration, and where its parts are in it."""
+class PosedRobot:
+    """A robot in one configuration, and the poses of its parts."""
 
     def __init__(self, text, seed=0):
         self.placed = load_parts(derive(text), LIBRARY)
@@ -56,7 +56,7 @@ class Situation:
         self.positions = dict(zip(names, self.q, strict=True))
 
     def alone(self, label):
-        """Pose of every link of a part in the part's root, the part by itself in that pose."""
+        """Return link poses of the part alone, in its root frame, at the same configuration."""
         body = self.placed[label].part.fragment
         joints = [body.joints[k].name for k in body.independent_joints]
         return forward_kinematics(body, [self.positions[f"{label}_{name}"] for name in joints])
@@ -70,12 +70,12 @@ class Situation:
         return [(self.T_world_link[index[n]], T) for n, T in there if n in index]
 
     def root(self, label):
-        """Pose of a part's root in the robot."""
+        """Return the pose of the root of a part in the robot."""
         T_world_link, T_part_link = self.links(label)[-1]
         return T_world_link @ np.linalg.inv(T_part_link)
 
     def placement(self, label, placement):
-        """Pose of a frame of a part's manifest, of plain numbers, in the robot."""
+        """Return the pose of a frame of a part manifest in the robot."""
         part = self.placed[label].part
         link = placement.link.replace("/", "_")
         T_part_link = self.alone(label)[part.fragment.link_index[link]]
@@ -95,19 +95,19 @@ def turn(yaw):
 
 @pytest.mark.parametrize("ee", [name for name in EES if name != "none"])
 def test_the_end_effector_mount_equals_the_flange_up_to_mount_yaw(ee):
-    there = Situation(f"arm=ur5 ee={ee} ee.mount_yaw=33deg")
+    there = PosedRobot(f"arm=ur5 ee={ee} ee.mount_yaw=33deg")
     expected = there.flange() @ turn(math.radians(33))
     np.testing.assert_allclose(there.mount(), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("arm", PAPER_ARMS)
 def test_every_arm_accepts_an_end_effector_on_its_flange(arm):
-    there = Situation(f"arm={arm} ee=panda_hand", seed=1)
+    there = PosedRobot(f"arm={arm} ee=panda_hand", seed=1)
     np.testing.assert_allclose(there.mount(), there.flange(), atol=1e-12)
 
 
 def test_without_an_end_effector_the_tool_is_the_flange():
-    there = Situation("arm=ur5 ee.mount_yaw=90deg ee=none")
+    there = PosedRobot("arm=ur5 ee.mount_yaw=90deg ee=none")
     tool = frame_pose(there.robot, there.q)
     np.testing.assert_allclose(tool, there.flange() @ turn(math.pi / 2), atol=1e-12)
 
@@ -116,7 +116,7 @@ def test_without_an_end_effector_the_tool_is_the_flange():
     "text", ["base=planar arm=panda ee=robotiq_2f85", "arm=lwr ee=jaco_fingers"]
 )
 def test_parts_have_the_same_kinematics_in_the_robot_as_alone(text):
-    there = Situation(text, seed=2)
+    there = PosedRobot(text, seed=2)
     for label in there.placed:
         for T_world_link, T_part_link in there.links(label):
             np.testing.assert_allclose(T_world_link, there.root(label) @ T_part_link, atol=1e-12)
@@ -179,7 +179,7 @@ def test_home_concatenates_the_homes_of_the_parts():
 
 
 def test_the_tool_frame_is_at_the_working_point_of_the_end_effector():
-    """At the plate's far edge, the centre of the stick's ball, and where fingers meet."""
+    """The far edge of the plate, the centre of the ball of the stick, or between the fingers."""
     for ee, ahead in (
         ("plane ee.size=80mm", 0.08),
         ("stick ee.length=0.25", 0.25),
@@ -187,15 +187,15 @@ def test_the_tool_frame_is_at_the_working_point_of_the_end_effector():
         ("panda_hand", 0.1034),
         ("robotiq_2f85", 0.144),
     ):
-        there = Situation(f"arm=ur5 ee={ee}")
+        there = PosedRobot(f"arm=ur5 ee={ee}")
         T_flange_tool = np.linalg.inv(there.flange()) @ frame_pose(there.robot, there.q)
         assert T_flange_tool[:3, 3] == pytest.approx([0, 0, ahead], abs=1e-9)
         assert T_flange_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-9)
 
 
 def test_the_composed_panda_equals_the_published_robot():
-    """The hand sits turned by 45 degrees, as Franka Emika delivers it."""
-    there = Situation("arm=panda ee=panda_hand")
+    """The hand is rotated by 45 degrees, as Franka Emika delivers it."""
+    there = PosedRobot("arm=panda ee=panda_hand")
     hand = there.T_world_link[there.robot.link_index["ee_panda_hand"]]
     np.testing.assert_allclose(hand, there.flange() @ turn(-math.pi / 4), atol=1e-9)
 
@@ -217,7 +217,7 @@ def test_no_robot_collides_with_itself_at_home(text):
 
 
 def test_link_pairs_that_can_collide_are_not_ignored():
-    """Arms side by side can strike each other, and an arm its own foot."""
+    """Arms side by side can collide with each other, and an arm with its own base."""
     robot = composed("left.arm=ur5 right.arm=ur5 base=fixed base.spread=0.5")
     assert ("left_arm_forearm_link", "right_arm_forearm_link") not in robot.ignore_pairs
     assert ("left_arm_base_link", "left_arm_forearm_link") not in robot.ignore_pairs

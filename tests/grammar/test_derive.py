@@ -16,8 +16,8 @@ def first(*lines):
     return derive(grammar(*lines), LIBRARY, FirstChooser())
 
 
-def draw(found, seed=0):
-    return derive(found, LIBRARY, RandomChooser(np.random.default_rng(seed)))
+def draw(robot_grammar, seed=0):
+    return derive(robot_grammar, LIBRARY, RandomChooser(np.random.default_rng(seed)))
 
 
 def labels(derivation):
@@ -25,7 +25,7 @@ def labels(derivation):
 
 
 def places(derivation):
-    """Where every part but the first is attached: its label, the part below it and the port."""
+    """Return label, parent and port of every part but the first."""
     return [(c.label, node.label, port) for node in derivation.walk() for port, c in node.children]
 
 

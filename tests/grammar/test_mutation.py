@@ -13,13 +13,20 @@ from morphgen.grammar.sampling import SamplingError, mutate, sample_robot
 
 
 def as_in_index(choices):
-    """Choices as they come back from a file."""
+    """Return choices as read back from a file."""
     return json.loads(json.dumps({key: round_number(value) for key, value in choices.items()}))
 
 
-def neighbours(found, origin, n, seed=0):
+def neighbours(robot_grammar, origin, n, seed=0):
     return list(
-        mutate(found, LIBRARY, as_in_index(origin.choices), n, seed=seed, name=origin.robot.name)
+        mutate(
+            robot_grammar,
+            LIBRARY,
+            as_in_index(origin.choices),
+            n,
+            seed=seed,
+            name=origin.robot.name,
+        )
     )
 
 

@@ -11,19 +11,20 @@ from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import sample_robots
 
 
-def parts(found, *words):
+def parts(links_grammar, *words):
     return [
-        node.part for node in derive(pin(found, words, LIBRARY), LIBRARY, FirstChooser()).walk()
+        node.part
+        for node in derive(pin(links_grammar, words, LIBRARY), LIBRARY, FirstChooser()).walk()
     ]
 
 
-def values(found, *words):
-    tree = derive(pin(found, words, LIBRARY), LIBRARY, FirstChooser())
+def values(links_grammar, *words):
+    tree = derive(pin(links_grammar, words, LIBRARY), LIBRARY, FirstChooser())
     return {node.label: dict(node.parameters) for node in tree.walk()}
 
 
 @pytest.fixture(scope="module")
-def found():
+def links_grammar():
     return grammar(
         "let r = uniform(1cm, 2cm)",
         "robot -> base links ee",
@@ -33,41 +34,47 @@ def found():
     )
 
 
-def test_without_pins_the_first_structure_is_taken(found):
-    assert parts(found) == ["slides", "bead", "bead", "plane"]
+def test_without_pins_the_first_structure_is_taken(links_grammar):
+    assert parts(links_grammar) == ["slides", "bead", "bead", "plane"]
 
 
-def test_a_symbol_can_be_pinned_to_an_alternative(found):
-    assert parts(found, "base=gantry", "links=beam", "ee=stick") == ["gantry", "beam", "stick"]
+def test_a_symbol_can_be_pinned_to_an_alternative(links_grammar):
+    assert parts(links_grammar, "base=gantry", "links=beam", "ee=stick") == [
+        "gantry",
+        "beam",
+        "stick",
+    ]
 
 
-def test_a_count_can_be_pinned(found):
-    assert parts(found, "links=4").count("bead") == 4
+def test_a_count_can_be_pinned(links_grammar):
+    assert parts(links_grammar, "links=4").count("bead") == 4
 
 
-def test_a_parameter_is_pinned_for_every_instance_of_the_part(found):
-    pinned = values(found, "bead.rod=80mm", "slides.low=0.3")
+def test_a_parameter_is_pinned_for_every_instance_of_the_part(links_grammar):
+    pinned = values(links_grammar, "bead.rod=80mm", "slides.low=0.3")
     assert [pinned[bead]["rod"] for bead in ("bead1", "bead2")] == [0.08, 0.08]
     assert pinned["bead1"]["radius"] == pytest.approx(0.015)
     assert pinned["base"]["low"] == 0.3
 
 
-def test_mount_yaw_can_be_pinned(found):
-    assert values(found, "plane.mount_yaw=90deg")["ee"]["mount_yaw"] == pytest.approx(1.57079632679)
+def test_mount_yaw_can_be_pinned(links_grammar):
+    assert values(links_grammar, "plane.mount_yaw=90deg")["ee"]["mount_yaw"] == pytest.approx(
+        1.57079632679
+    )
 
 
 @pytest.mark.parametrize("text", ["r=0.02", "r=20mm", "r=+2cm"])
-def test_a_let_can_be_pinned_with_or_without_a_unit(found, text):
-    assert values(found, text)["bead1"]["radius"] == pytest.approx(0.02)
+def test_a_let_can_be_pinned_with_or_without_a_unit(links_grammar, text):
+    assert values(links_grammar, text)["bead1"]["radius"] == pytest.approx(0.02)
 
 
-def test_the_order_of_words_does_not_matter(found):
+def test_the_order_of_words_does_not_matter(links_grammar):
     words = ["links=3", "bead.rod=80mm", "ee=stick", "r=2cm"]
-    assert values(found, *words) == values(found, *reversed(words))
+    assert values(links_grammar, *words) == values(links_grammar, *reversed(words))
 
 
-def test_pinned_choices_are_the_same_in_every_sample(found):
-    drawn = list(sample_robots(pin(found, ["links=2", "r=2cm"], LIBRARY), LIBRARY, 3))
+def test_pinned_choices_are_the_same_in_every_sample(links_grammar):
+    drawn = list(sample_robots(pin(links_grammar, ["links=2", "r=2cm"], LIBRARY), LIBRARY, 3))
     assert {str(d.derivation).count("=bead") for d in drawn} == {2}
     assert all("radius=0.02" in str(d.derivation) for d in drawn)
 
@@ -93,15 +100,15 @@ def test_pinned_choices_are_the_same_in_every_sample(found):
         ("r=2cm+", "r=2cm+:1:5: found the end, expected"),
     ],
 )
-def test_an_unknown_pin_is_an_error(found, word, message):
+def test_an_unknown_pin_is_an_error(links_grammar, word, message):
     with pytest.raises(MorphgenError, match=r"^[^\n]*$") as caught:
-        pin(found, [word], LIBRARY)
+        pin(links_grammar, [word], LIBRARY)
     assert message in str(caught.value)
 
 
-def test_a_pinned_value_with_a_wrong_unit_is_an_error_at_its_use(found):
+def test_a_pinned_value_with_a_wrong_unit_is_an_error_at_its_use(links_grammar):
     with pytest.raises(MorphgenError, match="radius is in m, r in rad"):
-        values(found, "r=2deg")
+        values(links_grammar, "r=2deg")
 
 
 def test_words_may_begin_with_a_grammar():

@@ -23,7 +23,7 @@ def only(text):
 
 
 def argument(text):
-    """The expression of a part's parameter."""
+    """Return the expression of a parameter of a part."""
     return only(f"robot -> part(x={text})").alternatives[0].items[0].arguments[0][1]
 
 

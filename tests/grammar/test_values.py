@@ -19,7 +19,7 @@ def value(text):
 
 
 def drawn(text, n=4000):
-    """Values of a distribution, always the same ones."""
+    """Return reproducible values of a distribution."""
     rng = np.random.default_rng(0)
     expression = parse_condition(text, "g")
     scope = Scope({}, lambda _, d: d.draw(rng.random, rng.standard_normal), "")

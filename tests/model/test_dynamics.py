@@ -21,7 +21,7 @@ from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
 
 
 def random_robot(rng):
-    """A tree of hinges, slides, fixed and mimic joints in no particular order."""
+    """Return a random tree of revolute, prismatic, fixed and mimic joints."""
     links = [Link("l0", random_inertial(rng))]
     joints = []
     for i in range(1, 9):

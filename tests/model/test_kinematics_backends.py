@@ -33,7 +33,7 @@ WORDS = (
 
 
 def tool_on_a_mimic_finger():
-    """The arm with its tool on a finger that follows a slide of another branch, with an offset."""
+    """Return the arm with its tool on a mimic finger whose leader is in another branch."""
     *joints, last = arm().joints
     joints.append(replace(last, mimic=Mimic("left", -0.5, 0.1)))
     frame = Frame("tool", "right", Pose.from_xyz_rpy((0.01, 0.02, 0.03), (0.3, 0.2, 0.1)))
@@ -41,7 +41,7 @@ def tool_on_a_mimic_finger():
 
 
 def two_leaders():
-    """The arm whose slide follows its shoulder, so that one leader moves the tool by two joints."""
+    """Return the arm whose slide mimics its shoulder: one leader moves two joints of the tool."""
     shoulder, elbow, slide, *fingers = arm().joints
     slide = replace(slide, mimic=Mimic("shoulder", 0.02, 0.03))
     home = (arm().home[0], arm().home[1], arm().home[3])
