@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
@@ -20,9 +19,6 @@ from matplotlib.transforms import Bbox
 
 from morphgen.benchmark.similarity import MdsMap
 from morphgen.typing import Array
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 MAX_NAMED = 60
 """Largest number of robots whose names are drawn."""
@@ -67,19 +63,15 @@ class MapPanel:
     """The map of n points."""
 
 
-def _with_default_style(draw: Callable[P, T]) -> Callable[P, T]:
+@contextmanager
+def _default_style() -> Iterator[None]:
     """Draw with matplotlib's default settings, whatever the user's."""
-
-    @functools.wraps(draw)
-    def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
-        with matplotlib.rc_context():
-            matplotlib.rcdefaults()
-            return draw(*args, **kwargs)
-
-    return wrapper
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        yield
 
 
-@_with_default_style
+@_default_style()
 def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
     """Draw matrices side by side, bright where robots are similar, and return the PNG.
 
@@ -107,7 +99,7 @@ def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
     return _png(figure)
 
 
-@_with_default_style
+@_default_style()
 def map_png(names: Sequence[str], panels: Sequence[MapPanel]) -> bytes:
     """Draw maps side by side and return the PNG.
 

@@ -49,6 +49,16 @@ _UNTRACEABLE = (
 """Exceptions that tracing an untraceable template can raise."""
 
 
+def _recorded(sign: str, *, reflected: bool = False) -> Callable[[Traced, object], Traced]:
+    """Return a method that records an operation; if reflected, the symbol is the right operand."""
+
+    def operate(symbol: Traced, other: object) -> Traced:
+        left, right = (other, symbol) if reflected else (symbol, other)
+        return Traced(f"({_code(left)} {sign} {_code(right)})")
+
+    return operate
+
+
 class Traced:
     """A symbol in place of a number; it records the arithmetic done with it as an expression."""
 
@@ -58,32 +68,15 @@ class Traced:
     def __str__(self) -> str:
         return f"{_OPEN}{self.code}{_CLOSE}"
 
-    def __add__(self, other: object) -> Traced:
-        return _binary(self, "+", other)
-
-    def __radd__(self, other: object) -> Traced:
-        return _binary(other, "+", self)
-
-    def __sub__(self, other: object) -> Traced:
-        return _binary(self, "-", other)
-
-    def __rsub__(self, other: object) -> Traced:
-        return _binary(other, "-", self)
-
-    def __mul__(self, other: object) -> Traced:
-        return _binary(self, "*", other)
-
-    def __rmul__(self, other: object) -> Traced:
-        return _binary(other, "*", self)
-
-    def __truediv__(self, other: object) -> Traced:
-        return _binary(self, "/", other)
-
-    def __rtruediv__(self, other: object) -> Traced:
-        return _binary(other, "/", self)
-
-    def __pow__(self, other: object) -> Traced:
-        return _binary(self, "**", other)
+    __add__ = _recorded("+")
+    __radd__ = _recorded("+", reflected=True)
+    __sub__ = _recorded("-")
+    __rsub__ = _recorded("-", reflected=True)
+    __mul__ = _recorded("*")
+    __rmul__ = _recorded("*", reflected=True)
+    __truediv__ = _recorded("/")
+    __rtruediv__ = _recorded("/", reflected=True)
+    __pow__ = _recorded("**")
 
     def __neg__(self) -> Traced:
         return Traced(f"(-{self.code})")
@@ -229,10 +222,6 @@ def _lifted(name: str, function: Callable[..., object]) -> Callable[..., object]
         return function(*operands)
 
     return call
-
-
-def _binary(left: object, sign: str, right: object) -> Traced:
-    return Traced(f"({_code(left)} {sign} {_code(right)})")
 
 
 def _code(operand: object) -> str:
