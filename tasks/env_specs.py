@@ -36,7 +36,7 @@ _FILE_KEYS = {
 
 @dataclass(frozen=True)
 class GoalConfig:
-    """What goal sets depend on besides robots, tasks and obstacles."""
+    """Seed and constants of tasks, from which goal sets are sampled."""
 
     seed: int = 0
     """Seed of all goals, the same in training and evaluation."""

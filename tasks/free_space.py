@@ -169,6 +169,7 @@ class FreeSpace:
     def _too_few(
         self, num_accepted: int, num_refused: int, n: int, tried: int, collisions: Counter[Pair]
     ) -> BenchmarkError:
+        """Return the error that too few random configurations are free."""
         ((a, b), count), *_ = collisions.most_common(1)
         more = ""
         if num_refused:

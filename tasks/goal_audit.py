@@ -118,10 +118,13 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
         for finding in audit.findings
         if not (finding.code == "accepted-unused" and finding.where in used_acceptances)
     ]
-    new = findings or ()
-    accepted = tuple((one, split.accepted[one.code]) for one in new if one.code in split.accepted)
-    remaining += [one for one in new if one.code not in split.accepted]
-    return replace(audit, findings=tuple(remaining), accepted=(*audit.accepted, *accepted))
+    accepted = list(audit.accepted)
+    for finding in findings or ():
+        if finding.code in split.accepted:
+            accepted.append((finding, split.accepted[finding.code]))
+        else:
+            remaining.append(finding)
+    return replace(audit, findings=tuple(remaining), accepted=tuple(accepted))
 
 
 @dataclass(frozen=True)

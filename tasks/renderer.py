@@ -231,6 +231,7 @@ def _append(
     writer: Any,  # noqa: ANN401 - imageio has no type for it
     frame: Frame,
 ) -> None:
+    """Append a frame to a video; raise ``VideoError`` if ffmpeg has ended."""
     try:
         writer.append_data(frame)
     except OSError as error:

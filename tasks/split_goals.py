@@ -331,7 +331,7 @@ def _parse_index(index: Mapping[str, Any], folder: Path) -> SplitGoals:
         index[task]  # a KeyError if it is missing
     constants = {key: index[key] for key in index if key not in ("format", "seed", "sets")}
     config = GoalConfig(int(index["seed"]), task_configs(constants))
-    return SplitGoals.from_results([_read_set(folder, one) for one in index["sets"]], config)
+    return SplitGoals.from_results([_read_set(folder, record) for record in index["sets"]], config)
 
 
 def _read_set(folder: Path, record: Mapping[str, Any]) -> GoalResult:

@@ -35,7 +35,7 @@ class Address:
     page: str
     """Key of the page in ``PAGES``."""
     subjects: tuple[str, ...] = ("",)
-    """What the page shows: a folder, a robot, a split's name, ...; several on page ``compare``."""
+    """Folder, robot URI or name of a split that the page shows; several on page ``compare``."""
     state: Mapping[str, str] = field(default_factory=dict)
     """Sort order, filter, joint positions, ... by key; default values are left out."""
     robots: tuple[str, ...] = ()

@@ -150,6 +150,7 @@ def _draw_tokens(
     table: Array,
     different: NDArray[np.bool_] | None,
 ) -> None:
+    """Draw a robot's tokens, with a dot at each number that differs from the first robot's."""
     ax.imshow(table, "RdBu_r", vmin=-1, vmax=1, aspect="auto", interpolation="nearest")
     for field in LAYOUT[1:]:
         ax.axvline(field.start - 0.5, color="0.45", linewidth=0.6)

@@ -178,6 +178,7 @@ def _show_page(gallery: Gallery, number: int) -> None:
 
 
 def _current_filter(gallery: Gallery) -> robot_rows.Filter:
+    """Return the filter that the controls are set to."""
     values = {
         key: "" if control.value == _ALL and key != "search" else control.value
         for key, control in gallery.controls.items()
@@ -198,6 +199,7 @@ def _current_filter(gallery: Gallery) -> robot_rows.Filter:
 
 
 def _draw_grid(gallery: Gallery) -> None:
+    """Draw the cards of the current page, in a column for each role if there are columns."""
     if gallery.grid is None:
         return
     columns: dict[str, list[str]] = {role: [] for role in gallery.columns}
@@ -235,6 +237,7 @@ def _draw_missing(gallery: Gallery) -> None:
 
 
 def _request_missing(gallery: Gallery) -> None:
+    """Draw missing thumbnails in the workers, and show them as they arrive."""
     session, rows, workers = gallery.session, gallery.page_rows, gallery.session.workers
     finished_uris = gallery.thumbnails.keys() | gallery.faults.keys()
     pending = {

@@ -99,6 +99,7 @@ def _add_robots(session: Session, robots: Sequence[Robot]) -> list[scene_robot.R
 
 
 def _add_robots_tab(page: ComparePage) -> None:
+    """Add the list of URIs to edit, and a table of the robots."""
     gui, session = page.session.client.gui, page.session
     text = gui.add_text(
         "a robot a line",

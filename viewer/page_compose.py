@@ -176,6 +176,7 @@ def _send_bundle(page: ComposePage, name: str) -> None:
 def _add_parts_tab(
     page: ComposePage, tabs: viser.GuiTabGroupHandle, choice: part_choice.PartChoice
 ) -> PartsTab:
+    """Add the tab with a dropdown for the base and the controls of its slots."""
     session = page.session
     gui = session.client.gui
     with tabs.add_tab("Parts", viser.Icon.PUZZLE):
@@ -237,6 +238,7 @@ def _add_part_dropdown(tab: PartsTab, slot: str) -> None:
 
 
 def _add_slider(tab: PartsTab, control: part_choice.Control) -> None:
+    """Add the slider of a part's parameter."""
     slider = tab.page.session.client.gui.add_slider(
         control.label,
         control.low,

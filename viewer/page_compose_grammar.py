@@ -36,7 +36,7 @@ ShowRobot = Callable[[Robot, Derivation, str, str], None]
 
 @dataclass(eq=False)
 class GrammarTab:
-    """The tab in one browser."""
+    """Controls of the grammar tab in one browser."""
 
     session: Session
     show_robot: ShowRobot

@@ -179,6 +179,7 @@ def _add_player(session: Session) -> tuple[PlayPage, Player]:
 
 
 def _add_downloads(page: PlayPage) -> None:
+    """Add buttons that send the episode as a file, a video or a recorded scene."""
     gui, session = page.session.client.gui, page.session
     downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
         (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),

@@ -38,7 +38,7 @@ ARMS = "arms with a plate"
 MAX_CHOICES = 500
 """Robots that a dropdown offers; others can be named by words."""
 ACTIONS = ("replace", "add", "only")
-"""What to do with the chosen robot: replace the first, add it, or remove all others."""
+"""Actions on the chosen robot: replace the first, add it, or remove all others."""
 
 Robots = list[tuple[str, str]]
 """Names and URIs."""
@@ -46,11 +46,11 @@ Robots = list[tuple[str, str]]
 
 @dataclass(eq=False)
 class RolloutControls:
-    """The controls in one browser."""
+    """Controls of a rollout in one browser."""
 
     session: Session
     config: RolloutConfig
-    """The current rollout."""
+    """Config of the rollout that the page shows."""
     trained_on: Robots
     """Robots that the policy was trained on."""
     start: Callable[[RolloutConfig], object]

@@ -186,6 +186,7 @@ def _apply_address(page: RobotPage) -> None:
 
 
 def _add_links_tab(page: RobotPage) -> None:
+    """Add the table of links, and a dropdown that paints one red and shows its properties."""
     gui = page.session.client.gui
     dropdown = gui.add_dropdown("Link", (_NO_LINK, *(link.name for link in page.robot.links)))
     details = gui.add_html("")

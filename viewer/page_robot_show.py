@@ -30,9 +30,9 @@ _SHOW_OVERLAY: Mapping[str, Callable[[Overlays], None]] = {
     "ignored pairs": scene_overlays.show_ignored_pairs,
 }
 TOGGLES = (*scene_robot.LAYERS, FRAMES, *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
-"""What can be shown of a robot, as named in the address."""
+"""Layers, overlays and gizmo that can be shown of a robot, as named in the address."""
 TOOL_TOGGLES = ("workspace", "trail", GIZMO)
-"""Those that need a tool."""
+"""Toggles for robots with a tool only."""
 ADDRESS_DELAY = 0.5
 """Delay of URL updates after a move [s]; Safari allows at most 100 updates in 30 s."""
 

@@ -125,6 +125,7 @@ class Player:
                 raise
 
     def _load(self, make_source: Callable[[], EpisodeSource], play: bool) -> None:
+        """Replace the episode by a new one, and show its start."""
         self.is_playing = False
         previous, self._source = self._source, None
         if previous is not None:

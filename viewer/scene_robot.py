@@ -278,6 +278,7 @@ def _mesh_triangles(mesh: Mesh, loaded: trimesh.Trimesh) -> Triangles:
 
 @lru_cache(maxsize=1024)
 def _primitive_triangles(geometry: Box | Sphere | Cylinder | Capsule) -> Triangles:
+    """Return the surface of a primitive; cached by its kind and size."""
     match geometry:
         case Box(size):
             mesh = trimesh.creation.box(size)
@@ -302,6 +303,7 @@ def _triangles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Trian
 def _add_mesh(
     view: RobotView, name: str, surface: Triangles, pose: Pose, layer: Layer, colour: Rgb
 ) -> DrawnShape:
+    """Add a mesh to a robot's node, in the opacity of its layer."""
     opacity = _OPACITY.get(layer)
     handle = view.scene.add_mesh_simple(
         name,

@@ -119,6 +119,7 @@ def grid_positions(areas: Sequence[tuple[Array, Array]]) -> list[Position]:
 def _add_track(
     scene: viser.SceneApi, name: str, track: Track, position: Position, *, labelled: bool
 ) -> DrawnTrack:
+    """Draw a robot of an episode with its obstacles, markers and block."""
     scene.add_frame(name, show_axes=False, position=position)
     view = add_robot(scene, track.robot, f"{name}/robot")
     for i, obstacle in enumerate(track.obstacles):

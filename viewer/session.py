@@ -22,7 +22,7 @@ from morphgen.viewer.viser_internals import run_javascript
 from morphgen.viewer.workers import Workers
 
 BUG = "this is a bug of morphgen; its traceback is in the terminal where the viewer was started"
-"""What a page shows for an unexpected error."""
+"""Text that a page shows for an unexpected error."""
 URL_TIMEOUT = 20.0
 """Time in which a browser has to report its URL [s]."""
 
@@ -45,7 +45,7 @@ class Session:
     workers: Workers
     """Processes for slow work, shared by all browsers."""
     address: Address
-    """The page with its state, as the URL shows it."""
+    """Address of the current page with its state, as the URL shows it."""
     cache: dict[str, object] = field(default_factory=dict)
     """Results of slow work, shared by all browsers."""
     closed: threading.Event = field(default_factory=threading.Event)
@@ -189,6 +189,7 @@ class Session:
         future.add_done_callback(self._print_bug)
 
     def _run(self, work: Work, key: str) -> None:
+        """Run queued work; show its error on the page, and raise an unexpected one again."""
         with self.lock:
             self.pending.discard(key)
         if self.closed.is_set():

@@ -1,4 +1,4 @@
-"""The region where a robot's block starts, the block's size, and the line that it must cross."""
+"""Region where a robot's block starts, the block's size, and the line that it must cross."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEVEL = 1e-3
 
 @dataclass(frozen=True)
 class Region:
-    """Where a block starts and ends, in the world."""
+    """Size of a block, range of its start poses and line that it must cross, in the world frame."""
 
     edge: float
     """Edge length of the block, a cube [m]."""

@@ -46,7 +46,7 @@ class PushStartSet:
     blocks: Array
     """Poses of the block at the start in the world: (x, y, z, qw, qx, qy, qz), shape (S, 7)."""
     block: Block
-    """The block, a cube, at its pose in the first start."""
+    """Cube that the robot pushes, at its pose in the first start."""
     line: float
     """y that the block's centre must cross [m]."""
     scale: float

@@ -44,7 +44,7 @@ class Scene:
     robot: Robot
     T_world_root: Pose = IDENTITY
     block: Block | None = None
-    """The only object that can be moved."""
+    """Box that the robot can push; None without one."""
     obstacles: tuple[Block, ...] = ()
     ground: float | None = 0.0
     """Height of a ground plane, or None without one [m]; the root link does not collide with it."""
