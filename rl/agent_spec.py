@@ -118,17 +118,17 @@ def configs_of(
     for name, on in spec.switches.items():
         values[current_name(name.replace("-", "_"))] = on
 
-    def own(config: type[PolicyConfig | PPOConfig | NetworkConfig]) -> dict[str, Any]:
+    def values_for(config: type[PolicyConfig | PPOConfig | NetworkConfig]) -> dict[str, Any]:
         names = {field.name for field in fields(config)}
         return {name: value for name, value in values.items() if name in names}
 
     policy = PolicyConfig(
         spec.agent,
         discrete=all(TASKS[task].discrete_actions for task in tasks),
-        network=network(**own(network)),
+        network=network(**values_for(network)),
     )
     ppo = PPOConfig(total_timesteps=total_timesteps)
-    return replace(policy, **own(PolicyConfig)), replace(ppo, **own(PPOConfig))
+    return replace(policy, **values_for(PolicyConfig)), replace(ppo, **values_for(PPOConfig))
 
 
 def parse_constants(texts: Sequence[str]) -> dict[str, Any]:

@@ -70,10 +70,10 @@ def current_policy(data: object) -> Any:  # noqa: ANN401
     policy = renamed("policy", data)
     if not isinstance(policy, dict) or "network" in policy or policy.get("agent") not in AGENTS:
         return policy
-    own = {field.name for field in fields(AGENTS[policy["agent"]].config)}
+    valid = {field.name for field in fields(AGENTS[policy["agent"]].config)}
     sizes = {name for name, _, _ in network_fields()} & policy.keys()
     network = {name: policy.pop(name) for name in sorted(sizes)}
-    return {**policy, "network": {k: v for k, v in network.items() if k in own}}
+    return {**policy, "network": {k: v for k, v in network.items() if k in valid}}
 
 
 def current_learner(data: object) -> Any:  # noqa: ANN401
