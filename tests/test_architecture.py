@@ -32,7 +32,7 @@ PACKAGES = (
 """Packages and modules of morphgen, the lowest first; each may import itself and those below."""
 MODULES = sorted(
     Path(folder, file)
-    for folder, _, files in os.walk(PACKAGE, followlinks=True)  # tasks, rl and viewer are links
+    for folder, _, files in os.walk(PACKAGE, followlinks=True)  # tasks, rl and viewer are symlinks
     for file in files
     if file.endswith(".py")
 )
@@ -57,7 +57,7 @@ NAMES = {name_of(path): path for path in MODULES}
 
 
 def imports(path):
-    """Modules that a module imports anywhere in it."""
+    """Return the modules that a module imports anywhere in its code."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -76,7 +76,7 @@ def package_of(module):
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
 def test_imports_go_down_only(path):
     own = package_of(name_of(path))
-    if own not in PACKAGES:  # morphgen/__init__.py and the folders of data
+    if own not in PACKAGES:  # morphgen/__init__.py and data folders
         return
     allowed = PACKAGES[: PACKAGES.index(own) + 1]
     for module in imports(path):
@@ -109,7 +109,7 @@ def test_no_module_imports_the_top_level_package(folder):
 
 
 def test_every_package_has_a_layer():
-    others = {"templates", "robots_real", "__main__"}  # data, and the way into the CLI
+    others = {"templates", "robots_real", "__main__"}  # data folders and the CLI entry point
     assert {package_of(name) for name in NAMES} - {""} == set(PACKAGES) | others
 
 

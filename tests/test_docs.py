@@ -13,13 +13,13 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def codes_in_source():
-    found = set()
+    codes = set()
     for room in ("checks", "formats"):
         for path in (ROOT / "morphgen" / room).glob("*.py"):
             text = path.read_text(encoding="utf-8")
-            found |= set(re.findall(r'"([a-z]+(?:-[a-z]+)+)",\s+"(?:error|warning|info)"', text))
-            found |= set(re.findall(r'finding\(\s*\w+,\s*"([a-z]+(?:-[a-z]+)*)"', text))
-    return found
+            codes |= set(re.findall(r'"([a-z]+(?:-[a-z]+)+)",\s+"(?:error|warning|info)"', text))
+            codes |= set(re.findall(r'finding\(\s*\w+,\s*"([a-z]+(?:-[a-z]+)*)"', text))
+    return codes
 
 
 def test_every_finding_code_is_documented():

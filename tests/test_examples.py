@@ -23,7 +23,7 @@ RUN = "runs/planar-cube-follow/se/seed0"
 
 @pytest.fixture
 def follow(monkeypatch, tmp_path):
-    """Register the example's task for one test."""
+    """Register the example task for one test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))

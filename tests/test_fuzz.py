@@ -156,7 +156,7 @@ expressions = st.one_of(
 
 @st.composite
 def mutated(draw, text, tokens):
-    """A text with some of its parts cut, doubled, moved or replaced."""
+    """Generate a text with some parts cut, doubled, moved or replaced."""
     for _ in range(draw(st.integers(1, 5))):
         size = len(text)
         start = draw(st.integers(0, size))
@@ -178,7 +178,7 @@ def mutated(draw, text, tokens):
 
 @st.composite
 def broken_urdf(draw):
-    """A description with strange values, broken tags and broken bytes."""
+    """Generate a URDF with invalid values, tags and bytes."""
     text = ROBOT
     for _ in range(draw(st.integers(0, 3))):
         values = [i for i, letter in enumerate(text) if letter == '"']

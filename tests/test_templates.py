@@ -201,7 +201,7 @@ movable joints."""
 
 
 def derivation(steps: list[Step], u: np.random.Generator | float) -> Derivation:
-    """The chain, every range at the fraction ``u`` of it or drawn."""
+    """Return a chain with every range at the fraction ``u``, or sampled."""
 
     def chosen(value: float | Range) -> float:
         if not isinstance(value, tuple):
@@ -240,7 +240,7 @@ def test_joint_efforts_are_at_least_twice_the_gravity_load(name, u):
 
 
 def gravity_load(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Largest force or torque that gravity puts on each joint, by differences of the energy."""
+    """Return the largest gravity load per joint, from finite differences of the energy."""
     moves = 1e-5 * np.eye(robot.dof)
     rise = [potential(robot, q + move) - potential(robot, q - move) for move in moves]
     return np.abs(rise).max(axis=1) / 2e-5

@@ -30,7 +30,7 @@ def run(capfd):
 
 @pytest.fixture
 def refused(run, tmp_path):
-    """Run a command that must be refused: exit code 2, one line, nothing changed on disk."""
+    """Run a command that must be rejected: exit code 2, one line, no changes on disk."""
 
     def command(*argv):
         before = tree(tmp_path)
@@ -58,7 +58,7 @@ def robot_urdf(tmp_path):
 
 @pytest.fixture
 def urdf(tmp_path):
-    """Write XML as ``urdf/robot.urdf``, so that the description is all of its folder."""
+    """Write XML to ``urdf/broken.urdf``, the only file of its folder."""
 
     def write(content):
         path = tmp_path / "urdf" / "broken.urdf"

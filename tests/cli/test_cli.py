@@ -252,7 +252,7 @@ def test_closed_stdout_causes_no_error_message():
 
 
 def test_internal_errors_keep_their_traceback(monkeypatch):
-    """Only what a user can cause is one line; a fault of the program keeps its traceback."""
+    """User errors print one line; internal errors keep their traceback."""
 
     def fail(*_):
         raise ZeroDivisionError

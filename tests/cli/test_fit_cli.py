@@ -35,7 +35,7 @@ FIGURES = {
 
 @pytest.fixture(autouse=True)
 def _nothing_is_stored(monkeypatch):
-    """A test that gets as far as storing would write beside the library's own parts."""
+    """Forbid storing fits, which would write into the library's folder."""
 
     def forbidden(*_, **__):
         raise AssertionError("a test was about to store the fits of the library's parts")
@@ -46,7 +46,7 @@ def _nothing_is_stored(monkeypatch):
 
 @pytest.fixture
 def box(tmp_path):
-    """``link.stl``, a box about (1, 2, 3)."""
+    """``link.stl``, a box centred at (1, 2, 3)."""
     mesh = trimesh.creation.box((0.1, 0.2, 0.3))
     mesh.apply_translation((1.0, 2.0, 3.0))
     mesh.export(tmp_path / "link.stl")
@@ -75,11 +75,11 @@ def meshed(tmp_path):
     on_base = Shape(Mesh(folder / "block.stl"), rgba=red)
     on_finger = Shape(Mesh(folder / "finger.stl"), Pose((0.0, 0.0, 0.05)), red)
     shapes = {"base": on_base, "left": on_finger, "right": on_finger}
-    made = [
+    links = [
         with_inertia(Link(name, visuals=(shape,), collisions=(shape,)), 2000.0)
         for name, shape in shapes.items()
     ]
-    return write_bundle(arm().with_links(made), tmp_path / "source", picture=False).relative_to(
+    return write_bundle(arm().with_links(links), tmp_path / "source", picture=False).relative_to(
         tmp_path
     )
 
@@ -90,10 +90,10 @@ def meshes_of(folder, kind):
     return [mesh.get("filename") for mesh in root.findall(f"link/{kind}/geometry/mesh")]
 
 
-def assert_same_inertials(made, source):
-    """Masses and inertias of the links, up to the digits of a URDF."""
-    assert [link.name for link in made.links] == [link.name for link in source.links]
-    for link, before in zip(made.links, source.links, strict=True):
+def assert_same_inertials(fitted, source):
+    """Assert equal masses and inertias of the links, up to the digits of a URDF."""
+    assert [link.name for link in fitted.links] == [link.name for link in source.links]
+    for link, before in zip(fitted.links, source.links, strict=True):
         if before.inertial is None:
             assert link.inertial is None or link.inertial.mass == 0
             continue
@@ -124,10 +124,10 @@ def test_mesh_fit_as_json_is_in_metres(run, box):
     data = json.loads(out)
     assert out.count("\n") == 1
     assert (data["mesh"], data["solid"], data["decimated_from"]) == ("link.stl", "watertight", None)
-    (found,) = data["primitives"]
-    np.testing.assert_allclose(sorted(found["box"]), (0.1, 0.2, 0.3), rtol=0.02)
-    np.testing.assert_allclose(found["xyz"], (1.0, 2.0, 3.0), atol=2e-3)
-    assert np.linalg.norm(found["quaternion"]) == pytest.approx(1.0)
+    (primitive,) = data["primitives"]
+    np.testing.assert_allclose(sorted(primitive["box"]), (0.1, 0.2, 0.3), rtol=0.02)
+    np.testing.assert_allclose(primitive["xyz"], (1.0, 2.0, 3.0), atol=2e-3)
+    assert np.linalg.norm(primitive["quaternion"]) == pytest.approx(1.0)
     assert set(data["quality"]) == FIGURES
     assert data["quality"]["iou"] > 0.97
     again = json.loads(run("fit", box, "--json", "--seed", "3")[1])
@@ -161,8 +161,8 @@ def test_every_mesh_format_is_read(run, tmp_path, suffix):
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / f"link.{suffix}")
     code, out, err = run("fit", f"link.{suffix}", "--json", "--enclose")
     assert (code, err) == (0, "")
-    (found,) = json.loads(out)["primitives"]
-    np.testing.assert_allclose(sorted(found["box"]), (0.1, 0.2, 0.3), atol=1e-5)
+    (primitive,) = json.loads(out)["primitives"]
+    np.testing.assert_allclose(sorted(primitive["box"]), (0.1, 0.2, 0.3), atol=1e-5)
 
 
 def test_part_made_of_primitives_keeps_them(run):
@@ -197,7 +197,7 @@ def test_user_part_is_found_in_the_given_library(run, tmp_path):
 
 @pytest.mark.slow
 def test_fitted_part_has_no_collision_meshes(run, tmp_path):
-    """The Fetch's gripper: a palm and two fingers that are each other's copies."""
+    """The Fetch gripper has a palm and two identical fingers."""
     words = ("fit", "fetch_gripper", "--out", "made/gripper", "--no-picture", "--json")
     code, out, err = run(*words, "--configurations", "50")
     assert (code, err) == (0, "")
@@ -210,21 +210,21 @@ def test_fitted_part_has_no_collision_meshes(run, tmp_path):
     assert [path.name for path in folder.parent.iterdir()] == ["gripper"]
     assert meshes_of(folder, "collision") == []
     assert meshes_of(folder, "visual") != []
-    made, source = (
+    fitted, source = (
         read_bundle(folder),
         load_part(default_library().manifest("fetch_gripper")).fragment,
     )
-    assert made.name == "gripper"
-    assert_same_inertials(made, source)
-    assert [joint.name for joint in made.joints] == [joint.name for joint in source.joints]
-    for link in made.links:
+    assert fitted.name == "gripper"
+    assert_same_inertials(fitted, source)
+    assert [joint.name for joint in fitted.joints] == [joint.name for joint in source.joints]
+    for link in fitted.links:
         kinds = {type(shape.geometry) for shape in link.collisions}
         assert kinds <= {Box, Cylinder, Sphere}
         assert bool(kinds) == bool(source.link(link.name).collisions)
     code, out, err = run("check", folder, "--json")
-    (found,) = json.loads(out).values()
+    (report,) = json.loads(out).values()
     assert code == 0
-    assert not [f for f in found["findings"] if f["severity"] == "error"]
+    assert not [f for f in report["findings"] if f["severity"] == "error"]
 
 
 def test_a_bundle_is_fitted_link_by_link(run, meshed, tmp_path):
@@ -238,12 +238,12 @@ def test_a_bundle_is_fitted_link_by_link(run, meshed, tmp_path):
     assert rows["right"][1:4] == ["box", "as", "left"]
     assert "collisions in 50 random configurations" in out
     assert lines[-1] == "made"
-    made, source = read_bundle(tmp_path / "made"), read_bundle(tmp_path / meshed)
+    fitted, source = read_bundle(tmp_path / "made"), read_bundle(tmp_path / meshed)
     assert meshes_of(tmp_path / "made", "collision") == []
     assert len(meshes_of(tmp_path / "made", "visual")) == 3
-    assert_same_inertials(made, source)
-    assert (made.name, made.home, made.frames) == ("made", source.home, source.frames)
-    assert replace(made, name="x").joints == source.joints
+    assert_same_inertials(fitted, source)
+    assert (fitted.name, fitted.home, fitted.frames) == ("made", source.home, source.frames)
+    assert replace(fitted, name="x").joints == source.joints
     assert run("check", "made")[0] == 0
     assert run("check", meshed)[0] == 0
     card = json.loads((tmp_path / "made" / "card.json").read_text())
@@ -320,8 +320,8 @@ def test_flat_link_is_reported_and_the_others_are_fitted(run, box, tmp_path, out
     if output:
         data = json.loads(out)
         assert [link["link"] for link in data["links"]] == ["link"]
-        (found,) = data["findings"]
-        assert (found["code"], found["where"]) == ("no-primitive", "link leaf")
+        (flat_finding,) = data["findings"]
+        assert (flat_finding["code"], flat_finding["where"]) == ("no-primitive", "link leaf")
     else:
         _, _, row, _, finding = out.splitlines()
         assert row.split()[:2] == ["link", "box"]

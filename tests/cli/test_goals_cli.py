@@ -17,7 +17,7 @@ from morphgen.tasks.registry import TASKS
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """A cache of the test's own, but for fits."""
+    """A temporary goal cache; fits use the user's cache."""
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
     return tmp_path / "cache" / "morphgen"
 

@@ -25,7 +25,7 @@ def records(folder):
 
 @pytest.fixture
 def mine():
-    """A grammar of the user's own, in the folder where the command runs."""
+    """A user grammar in the current folder."""
     path = Path("mine.grammar")
     path.write_text(GRAMMAR)
     return path
@@ -33,7 +33,7 @@ def mine():
 
 @pytest.fixture
 def cubes(run):
-    """A light set of four cubes: its folder."""
+    """The folder of a light set of four cubes."""
     assert run("sample", "cubes", "-n", 4, "--light", "--out", "set")[0] == 0
     return Path("set")
 
@@ -212,8 +212,8 @@ def test_huge_number_of_structures_is_counted_quickly(run, mine):
     )
     line = "mine: more than 10^100 structures, 0 values drawn"
     assert run("grammar", "count", mine)[1].splitlines() == [line]
-    found = json.loads(run("grammar", "count", mine, "--json")[1])
-    assert (found["structures"], found["finite"]) == (None, True)
+    data = json.loads(run("grammar", "count", mine, "--json")[1])
+    assert (data["structures"], data["finite"]) == (None, True)
 
 
 def test_negative_limit_is_rejected(run, mine):

@@ -21,7 +21,7 @@ CALL = (  # runs a command with a deny-list of names that begin with __
 
 @pytest.fixture
 def hostile(tmp_path):
-    """Write a document into a folder of its own, with a secret beside that folder."""
+    """Write a document to its own folder, with a secret file next to that folder."""
     folder = tmp_path / "home" / "downloads"
     folder.mkdir(parents=True)
     (tmp_path / "home" / "secret.yaml").write_text(f"key: {SECRET}\n")
@@ -37,7 +37,7 @@ def hostile(tmp_path):
 
 @pytest.fixture
 def refused_at(refused, hostile):
-    """Refuse a document by every command that reads it; return the message."""
+    """Assert that every command that reads the document rejects it; return the message."""
 
     def refuse(body, line=2):
         path = hostile(body)

@@ -66,7 +66,7 @@ def check(tmp_path, name, later):
         assert err.startswith("morphgen: interrupted; ")
         assert err.index("\n") == len(err) - 1
         while group(process.pid) and time.monotonic() < deadline + PATIENCE:
-            time.sleep(0.05)  # the keeper of shared memory ends after the others
+            time.sleep(0.05)  # the resource tracker ends after the other processes
         assert group(process.pid) == {}
     finally:
         for left in group(process.pid):
@@ -75,13 +75,13 @@ def check(tmp_path, name, later):
 
 
 def group(leader):
-    """Command lines of the living processes of a group, by number."""
+    """Command lines of the running processes of a process group, by process id."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             state, _, number = (folder / "stat").read_text().rpartition(")")[2].split()[:3]
             words = (folder / "cmdline").read_text()
-        except OSError:  # it ended meanwhile
+        except OSError:  # the process has ended
             continue
         if int(number) == leader and state != "Z":
             found[int(folder.name)] = words

@@ -23,15 +23,15 @@ def _own_cache(cache, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
 
 
-def told(out):
-    """Facts of every episode that was printed."""
+def parse_episodes(out):
+    """Parse the printed line of every episode."""
     return [LINE.fullmatch(line).groups() for line in out.splitlines() if "episode" in line]
 
 
 def test_ik_policy_reaches_the_goal(run, tmp_path):
     code, out, err = run("play", "reach", "arm3-stick", "--policy", "ik", "--sim", "mujoco")
     assert (code, err) == (0, "")
-    ((number, result, distance, place, score, seconds),) = told(out)
+    ((number, result, distance, place, score, seconds),) = parse_episodes(out)
     assert (number, result, place, seconds) == ("1", "success", "goal", "6.00")
     assert float(distance) < 0.03
     assert float(score) > 0
@@ -43,7 +43,7 @@ def test_scripted_policy_pushes_before_the_time_limit_and_is_recorded(run, tmp_p
     words = ("play", "push", "prims", "--policy", "scripted", "--sim", "mujoco")
     code, out, err = run(*words, "--out", "push.mp4")
     assert (code, err) == (0, "")
-    ((_, result, distance, place, score, seconds),) = told(out)
+    ((_, result, distance, place, score, seconds),) = parse_episodes(out)
     assert (result, distance, place, score) == ("success", "0.000", "line", "1.00")
     assert float(seconds) < 6
     assert out.splitlines()[-1] == "push.mp4"
@@ -58,20 +58,20 @@ def test_episodes_differ_and_are_reproducible(run):
     words = ("play", "reach", "arm3-stick", "--sim", "mujoco", "--episodes", "2", "--obstacles")
     outs = [run(*words, "--seed", seed, "--kind", "discrete")[1] for seed in (1, 1, 2)]
     assert outs[0] == outs[1] != outs[2]
-    first, second = told(outs[0])
+    first, second = parse_episodes(outs[0])
     assert first[2:] != second[2:]
 
 
 def test_zero_policy_does_not_move(run):
     code, out, _ = run("play", "push", "prims", "--policy", "zero", "--sim", "mujoco")
     assert code == 0
-    ((_, result, distance, _, score, seconds),) = told(out)
+    ((_, result, distance, _, score, seconds),) = parse_episodes(out)
     assert (result, score, seconds) == ("failure", "0.00", "6.00")
     assert 0.3 < float(distance) < 0.5
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (("reach", "arm3-stick", "--policy", "scripted"), "valid: ik, zero, random"),
         (("push", "prims", "--policy", "ik"), "valid: scripted, zero, random"),
@@ -89,8 +89,8 @@ def test_zero_policy_does_not_move(run):
         (("push", "arm=ur5", "ee=plain"), "did you mean 'plane'?"),
     ],
 )
-def test_invalid_arguments_are_rejected(refused, words, says):
-    assert says in refused("play", *words)
+def test_invalid_arguments_are_rejected(refused, words, message):
+    assert message in refused("play", *words)
 
 
 @pytest.mark.parametrize(

@@ -36,18 +36,18 @@ def test_diverged_episodes_are_reported_when_they_occur(show, capsys):
     show(replace(REPORT, update=99, transitions=99 * 32), 100)
     assert "diverged" not in capsys.readouterr().err
     show(replace(REPORT, update=99, transitions=99 * 32, unstable=2), 100)
-    told = "update 99: 2 of 7 episodes ended because their simulation diverged\n"
-    assert told in capsys.readouterr().err
+    message = "update 99: 2 of 7 episodes ended because their simulation diverged\n"
+    assert message in capsys.readouterr().err
 
 
 def test_progress_is_printed_once_per_minute(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with closing(TrainingProgress()) as display:
-        tell = display.evaluation("stochastic on test")
+        report = display.evaluation("stochastic on test")
         for i in range(1, 13):
             now[0] += 11
-            tell(i / 2, 6)
+            report(i / 2, 6)
     out, err = capsys.readouterr()
     assert (out, err.splitlines()) == (
         "",
@@ -58,9 +58,9 @@ def test_progress_is_printed_once_per_minute(capsys, monkeypatch):
 def test_terminal_progress_bar_is_removed_at_the_end(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with closing(TrainingProgress()) as display:
-        tell = display.evaluation("train")
-        tell(0.5, 2)
-        tell(2, 2)
+        report = display.evaluation("train")
+        report(0.5, 2)
+        report(2, 2)
         display.evaluation("test")(1, 2)
     err = capsys.readouterr().err
     assert "train" in err

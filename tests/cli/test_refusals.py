@@ -96,7 +96,7 @@ def test_robot_name_in_a_file_cannot_leave_the_output_folder(refused, robot_urdf
     ids=["broken", "empty", "bomb", "dtd", "climbing", "absolute", "mesh", "package", "sdf"],
 )
 def test_broken_urdf_is_rejected(refused, urdf, xml, message):
-    started = time.process_time()  # of this process: other load does not count
+    started = time.process_time()  # CPU time of this process, independent of other load
     path = urdf(xml)
     assert message in refused("import", path, "--out", "out")
     assert message in refused("show", path)
@@ -248,7 +248,7 @@ def test_ctrl_c_converted_by_a_package_is_treated_as_ctrl_c(run, monkeypatch):
             raise TypeError("unsupported operand")  # noqa: B904
 
     monkeypatch.setattr(library, "default_library", swallow)
-    # What is started in a shell's background ignores Ctrl-C, and so would this process.
+    # Background processes of a shell ignore Ctrl-C, and this process would inherit that.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     code, out, err = run("list")
     assert (code, out) == (130, "")

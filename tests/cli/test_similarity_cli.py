@@ -50,7 +50,7 @@ def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
     assert (code, err) == (0, "")
     assert tree(tmp_path) == before
     blocks = out.rstrip("\n").split("\n\n")
-    made = [features(robot, token_shapes(robot)) for robot in bundles]
+    robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
     for block, measure in zip(blocks, MEASURES.values(), strict=True):
         title, header, _, *rows, statistics = block.splitlines()
         assert title.startswith(f"{measure.name}: {measure.meaning}")
@@ -58,7 +58,7 @@ def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
             "larger is more alike" if measure.larger_is_more_alike else "smaller is more alike"
         )
         assert header.split() == ["#", "robot", "0", "1", "2"]
-        values = similarity_matrix(made, measure.name)
+        values = similarity_matrix(robot_features, measure.name)
         for i, row in enumerate(rows):
             number, name, *numbers = row.split()
             assert (number, name) == (str(i), bundles[i].name)
@@ -69,14 +69,16 @@ def test_folder_of_bundles_gives_one_matrix_per_measure(run, bundles, tmp_path):
 def test_json_holds_the_matrices(run, bundles):
     code, out, err = run("similarity", *ARGUMENTS, "--json")
     assert (code, err) == (0, "")
-    found = json.loads(out)
-    assert found["robots"] == ["arm", "lwr-claw", "lwr-plane"]
-    assert found["files"] == []
-    assert list(found["measures"]) == list(MEASURES)
-    made = [features(robot, token_shapes(robot)) for robot in bundles]
-    for name, about in found["measures"].items():
+    data = json.loads(out)
+    assert data["robots"] == ["arm", "lwr-claw", "lwr-plane"]
+    assert data["files"] == []
+    assert list(data["measures"]) == list(MEASURES)
+    robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
+    for name, about in data["measures"].items():
         assert about["larger_is_more_alike"] == MEASURES[name].larger_is_more_alike
-        np.testing.assert_allclose(about["matrix"], similarity_matrix(made, name), atol=1e-6)
+        np.testing.assert_allclose(
+            about["matrix"], similarity_matrix(robot_features, name), atol=1e-6
+        )
 
 
 def test_tree_is_the_default_measure(run, bundles):
@@ -99,12 +101,12 @@ def test_paths_can_be_mixed_and_duplicates_are_dropped(run, bundles, light_set):
 def test_robots_of_a_light_set_are_composed(run, light_set):
     code, out, _ = run("similarity", light_set, "--measure", "cosine", "--json")
     assert code == 0
-    found = json.loads(out)
-    assert found["robots"] == [f"cubes-{i:06d}" for i in range(4)]
+    data = json.loads(out)
+    assert data["robots"] == [f"cubes-{i:06d}" for i in range(4)]
     robots = list(morphgen.sample("cubes", 4))
-    made = [features(robot, token_shapes(robot)) for robot in robots]
+    robot_features = [features(robot, token_shapes(robot)) for robot in robots]
     np.testing.assert_allclose(
-        found["measures"]["cosine"]["matrix"], similarity_matrix(made, "cosine"), atol=1e-9
+        data["measures"]["cosine"]["matrix"], similarity_matrix(robot_features, "cosine"), atol=1e-9
     )
 
 

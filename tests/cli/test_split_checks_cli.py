@@ -20,15 +20,15 @@ from morphgen.tasks.split_goals import read_goals
 def write(tmp_path):
     """Write a split's file; return its name."""
 
-    def written(made, name="some.yaml"):
-        (tmp_path / name).write_text(split_text(made))
+    def written(definition, name="some.yaml"):
+        (tmp_path / name).write_text(split_text(definition))
         return name
 
     return written
 
 
 def leaky():
-    """A split whose test robots are all known in some way."""
+    """A split in which every test robot leaks from the train side."""
     twin = member(TRAIN[0], "twin")
     near = member(f"{TRAIN[1]} ee.size=100.1mm", "near")
     return combined(test=[*TEST, twin, near, "base=planar ee=sphere"])
@@ -227,18 +227,18 @@ def test_invalid_arguments_are_rejected_in_one_line(run, write, tmp_path, argv, 
 
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
-    """A cache of the test's own, but for fits."""
+    """A temporary goal cache; fits use the user's cache."""
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
 
 
 def reaching(**more):
-    """A sound split of robots that reach."""
+    """A valid split of reach robots."""
     train, test = ([member(words, task="reach") for words in side] for side in (TRAIN, TEST))
     return combined(train=train, test=test, **more)
 
 
 def known(**more):
-    """A split that tests a body that it trains, among obstacles or not."""
+    """A split with one robot on both sides."""
     twin = member(TRAIN[0], "twin", task="reach")
     return replace(reaching(**more), test=(*reaching().test, twin))
 

@@ -226,9 +226,9 @@ def test_broken_split_file_is_rejected_with_its_line(run, refused, trap):
     text = Path("a.yaml").read_text()
     assert old in text
     Path("a.yaml").write_text(text.replace(old, new, 1))
-    told = refused("split", "show", "a.yaml")
-    assert told.startswith("morphgen: a.yaml:")
-    assert message in told
+    error = refused("split", "show", "a.yaml")
+    assert error.startswith("morphgen: a.yaml:")
+    assert message in error
 
 
 def test_missing_arguments_are_named(refused):

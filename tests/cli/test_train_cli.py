@@ -122,7 +122,9 @@ def test_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml
     assert [line.split()[1] for line in out.splitlines()[2:5]] == ["train", "train", "test"]
     assert re.search(r"deterministic: MT reach .*; ZS reach ", out)
     code, out, _ = run("eval", "a", "--on", "test", "--episodes", "1", "--json")
-    assert {each["side"] for own in json.loads(out).values() for each in own} == {"test"}
+    assert {each["side"] for mode_scores in json.loads(out).values() for each in mode_scores} == {
+        "test"
+    }
 
     code, out, _ = run("finetune", "a", "--steps", "32", "--envs", "4", "--no-tensorboard")
     assert (code, out) == (0, f"a/finetuned/test-seed0/{CHECKPOINT}\n")
@@ -162,19 +164,19 @@ def test_training_uses_the_goals_stored_with_a_split(run, split_yaml):
 
 @pytest.mark.slow
 def test_train_goals_option_does_not_change_evaluation_goals(run):
-    """Which have the same, whatever the training had."""
-    found = []
+    """Evaluation goals do not depend on the number of training goals."""
+    goal_counts = []
     for name, more in (("a", ()), ("b", ("--train-goals", "150"))):
         assert run(*RUN, "--steps", "32", "--no-tensorboard", "--out", name, *more)[0] == 0
         config = read_config(Path(name))
         (setting,) = specs_of(config.source, GoalConfig(tasks=config.tasks))
-        found.append(len(setting.goals.q))
-        assert {task.num_goals for task in config.tasks} == {found[-1]}
-    assert found == [100, 150]
+        goal_counts.append(len(setting.goals.q))
+        assert {task.num_goals for task in config.tasks} == {goal_counts[-1]}
+    assert goal_counts == [100, 150]
     _, out, _ = run("eval", "b", "--episodes", "1", "--json")
     _, chance, _ = run("eval", "a", "--episodes", "1", "--json")
     randoms = [
-        {each["random"] for own in json.loads(one).values() for each in own}
+        {each["random"] for mode_scores in json.loads(one).values() for each in mode_scores}
         for one in (out, chance)
     ]
     assert randoms[0] == randoms[1]
@@ -309,7 +311,7 @@ def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (("train", "interpolation/arm3/reech"), "did you mean 'interpolation/arm3/reach'?"),
         (("train", "planar-cube"), "a robot needs task=reach or task=push"),
@@ -364,8 +366,8 @@ def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_pat
         (("study", "interpolation/arm3/reach", "--steps", "10"), "an update takes"),
     ],
 )
-def test_invalid_arguments_are_rejected_in_one_line(refused, words, says):
-    assert says in refused(*words)
+def test_invalid_arguments_are_rejected_in_one_line(refused, words, message):
+    assert message in refused(*words)
 
 
 def test_foreign_folders_and_checkpoints_are_rejected(run, refused, tmp_path):

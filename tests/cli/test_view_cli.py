@@ -15,7 +15,7 @@ from morphgen.formats.bundle import write_bundle
 
 
 def address(process):
-    """Where a started viewer listens; the line that says so."""
+    """Return the URL that a started viewer prints."""
     for line in process.stdout:
         if line.startswith("http://"):
             return line.split()[0]

@@ -15,7 +15,7 @@ def tree(folder):
 
 
 def start(*argv, **environment):
-    """Start ``morphgen`` with words and environment variables; its output is piped."""
+    """Start ``morphgen`` with arguments and environment variables; its output is piped."""
     return subprocess.Popen(
         [sys.executable, "-m", "morphgen", *map(str, argv)],
         stdout=subprocess.PIPE,
@@ -27,5 +27,5 @@ def start(*argv, **environment):
 
 
 def heed_ctrl_c():
-    """What is started in a shell's background ignores Ctrl-C, and so does all that it starts."""
+    """Restore Ctrl-C handling, which background processes of a shell ignore."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -82,7 +82,7 @@ def serve() -> None:
             except BaseException:
                 traceback.print_exc()
                 code = None
-        # Not ru_maxrss: it begins with that of the process that started this one.
+        # Not ru_maxrss, which starts at the value of the parent process.
         status = Path("/proc/self/status").read_text()
         peak = int(status.partition("VmHWM:")[2].split()[0]) / 1024
         answer = {

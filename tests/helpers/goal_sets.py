@@ -6,11 +6,11 @@ from morphgen.tasks.registry import TASKS
 
 
 def draw_goals(robot, config, *, obstacles=False, seed=0, **options):
-    """The goal set of a robot, from the constants of its task."""
+    """Return the goal set of a robot for a task config."""
     return goal_set(robot, TASKS[config.task], config, obstacles=obstacles, seed=seed, **options)
 
 
 def draw_spec(robot, config, *, obstacles=False, seed=0, cache=None):
-    """The environment specification of a robot, likewise."""
-    own = GoalConfig(seed, (config,))
-    return env_spec(robot, config.task, own, obstacles=obstacles, cache=cache)
+    """Return the environment specification of a robot for a task config."""
+    goal_config = GoalConfig(seed, (config,))
+    return env_spec(robot, config.task, goal_config, obstacles=obstacles, cache=cache)

@@ -15,17 +15,17 @@ CATEGORIES = grammar_names()
 
 
 def grammar(*lines, name="g"):
-    """The grammar of some lines."""
+    """Parse a grammar from text lines."""
     return grammar_from_text("\n".join(lines) + "\n", name)
 
 
 def shipped(name):
-    """A grammar that comes with morphgen."""
+    """Return a built-in grammar."""
     return load_grammar(find_grammar(name))
 
 
 def benchmark_counts(category, derivation):
-    """Links and movable joints that the benchmark's table gives a robot of a category."""
+    """Return the numbers of links and movable joints in the benchmark's table."""
     nodes = list(derivation.walk())
     parts = [node.part for node in nodes]
     values = {node.part: dict(node.parameters) for node in nodes}
@@ -64,22 +64,22 @@ FIXED_COUNTS = {
 
 
 def unphysical(robot):
-    """What no body can be: a line for every link and joint that is so."""
-    found = []
+    """Return one line per link or joint with impossible physical values."""
+    faults = []
     for link in robot.links:
         if link.inertial is None:
             continue
         xx, _, _, yy, _, zz = link.inertial.inertia
         moments = sorted((xx, yy, zz))
         if not (link.inertial.mass > 0 and math.isfinite(link.inertial.mass)):
-            found.append(f"{link.name}: mass {link.inertial.mass}")
+            faults.append(f"{link.name}: mass {link.inertial.mass}")
         if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - 1e-9)):
-            found.append(f"{link.name}: inertia {moments}")
+            faults.append(f"{link.name}: inertia {moments}")
     for joint in robot.joints:
         if joint.limits is not None and not joint.limits[0] < joint.limits[1]:
-            found.append(f"{joint.name}: limits {joint.limits}")
+            faults.append(f"{joint.name}: limits {joint.limits}")
     for k, q in zip(robot.independent_joints, robot.home, strict=True):
         low, high = robot.joints[k].limits or (-math.inf, math.inf)
         if not low <= q <= high:
-            found.append(f"{robot.joints[k].name}: home {q} outside of {low}, {high}")
-    return found
+            faults.append(f"{robot.joints[k].name}: home {q} outside of {low}, {high}")
+    return faults

@@ -19,8 +19,8 @@ def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, device="cpu", 
     return Learner(batch, policy, replace(SMALL, **changes), seed=seed, device=device)
 
 
-def weights(made):
-    networks = {"actor": made.actor, "critic": made.critic, "target_critic": made.target_critic}
+def weights(agent):
+    networks = {"actor": agent.actor, "critic": agent.critic, "target_critic": agent.target_critic}
     return {
         f"{name}.{key}": each.clone()
         for name, network in networks.items()
@@ -33,13 +33,13 @@ def equal(a, b):
 
 
 def untimed(report):
-    """A report without what depends on the machine; repr, as nan is no equal of nan."""
+    """Return the report without timings, as repr because nan != nan."""
     timed = ("collect_seconds", "learn_seconds", "steps_per_second")
     return repr({name: value for name, value in asdict(report).items() if name not in timed})
 
 
 def stored(checkpoint):
-    """What is left of a checkpoint after a file."""
+    """Return a checkpoint after a round trip through a file."""
     file = io.BytesIO()
     torch.save(checkpoint, file)
     file.seek(0)

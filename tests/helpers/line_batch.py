@@ -12,8 +12,9 @@ NEAR = 0.15
 
 
 class OnALine:
-    """Even environments reach: time ends their episodes. Odd ones push: their body goes the other
-    way, another link moves it, the goal is the line, and being there ends the episode.
+    """Even environments are reach tasks, whose episodes end by time. Odd environments are push
+    tasks: the robot moves in the opposite direction, another link is actuated, the goal is the
+    line, and reaching it ends the episode.
     """
 
     def __init__(self, num_envs, *, kind="discrete", seed=0, horizon=12):

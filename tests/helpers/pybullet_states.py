@@ -9,7 +9,7 @@ PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 
 
 def starts(simulation):
-    """Home, or behind the block, for every environment; blocks where the scenes have them."""
+    """Return start states at home or behind the block, with blocks at their scene poses."""
     q = torch.zeros_like(simulation.q)
     pose = torch.zeros_like(simulation.block_pose)
     for env, scene in enumerate(simulation.scenes):
@@ -35,15 +35,15 @@ def client_of(simulation, env=0):
 
 
 def state(simulation):
-    """All that is reported now."""
+    """Return copies of all reported state."""
     parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
     return torch.cat(parts, dim=1).clone()
 
 
 def wander(simulation, q, steps, seed=0, size=0.03, ahead=0.0):
-    """Targets on a random walk from ``q``, the same for every environment.
+    """Step with targets on a random walk from ``q``, the same for every environment.
 
-    With ``ahead``, the second joint of each, which is the gantry's along y, moves on besides.
+    ``ahead`` is added to the second joint's target each step; it is the gantry's y axis.
     """
     generator = torch.Generator().manual_seed(seed)
     seen = []

@@ -38,7 +38,7 @@ def push_scene(mass=0.1, friction=1.0):
 
 
 def mixed_scenes():
-    """One of each: three bodies, with and without a block."""
+    """Return three scenes with different robots, with and without a block."""
     return [reach_scene(), push_scene(), real_arm_scene()]
 
 

@@ -11,15 +11,15 @@ LIBRARY = default_library()
 
 
 def member(words, name=None, *, task="push", obstacles=False, category=COMPOSED):
-    """A member given by words of ``morphgen compose``."""
-    derivation, own = parse_words(words.split(), LIBRARY)
+    """Return a split member from compose arguments."""
+    derivation, default_name = parse_words(words.split(), LIBRARY)
     text = str(derivation)
-    robot = compose(parse_derivation(text), LIBRARY, name or own)
+    robot = compose(parse_derivation(text), LIBRARY, name or default_name)
     return Member(robot.name, category, text, task, obstacles, robot_hash(robot))
 
 
 def split(train, test, *, name="mine/some", regime="composition", **more):
-    """A split of members, or of words."""
+    """Return a split of members or compose arguments."""
     sides = [
         tuple(m if isinstance(m, Member) else member(m) for m in side) for side in (train, test)
     ]
@@ -31,5 +31,5 @@ TEST = ("base=planar ee=plane",)
 
 
 def combined(train=TRAIN, test=TEST, **more):
-    """A sound split by composition, of bodies without meshes."""
+    """Return a valid composition split of robots without meshes."""
     return split(train, test, **more)

@@ -17,5 +17,5 @@ def arm_tokens(**changes):
     return tokens(robot, shapes_of(robot))
 
 
-def field_of(made, name):
-    return made[..., FIELDS[name]]
+def field_of(token_array, name):
+    return token_array[..., FIELDS[name]]

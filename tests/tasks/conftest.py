@@ -7,13 +7,13 @@ from morphgen.tasks.sim.bullet import BulletSimulation
 
 @pytest.fixture
 def simulate():
-    """Makes simulations of scenes in PyBullet, in this process."""
-    made = []
+    """Create PyBullet simulations of scenes in this process."""
+    simulations = []
 
     def make(*scenes, contacts=None):
-        made.append(BulletSimulation(scenes, contacts))
-        return made[-1]
+        simulations.append(BulletSimulation(scenes, contacts))
+        return simulations[-1]
 
     yield make
-    for simulation in made:
+    for simulation in simulations:
         simulation.close()

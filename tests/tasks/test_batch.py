@@ -40,8 +40,8 @@ def settings(robots, tmp_path_factory):
 
 
 @pytest.fixture
-def made(settings):
-    """Make batches; they are closed when the test is over."""
+def build_batch(settings):
+    """Create batches and close them after the test."""
     opened = []
 
     def make(num_envs=3, robots=(0, 1, 2), obstacles=False, config=CONFIG, **options):
@@ -60,9 +60,9 @@ def run(batch, controller, steps):
     return [batch.step(controller.act(batch)) for _ in range(steps)]
 
 
-def test_observations_have_the_declared_shapes(made):
+def test_observations_have_the_declared_shapes(build_batch):
     channels = ObservationConfig(velocity=True, previous_action=True, tool=True, points=50)
-    batch = made(obstacles=True, observe=channels)
+    batch = build_batch(obstacles=True, observe=channels)
     seen = batch.reset()
     n, links = 3, batch.robot_tables.max_links
     assert {name: tuple(value.shape) for name, value in seen.items()} == {
@@ -86,8 +86,8 @@ def test_observations_have_the_declared_shapes(made):
     assert all(value.isfinite().all() for value in seen.values())
 
 
-def test_reach_episode_has_one_goal_and_ends_only_by_time(made):
-    batch = made(config=replace(CONFIG, max_episode_steps=5))
+def test_reach_episode_has_one_goal_and_ends_only_by_time(build_batch):
+    batch = build_batch(config=replace(CONFIG, max_episode_steps=5))
     batch.reset()
     goal = batch.field("goal").clone()
     controller = Random(0)
@@ -102,8 +102,8 @@ def test_reach_episode_has_one_goal_and_ends_only_by_time(made):
     assert (batch.episode_step == 0).all()
 
 
-def test_final_observation_precedes_the_reset(made):
-    batch = made(config=replace(CONFIG, max_episode_steps=3))
+def test_final_observation_precedes_the_reset(build_batch):
+    batch = build_batch(config=replace(CONFIG, max_episode_steps=3))
     batch.reset()
     for _ in range(3):
         goal = batch.field("goal").clone()
@@ -113,8 +113,8 @@ def test_final_observation_precedes_the_reset(made):
     assert not torch.equal(step.observation["tokens"], step.final_observation["tokens"])
 
 
-def test_start_is_never_the_goal_configuration(made):
-    batch = made(40, robots=(0,))
+def test_start_is_never_the_goal_configuration(build_batch):
+    batch = build_batch(40, robots=(0,))
     for _ in range(3):
         batch.reset()
         goal_q = batch.groups["reach"].goal_configuration
@@ -123,8 +123,8 @@ def test_start_is_never_the_goal_configuration(made):
         assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
 
 
-def test_zero_actions_move_no_joint(made):
-    batch = made()
+def test_zero_actions_move_no_joint(build_batch):
+    batch = build_batch()
     batch.reset()
     before = frame_positions(batch.robot_tables.tool_chain, batch.env_robot_index, batch.q)
     for _ in range(CONFIG.max_episode_steps - 1):
@@ -134,29 +134,31 @@ def test_zero_actions_move_no_joint(made):
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_ik_reaches_the_goal_and_random_actions_do_not(made, kind):
-    steps = run(made(12, robots=(0,), kind=kind), InverseKinematics(0), CONFIG.max_episode_steps)
+def test_ik_reaches_the_goal_and_random_actions_do_not(build_batch, kind):
+    steps = run(
+        build_batch(12, robots=(0,), kind=kind), InverseKinematics(0), CONFIG.max_episode_steps
+    )
     assert steps[-1].success.float().mean() >= 0.9
     assert steps[-1].score[steps[-1].success].unique().tolist() == [CONFIG.score_near]
-    steps = run(made(12, robots=(0,), kind=kind), Random(0), CONFIG.max_episode_steps)
+    steps = run(build_batch(12, robots=(0,), kind=kind), Random(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() <= 0.2
 
 
-def test_ik_avoids_obstacles(made):
-    batch = made(12, robots=(1, 1, 2))
+def test_ik_avoids_obstacles(build_batch):
+    batch = build_batch(12, robots=(1, 1, 2))
     steps = run(batch, InverseKinematics(0), CONFIG.max_episode_steps)
     assert steps[-1].success.float().mean() >= 0.9
 
 
-def test_reward_is_the_sum_of_its_terms(made):
-    for step in run(made(obstacles=True), Random(3), 20):
+def test_reward_is_the_sum_of_its_terms(build_batch):
+    for step in run(build_batch(obstacles=True), Random(3), 20):
         assert torch.allclose(step.reward, sum(step.terms.values()))
         assert step.reward.isfinite().all()
 
 
-def test_environment_does_not_depend_on_its_batch(made):
-    whole = made(4, seed=7)
-    part = made(2, seed=7, first=2)
+def test_environment_does_not_depend_on_its_batch(build_batch):
+    whole = build_batch(4, seed=7)
+    part = build_batch(2, seed=7, first=2)
     actions = torch.rand(
         30, 4, whole.robot_tables.max_links, generator=torch.Generator().manual_seed(0)
     )
@@ -169,22 +171,25 @@ def test_environment_does_not_depend_on_its_batch(made):
 
 
 @pytest.mark.parametrize("others", [(), (1,), (1, 2), (0, 0, 0, 0, 0, 0, 0)])
-def test_rewards_are_bit_identical_in_any_batch(made, others):
-    alone, beside = (made(1 + len(more), robots=(0, *more), seed=7) for more in ((), others))
+def test_rewards_are_bit_identical_in_any_batch(build_batch, others):
+    alone, batched = (
+        build_batch(1 + len(more), robots=(0, *more), seed=7) for more in ((), others)
+    )
     actions = torch.rand(
         30, 1, alone.robot_tables.max_links, generator=torch.Generator().manual_seed(0)
     )
     alone.reset()
-    beside.reset()
+    batched.reset()
     for action in 2 * actions - 1:
-        a, b = alone.step(action), beside.step(action.expand(1 + len(others), -1))
+        a, b = alone.step(action), batched.step(action.expand(1 + len(others), -1))
         for name, term in a.terms.items():
             assert torch.equal(term, b.terms[name][:1]), name
 
 
-def test_point_cloud_observations_do_not_change_episodes(made):
+def test_point_cloud_observations_do_not_change_episodes(build_batch):
     with_points, without = (
-        made(obstacles=True, seed=2, observe=ObservationConfig(points=points)) for points in (5, 0)
+        build_batch(obstacles=True, seed=2, observe=ObservationConfig(points=points))
+        for points in (5, 0)
     )
     for _ in range(3):
         with_points.reset()
@@ -200,19 +205,19 @@ def test_batches_smaller_than_the_robot_list_are_rejected():
         make_batch("reach", "prims", 2)
 
 
-def test_negative_seed_is_rejected(made):
+def test_negative_seed_is_rejected(build_batch):
     with pytest.raises(TaskError, match="seed -1"):
-        made(seed=-1)
+        build_batch(seed=-1)
 
 
 def test_actions_are_rounded_to_the_nearest_bin_towards_zero():
     shares = torch.tensor([[0.0, 1.0, -1.0, 0.3, -0.3, 0.01]])
-    found = [BINS[i] for i in encode_actions(shares, "discrete")[0].tolist()]
-    assert found == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
+    bins = [BINS[i] for i in encode_actions(shares, "discrete")[0].tolist()]
+    assert bins == [0.0, 1.0, -1.0, 0.25, -0.25, 0.0]
 
 
-def test_batch_continues_from_a_saved_state(made):
-    one, other = made(seed=3), made(seed=3)
+def test_batch_continues_from_a_saved_state(build_batch):
+    one, other = build_batch(seed=3), build_batch(seed=3)
     one.reset()
     other.reset()
     other.reset()
@@ -224,16 +229,16 @@ def test_batch_continues_from_a_saved_state(made):
     assert torch.equal(one.field("goal"), other.field("goal"))
     assert torch.equal(one.targets, other.targets)
     with pytest.raises(TaskError, match="the state is of 3 environments; expected 2"):
-        made(2).load_state_dict(state)
+        build_batch(2).load_state_dict(state)
 
 
-def test_returned_tensors_are_copies(made):
-    """Whoever keeps it finds it as it was, and whoever writes into it changes no batch."""
+def test_returned_tensors_are_copies(build_batch):
+    """Kept tensors do not change later, and writing to them does not change the batch."""
     options = {
         "obstacles": True,
         "observe": ObservationConfig(velocity=True, previous_action=True, tool=True, points=8),
     }
-    batch, whole, chance = made(**options), made(**options), Random(0)
+    batch, whole, chance = build_batch(**options), build_batch(**options), Random(0)
 
     def tensors(step):
         parts = {"now": step.observation, "final": step.final_observation, "terms": step.terms}
@@ -270,8 +275,8 @@ def test_returned_tensors_are_copies(made):
         assert all(torch.equal(kept[name], before[name]) for name in kept)
 
 
-def test_spread_reset_staggers_the_first_episodes(made):
-    batch = made(60, robots=(0,), seed=1)
+def test_spread_reset_staggers_the_first_episodes(build_batch):
+    batch = build_batch(60, robots=(0,), seed=1)
     batch.reset(spread=True)
     passed = batch.episode_step.clone()
     assert passed.unique().numel() > 40
@@ -284,8 +289,8 @@ def test_spread_reset_staggers_the_first_episodes(made):
     assert torch.equal(over, passed == passed.max())
 
 
-def test_observed_velocities_and_actions_match_the_links(made):
-    batch = made(observe=ObservationConfig(velocity=True, previous_action=True))
+def test_observed_velocities_and_actions_match_the_links(build_batch):
+    batch = build_batch(observe=ObservationConfig(velocity=True, previous_action=True))
     assert batch.reset()["velocity"].abs().max() == 0
     action = torch.ones(batch.action_mask.shape)
     seen = batch.step(action).observation
@@ -296,8 +301,8 @@ def test_observed_velocities_and_actions_match_the_links(made):
     assert (seen["velocity"].abs().amax(dim=1) > 0.01).all()
 
 
-def test_observed_tool_position_matches_forward_kinematics(made):
-    batch = made(observe=ObservationConfig(tool=True))
+def test_observed_tool_position_matches_forward_kinematics(build_batch):
+    batch = build_batch(observe=ObservationConfig(tool=True))
     batch.reset()
     for _ in range(5):
         step = batch.step(torch.ones(batch.action_mask.shape))
@@ -308,8 +313,8 @@ def test_observed_tool_position_matches_forward_kinematics(made):
         assert np.linalg.norm(expected - each.goals.poses[0, :3]) > 0.01
 
 
-def test_goal_configuration_puts_the_tool_at_the_goal(made):
-    batch = made(observe=ObservationConfig(tool=True))
+def test_goal_configuration_puts_the_tool_at_the_goal(build_batch):
+    batch = build_batch(observe=ObservationConfig(tool=True))
     batch.reset()
     envs = torch.arange(3)
     batch.simulation.reset(
@@ -320,8 +325,8 @@ def test_goal_configuration_puts_the_tool_at_the_goal(made):
     )
 
 
-def test_point_cloud_lies_on_the_obstacles(made):
-    batch = made(obstacles=True, observe=ObservationConfig(points=80))
+def test_point_cloud_lies_on_the_obstacles(build_batch):
+    batch = build_batch(obstacles=True, observe=ObservationConfig(points=80))
     seen = batch.reset()
     for env in range(3):
         off = torch.stack(
@@ -333,7 +338,7 @@ def test_point_cloud_lies_on_the_obstacles(made):
 
 
 def _outside(points, block):
-    """Signed distance of points from the surface of a box along the axes, at most."""
+    """Return the largest per-axis signed distance of points from the surface of a box."""
     T = torch.tensor(block.pose.inverse().matrix, dtype=torch.float32)
     local = points @ T[:3, :3].T + T[:3, 3]
     return (local.abs() - torch.tensor(block.size) / 2).amax(dim=1)

@@ -40,7 +40,7 @@ def test_padding_of_targets_is_ignored(simulate):
 
 
 def touching_starts(scene, seed):
-    """A start in which bodies touch, so that contact points are kept between steps."""
+    """Start states in contact, so that PyBullet keeps contact points between steps."""
     rng = np.random.default_rng(seed)
     if scene.block:
         q = np.array(PUSHING)
@@ -51,7 +51,7 @@ def touching_starts(scene, seed):
 
 @pytest.mark.parametrize("scene", [push_scene, reach_scene, real_arm_scene])
 def test_reset_removes_all_earlier_state(simulate, scene):
-    """Random pasts near a touching start; without new broad-phase entries some show."""
+    """Random earlier motion near contact; without new broad-phase entries it would matter."""
     rng = np.random.default_rng(3)
     used = simulate(scene())
     for seed in range(12):
@@ -68,7 +68,7 @@ def test_reset_removes_all_earlier_state(simulate, scene):
 
 
 def test_touching_starts_are_in_contact(simulate):
-    """Without contacts the test above would show little."""
+    """The test above needs contacts."""
     simulation = simulate(push_scene())
     q, pose = touching_starts(push_scene(), 0)
     simulation.step(reset(simulation, q, pose))

@@ -104,7 +104,7 @@ def test_obstacles_stop_the_robot(simulate):
 
 
 def test_fixed_base_touches_blocks_but_not_static_objects(simulate):
-    """The foot of the arm stands in the ground and in a box, and on a block."""
+    """The arm's base overlaps the ground and a box, and touches a block."""
     box = Block((0.1, 0.1, 0.05), Pose((0.0, 0.0, -0.01)))
     scene = Scene(robot("arm=ur5 ee=plane"), obstacles=(box,))
     simulation = simulate(scene, replace(scene, block=replace(box, mass=0.1), obstacles=()))
@@ -120,7 +120,7 @@ def self_contact(simulate, body, **contacts):
         Scene(body, Pose((0.0, 0.0, 2.0)), ground=None), contacts=Contacts(**contacts)
     )
     reset(simulation, (0.0, 0.0, 0.0, 0.0))
-    # Not after a step, in which what overlaps gives way.
+    # Before a step, because a step separates overlapping bodies.
     client = client_of(simulation).id
     pybullet.performCollisionDetection(physicsClientId=client)
     points = pybullet.getContactPoints(physicsClientId=client)
@@ -128,7 +128,7 @@ def self_contact(simulate, body, **contacts):
 
 
 def overlapping():
-    """An arm whose third link lies in its base."""
+    """An arm whose third link overlaps its base."""
     body = arm()
     joints = list(body.joints)
     joints[2] = replace(joints[2], T_parent_joint=Pose((0.0, 0.0, -0.4)))

@@ -101,7 +101,7 @@ def test_velocity_is_limited(simulate):
 
 @pytest.mark.parametrize("pushes", [False, True])
 def test_joints_return_to_their_limits(simulate, pushes):
-    """Whatever pushes them past; with and without a block the solver is another."""
+    """Joints return whatever pushed them; scenes with a block use another solver."""
     body = arm()
     block = Block((0.1, 0.1, 0.1), Pose((3.0, 0.0, 0.05)), 1.0) if pushes else None
     simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0)), block=block))
@@ -124,17 +124,17 @@ def test_joints_return_to_their_limits(simulate, pushes):
 
 
 def test_strong_contacts_do_not_exceed_joint_speed_limits(simulate):
-    """An arm that presses itself and the ground as hard as it can."""
+    """The arm presses against itself and the ground with full effort."""
     body = robot("arm=ur5 ee=plane")
     simulation = simulate(*[Scene(body)] * 8)
     corners = torch.randn(8, body.dof, generator=torch.Generator().manual_seed(0)).sign()
     low, high = (torch.tensor(each, dtype=torch.float32) for each in joint_limits(body).T)
-    wanted = torch.where(corners > 0, high, low)
+    final_targets = torch.where(corners > 0, high, low)
     q = reset(simulation)
     fastest = max(joint.velocity for joint in body.joints if joint.is_movable)
     for _ in range(200):
         before = simulation.q.clone()
-        q = q + (wanted - q).clamp(-0.05, 0.05)
+        q = q + (final_targets - q).clamp(-0.05, 0.05)
         simulation.step(q)
         moved = (simulation.q - before).abs().max()
         assert float(moved) <= OVERSPEED * fastest * SUBSTEPS * TIMESTEP * (1 + 1e-4)

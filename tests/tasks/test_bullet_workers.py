@@ -47,7 +47,7 @@ def keep_stepping(simulation, q):
 
 
 def is_running(pid):
-    """Whether a process runs; a zombie does not."""
+    """Return whether a process runs and is not a zombie."""
     try:
         status = Path(f"/proc/{pid}/stat").read_text()
     except FileNotFoundError:
@@ -70,7 +70,7 @@ def pids(simulation):
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """Where temporary folders of this test and its processes are made."""
+    """Folder for temporary files of this test and its processes."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -79,7 +79,7 @@ def scratch(tmp_path, monkeypatch):
 
 
 def leftovers(scratch, pid):
-    """Folders, and shared memory of a process, that a simulation could leave behind."""
+    """Return temporary folders and shared memory left behind by a simulation."""
     return [*scratch.glob("morphgen-*"), *Path("/dev/shm").glob(f"*{pid}*")]
 
 
@@ -113,7 +113,7 @@ def test_invalid_arguments_do_not_stop_the_workers(workers):
 
 @pytest.mark.parametrize("heavy", [{0}, {1}, {0, 1}], ids=["here", "in a worker", "both"])
 def test_diverged_environments_are_reported_and_the_others_step(heavy):
-    """The weight of such a block is not finite."""
+    """The block's weight is not finite."""
     scenes = [push_scene() for _ in range(4)]
     for env in heavy:
         scenes[env] = Scene(push_scene().robot, block=Block((0.1, 0.1, 0.1), mass=1e308))
@@ -224,7 +224,7 @@ if __name__ == "__main__":
 
 
 def script(tmp_path, ending):
-    """Start a process that simulates with two others; it writes their ids, then goes on."""
+    """Start a process that simulates with two workers and writes their process ids."""
     path = tmp_path / "script.py"
     path.write_text(SCRIPT + textwrap.indent(textwrap.dedent(ending), " " * 4) + MAIN)
     process = subprocess.Popen(
@@ -255,7 +255,7 @@ def test_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
 
 @pytest.mark.parametrize("ending", [FOREVER, FOREVER.replace("simulation.step(q)", "pass")])
 def test_ctrl_c_ends_the_workers(tmp_path, scratch, ending):
-    """Which a terminal sends to all processes of the foreground."""
+    """A terminal sends Ctrl-C to all foreground processes."""
     process, running = script(tmp_path, ending)
     time.sleep(0.3)
     os.killpg(process.pid, signal.SIGINT)

@@ -36,7 +36,7 @@ def walled(*walls):
 
 
 def hinged(kind, *walls):
-    """The same with a hinge for the first slide, so that the ball goes round the middle."""
+    """The same robot with a hinge as first joint, so that the ball circles the origin."""
     body = walled(*walls)
     first, second = body.joints
     limits = None if kind == "continuous" else (-2 * math.pi, 2 * math.pi)
@@ -47,14 +47,14 @@ def hinged(kind, *walls):
 
 def test_wall_splits_the_joint_range():
     body = walled(ACROSS)
-    (found,) = cspace_components(body)
-    assert found.pairs == (("ball", "base"),)
-    assert found.joints == (0, 1)
-    assert in_other_component([found], THERE).tolist() == [True]
-    assert in_other_component([found], HERE).tolist() == [False]
+    (component,) = cspace_components(body)
+    assert component.pairs == (("ball", "base"),)
+    assert component.joints == (0, 1)
+    assert in_other_component([component], THERE).tolist() == [True]
+    assert in_other_component([component], HERE).tolist() == [False]
     for x, far in ((0.33, False), (0.67, True)):
         assert FreeSpace(Scene(body)).free([[x, 0.0]])[0]
-        assert in_other_component([found], np.array([x, 0.0]))[0] == far
+        assert in_other_component([component], np.array([x, 0.0]))[0] == far
 
 
 @pytest.mark.parametrize("walls", [(), GAP])
@@ -63,18 +63,18 @@ def test_passable_obstacle_does_not_split_the_range(walls):
 
 
 def test_continuous_joint_wraps_around():
-    """A wall on one side is no barrier to what goes round, two are; limits make one enough."""
+    """Two walls split a continuous joint; with joint limits one wall is enough."""
     left, right = ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0))
     assert cspace_components(hinged("continuous", left)) == ()
     body = hinged("continuous", left, right)
-    found = cspace_components(body)
-    assert in_other_component(found, np.array([math.pi - 0.1, 0.9])).all()
-    assert in_other_component(found, np.array([0.1 - math.pi, 0.9])).all()
-    assert not in_other_component(found, np.array([0.5, 0.9])).any()
+    components = cspace_components(body)
+    assert in_other_component(components, np.array([math.pi - 0.1, 0.9])).all()
+    assert in_other_component(components, np.array([0.1 - math.pi, 0.9])).all()
+    assert not in_other_component(components, np.array([0.5, 0.9])).any()
 
 
 def test_ranges_of_full_turns_are_not_split():
-    """A wall in the way of a hinge that turns twice: where it is counts, not how often round."""
+    """For a hinge with two turns, the angle matters and not the turn."""
     body = hinged("revolute", ((-0.3, 0.9), (0.1, 1.0)), ((-0.3, -0.9), (0.1, 1.0)))
     found = cspace_components(body)
     for turns in (-1, 0):

@@ -28,12 +28,12 @@ def lift(**changes):
     plate = Link("plate", collisions=(Shape(Box((0.1, 0.1, 0.1))),))
     ball = Link("ball", collisions=(Shape(Sphere(0.1)),))
     slide = Joint("z", "prismatic", "plate", "ball", Pose((0, 0, 0.5)), (0, 0, 1), (-1.0, 1.0))
-    made = Robot("lift", (plate, ball), (slide,), (Frame("tool", "ball"),), (0.0,))
-    return replace(made, **changes)
+    lift_robot = Robot("lift", (plate, ball), (slide,), (Frame("tool", "ball"),), (0.0,))
+    return replace(lift_robot, **changes)
 
 
 def aside():
-    """The same, 0.5 m beside its plate."""
+    """The same robot with the ball 0.5 m beside its plate."""
     (slide,) = lift().joints
     return lift(joints=(replace(slide, T_parent_joint=Pose((0.5, 0.0, 0.5))),))
 
@@ -96,7 +96,7 @@ def test_obstacle_hits_are_named_and_obstacles_may_overlap():
 
 
 def test_obstacle_in_the_base_leaves_no_free_configuration():
-    """The base stands still, and simulators do not test what does; so this has to."""
+    """Simulators do not test contacts between static objects, so FreeSpace must."""
     inside = Block((0.05, 0.05, 0.05))
     assert free(Scene(aside(), obstacles=(inside,)), 0.0, 0.5) == [False, False]
 
@@ -112,7 +112,7 @@ def test_tool_point_inside_an_obstacle_is_in_collision():
 
 
 def test_robot_base_pose_of_the_scene_is_used():
-    """Upside down the slide goes down."""
+    """With an inverted base the slide points down."""
     assert free(Scene(aside(), HALF_TURN), 0.0, 0.5, -0.5) == [True, False, True]
     assert free(Scene(aside(), Pose((0.0, 0.0, 1.0))), 0.5, -0.5) == [True, True]
 
@@ -144,20 +144,20 @@ def test_configurations_have_the_shape_of_the_robot():
 @pytest.mark.filterwarnings("ignore:Attach conflict")
 @pytest.mark.parametrize("scene", [reach_scene, real_arm_scene, push_scene])
 def test_results_agree_with_mujoco_plane_contacts(scene):
-    """A model built another way: what is written as MJCF, in a world with a true plane."""
+    """The reference model is the exported MJCF in a world with a plane."""
     scene = scene()
     robot = scene.robot
     q = random_configurations(robot, 300, np.random.default_rng(1))
-    found = FreeSpace(scene).free(q)
-    assert 0.1 < found.mean() < 0.95
-    assert found.tolist() == [not hit for hit in plane_hits(scene, q)]
+    free_mask = FreeSpace(scene).free(q)
+    assert 0.1 < free_mask.mean() < 0.95
+    assert free_mask.tolist() == [not hit for hit in plane_hits(scene, q)]
 
 
 def plane_hits(scene, q):
-    """Whether MuJoCo finds contacts; not those of level links with the plane, see there."""
+    """Return whether MuJoCo finds contacts, except of level links with the plane."""
     robot = scene.robot
     spec, child = mujoco.MjSpec(), to_spec(robot)
-    # Else MuJoCo writes a log of the conflict into the working directory.
+    # Otherwise MuJoCo writes a log file to the working directory.
     spec.option.timestep, spec.option.integrator = child.option.timestep, child.option.integrator
     place = {"pos": scene.T_world_root.position, "quat": scene.T_world_root.quaternion}
     spec.attach(child, frame=spec.worldbody.add_frame(**place), prefix="robot/")
@@ -203,10 +203,10 @@ def test_sample_returns_the_number_of_tested_configurations(monkeypatch):
     space = FreeSpace(Scene(aside()))
     q, tried = space.sample(50, np.random.default_rng(0))
     all_drawn = random_configurations(aside(), tried, np.random.default_rng(0))
-    verdicts = space.free(all_drawn)
-    assert verdicts.sum() == 50
-    assert verdicts[-1]
-    assert (all_drawn[verdicts] == q).all()
+    free_mask = space.free(all_drawn)
+    assert free_mask.sum() == 50
+    assert free_mask[-1]
+    assert (all_drawn[free_mask] == q).all()
 
 
 def test_robot_without_free_configuration_is_named_with_its_collisions(monkeypatch):
@@ -230,7 +230,7 @@ def pushed(robot=None, **changes):
 
 
 def test_block_is_an_obstacle_at_the_given_pose():
-    """The ball of 0.1 m is 0.5 m beside the plate, and its centre 0.5 m above the ground."""
+    """The 0.1 m ball is 0.5 m beside the plate and its centre 0.5 m above the ground."""
     space = pushed()
     above = 0.5 + 0.1 + 0.1
     heights = (above + SHALLOW, above - SHALLOW, above - DEEP, 5.0)

@@ -27,33 +27,33 @@ def cache(tmp_path_factory):
 
 
 def some(**more):
-    """Reach and push, with and without obstacles."""
+    """A split with reach and push members, with and without obstacles."""
     train = [member(TRAIN[0], task="reach"), member(TRAIN[2])]
     return split(train, [member(TEST[0], task="reach", obstacles=True)], **more)
 
 
-def made(which, cache, config=RECIPE):
+def draw_sets(which, cache, config=RECIPE):
     return SplitGoals.from_results(sample_split_goals(which, LIBRARY, config, cache=cache), config)
 
 
 @pytest.fixture
 def sets(cache):
-    return made(some(), cache)
+    return draw_sets(some(), cache)
 
 
 def changed(sets, at, fields=None, **changes):
-    """The sets with one of them changed."""
+    """Return the goal sets with one of them changed."""
     one = replace(sets.sets[at], **changes)
     one = replace(one, goals=replace(one.goals, **(fields or {})))
     return replace(sets, sets={**sets.sets, at: one})
 
 
-def found(which, sets):
-    return [(each.code, each.where) for each in audit_goals(which, sets, LIBRARY)]
+def audit_codes(which, sets):
+    return [(finding.code, finding.where) for finding in audit_goals(which, sets, LIBRARY)]
 
 
-def whys(which, sets):
-    return [each.why for each in audit_goals(which, sets, LIBRARY)]
+def audit_reasons(which, sets):
+    return [finding.why for finding in audit_goals(which, sets, LIBRARY)]
 
 
 def moved(array, row, column, by):
@@ -63,30 +63,30 @@ def moved(array, row, column, by):
 
 
 def test_valid_sets_have_no_findings(sets):
-    assert found(some(), sets) == []
+    assert audit_codes(some(), sets) == []
 
 
 def test_built_in_split_has_no_findings(cache):
     which = read_split("extrapolation/primitives/reach")
-    assert found(which, made(which, cache)) == []
+    assert audit_codes(which, draw_sets(which, cache)) == []
 
 
 def test_cache_that_ignores_the_seed_is_reported(sets, cache):
-    """The set of another seed under the key of this one is proven, and not the one."""
-    other = made(some(), cache, replace(RECIPE, seed=1))
+    """A valid set of another seed stored under this seed's key is reported."""
+    other = draw_sets(some(), cache, replace(RECIPE, seed=1))
     for at in (REACH, PUSH):
         wrong = replace(other.sets[at].goals, key=sets.sets[at].goals.key, seed=0)
-        told = audit_goals(some(), changed(sets, at, goals=wrong), LIBRARY)
-        assert [each.code for each in told] == ["goals-changed"]
-        assert told[0].why == "its goals are not those that seed 0 gives"
+        findings = audit_goals(some(), changed(sets, at, goals=wrong), LIBRARY)
+        assert [finding.code for finding in findings] == ["goals-changed"]
+        assert findings[0].why == "its goals are not those that seed 0 gives"
 
 
 def test_sets_of_another_seed_are_reported(cache):
-    other = made(some(), cache, replace(RECIPE, seed=1))
-    told = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
-    assert [each.code for each in told] == ["goals-seed"] * 3
-    assert told[0].why == "its set was made with seed 1, the split's with 0"
-    assert found(some(), other) == []
+    other = draw_sets(some(), cache, replace(RECIPE, seed=1))
+    findings = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
+    assert [finding.code for finding in findings] == ["goals-seed"] * 3
+    assert findings[0].why == "its set was made with seed 1, the split's with 0"
+    assert audit_codes(some(), other) == []
 
 
 @pytest.mark.parametrize(
@@ -103,61 +103,67 @@ def test_sets_of_another_seed_are_reported(cache):
     ],
 )
 def test_sets_with_other_constants_are_reported(sets, cache, recipe):
-    other = made(some(), cache, recipe)
+    other = draw_sets(some(), cache, recipe)
     wrong = [at for at, one in other.sets.items() if one.goals.key != sets.sets[at].goals.key]
-    told = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
-    assert [each.code for each in told] == ["goals-config"] * len(wrong)
+    findings = audit_goals(some(), replace(other, config=RECIPE), LIBRARY)
+    assert [finding.code for finding in findings] == ["goals-config"] * len(wrong)
     assert len(wrong) >= 2
 
 
 def test_set_without_the_obstacles_of_its_member_is_reported(cache):
     bare = replace(some().test[0], obstacles=False)
-    other = made(replace(some(), test=(bare,)), cache)
-    (why,) = whys(some(), other)
+    other = draw_sets(replace(some(), test=(bare,)), cache)
+    (why,) = audit_reasons(some(), other)
     assert why == "its set is for reach, not reach with obstacles"
 
 
 def test_set_of_another_robot_is_reported(sets):
     body = "0" * 32
-    told = audit_goals(some(), changed(sets, REACH, {"key": "1" * 64}, robot_hash=body), LIBRARY)
-    assert [(each.code, each.where) for each in told] == [
+    findings = audit_goals(
+        some(), changed(sets, REACH, {"key": "1" * 64}, robot_hash=body), LIBRARY
+    )
+    assert [(finding.code, finding.where) for finding in findings] == [
         ("goals-body", "train robot gantry-plane")
     ]
-    assert told[0].why.startswith(f"its set is of body {body}, not of ")
+    assert findings[0].why.startswith(f"its set is of body {body}, not of ")
 
 
 def test_swapped_sets_are_reported(cache):
     which = split([member(TRAIN[0], task="reach"), member(TRAIN[1], task="reach")], [TEST[0]])
-    sets = made(which, cache)
+    sets = draw_sets(which, cache)
     a, b = (("train", name) for name in ("gantry-plane", "planar-cube"))
     goals = {a: sets.sets[b].goals, b: sets.sets[a].goals}
     swapped = {at: replace(one, goals=goals.get(at, one.goals)) for at, one in sets.sets.items()}
-    told = audit_goals(which, replace(sets, sets=swapped), LIBRARY)
-    bodies = [each for each in told if each.code == "goals-body"]
-    assert [each.why for each in bodies] == [
+    findings = audit_goals(which, replace(sets, sets=swapped), LIBRARY)
+    bodies = [finding for finding in findings if finding.code == "goals-body"]
+    assert [finding.why for finding in bodies] == [
         "its set is that of train robot planar-cube",
         "its set is that of train robot gantry-plane",
     ]
-    assert {each.code for each in told} == {"goals-body", "goals-unproven", "goals-missing"}
+    assert {finding.code for finding in findings} == {
+        "goals-body",
+        "goals-unproven",
+        "goals-missing",
+    }
 
 
 def test_goals_out_of_reach_are_reported(sets):
     goals = sets.sets[REACH].goals
-    told = audit_goals(
+    findings = audit_goals(
         some(), changed(sets, REACH, {"poses": moved(goals.poses, [3, 5], 0, 0.01)}), LIBRARY
     )
-    assert [each.code for each in told] == ["goals-changed", "goals-unproven"]
-    assert told[1].why.startswith("goal 3: the tool of its configuration is 0.01 m away")
-    assert told[1].why.endswith("(and 1 more)")
+    assert [finding.code for finding in findings] == ["goals-changed", "goals-unproven"]
+    assert findings[1].why.startswith("goal 3: the tool of its configuration is 0.01 m away")
+    assert findings[1].why.endswith("(and 1 more)")
 
 
 def test_goals_in_collision_are_reported(sets):
     box = sets.sets[LAST].goals.obstacles[0]
     at = tuple(sets.sets[LAST].goals.poses[0, :3].tolist())
     inside = (replace(box, pose=replace(box.pose, position=at)),)
-    told = audit_goals(some(), changed(sets, LAST, {"obstacles": inside}), LIBRARY)
-    assert [each.code for each in told] == ["goals-changed", "goals-unproven"]
-    assert told[1].why.startswith("goal 0: its configuration is in collision")
+    findings = audit_goals(some(), changed(sets, LAST, {"obstacles": inside}), LIBRARY)
+    assert [finding.code for finding in findings] == ["goals-changed", "goals-unproven"]
+    assert findings[1].why.startswith("goal 0: its configuration is in collision")
 
 
 @pytest.mark.parametrize(
@@ -175,27 +181,31 @@ def test_goals_in_collision_are_reported(sets):
 def test_unproven_pushes_are_reported(sets, field, column, by, why):
     array = getattr(sets.sets[PUSH].goals, field)
     wrong = changed(sets, PUSH, {field: moved(array, 2, column, by)})
-    told = [each for each in audit_goals(some(), wrong, LIBRARY) if each.code == "goals-unproven"]
-    assert [each.where for each in told] == ["train robot gantry-cylinder"]
-    assert told[0].why.startswith(why)
+    findings = [
+        finding
+        for finding in audit_goals(some(), wrong, LIBRARY)
+        if finding.code == "goals-unproven"
+    ]
+    assert [finding.where for finding in findings] == ["train robot gantry-cylinder"]
+    assert findings[0].why.startswith(why)
 
 
 def test_block_in_an_obstacle_is_reported(cache):
     which = split([member(TRAIN[0], obstacles=True)], [member(TRAIN[2])])
-    sets = made(which, cache)
+    sets = draw_sets(which, cache)
     goals = sets.sets[REACH].goals
     box = goals.obstacles[0]
     at = tuple(goals.blocks[1, :3].tolist())
     inside = (replace(box, pose=replace(box.pose, position=at)), *goals.obstacles[1:])
-    told = audit_goals(which, changed(sets, REACH, {"obstacles": inside}), LIBRARY)
-    (unproven,) = [each.why for each in told if each.code == "goals-unproven"]
+    findings = audit_goals(which, changed(sets, REACH, {"obstacles": inside}), LIBRARY)
+    (unproven,) = [finding.why for finding in findings if finding.code == "goals-unproven"]
     assert re.match(r"start \d: the block is in an obstacle or the base", unproven)
 
 
 def test_missing_and_surplus_sets_are_reported(sets):
     other = {**sets.sets, ("test", "stranger"): sets.sets[LAST]}
     del other[REACH]
-    assert found(some(), replace(sets, sets=other)) == [
+    assert audit_codes(some(), replace(sets, sets=other)) == [
         ("goals-missing", "train robot gantry-plane"),
         ("goals-unknown", "test robot stranger"),
     ]
@@ -204,13 +214,13 @@ def test_missing_and_surplus_sets_are_reported(sets):
 def test_finding_explains_why_a_robot_has_no_goals(sets):
     broken = replace(some().train[0], derivation="base=planar[top: ee=cubw]")
     which = replace(some(), train=(broken, some().train[1]))
-    told = audit_goals(which, sets, LIBRARY)
-    assert [each.code for each in told] == ["goals-missing"]
-    assert "unknown part 'cubw'" in told[0].why
+    findings = audit_goals(which, sets, LIBRARY)
+    assert [finding.code for finding in findings] == ["goals-missing"]
+    assert "unknown part 'cubw'" in findings[0].why
 
 
 def twins(task, obstacles=False):
-    """The same body on both sides under two names, beside another."""
+    """A split with one robot on both sides under two names, and another robot."""
     train = [member(TRAIN[2], task=task), member(TRAIN[0], task=task)]
     return split(train, [member(TRAIN[0], "twin", task=task, obstacles=obstacles)])
 
@@ -218,27 +228,27 @@ def twins(task, obstacles=False):
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_same_robot_on_both_sides_shares_its_goals(cache, task):
     count = 12 if task == "reach" else 4
-    told = audit_goals(twins(task), made(twins(task), cache), LIBRARY)
-    assert [(each.code, each.severity, each.where) for each in told] == [
+    findings = audit_goals(twins(task), draw_sets(twins(task), cache), LIBRARY)
+    assert [(finding.code, finding.severity, finding.where) for finding in findings] == [
         ("goals-shared", "error", "test robot twin")
     ]
-    assert told[0].why == f"train robot gantry-plane has {count} of its {count} goals"
+    assert findings[0].why == f"train robot gantry-plane has {count} of its {count} goals"
 
 
 def test_same_robot_with_another_task_shares_no_goals(cache):
     train = [member(TRAIN[0], task="reach")]
     which = split(train, [member(TRAIN[0], "twin")])
-    assert found(which, made(which, cache)) == []
-    assert found(twins("reach", True), made(twins("reach", True), cache)) == []
+    assert audit_codes(which, draw_sets(which, cache)) == []
+    assert audit_codes(twins("reach", True), draw_sets(twins("reach", True), cache)) == []
 
 
 def test_single_nearby_goal_of_the_same_robot_is_a_leak(cache):
     which = twins("reach", obstacles=True)
-    sets = made(which, cache)
+    sets = draw_sets(which, cache)
     goal = sets.sets[REACH].goals.poses[7]
     poses = sets.sets["test", "twin"].goals.poses.copy()
 
-    def told(by, turned=0.0):
+    def shifted_codes(by, turned=0.0):
         poses[2] = goal
         poses[2, 0] += by
         half = turned / 2
@@ -251,23 +261,23 @@ def test_single_nearby_goal_of_the_same_robot_is_a_leak(cache):
             z * spin[0] - y * spin[1],
         ]
         wrong = changed(sets, ("test", "twin"), {"poses": poses})
-        return [why for why in whys(which, wrong) if why.startswith("train robot")]
+        return [why for why in audit_reasons(which, wrong) if why.startswith("train robot")]
 
     expected = ["train robot gantry-plane has 1 of its 12 goals"]
-    assert told(0.9 * NEAR, np.radians(0.9)) == expected
-    assert told(1.1 * NEAR) == told(0.0, np.radians(1.1)) == []
+    assert shifted_codes(0.9 * NEAR, np.radians(0.9)) == expected
+    assert shifted_codes(1.1 * NEAR) == shifted_codes(0.0, np.radians(1.1)) == []
 
 
 def test_most_goals_shared_with_another_robot_are_a_leak_but_one_is_not(cache):
     which = split([member(TRAIN[0], task="reach")], [member(TRAIN[2], "other", task="reach")])
-    sets = made(which, cache)
-    theirs = sets.sets[REACH].goals
+    sets = draw_sets(which, cache)
+    other_goals = sets.sets[REACH].goals
 
     def shared(n, field):
         array = getattr(sets.sets["test", "other"].goals, field).copy()
-        array[:n] = getattr(theirs, field)[:n]
+        array[:n] = getattr(other_goals, field)[:n]
         wrong = changed(sets, ("test", "other"), {field: array})
-        return [why for why in whys(which, wrong) if why.startswith("train robot")]
+        return [why for why in audit_reasons(which, wrong) if why.startswith("train robot")]
 
     assert shared(6, "poses") == shared(6, "q") == []
     assert shared(7, "poses") == ["train robot gantry-plane has 7 of its 12 goals"]
@@ -277,7 +287,9 @@ def test_most_goals_shared_with_another_robot_are_a_leak_but_one_is_not(cache):
 def test_worst_of_several_leaks_is_named(cache):
     train = [member(TRAIN[0], name, task="reach") for name in ("a", "b")]
     which = split(train, [member(TRAIN[0], "twin", task="reach")])
-    assert whys(which, made(which, cache)) == ["train robot a (and 1 more) has 12 of its 12 goals"]
+    assert audit_reasons(which, draw_sets(which, cache)) == [
+        "train robot a (and 1 more) has 12 of its 12 goals"
+    ]
 
 
 @pytest.mark.parametrize(("at", "fields"), [(REACH, ["poses", "q"]), (PUSH, ["blocks", "q"])])
@@ -286,8 +298,8 @@ def test_duplicate_goals_in_a_set_are_a_warning(sets, at, fields):
     arrays = {name: getattr(goals, name).copy() for name in fields}
     for array in arrays.values():
         array[[1, 2]] = array[0]
-    told = audit_goals(some(), changed(sets, at, arrays), LIBRARY)
-    (twice,) = [each for each in told if each.code == "goals-repeated"]
+    findings = audit_goals(some(), changed(sets, at, arrays), LIBRARY)
+    (twice,) = [finding for finding in findings if finding.code == "goals-repeated"]
     assert (twice.severity, twice.where) == ("warning", f"train robot {at[1]}")
     assert twice.why == "goals 0 and 1 of its set are the same (and 2 more pairs)"
 
@@ -295,19 +307,19 @@ def test_duplicate_goals_in_a_set_are_a_warning(sets, at, fields):
 def test_push_starts_with_equal_blocks_differ_by_configuration(sets):
     blocks = sets.sets[PUSH].goals.blocks.copy()
     blocks[1] = blocks[0]
-    told = found(some(), changed(sets, PUSH, {"blocks": blocks}))
-    assert ("goals-repeated", "train robot gantry-cylinder") not in told
-    assert ("goals-changed", "train robot gantry-cylinder") in told
+    codes = audit_codes(some(), changed(sets, PUSH, {"blocks": blocks}))
+    assert ("goals-repeated", "train robot gantry-cylinder") not in codes
+    assert ("goals-changed", "train robot gantry-cylinder") in codes
 
 
 def test_accepted_findings_do_not_fail(cache):
     reasons = {"body-shared": "new goals of a known body", "goals-shared": "on purpose"}
     which = replace(twins("reach"), accepted=reasons, regime="interpolation")
     done = audit(which, LIBRARY)
-    findings = audit_goals(which, made(which, cache), LIBRARY)
+    findings = audit_goals(which, draw_sets(which, cache), LIBRARY)
     joined = with_goal_findings(done, which, findings)
-    assert {each.code: why for each, why in joined.accepted} == reasons
-    assert "goals-shared" not in {each.code for each in joined.findings}
+    assert {finding.code: why for finding, why in joined.accepted} == reasons
+    assert "goals-shared" not in {finding.code for finding in joined.findings}
     strict = replace(which, accepted={"body-shared": "a reason"})
     assert not with_goal_findings(audit(strict, LIBRARY), strict, findings).passed()
 
@@ -316,12 +328,14 @@ def test_unused_accepted_goal_findings_are_reported_only_after_a_goal_audit(sets
     which = replace(some(), accepted={"goals-shared": "on purpose"}, regime="interpolation")
     done = audit(which, LIBRARY)
     unused = "accepted goals-shared"
-    assert unused not in {each.where for each in with_goal_findings(done, which, None).findings}
-    assert unused in {each.where for each in with_goal_findings(done, which, ()).findings}
+    assert unused not in {
+        finding.where for finding in with_goal_findings(done, which, None).findings
+    }
+    assert unused in {finding.where for finding in with_goal_findings(done, which, ()).findings}
 
 
 def test_every_code_has_a_fix(sets):
     broken = replace(sets, sets={})
-    told = audit_goals(some(), broken, LIBRARY)
-    assert {each.code for each in told} == {"goals-missing"} <= CODES
-    assert all(each.fix for each in told)
+    findings = audit_goals(some(), broken, LIBRARY)
+    assert {finding.code for finding in findings} == {"goals-missing"} <= CODES
+    assert all(finding.fix for finding in findings)

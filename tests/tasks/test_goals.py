@@ -48,12 +48,12 @@ def body():
     return replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs)
 
 
-def made(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
+def sample_goals(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
     return draw_goals(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
 
 
-def scene_of(body, found, ground=LIFTED):
-    return Scene(body, obstacles=found.obstacles, ground=ground)
+def scene_of(body, goal_set, ground=LIFTED):
+    return Scene(body, obstacles=goal_set.obstacles, ground=ground)
 
 
 def files(folder):
@@ -64,18 +64,18 @@ def files(folder):
 @pytest.mark.parametrize("boxes", [False, True])
 def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
     body = robot(words)
-    found = made(body, cache, obstacles=boxes, ground=0.0)
-    assert found.q.shape == (12, body.dof)
-    assert found.poses.shape == (12, 7)
-    assert (found.poses[:, 3] >= 0).all()
-    assert len(found.obstacles) == (3 if boxes else 0)
-    assert certify_goals(found, body, scene_of(body, found, 0.0)) == []
-    assert 12 == found.accepted <= found.tried
-    assert len(np.unique(found.q, axis=0)) == 12
+    goal_set = sample_goals(body, cache, obstacles=boxes, ground=0.0)
+    assert goal_set.q.shape == (12, body.dof)
+    assert goal_set.poses.shape == (12, 7)
+    assert (goal_set.poses[:, 3] >= 0).all()
+    assert len(goal_set.obstacles) == (3 if boxes else 0)
+    assert certify_goals(goal_set, body, scene_of(body, goal_set, 0.0)) == []
+    assert 12 == goal_set.accepted <= goal_set.tried
+    assert len(np.unique(goal_set.q, axis=0)) == 12
 
 
 def test_goals_are_above_the_ground_at_any_height(body, cache):
-    here, there = (made(body, cache, ground=ground) for ground in (0.0, LIFTED))
+    here, there = (sample_goals(body, cache, ground=ground) for ground in (0.0, LIFTED))
     assert there.poses[:, :3] == pytest.approx(frame_pose(body, there.q)[:, :3, 3])
     assert certify_goals(there, body, scene_of(body, there)) == []
     assert certify_goals(there, body, scene_of(body, there, 0.5)) != []
@@ -84,14 +84,14 @@ def test_goals_are_above_the_ground_at_any_height(body, cache):
 
 @pytest.mark.parametrize("words", WORDS)
 def test_goals_are_never_inside_an_obstacle(words, cache):
-    """Neither the witness's links nor the tool's point, which may be where no link is."""
+    """Neither the links at the goal configuration nor the tool point are inside an obstacle."""
     body = robot(words)
     config = replace(CONFIG, num_goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
-    found = made(body, cache, obstacles=True, config=config, ground=0.0)
-    assert not FreeSpace(scene_of(body, found, 0.0)).obstacle_hits(found.q).any()
-    for box in found.obstacles:
+    goal_set = sample_goals(body, cache, obstacles=True, config=config, ground=0.0)
+    assert not FreeSpace(scene_of(body, goal_set, 0.0)).obstacle_hits(goal_set.q).any()
+    for box in goal_set.obstacles:
         T = box.pose.inverse().matrix
-        inside = np.abs(found.poses[:, :3] @ T[:3, :3].T + T[:3, 3]) <= np.array(box.size) / 2
+        inside = np.abs(goal_set.poses[:, :3] @ T[:3, :3].T + T[:3, 3]) <= np.array(box.size) / 2
         assert not inside.all(axis=1).any()
 
 
@@ -99,11 +99,13 @@ def test_goals_are_never_inside_an_obstacle(words, cache):
 @pytest.mark.parametrize("words", WORDS)
 def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground, cache):
     body = robot(words)
-    found = made(body, cache, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6))
-    space = FreeSpace(scene_of(body, found, ground))
+    goal_set = sample_goals(
+        body, cache, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6)
+    )
+    space = FreeSpace(scene_of(body, goal_set, ground))
     assert not space.obstacle_hits([body.home]).any()
     reach, centre = workspace(body).reach, shoulder(body)
-    for box in found.obstacles:
+    for box in goal_set.obstacles:
         assert all(0.06 * reach <= edge <= 0.15 * reach for edge in box.size)
         assert box.pose.position[2] >= ground + box.size[2] / 2 - 1e-12
         assert np.linalg.norm(np.subtract(centre, box.pose.position)) <= reach
@@ -125,15 +127,15 @@ def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
 def test_missing_room_for_obstacles_is_an_error(body, cache):
     config = replace(CONFIG, obstacles=2, obstacle_size=(3.0, 4.0))
     with pytest.raises(BenchmarkError, match=r"'arm': of 32 boxes .* only 0 .* fewer or smaller"):
-        made(body, cache, obstacles=True, config=config)
+        sample_goals(body, cache, obstacles=True, config=config)
     assert not cache.exists()
 
 
 def test_obstacle_count_is_required(body, cache):
     config = replace(CONFIG, obstacles=0)
     with pytest.raises(BenchmarkError, match="0 obstacles of size"):
-        made(body, cache, obstacles=True, config=config)
-    assert len(made(body, cache, config=config).q) == 12
+        sample_goals(body, cache, obstacles=True, config=config)
+    assert len(sample_goals(body, cache, config=config).q) == 12
 
 
 @pytest.mark.parametrize("size", [(0.0, 0.1), (0.2, 0.1), (0.1, np.inf)])
@@ -143,10 +145,10 @@ def test_invalid_obstacle_sizes_are_rejected(body, size):
 
 
 def test_cache_key_depends_on_the_seed(body, cache):
-    first, second = made(body, cache, seed=0), made(body, cache, seed=1)
+    first, second = sample_goals(body, cache, seed=0), sample_goals(body, cache, seed=1)
     assert not np.isin(first.q, second.q).any()
-    assert (made(body, cache, seed=1).q == second.q).all()
-    assert made(body, cache, seed=1).seed == 1
+    assert (sample_goals(body, cache, seed=1).q == second.q).all()
+    assert sample_goals(body, cache, seed=1).seed == 1
     assert len(files(cache)) == 2
 
 
@@ -167,26 +169,27 @@ def changes(body):
 
 def test_cache_key_depends_on_exactly_the_relevant_inputs(body, cache):
     keys = [
-        made(**{"body": body, "cache": cache, **change}).key for change in changes(body).values()
+        sample_goals(**{"body": body, "cache": cache, **change}).key
+        for change in changes(body).values()
     ]
-    keys.append(made(body, cache).key)
+    keys.append(sample_goals(body, cache).key)
     assert len(set(keys)) == len(keys)
     count = len(files(cache))
     same = replace(CONFIG, near=0.1, max_episode_steps=5, obstacles=7)
     other = replace(body, name="other")
-    assert made(other, cache, config=same).robot == "other"
-    assert (made(other, cache).q == made(body, cache).q).all()
+    assert sample_goals(other, cache, config=same).robot == "other"
+    assert (sample_goals(other, cache).q == sample_goals(body, cache).q).all()
     assert len(files(cache)) == count
 
 
 def test_stored_set_equals_the_sampled_set(body, cache, monkeypatch):
-    fresh = made(body, cache, obstacles=True)
+    fresh = sample_goals(body, cache, obstacles=True)
 
     def forbidden(*_):
         raise AssertionError("it was made again")
 
     monkeypatch.setattr(module, "FreeSpace", forbidden)
-    stored = made(body, cache, obstacles=True)
+    stored = sample_goals(body, cache, obstacles=True)
     for name in ("robot", "key", "obstacles", "tried", "accepted", "seed"):
         assert getattr(stored, name) == getattr(fresh, name)
     assert (stored.q == fresh.q).all()
@@ -194,7 +197,7 @@ def test_stored_set_equals_the_sampled_set(body, cache, monkeypatch):
 
 
 def test_goal_sets_are_byte_identical_across_processes(body, tmp_path):
-    made(body, tmp_path / "here", obstacles=True)
+    sample_goals(body, tmp_path / "here", obstacles=True)
     code = (
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; "
         "from dataclasses import replace; from helpers.robots import arm; "
@@ -213,23 +216,23 @@ def test_goal_sets_are_byte_identical_across_processes(body, tmp_path):
 
 
 def test_smaller_goal_sets_are_prefixes_of_larger_ones(body, cache):
-    few = made(body, cache)
-    more = made(body, cache, config=replace(CONFIG, num_goals=30))
+    few = sample_goals(body, cache)
+    more = sample_goals(body, cache, config=replace(CONFIG, num_goals=30))
     assert (more.q[:12] == few.q).all()
 
 
 def test_failed_samples_do_not_truncate_the_set(cache):
-    """Three of four configurations of this arm collide, and every set is full."""
+    """Three quarters of this arm's configurations collide, yet every set is complete."""
     body = robot("arm=ur5 ee=plane")
-    found = made(body, cache, ground=0.0)
-    assert found.tried > 2 * found.accepted
-    assert len(found.q) == 12
+    goal_set = sample_goals(body, cache, ground=0.0)
+    assert goal_set.tried > 2 * goal_set.accepted
+    assert len(goal_set.q) == 12
 
 
 def test_too_few_goals_error_has_the_acceptance_rate(body, cache, monkeypatch):
     monkeypatch.setattr(free_space, "TRIES", 20)
     with pytest.raises(BenchmarkError) as caught:
-        made(body, cache, ground=5.0)
+        sample_goals(body, cache, ground=5.0)
     text = str(caught.value)
     assert "robot 'arm': only 0 of 240 random configurations" in text
     assert "acceptance rate 0), 12 are needed" in text
@@ -240,14 +243,14 @@ def test_too_few_goals_error_has_the_acceptance_rate(body, cache, monkeypatch):
 def test_fixed_tool_is_rejected(body, cache):
     fixed = replace(body, frames=(replace(body.frame("tool"), link="base"),))
     with pytest.raises(BenchmarkError, match="no joint moves its tool"):
-        made(fixed, cache)
+        sample_goals(fixed, cache)
     with pytest.raises(BenchmarkError, match="no frame 'tool'"):
-        made(replace(body, frames=()), cache)
+        sample_goals(replace(body, frames=()), cache)
 
 
 def test_negative_seed_is_rejected(body, cache):
     with pytest.raises(BenchmarkError, match="12 goals with seed -1"):
-        made(body, cache, seed=-1)
+        sample_goals(body, cache, seed=-1)
 
 
 @pytest.mark.parametrize(
@@ -272,70 +275,70 @@ def test_invalid_constants_are_rejected(changes, text):
 
 @pytest.mark.parametrize("keep", [0, 100, -200])
 def test_broken_file_is_named(body, cache, keep):
-    made(body, cache)
+    sample_goals(body, cache)
     (path,) = cache.iterdir()
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(TaskError, match=f"{path.name}: not a ReachGoalSet: .*; delete it"):
-        made(body, cache)
+        sample_goals(body, cache)
 
 
 def test_changed_byte_is_detected(body, cache):
-    found = made(body, cache)
+    goal_set = sample_goals(body, cache)
     (path,) = cache.iterdir()
     data = path.read_bytes()
-    assert found.q.tobytes() in data
-    at = data.index(found.q.tobytes()) + 5
+    assert goal_set.q.tobytes() in data
+    at = data.index(goal_set.q.tobytes()) + 5
     path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
     with pytest.raises(TaskError, match="delete it"):
-        made(body, cache)
+        sample_goals(body, cache)
 
 
 def test_renamed_file_is_detected(body, cache):
-    first, second = made(body, cache), made(body, cache, seed=1)
+    first, second = sample_goals(body, cache), sample_goals(body, cache, seed=1)
     (cache / f"{first.key}.npz").replace(cache / f"{second.key}.npz")
     with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
-        made(body, cache, seed=1)
+        sample_goals(body, cache, seed=1)
 
 
 def test_unwritable_cache_is_a_warning(body, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(UserWarning, match="cannot store a ReachGoalSet"):
-        found = made(body, tmp_path / "file" / "goals")
-    assert len(found.q) == 12
+        goal_set = sample_goals(body, tmp_path / "file" / "goals")
+    assert len(goal_set.q) == 12
 
 
 def test_user_cache_is_the_default(body, tmp_path, monkeypatch):
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / name)
-    found = made(body, None)
-    assert (tmp_path / "morphgen" / "goals-4" / f"{found.key}.npz").is_file()
+    goal_set = sample_goals(body, None)
+    assert (tmp_path / "morphgen" / "goals-4" / f"{goal_set.key}.npz").is_file()
 
 
 def test_certificate_names_every_fault(body, cache):
-    found = made(body, cache, obstacles=True)
-    scene = scene_of(body, found)
+    goal_set = sample_goals(body, cache, obstacles=True)
+    scene = scene_of(body, goal_set)
 
     def faults(**changes):
-        return certify_goals(replace(found, **changes), body, scene)
+        return certify_goals(replace(goal_set, **changes), body, scene)
 
-    q, poses = found.q.copy(), found.poses.copy()
+    q, poses = goal_set.q.copy(), goal_set.poses.copy()
     q[3, 1] = joint_limits(body)[1, 1] + 0.1
     assert faults(q=q)[0].startswith("goal 3: joint 'elbow' is at 2.1, outside (-2, 2)")
     q[3, 1] = np.nan
     assert len(faults(q=q)) == 1
     poses[4, 0] += 2e-6
     assert [line.split(":")[0] for line in faults(poses=poses)] == ["goal 4"]
-    poses = found.poses.copy()
+    poses = goal_set.poses.copy()
     poses[5, 4:] *= -1
     assert "goal 5: the tool" in faults(poses=poses)[0]
-    assert faults(poses=found.poses * [1, 1, 1, -1, -1, -1, -1]) == []
+    assert faults(poses=goal_set.poses * [1, 1, 1, -1, -1, -1, -1]) == []
     assert faults(obstacles=()) == ["the obstacles of the scene are not those of the goal set"]
-    assert "not goals of robot 'arm'" in faults(q=found.q[:, :2])[0]
-    assert "not goals of robot 'arm'" in faults(poses=found.poses[1:])[0]
+    assert "not goals of robot 'arm'" in faults(q=goal_set.q[:, :2])[0]
+    assert "not goals of robot 'arm'" in faults(poses=goal_set.poses[1:])[0]
 
 
 def test_certificate_detects_a_collision(body, cache):
-    found = made(body, cache)
+    goal_set = sample_goals(body, cache)
     around = Shape(Box((2.0, 2.0, 2.0)))
     walled = body.with_links([Link("base", body.link("base").inertial, (), (around,))])
-    lines = certify_goals(found, walled, scene_of(walled, found))
+    lines = certify_goals(goal_set, walled, scene_of(walled, goal_set))
     assert "goal 0: its configuration is in collision" in lines

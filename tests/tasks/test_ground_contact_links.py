@@ -33,7 +33,7 @@ def test_level_links_have_constant_height_and_tilt(request_, roll, count):
 
 @pytest.mark.parametrize("simulation", [MujocoSimulation, BulletSimulation])
 def test_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
-    """The disc of arm3 stands on the ground, to which no joint brings it nearer."""
+    """The disc of arm3 rests on the ground and no joint changes its height."""
     body = robot(ARM)
     block = Block((0.1, 0.1, 0.1), Pose((0.0, -0.7, 0.05)), mass=0.1)
     n = 16
@@ -43,35 +43,35 @@ def test_turntable_on_the_ground_does_not_disturb_the_arm(simulation):
     q[:, 0] = torch.linspace(0.2, 2.0, n)
     paths = []
     for contacts in (Contacts(self_collision=False), Contacts(False, False)):
-        made = simulation([scene] * n, contacts)
-        made.reset(torch.arange(n), q, places)
+        sim = simulation([scene] * n, contacts)
+        sim.reset(torch.arange(n), q, places)
         path = []
         for i in range(1, 16):
             turned = q.clone()
             turned[:, 0] += 0.05 * i
             turned[:, 3] -= 0.03 * i
-            made.step(turned)
-            path.append(made.q.clone())
-        made.close()
+            sim.step(turned)
+            path.append(sim.q.clone())
+        sim.close()
         paths.append(torch.stack(path))
     torch.testing.assert_close(*paths, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("simulation", [MujocoSimulation, BulletSimulation])
 def test_links_on_a_turntable_collide_with_obstacles(simulation):
-    """The arm, stretched out level, is stopped by a post."""
+    """The horizontally stretched arm is stopped by a post."""
     body = robot("arm=arm3 ee=claw arm.length=0.3")
     q = torch.tensor([body.home], dtype=torch.float32)
     q[0, 1:4] = torch.tensor([0.0, 0.0, 0.0])
     post = Block((0.05, 0.05, 0.4), Pose((0.25, 0.35, 0.2)))
     places = torch.zeros(1, 7)
     for obstacles in ((), (post,)):
-        made = simulation([Scene(body, obstacles=obstacles)], Contacts(self_collision=False))
-        made.reset(torch.arange(1), q, places)
+        sim = simulation([Scene(body, obstacles=obstacles)], Contacts(self_collision=False))
+        sim.reset(torch.arange(1), q, places)
         for i in range(1, 40):
             turned = q.clone()
             turned[0, 0] = min(float(q[0, 0]) + 0.05 * i, 3.1)
-            made.step(turned)
-        base = float(made.q[0, 0])
-        made.close()
+            sim.step(turned)
+        base = float(sim.q[0, 0])
+        sim.close()
         assert (base > 3.0) == (not obstacles)

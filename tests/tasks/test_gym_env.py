@@ -37,22 +37,22 @@ def cache(tmp_path_factory):
 
 @pytest.fixture
 def make(cache):
-    """Make environments, which are closed at the end of the test."""
-    made = []
+    """Create environments and close them after the test."""
+    envs = []
 
     def of(name, robot="arm3-stick", **options):
         config = REACH if name == "morphgen/Reach-v0" else PUSH
         given = {"config": config, "sim": "mujoco", "cache": cache} | options
-        made.append(gym.make(name, robot=robot, **given))
-        return made[-1]
+        envs.append(gym.make(name, robot=robot, **given))
+        return envs[-1]
 
     yield of
-    for env in made:
+    for env in envs:
         env.unwrapped.close()
 
 
 def run(env, steps):
-    """Observations and rewards of random actions, episode after episode."""
+    """Return observations and rewards of random actions over several episodes."""
     env.action_space.seed(0)
     rows = []
     for _ in range(steps):
@@ -80,7 +80,7 @@ def run(env, steps):
     ],
 )
 def test_both_checkers_pass(make, name, options):
-    """All that they have to say is that tokens are no vector; flattened they say nothing."""
+    """The checkers warn only that tokens are not a vector; flattened, they do not warn."""
     env = make(name, render_mode="rgb_array", size=(64, 48), **options)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -256,7 +256,7 @@ def test_info_describes_the_contact_settings(make):
     ("name", "robot"), [("morphgen/Reach-v0", "arm3-stick"), ("morphgen/Push-v0", "prims")]
 )
 def test_last_state_of_an_episode_can_be_rendered(make, name, robot):
-    """The batch has begun the next one by then, elsewhere."""
+    """The batch itself has already started the next episode."""
     env = make(name, robot, render_mode="rgb_array", size=(160, 120)).unwrapped
     env.reset(seed=3)
     action = np.zeros(env.action_space.shape, dtype=np.float32)
@@ -289,22 +289,22 @@ def test_closed_environment_raises_a_clear_error(make):
 
 
 @pytest.mark.parametrize(
-    ("action", "says"),
+    ("action", "message"),
     [
         (np.zeros(23, dtype=np.float32), r"shape \(23,\); expected \(5,\): arm_base, arm_shoulder"),
         (np.float32(0), r"shape \(\); expected \(5,\)"),
         (np.full(5, np.nan, dtype=np.float32), "not finite"),
     ],
 )
-def test_invalid_actions_are_rejected(make, action, says):
+def test_invalid_actions_are_rejected(make, action, message):
     env = make("morphgen/Reach-v0").unwrapped
     env.reset(seed=0)
-    with pytest.raises(TaskError, match=says):
+    with pytest.raises(TaskError, match=message):
         env.step(action)
 
 
 @pytest.mark.parametrize(
-    ("task", "options", "error", "says"),
+    ("task", "options", "error", "message"),
     [
         ("raech", {}, TaskError, "unknown task 'raech'; did you mean 'reach'"),
         ("reach", {"robot": "ur5-plain"}, CompositionError, "did you mean 'plane'"),
@@ -315,10 +315,10 @@ def test_invalid_actions_are_rejected(make, action, says):
         ("push", {"config": REACH}, TaskError, "ReachConfig is not the config of push"),
     ],
 )
-def test_invalid_options_are_rejected(task, options, error, says, cache):
+def test_invalid_options_are_rejected(task, options, error, message, cache):
     config = REACH if task == "reach" else PUSH
     given = {"robot": "arm3-stick", "config": config, "cache": cache} | options
-    with pytest.raises(error, match=says):
+    with pytest.raises(error, match=message):
         TaskEnv(task, **given)
 
 

@@ -26,7 +26,7 @@ OUTPUTS = ("q", "qd", "block_pose", "block_velocity")
 
 
 def outputs(sim, env=0):
-    """What an environment reports, without the padding."""
+    """Return the reported state of an environment without padding."""
     dof = sim.scenes[env].robot.dof
     return [
         getattr(sim, name)[env, : dof if name.startswith("q") else None].clone() for name in OUTPUTS
@@ -38,7 +38,7 @@ def same_bits(a, b):
 
 
 def drive(sim, steps=25, seed=0):
-    """Random targets near where all are now, the same for an environment wherever it is."""
+    """Step with random targets that do not depend on an environment's index."""
     start = sim.q.clone()
     for k in range(steps):
         rng = np.random.default_rng([seed, k])
@@ -219,7 +219,7 @@ def test_block_falls_freely_and_comes_to_rest():
 
 @pytest.mark.parametrize("friction", [0.3, 0.6])
 def test_friction_is_that_of_the_block(friction):
-    """On a slope that is a tenth steeper than friction holds, or flatter."""
+    """The slope is 10 % steeper or flatter than the friction limit."""
     travelled = []
     for share in (0.9, 1.1):
         angle = math.atan(friction * share)
@@ -302,9 +302,9 @@ def test_diverged_environment_is_reported_and_can_be_reset(tmp_path, monkeypatch
     put_back(sim, [1], home)
     sim.step(home[0])
     sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
-    with pytest.raises(DivergedError, match=r"environment 0 .*beyond 10000") as found:
+    with pytest.raises(DivergedError, match=r"environment 0 .*beyond 10000") as joint_names:
         sim.step(home[0])
-    assert list(found.value.reasons) == [0, 2]
+    assert list(joint_names.value.reasons) == [0, 2]
     assert list(Path(tmp_path).iterdir()) == []
 
 
@@ -399,7 +399,7 @@ def test_equal_scenes_share_one_model():
 
 @pytest.mark.parametrize("request_", ["chain beads=7", "arm=widowx ee=widowx_gripper"])
 def test_full_speed_back_and_forth_is_stable(request_):
-    """Light links that strong motors move, at the limits of effort."""
+    """Strong motors move light links at their effort limits."""
     body = robot(request_)
     sim = MujocoSimulation([Scene(body, block=Block((0.1,) * 3, Pose((0.4, 0.2, 0.05)), 0.1))])
     rng = np.random.default_rng(3)
@@ -422,7 +422,7 @@ def test_movable_joint_order_matches_the_robot():
     sim.reset(torch.tensor([0]), q, torch.zeros(1, 7))
     assert torch.equal(sim.q, q)
     expected = movable_positions(scene.robot, q[0].double().numpy())
-    found = [
+    joint_positions = [
         sim._data[0].joint(scene.robot.joints[k].name).qpos[0] for k in scene.robot.movable_joints
     ]
-    assert found == pytest.approx(expected)
+    assert joint_positions == pytest.approx(expected)

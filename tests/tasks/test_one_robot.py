@@ -20,7 +20,7 @@ NAMES = ("words", "bundle", "urdf", "robot", "read", "primitives", "bundle of pr
 
 @pytest.fixture(scope="module")
 def named(tmp_path_factory):
-    """The robot by every name but that of a split's member."""
+    """The robot under every name except that of a split member."""
     folder = tmp_path_factory.mktemp("robots")
     robot = morphgen.compose(WORDS)
     primitives = morphgen.compose(WORDS, name="primitives", geometry="primitive")
@@ -39,7 +39,7 @@ def named(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def batches(named, tmp_path_factory):
-    """An environment of each, with goals that are drawn anew."""
+    """One environment per name, with freshly sampled goals."""
 
     def options(name):
         cache = tmp_path_factory.mktemp(name.replace(" ", "-"))
@@ -58,42 +58,44 @@ def batches(named, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scores(batches):
-    """Rewards of all steps, by name, of the same actions."""
-    found = {}
+    """Return the rewards of all steps by name, for the same actions."""
+    rewards = {}
     for name, batch in batches.items():
         rng = np.random.default_rng(0)
         batch.reset(0)
-        found[name] = [
+        rewards[name] = [
             float(batch.step(batch.action_mask * float(rng.uniform(-1, 1))).reward[0])
             for _ in range(STEPS)
         ]
-    return found
+    return rewards
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_shapes_and_key_are_the_same(batches, name):
-    ours, theirs = (batches[each].specs[0].robot for each in ("words", name))
-    assert [link.collisions for link in theirs.links] == [link.collisions for link in ours.links]
-    assert theirs.joints == ours.joints
-    assert theirs.home == ours.home
-    assert theirs.ignore_pairs == ours.ignore_pairs
-    assert robot_hash(theirs, visuals=False) == robot_hash(ours, visuals=False)
+    reference, other = (batches[each].specs[0].robot for each in ("words", name))
+    assert [link.collisions for link in other.links] == [
+        link.collisions for link in reference.links
+    ]
+    assert other.joints == reference.joints
+    assert other.home == reference.home
+    assert other.ignore_pairs == reference.ignore_pairs
+    assert robot_hash(other, visuals=False) == robot_hash(reference, visuals=False)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_goals_are_the_same(batches, name):
-    ours, theirs = (batches[each].specs[0].goals for each in ("words", name))
-    assert theirs.key == ours.key
-    assert theirs.tried == ours.tried
-    assert theirs.obstacles == ours.obstacles
-    np.testing.assert_array_equal(theirs.q, ours.q)
-    np.testing.assert_array_equal(theirs.poses, ours.poses)
+    reference, other = (batches[each].specs[0].goals for each in ("words", name))
+    assert other.key == reference.key
+    assert other.tried == reference.tried
+    assert other.obstacles == reference.obstacles
+    np.testing.assert_array_equal(other.q, reference.q)
+    np.testing.assert_array_equal(other.poses, reference.poses)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tokens_are_the_same(batches, name):
-    ours, theirs = (batches[each].robot_tables.tokens for each in ("words", name))
-    assert (theirs == ours).all()
+    reference, other = (batches[each].robot_tables.tokens for each in ("words", name))
+    assert (other == reference).all()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -32,71 +32,73 @@ def cache(tmp_path):
     return tmp_path / "pushes"
 
 
-def made(words, cache, *, config=CONFIG, obstacles=False, seed=0, ground=0.0):
+def sample_starts(words, cache, *, config=CONFIG, obstacles=False, seed=0, ground=0.0):
     return draw_goals(
         robot(words), config, obstacles=obstacles, seed=seed, ground=ground, cache=cache
     )
 
 
-def space_of(words, found):
-    scene = Scene(robot(words), block=found.block, obstacles=found.obstacles, ground=found.ground)
+def space_of(words, push_set):
+    scene = Scene(
+        robot(words), block=push_set.block, obstacles=push_set.obstacles, ground=push_set.ground
+    )
     return FreeSpace(scene)
 
 
 @pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
 @pytest.mark.parametrize("boxes", [False, True])
 def test_every_block_can_be_pushed_across_the_line(words, boxes, cache):
-    found = made(words, cache, obstacles=boxes)
-    body, space = robot(words), space_of(words, found)
-    edge, x, y = found.block.size[0], *found.blocks[:, :2].T
-    assert len(found.obstacles) == (3 if boxes else 0)
-    assert 5 == found.accepted == len(found.q) <= found.tried
-    assert found.blocks[:, 2] == pytest.approx(edge / 2)
-    assert np.linalg.norm(found.blocks[:, 3:], axis=1) == pytest.approx(1.0)
-    assert ((-0.2 * found.scale <= y) & (y <= -0.15 * found.scale)).all()
-    assert found.line == pytest.approx(0.2 * found.scale)
-    for q in (found.q, found.behind, found.across):
+    push_set = sample_starts(words, cache, obstacles=boxes)
+    body, space = robot(words), space_of(words, push_set)
+    edge, x, y = push_set.block.size[0], *push_set.blocks[:, :2].T
+    assert len(push_set.obstacles) == (3 if boxes else 0)
+    assert 5 == push_set.accepted == len(push_set.q) <= push_set.tried
+    assert push_set.blocks[:, 2] == pytest.approx(edge / 2)
+    assert np.linalg.norm(push_set.blocks[:, 3:], axis=1) == pytest.approx(1.0)
+    assert ((-0.2 * push_set.scale <= y) & (y <= -0.15 * push_set.scale)).all()
+    assert push_set.line == pytest.approx(0.2 * push_set.scale)
+    for q in (push_set.q, push_set.behind, push_set.across):
         assert ((q >= joint_limits(body)[:, 0]) & (q <= joint_limits(body)[:, 1])).all()
-    assert space.free(found.q, found.blocks).all()
-    assert space.free(found.behind, found.blocks).all()
-    assert space.free(found.across).all()
-    behind, across = (frame_pose(body, q)[:, :3, 3] for q in (found.behind, found.across))
+    assert space.free(push_set.q, push_set.blocks).all()
+    assert space.free(push_set.behind, push_set.blocks).all()
+    assert space.free(push_set.across).all()
+    behind, across = (frame_pose(body, q)[:, :3, 3] for q in (push_set.behind, push_set.across))
     assert (behind[:, 1] < y - edge / 2).all()
     assert np.abs(behind[:, 0] - x).max() < CLOSE
-    assert np.abs(across[:, :2] - np.column_stack([x, np.full(5, found.line)])).max() < CLOSE
+    assert np.abs(across[:, :2] - np.column_stack([x, np.full(5, push_set.line)])).max() < CLOSE
     for tools in (behind, across):
         assert ((tools[:, 2] > 0) & (tools[:, 2] < edge)).all()
     for share in np.linspace(0, 1, 9):
-        on_its_way = found.blocks.copy()
-        on_its_way[:, 1] += share * (found.line - y)
+        on_its_way = push_set.blocks.copy()
+        on_its_way[:, 1] += share * (push_set.line - y)
         assert space.block_is_clear(on_its_way).all()
 
 
 @pytest.mark.parametrize("words", ARMS)
 def test_arm_block_distance_scales_with_effective_reach(words, cache):
-    found, work = made(words, cache), workspace(robot(words))
-    edge = found.block.size[0]
+    push_set, work = sample_starts(words, cache), workspace(robot(words))
+    edge = push_set.block.size[0]
     reach = np.sqrt(work.reach**2 - (work.shoulder[2] - edge / 2) ** 2)
     assert 0.15 * reach <= edge <= 0.2 * reach
-    x = found.blocks[:, 0] - work.shoulder[0]
+    x = push_set.blocks[:, 0] - work.shoulder[0]
     assert ((0.4 * reach <= x) & (x <= 0.6 * reach)).all()
-    assert found.scale == 1
+    assert push_set.scale == 1
 
 
 @pytest.mark.parametrize("words", FREE)
 def test_mobile_bases_have_the_block_at_a_fixed_distance(words, cache):
-    found = made(words, cache)
-    assert 0.15 <= found.block.size[0] <= 0.2
-    assert (np.abs(found.blocks[:, 0]) <= 0.2).all()
-    assert found.scale == 1
+    push_set = sample_starts(words, cache)
+    assert 0.15 <= push_set.block.size[0] <= 0.2
+    assert (np.abs(push_set.blocks[:, 0]) <= 0.2).all()
+    assert push_set.scale == 1
 
 
 def test_short_robots_have_a_scaled_down_push_region(cache):
-    """A rod of 0.15 m and its ball of 0.03 m, that swings on a slide."""
-    found = made(SHORT, cache)
-    assert found.scale == pytest.approx(0.18 / np.sqrt(2) / 0.4, rel=0.2)
-    assert 0.15 * found.scale <= found.block.size[0] <= 0.2 * found.scale
-    assert found.line == pytest.approx(0.2 * found.scale)
+    """A 0.15 m rod with a 0.03 m ball swings on a slide."""
+    push_set = sample_starts(SHORT, cache)
+    assert push_set.scale == pytest.approx(0.18 / np.sqrt(2) / 0.4, rel=0.2)
+    assert 0.15 * push_set.scale <= push_set.block.size[0] <= 0.2 * push_set.scale
+    assert push_set.line == pytest.approx(0.2 * push_set.scale)
 
 
 def test_effective_reach_follows_the_right_triangle():
@@ -110,43 +112,43 @@ def test_effective_reach_follows_the_right_triangle():
 
 def test_ground_may_be_below_the_base(cache):
     words = "arm=panda ee=panda_hand"
-    found = made(words, cache, ground=-0.05)
-    assert found.ground == -0.05
-    assert found.blocks[:, 2] == pytest.approx(found.block.size[0] / 2 - 0.05)
-    assert found.key != made(words, cache).key
+    push_set = sample_starts(words, cache, ground=-0.05)
+    assert push_set.ground == -0.05
+    assert push_set.blocks[:, 2] == pytest.approx(push_set.block.size[0] / 2 - 0.05)
+    assert push_set.key != sample_starts(words, cache).key
 
 
 def test_block_matches_the_config(cache):
     config = replace(CONFIG, block_mass=0.3, friction=0.6, line=0.1, start=-0.1, start_depth=0.0)
-    found = made("prims", cache, config=config)
-    assert (found.block.mass, found.block.friction, found.line) == (0.3, 0.6, 0.1)
-    assert found.blocks[:, 1] == pytest.approx(-0.1)
-    x, y, z, *turn = found.blocks[0].tolist()
-    assert found.block.pose == Pose((x, y, z), tuple(turn))
+    push_set = sample_starts("prims", cache, config=config)
+    assert (push_set.block.mass, push_set.block.friction, push_set.line) == (0.3, 0.6, 0.1)
+    assert push_set.blocks[:, 1] == pytest.approx(-0.1)
+    x, y, z, *turn = push_set.blocks[0].tolist()
+    assert push_set.block.pose == Pose((x, y, z), tuple(turn))
 
 
 def test_block_positions_and_orientations_are_random(cache):
-    found = made("prims", cache, config=replace(CONFIG, num_goals=60))
-    assert np.histogram(found.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
-    yaw = 2 * np.arctan2(found.blocks[:, 6], found.blocks[:, 3])
+    push_set = sample_starts("prims", cache, config=replace(CONFIG, num_goals=60))
+    assert np.histogram(push_set.blocks[:, 0], 3, (-0.2, 0.2))[0] == pytest.approx(20, abs=12)
+    yaw = 2 * np.arctan2(push_set.blocks[:, 6], push_set.blocks[:, 3])
     assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
 
 
 def test_smaller_sets_are_prefixes_of_larger_ones(cache):
-    few = made("arm=ur5 ee=plane", cache)
-    more = made("arm=ur5 ee=plane", cache, config=replace(CONFIG, num_goals=40))
+    few = sample_starts("arm=ur5 ee=plane", cache)
+    more = sample_starts("arm=ur5 ee=plane", cache, config=replace(CONFIG, num_goals=40))
     for name in ("q", "blocks", "behind", "across"):
         assert (getattr(more, name)[:5] == getattr(few, name)).all()
 
 
 def test_stored_set_equals_the_sampled_set(cache, monkeypatch):
-    fresh = made("prims", cache, obstacles=True)
+    fresh = sample_starts("prims", cache, obstacles=True)
 
     def forbidden(*_):
         raise AssertionError("it was made again")
 
     monkeypatch.setattr(module, "FreeSpace", forbidden)
-    stored = made("prims", cache, obstacles=True)
+    stored = sample_starts("prims", cache, obstacles=True)
     for field in fields(PushStartSet):
         a, b = getattr(stored, field.name), getattr(fresh, field.name)
         assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
@@ -154,7 +156,7 @@ def test_stored_set_equals_the_sampled_set(cache, monkeypatch):
 
 def test_same_seed_gives_the_same_bytes(tmp_path):
     for folder in ("here", "there"):
-        made("prims", tmp_path / folder, obstacles=True)
+        sample_starts("prims", tmp_path / folder, obstacles=True)
     files = [list((tmp_path / folder).iterdir()) for folder in ("here", "there")]
     assert [path.name for path in files[0]] == [path.name for path in files[1]]
     assert files[0][0].read_bytes() == files[1][0].read_bytes()
@@ -172,21 +174,21 @@ def test_cache_key_depends_on_exactly_the_relevant_inputs(cache):
         {**base, "seed": 1},
         {**base, "obstacles": True},
     ]
-    keys = [made("prims", cache, **change).key for change in changes]
+    keys = [sample_starts("prims", cache, **change).key for change in changes]
     assert len(set(keys)) == len(keys)
     same = replace(CONFIG, max_episode_steps=5, success_weight=3.0, curriculum_steps=2, obstacles=9)
     other = replace(robot("prims"), name="other")
-    found = draw_goals(other, same, obstacles=False, seed=0, cache=cache)
-    assert (found.key, found.robot) == (keys[0], "other")
+    push_set = draw_goals(other, same, obstacles=False, seed=0, cache=cache)
+    assert (push_set.key, push_set.robot) == (keys[0], "other")
 
 
 def test_robot_that_cannot_push_is_rejected_with_the_reason(cache):
     with pytest.raises(
         TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
     ):
-        made("cartpole", cache)
+        sample_starts("cartpole", cache)
     with pytest.raises(TaskError, match="'prims' can hardly push: only 0 of 160 poses") as caught:
-        made("prims", cache, config=replace(CONFIG, start=-0.9))
+        sample_starts("prims", cache, config=replace(CONFIG, start=-0.9))
     assert "acceptance rate 0), 5 are needed; the tool does not get behind it (100%)" in str(
         caught.value
     )
@@ -203,7 +205,7 @@ def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
 
     monkeypatch.setattr(feasibility, "draw_obstacles", wall)
     with pytest.raises(TaskError, match="each of 8 layouts of 3 obstacles stands in more than 50%"):
-        made("prims", cache, obstacles=True)
+        sample_starts("prims", cache, obstacles=True)
 
 
 @pytest.mark.parametrize(
@@ -216,24 +218,24 @@ def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
 )
 def test_invalid_constants_are_rejected(changes, text, cache):
     with pytest.raises((TaskError, BenchmarkError), match=text):
-        made("prims", cache, config=replace(CONFIG, **changes))
+        sample_starts("prims", cache, config=replace(CONFIG, **changes))
     with pytest.raises(BenchmarkError, match="with seed -1"):
-        made("prims", cache, seed=-1)
+        sample_starts("prims", cache, seed=-1)
 
 
 def test_broken_or_renamed_file_is_named(cache):
-    first, second = made("prims", cache), made("prims", cache, seed=1)
+    first, second = sample_starts("prims", cache), sample_starts("prims", cache, seed=1)
     paths = [cache / f"{each.key}.npz" for each in (first, second)]
     paths[1].write_bytes(paths[0].read_bytes())
     with pytest.raises(TaskError, match=f"its key is {first.key}, not"):
-        made("prims", cache, seed=1)
+        sample_starts("prims", cache, seed=1)
     paths[0].write_bytes(paths[0].read_bytes()[:-100])
     with pytest.raises(TaskError, match=f"{paths[0].name}: not a PushStartSet: .*; delete it"):
-        made("prims", cache)
+        sample_starts("prims", cache)
 
 
 def test_unwritable_cache_is_a_warning(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(UserWarning, match="cannot store a PushStartSet"):
-        found = made("prims", tmp_path / "file" / "pushes")
-    assert len(found.q) == 5
+        push_set = sample_starts("prims", tmp_path / "file" / "pushes")
+    assert len(push_set.q) == 5

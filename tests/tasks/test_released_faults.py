@@ -36,9 +36,9 @@ def robot():
 
 @pytest.mark.parametrize("sim", SIMS)
 def test_joints_are_reset_within_their_limits_and_stay_there(robot, sim, cache):
-    """Their reset at joint limits was computed and discarded.
+    """The original code computed the clamped joint positions and discarded them.
 
-    Where nothing touches: what an arm lies on can press a joint past its limit for a while.
+    Contacts are off, because a contact can press a joint past its limit for a while.
     """
     setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
     free = Contacts(False, False)
@@ -60,9 +60,9 @@ def test_joints_are_reset_within_their_limits_and_stay_there(robot, sim, cache):
 
 @pytest.mark.parametrize("sim", SIMS)
 def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
-    """Theirs were computed for each robot and never used.
+    """The original code computed gains for each robot and never used them.
 
-    Ten times the inertia has ten times the stiffness, so that the body moves as before.
+    Ten times the inertia gives ten times the stiffness, so the motion stays the same.
     """
     heavy = robot.with_links(
         [
@@ -102,7 +102,7 @@ def test_gains_of_a_robot_are_those_that_move_it(robot, sim, cache):
 
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_obstacles_never_contain_the_goal_or_start(robot, task, cache):
-    """Their goals could lie inside the obstacle that was there at the time."""
+    """In the original code a goal could lie inside an obstacle."""
     config = FEW if task == "reach" else replace(PushConfig(), num_goals=6, max_episode_steps=40)
     setting = draw_spec(robot, config, obstacles=True, seed=0, cache=cache)
     space = FreeSpace(setting.scene)
@@ -116,7 +116,7 @@ def test_obstacles_never_contain_the_goal_or_start(robot, task, cache):
 
 
 def test_goal_is_constant_during_an_episode(robot, cache):
-    """Theirs was drawn again inside the episode."""
+    """The original code sampled the goal again during the episode."""
     setting = draw_spec(robot, FEW, obstacles=False, seed=0, cache=cache)
     with closing(batch_from_specs([setting], 3, sim="mujoco")) as batch:
         batch.reset()
@@ -130,7 +130,7 @@ def test_goal_is_constant_during_an_episode(robot, cache):
 
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_seed_determines_the_episodes(robot, task, cache):
-    """Generators of theirs had none."""
+    """The random generators of the original code were not seeded."""
     config = FEW if task == "reach" else replace(PushConfig(), num_goals=6)
     setting = draw_spec(robot, config, obstacles=False, seed=0, cache=cache)
     seen = []

@@ -47,7 +47,7 @@ def push(cache):
 
 @pytest.fixture
 def on():
-    """Make renderers, which are closed at the end of the test."""
+    """Create renderers and close them after the test."""
     drawn = []
 
     def of(spec, size=SIZE):
@@ -61,7 +61,7 @@ def on():
 
 @pytest.fixture
 def plain():
-    """Make renderers of scenes alone, likewise."""
+    """Create renderers of bare scenes and close them after the test."""
     made = []
 
     def of(scene):
@@ -75,12 +75,12 @@ def plain():
 
 
 def at_goal(spec, i):
-    """The first start, with a goal."""
+    """The first start state, with a goal."""
     return RenderState(spec.goals.q[0], markers={"goal": spec.goals.poses[i]})
 
 
 def changed(a, b):
-    """Pixels that differ, shape (height, width)."""
+    """Return the mask of differing pixels, shape (height, width)."""
     return np.abs(a.astype(int) - b).max(axis=2) > 8
 
 
@@ -138,7 +138,7 @@ def test_obstacles_are_drawn(on, reach):
 
 @pytest.mark.parametrize("name", ["reach", "push"])
 def test_camera_frames_the_whole_scene(name, request):
-    """Points are projected here anew, by the position and axes of the camera."""
+    """The test projects points itself, from the position and axes of the camera."""
     points = Renderer.of_spec(request.getfixturevalue(name))._model.points
     camera = renderer._camera(points, 4 / 3)
     azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
@@ -264,7 +264,7 @@ NOISE = np.random.default_rng(0).integers(0, 255, (12, 120, 160, 3), dtype=np.ui
 
 @pytest.fixture
 def full_disk():
-    """No file may become larger than 20 kB, neither of this process nor of ffmpeg."""
+    """Limit the files of this process and of ffmpeg to 20 kB."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
     yield

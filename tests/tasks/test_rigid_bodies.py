@@ -29,7 +29,7 @@ def test_merged_links_move_like_separate_ones(request_):
 
 
 def test_links_with_different_ignored_pairs_are_not_merged():
-    """A fixed finger that may touch what its palm may not stays a body of its own."""
+    """A fixed finger with other ignored pairs than its palm stays a separate body."""
     body = arm()
     fixed = replace(body.joints[3], kind="fixed", limits=None)
     moving = replace(body.joints[4], mimic=None)

@@ -31,7 +31,7 @@ def robot_tables(robots):
 
 
 def configurations(robots, robot_tables, n=20):
-    """Which body and q of n configurations each, (n R,) and (n R, J)."""
+    """Return robot indices (n R,) and joint positions (n R, J) of n configurations per robot."""
     rng = np.random.default_rng(0)
     body = torch.arange(len(robots)).repeat_interleave(n)
     q = torch.zeros(len(body), robot_tables.max_joints, dtype=torch.float64)
@@ -42,13 +42,13 @@ def configurations(robots, robot_tables, n=20):
 
 def test_position_codes_match_the_tokens(robots, robot_tables):
     body, q = configurations(robots, robot_tables, n=4)
-    found = LinkTokens(robot_tables, body)(q.float())
+    link_tokens = LinkTokens(robot_tables, body)(q.float())
     for i, robot in enumerate(robots):
         shapes = token_shapes(robot, FOLDERS)
         expected = tokens(robot, shapes, q[body == i, : robot.dof].numpy())
-        together = found[body == i]
+        together = link_tokens[body == i]
         n = len(robot.links)
-        # The fastest sine turns 64 pi a unit, so float32 costs it five digits.
+        # The fastest sine has angular frequency 64 pi, which costs five digits in float32.
         assert together[:, :n].numpy() == pytest.approx(expected, abs=2e-4)
         assert (together[:, n:] == 0).all()
 

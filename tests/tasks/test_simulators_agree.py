@@ -44,7 +44,7 @@ SLOW = [pytest.param(words, id=words, marks=pytest.mark.slow) for words in OF_TH
 
 
 def largest_steps(body):
-    """How far the benchmark moves a target at once, shape (dof,)."""
+    """Return the largest target change per step in the benchmark, shape (dof,)."""
     joints = [body.joints[k] for k in body.independent_joints]
     most = [STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN for joint in joints]
     fast = [(joint.velocity or np.inf) * CONTROL_PERIOD for joint in joints]
@@ -64,7 +64,7 @@ def smooth_walk(body, seed, steps=SECOND):
 
 
 def begun(simulation, scene, q, contacts=None):
-    """A simulation of one scene at a state."""
+    """Return a simulation of one scene, reset to a state."""
     sim = simulation([scene], contacts)
     block = scene.block.pose if scene.block is not None else Pose()
     sim.reset(
@@ -76,7 +76,7 @@ def begun(simulation, scene, q, contacts=None):
 
 
 def positions(simulation, scene, targets, contacts):
-    """Where targets lead: q after every step, (steps, dof)."""
+    """Return the joint positions after every step, (steps, dof)."""
     sim = begun(simulation, scene, scene.robot.home, contacts)
     path = []
     for target in torch.from_numpy(targets).float():
@@ -126,7 +126,7 @@ def test_dropped_blocks_come_to_rest_at_the_same_pose(edge, mass, turn):
 @pytest.mark.parametrize("friction", [0.5, 1.0])
 @pytest.mark.parametrize("aside", [0.0, 0.03])
 def test_pushed_blocks_move_the_same_distance(friction, aside):
-    """By the gantry's plate, upright behind it and off the ground, at 0.2 m/s."""
+    """The gantry's vertical plate pushes the block at 0.2 m/s without touching the ground."""
     scene = replace(push_scene(friction=friction), obstacles=())
     ends = []
     for simulation in SIMULATIONS:

@@ -27,17 +27,17 @@ def test_shares_sum_to_one_and_separate_the_native_step(robot, sim, tmp_path):
     with closing(
         make_batch("reach", [robot], 3, sim=sim, configs=(CONFIG,), cache=tmp_path)
     ) as batch:
-        found = measure_speed(
+        report = measure_speed(
             batch, 2000, own=[(import_module(module), step)], clock=lambda: float(next(ticks))
         )
         assert "step" not in vars(batch.simulation)
         assert "observe" not in vars(batch)
-    assert sum(found.shares.values()) == pytest.approx(1)
+    assert sum(report.shares.values()) == pytest.approx(1)
     for part in ("simulator", "around the simulator", "observation", "rewards", "new episodes"):
-        assert found.shares[part] > 0, part
-    # A step reads the clock twice in every part, and for each environment in the simulator.
-    assert found.shares["simulator"] == pytest.approx(3 * found.shares["actions"], rel=0.05)
-    assert found.substeps_per_second == 4 * found.steps_per_second > 0
+        assert report.shares[part] > 0, part
+    # A step reads the clock twice per part, and again per environment in the simulator.
+    assert report.shares["simulator"] == pytest.approx(3 * report.shares["actions"], rel=0.05)
+    assert report.substeps_per_second == 4 * report.steps_per_second > 0
 
 
 def test_simulator_time_is_one_share_without_the_native_step(robot, tmp_path):
@@ -45,7 +45,7 @@ def test_simulator_time_is_one_share_without_the_native_step(robot, tmp_path):
     with closing(
         make_batch("reach", [robot], 2, sim="mujoco", configs=(CONFIG,), cache=tmp_path)
     ) as batch:
-        found = measure_speed(batch, 507, clock=lambda: float(next(ticks)))
+        report = measure_speed(batch, 507, clock=lambda: float(next(ticks)))
         assert batch.episode_step.tolist() == [0, 0]  # whole episodes
-    assert "around the simulator" not in found.shares
-    assert found.shares["simulator"] == pytest.approx(found.shares["actions"], rel=0.05)
+    assert "around the simulator" not in report.shares
+    assert report.shares["simulator"] == pytest.approx(report.shares["actions"], rel=0.05)

@@ -45,25 +45,25 @@ def cache(tmp_path):
 
 
 def reaching(train=TRAIN, test=TEST, **more):
-    """A split of robots that reach, the last with obstacles."""
+    """A split of reach robots, the last one with obstacles."""
     sides = [[member(words, task="reach") for words in side] for side in (train, test)]
     sides[1][-1] = replace(sides[1][-1], obstacles=True)
     return split(*sides, **more)
 
 
 def mixed():
-    """Robots that reach and push; a name is on both sides."""
+    """A split with reach and push members and one name on both sides."""
     train = [member(TRAIN[0], task="reach"), member(TRAIN[2], obstacles=True)]
     return split(train, [member(TRAIN[0])])
 
 
-def made(which, cache, config=RECIPE, **options):
+def sample_sets(which, cache, config=RECIPE, **options):
     return make(which, LIBRARY, config, cache=cache, **options)
 
 
 def same(a, b):
-    ours, theirs = arrays_of(a), arrays_of(b)
-    return ours.keys() == theirs.keys() and all((ours[k] == theirs[k]).all() for k in ours)
+    first, second = arrays_of(a), arrays_of(b)
+    return first.keys() == second.keys() and all((first[k] == second[k]).all() for k in first)
 
 
 def forbidden(*_, **__):
@@ -71,10 +71,10 @@ def forbidden(*_, **__):
 
 
 def test_single_and_multi_embodiment_have_the_same_goals(tmp_path):
-    """A set hangs on its robot, not on the split, the side or the robots beside it."""
+    """A goal set depends on its robot and not on the split, the side or other robots."""
     one = member(TRAIN[1], "alone", task="reach")
-    single = made(split([one], [one]), tmp_path / "single")
-    multi = made(reaching(train=TRAIN[::-1]), tmp_path / "multi")
+    single = sample_sets(split([one], [one]), tmp_path / "single")
+    multi = sample_sets(reaching(train=TRAIN[::-1]), tmp_path / "multi")
     (among,) = [each for each in multi if each.robot == "planar-cube"]
     assert among.goals.key == single[0].goals.key == single[1].goals.key
     assert (among.goals.q == single[0].goals.q).all()
@@ -82,7 +82,7 @@ def test_single_and_multi_embodiment_have_the_same_goals(tmp_path):
 
 
 def test_goals_depend_on_the_seed_despite_the_cache(cache):
-    first, second = (made(reaching(), cache, replace(RECIPE, seed=seed)) for seed in (0, 1))
+    first, second = (sample_sets(reaching(), cache, replace(RECIPE, seed=seed)) for seed in (0, 1))
     for a, b in zip(first, second, strict=True):
         assert (a.goals.seed, b.goals.seed) == (0, 1)
         assert not np.isin(a.goals.q, b.goals.q).any()
@@ -90,17 +90,17 @@ def test_goals_depend_on_the_seed_despite_the_cache(cache):
 
 
 def test_every_member_has_a_set_in_train_test_order(cache):
-    found = made(mixed(), cache, certified=True)
-    assert [(one.side, one.robot, one.task) for one in found] == [
+    member_sets = sample_sets(mixed(), cache, certified=True)
+    assert [(one.side, one.robot, one.task) for one in member_sets] == [
         ("train", "gantry-plane", "reach"),
         ("train", "gantry-cylinder", "push"),
         ("test", "gantry-plane", "push"),
     ]
-    assert [len(one.goals.q) for one in found] == [12, 4, 4]
-    assert [len(one.goals.obstacles) for one in found] == [0, 3, 0]
-    assert [one.certificate_errors for one in found] == [(), (), ()]
-    assert [0 < one.acceptance <= 1 for one in found] == [True] * 3
-    assert [one.certificate_errors for one in made(mixed(), cache)] == [None] * 3
+    assert [len(one.goals.q) for one in member_sets] == [12, 4, 4]
+    assert [len(one.goals.obstacles) for one in member_sets] == [0, 3, 0]
+    assert [one.certificate_errors for one in member_sets] == [(), (), ()]
+    assert [0 < one.acceptance <= 1 for one in member_sets] == [True] * 3
+    assert [one.certificate_errors for one in sample_sets(mixed(), cache)] == [None] * 3
 
 
 def test_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
@@ -108,10 +108,10 @@ def test_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
     words = ("arm=arm3 ee=claw", TRAIN[1], TRAIN[0])
     few, part, fine = (member(each, task="reach") for each in words)
     part = replace(part, derivation="base=planar[top: ee=cubw]")
-    found = made(split([few, part], [fine]), cache)
-    assert [one.goals is None for one in found] == [True, True, False]
-    assert [one.acceptance for one in found] == [None, None, 1.0]
-    few, part, fine = (one.error for one in found)
+    member_sets = sample_sets(split([few, part], [fine]), cache)
+    assert [one.goals is None for one in member_sets] == [True, True, False]
+    assert [one.acceptance for one in member_sets] == [None, None, 1.0]
+    few, part, fine = (one.error for one in member_sets)
     assert re.search(r"only \d of 12 random configurations .* \(acceptance rate 0\.\d+\)", few)
     assert "unknown part 'cubw'" in part
     assert fine == ""
@@ -120,8 +120,8 @@ def test_robot_without_goals_does_not_stop_the_others(cache, monkeypatch):
 def test_uncertified_set_reports_its_faults(cache, monkeypatch):
     line = "goal 3: its configuration is in collision"
     monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: [line])
-    found = made(reaching(), cache, certified=True)
-    assert {one.certificate_errors for one in found} == {
+    member_sets = sample_sets(reaching(), cache, certified=True)
+    assert {one.certificate_errors for one in member_sets} == {
         ("goal 3: its configuration is in collision",)
     }
 
@@ -133,11 +133,14 @@ def test_interrupted_run_reuses_completed_sets(cache, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        made(reaching(), cache, progress=interrupt)
+        sample_sets(reaching(), cache, progress=interrupt)
     assert len(list(cache.iterdir())) == 2
-    found = made(reaching(), cache)
+    member_sets = sample_sets(reaching(), cache)
     monkeypatch.setattr(reach_goals, "FreeSpace", forbidden)
-    assert all(same(a.goals, b.goals) for a, b in zip(found, made(reaching(), cache), strict=True))
+    assert all(
+        same(a.goals, b.goals)
+        for a, b in zip(member_sets, sample_sets(reaching(), cache), strict=True)
+    )
 
 
 @pytest.mark.slow
@@ -147,7 +150,9 @@ def test_sets_do_not_depend_on_the_number_of_processes(tmp_path):
         [member(words, f"cube-{i}", task="reach") for i, words in enumerate(sizes)],
         [member(TEST[0], task="reach")],
     )
-    here, there = (made(which, tmp_path / str(jobs), jobs=jobs, certified=True) for jobs in (1, 2))
+    here, there = (
+        sample_sets(which, tmp_path / str(jobs), jobs=jobs, certified=True) for jobs in (1, 2)
+    )
     assert [one.robot for one in here] == [one.robot for one in there]
     assert all(same(a.goals, b.goals) for a, b in zip(here, there, strict=True))
     assert all(one.certificate_errors == () for one in there)
@@ -156,7 +161,7 @@ def test_sets_do_not_depend_on_the_number_of_processes(tmp_path):
 def test_single_robot_has_the_same_set_as_in_a_split(cache):
     body = robot("base=gantry ee=plane")
     alone = sample_robot_goals(body, "reach", RECIPE, obstacles=False, cache=cache)
-    among = made(reaching(), cache)[0]
+    among = sample_sets(reaching(), cache)[0]
     assert (alone.side, alone.robot) == (None, body.name)
     assert alone.goals.key == among.goals.key
     wrong = sample_robot_goals(
@@ -175,21 +180,21 @@ def built(folder, which):
 
 
 def test_stored_sets_are_read_back_unchanged(home, cache):
-    found = made(mixed(), cache)
-    assert write_goals(home, found, RECIPE) == home / "goals"
+    member_sets = sample_sets(mixed(), cache)
+    assert write_goals(home, member_sets, RECIPE) == home / "goals"
     read = read_split_goals(home)
     assert read.config == RECIPE
-    assert read.sets.keys() == SplitGoals.from_results(found, RECIPE).sets.keys()
-    for one in found:
+    assert read.sets.keys() == SplitGoals.from_results(member_sets, RECIPE).sets.keys()
+    for one in member_sets:
         again = read.sets[one.side, one.robot]
         assert same(again.goals, one.goals)
         assert again.goals.obstacles == one.goals.obstacles
         assert (again.robot_hash, again.task) == (one.robot_hash, one.task)
         assert again.obstacles == one.obstacles
-    assert read_goals(home, "train")["gantry-cylinder"].block == found[1].goals.block
+    assert read_goals(home, "train")["gantry-cylinder"].block == member_sets[1].goals.block
     assert read_goals(home, "test").keys() == {"gantry-plane"}
     assert type(read_goals(home, "train")["gantry-plane"]) is reach_goals.ReachGoalSet
-    for one in found:
+    for one in member_sets:
         for each in fields(one.goals):
             was, is_ = (getattr(x, each.name) for x in (one.goals, read.get(one.side, one.robot)))
             assert type(was) is type(is_), each.name
@@ -198,9 +203,9 @@ def test_stored_sets_are_read_back_unchanged(home, cache):
 def test_builds_are_byte_identical(home, tmp_path):
     other = built(tmp_path / "there", mixed())
     for i, folder in enumerate((home, other)):
-        write_goals(folder, made(mixed(), tmp_path / f"cache{i}"), RECIPE)
+        write_goals(folder, sample_sets(mixed(), tmp_path / f"cache{i}"), RECIPE)
     assert tree(home) == tree(other)
-    write_goals(home, made(mixed(), tmp_path / "cache0"), RECIPE)
+    write_goals(home, sample_sets(mixed(), tmp_path / "cache0"), RECIPE)
     assert tree(home) == tree(other)
     assert sorted(path.name for path in (home / "goals").iterdir()) == [
         "README.md",
@@ -211,14 +216,14 @@ def test_builds_are_byte_identical(home, tmp_path):
 
 
 def test_files_contain_no_timestamp(cache):
-    content = set_npz(made(reaching(), cache)[0].goals)
+    content = set_npz(sample_sets(reaching(), cache)[0].goals)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
 def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):
     which = mixed()
-    write_goals(home, made(which, cache), RECIPE)
+    write_goals(home, sample_sets(which, cache), RECIPE)
     monkeypatch.setattr(TASKS["push"], "sample", forbidden)
     options = {"sim": "mujoco", "configs": RECIPE.tasks, "goals": home}
     for side in ("train", "test"):
@@ -238,11 +243,11 @@ def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):
 
 
 def test_index_describes_the_sets(home, cache):
-    found = made(mixed(), cache)
-    write_goals(home, found, RECIPE)
+    member_sets = sample_sets(mixed(), cache)
+    write_goals(home, member_sets, RECIPE)
     index = json.loads((home / "goals" / "index.json").read_text())
     assert (index["format"], index["seed"], index["reach"]["goals"]) == (1, 0, 12)
-    for record, one in zip(index["sets"], found, strict=True):
+    for record, one in zip(index["sets"], member_sets, strict=True):
         assert (record["robot"], record["side"], record["body"]) == (
             one.robot,
             one.side,
@@ -254,7 +259,7 @@ def test_index_describes_the_sets(home, cache):
 
 
 def test_checksums_of_a_build_cover_its_goals(home, cache):
-    write_goals(home, made(mixed(), cache), RECIPE)
+    write_goals(home, sample_sets(mixed(), cache), RECIPE)
     assert verify(home, LIBRARY).differences == ()
     path = home / "goals" / "train" / "gantry-cylinder.npz"
     path.write_bytes(path.read_bytes()[:-1])
@@ -264,7 +269,7 @@ def test_checksums_of_a_build_cover_its_goals(home, cache):
 
 
 def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
-    found = made(mixed(), cache)
+    member_sets = sample_sets(mixed(), cache)
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -272,20 +277,22 @@ def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(split_goals, "sums_text", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            write_goals(home, found, RECIPE)
+            write_goals(home, member_sets, RECIPE)
     with pytest.raises(BenchmarkError, match="is not finished"):
         load_split_folder(home)
     (home / ".goals.old").mkdir()
     build_split(mixed(), home.parents[1], LIBRARY, settings=BuildSettings(light=True))
-    write_goals(home, found, RECIPE)
+    write_goals(home, member_sets, RECIPE)
     assert verify(home, LIBRARY).differences == ()
     assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []
 
 
 def test_missing_set_is_rejected_before_writing(home, cache):
-    found = made(mixed(), cache)
+    member_sets = sample_sets(mixed(), cache)
     before = tree(home)
-    without = [replace(one, goals=None, error="too few") for one in found[:2]] + found[2:]
+    without = [replace(one, goals=None, error="too few") for one in member_sets[:2]] + member_sets[
+        2:
+    ]
     with pytest.raises(BenchmarkError) as caught:
         write_goals(home, without, RECIPE)
     text = "train robot gantry-plane has no goal set: too few; nor has gantry-cylinder"
@@ -294,10 +301,10 @@ def test_missing_set_is_rejected_before_writing(home, cache):
 
 
 def test_goals_are_added_only_to_finished_builds(tmp_path, cache):
-    found = made(mixed(), cache)
+    member_sets = sample_sets(mixed(), cache)
     (tmp_path / "other").mkdir()
     with pytest.raises(MorphgenError, match="SHA256SUMS: no such file"):
-        write_goals(tmp_path / "other", found, RECIPE)
+        write_goals(tmp_path / "other", member_sets, RECIPE)
     assert tree(tmp_path / "other") == {}
 
 
@@ -324,7 +331,7 @@ def test_build_without_goals_error_says_how_to_add_them(home):
     ],
 )
 def test_broken_index_is_named(home, cache, old, new, message):
-    write_goals(home, made(mixed(), cache), RECIPE)
+    write_goals(home, sample_sets(mixed(), cache), RECIPE)
     path = home / "goals" / "index.json"
     text = path.read_text()
     assert old in text
@@ -336,7 +343,7 @@ def test_broken_index_is_named(home, cache, old, new, message):
 
 
 def test_broken_file_is_named(cache, tmp_path):
-    whole = made(reaching(), cache)[0].goals
+    whole = sample_sets(reaching(), cache)[0].goals
     content = set_npz(whole)
     path = tmp_path / "some.npz"
     for broken in (b"", content[:100], content[:-200]):
@@ -350,7 +357,7 @@ def test_broken_file_is_named(cache, tmp_path):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["q", "poses"])
 def test_non_finite_numbers_are_rejected(cache, tmp_path, name, value):
-    whole = made(reaching(), cache)[0].goals
+    whole = sample_sets(reaching(), cache)[0].goals
     values = getattr(whole, name).copy()
     values[1, 2] = value
     content = set_npz(replace(whole, **{name: values}))
@@ -361,6 +368,6 @@ def test_non_finite_numbers_are_rejected(cache, tmp_path, name, value):
 
 
 def test_sets_can_be_pickled(cache):
-    one = made(mixed(), cache)[1]
+    one = sample_sets(mixed(), cache)[1]
     assert one.goals is not None
     assert same(pickle.loads(pickle.dumps(one)).goals, one.goals)

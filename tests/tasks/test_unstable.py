@@ -27,7 +27,7 @@ ENVS = 4
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    """A robot that reaches and one that pushes."""
+    """Environment specs of a reach robot and a push robot."""
     cache = tmp_path_factory.mktemp("goals")
     chosen = {"obstacles": False, "seed": 0, "cache": cache}
     reaching = draw_spec(load_robot("arm3-stick"), REACH, **chosen)
@@ -35,8 +35,8 @@ def settings(tmp_path_factory):
 
 
 @pytest.fixture(params=["pybullet", "mujoco"])
-def made(request, settings):
-    """Batches whose even environments reach and whose odd ones push."""
+def build_batch(request, settings):
+    """Create batches whose even environments reach and odd environments push."""
     opened = []
 
     def make():
@@ -51,7 +51,7 @@ def made(request, settings):
 
 
 def break_physics(batch, env):
-    """Leave a velocity that is no number."""
+    """Set a velocity to nan."""
     if hasattr(batch.simulation, "_data"):
         batch.simulation._data[env].qvel[0] = math.nan
         return
@@ -60,16 +60,16 @@ def break_physics(batch, env):
 
 
 def numbers(step):
-    """All that a step says of each environment."""
-    told = {**step.terms, "reward": step.reward, "score": step.score, "distance": step.distance}
-    seen = {f"next {name}": each for name, each in step.observation.items()}
-    final = {f"final {name}": each for name, each in step.final_observation.items()}
-    return {**told, **seen, **final, "q": step.q, "block": step.block_pose}
+    """Return all step results of each environment."""
+    current = {**step.terms, "reward": step.reward, "score": step.score, "distance": step.distance}
+    seen = {f"next {name}": value for name, value in step.observation.items()}
+    final = {f"final {name}": value for name, value in step.final_observation.items()}
+    return {**current, **seen, **final, "q": step.q, "block": step.block_pose}
 
 
 @pytest.mark.parametrize("lost", [[0], [1], [0, 1, 2, 3]], ids=["reach", "push", "all"])
-def test_diverged_environment_is_reset_and_the_others_continue(made, lost):
-    batch, whole = made(), made()
+def test_diverged_environment_is_reset_and_the_others_continue(build_batch, lost):
+    batch, whole = build_batch(), build_batch()
     batch.reset()
     whole.reset()
     chance = Random(0)
@@ -80,28 +80,28 @@ def test_diverged_environment_is_reset_and_the_others_continue(made, lost):
     for env in lost:
         break_physics(batch, env)
     actions = chance.act(batch)
-    found, other = batch.step(actions), whole.step(actions)
+    result, other = batch.step(actions), whole.step(actions)
     kept = [env for env in range(ENVS) if env not in lost]
-    assert found.diverged.tolist() == [env in lost for env in range(ENVS)]
-    assert torch.equal(found.truncated, found.diverged)
-    assert not found.terminated.any()
-    for name, each in numbers(found).items():
+    assert result.diverged.tolist() == [env in lost for env in range(ENVS)]
+    assert torch.equal(result.truncated, result.diverged)
+    assert not result.terminated.any()
+    for name, each in numbers(result).items():
         assert each.isfinite().all(), name
         assert torch.equal(each[kept], numbers(other)[name][kept]), name
-    assert torch.equal(found.q[lost], before.q[lost])
-    torch.testing.assert_close(found.block_pose[lost], before.block_pose[lost])
-    assert not found.final_observation["velocity"][lost].any()
+    assert torch.equal(result.q[lost], before.q[lost])
+    torch.testing.assert_close(result.block_pose[lost], before.block_pose[lost])
+    assert not result.final_observation["velocity"][lost].any()
     assert not batch.episode_step[lost].any()
     assert (batch.episode_step[kept] == 6).all()
-    found, other = batch.step(actions), whole.step(actions)
-    assert not found.diverged.any()
-    for name, each in numbers(found).items():
+    result, other = batch.step(actions), whole.step(actions)
+    assert not result.diverged.any()
+    for name, each in numbers(result).items():
         assert each.isfinite().all(), name
         assert torch.equal(each[kept], numbers(other)[name][kept]), name
 
 
-def test_episode_after_divergence_is_unchanged(made):
-    batch, whole = made(), made()
+def test_episode_after_divergence_is_unchanged(build_batch):
+    batch, whole = build_batch(), build_batch()
     batch.reset()
     whole.reset()
     assert torch.equal(batch.field("goal"), whole.field("goal"))
@@ -113,7 +113,7 @@ def test_episode_after_divergence_is_unchanged(made):
     assert torch.equal(batch.targets[0], whole.targets[0])
 
 
-def test_episodes_report_divergence(made):
+def test_episodes_report_divergence(build_batch):
     class Breaks(Random):
         acted = 0
 
@@ -123,7 +123,7 @@ def test_episodes_report_divergence(made):
                 break_physics(task, 0)
             return super().act(task)
 
-    batch = made()
+    batch = build_batch()
     first, second, *others = run_episodes(batch, Breaks(0), 2)
     assert (first.env, first.unstable, first.steps) == (0, True, 10)
     assert (second.env, second.unstable, second.steps) == (0, False, REACH.max_episode_steps)
@@ -131,9 +131,9 @@ def test_episodes_report_divergence(made):
     assert len(others) == 2 * ENVS - 2
 
 
-def test_diverged_episode_is_never_a_success(made):
-    """Not even where the tool is at the goal, or the block across the line."""
-    batch = made()
+def test_diverged_episode_is_never_a_success(build_batch):
+    """Even with the tool at the goal or the block across the line."""
+    batch = build_batch()
 
     def put_at_goals():
         q, block = batch.simulation.q.clone(), batch.simulation.block_pose.clone()
@@ -178,10 +178,10 @@ def test_diverged_episode_is_never_a_success(made):
     assert pushed.score == 0
 
 
-@pytest.mark.parametrize("made", ["mujoco"], indirect=True)
+@pytest.mark.parametrize("build_batch", ["mujoco"], indirect=True)
 @pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
-def test_contact_overflow_ends_one_episode(made, warning):
-    batch, whole = made(), made()
+def test_contact_overflow_ends_one_episode(build_batch, warning):
+    batch, whole = build_batch(), build_batch()
     batch.reset()
     whole.reset()
     number = getattr(mujoco.mjtWarning, f"mjWARN_{warning}").value

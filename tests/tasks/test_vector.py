@@ -37,7 +37,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture
 def batch_from_specs(cache):
-    """Make batches of two bodies at two tasks, one of them with obstacles."""
+    """Create batches of two robots with two tasks, one with obstacles."""
     made = []
 
     def of(num_envs=4, **options):
@@ -134,7 +134,7 @@ def test_returned_arrays_are_copies(batch_from_specs):
 
 
 def test_cleanrl_style_loop_runs(batch_from_specs):
-    """Statistics of episodes, values of final observations, everything in preallocated rows."""
+    """The loop collects episode statistics and final observations in preallocated arrays."""
     envs = RecordEpisodeStatistics(TaskVector(batch_from_specs()))
     envs.reset(seed=1)
     rewards, dones = np.zeros((50, 4)), np.zeros((50, 4), dtype=bool)

@@ -30,7 +30,7 @@ WAIT = 120_000
 
 @pytest.fixture(scope="session")
 def browser_command():
-    """The browser that is installed, and its options."""
+    """Return the installed browser and its options."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         pytest.skip("there is no chromium (apt-get install chromium)")
@@ -39,7 +39,7 @@ def browser_command():
 
 @pytest.fixture(scope="session")
 def chromium(browser_command):
-    """A browser; every test opens pages of its own."""
+    """A shared browser; every test opens its own pages."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
     )

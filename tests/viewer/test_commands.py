@@ -18,7 +18,7 @@ PROSE = ("itself",)
 
 
 def commands(client):
-    """The commands in the boxes of a page that are there to be copied."""
+    """Return the commands in the copy boxes of a page."""
     boxes = re.findall(r"<pre>(.*?)</pre>", client.text, re.DOTALL)
     lines = [line for box in boxes for line in html.unescape(box).splitlines()]
     return [line for line in lines if line.startswith("morphgen ")]

@@ -75,21 +75,21 @@ def test_token_picture_is_reproducible():
 
 def test_robot_compared_with_itself_is_identical():
     robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
-    found = compare_robots(robots, LIBRARY.folders)
-    assert found.values["cosine"].diagonal() == pytest.approx([1, 1])
-    assert found.values["tree"].diagonal() == pytest.approx([0, 0])
-    assert found.values["tree"][0, 1] > 0
-    table = similarity_table(["<a>", "b"], found)
+    comparison = compare_robots(robots, LIBRARY.folders)
+    assert comparison.values["cosine"].diagonal() == pytest.approx([1, 1])
+    assert comparison.values["tree"].diagonal() == pytest.approx([0, 0])
+    assert comparison.values["tree"][0, 1] > 0
+    table = similarity_table(["<a>", "b"], comparison)
     assert "&lt;a&gt; and b" in table
 
 
 def test_fits_have_an_iou():
     robot = robot_of("arm=ur5 ee=plane")
-    found = fit_quality(robot, LIBRARY.folders)
-    assert found["ee_plate"][0] == 1.0
-    assert 0.5 < found["arm_forearm_link"][0] < 1.0
-    table = fit_table(robot, found)
-    assert f"{found['arm_forearm_link'][0]:.2f}" in table
+    fits = fit_quality(robot, LIBRARY.folders)
+    assert fits["ee_plate"][0] == 1.0
+    assert 0.5 < fits["arm_forearm_link"][0] < 1.0
+    table = fit_table(robot, fits)
+    assert f"{fits['arm_forearm_link'][0]:.2f}" in table
     assert "not fitted yet" in fit_table(robot, {})
 
 

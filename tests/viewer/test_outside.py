@@ -19,7 +19,7 @@ NOTHING = "There is nothing to see here"
 
 @pytest.fixture
 def secret(tmp_path):
-    """Files outside of the viewer's folder, that quote a word wherever they fail to parse."""
+    """Files outside the viewer's folder whose parse errors would quote a secret word."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     (folder / "a.grammar").write_text(f"robot -> {WORD} }}{WORD}\n")

@@ -36,7 +36,7 @@ def wait_for_end(page, seconds="6.00"):
 
 
 def players():
-    """Threads that play, for all browsers."""
+    """Return the player threads of all browsers."""
     return [each for each in threading.enumerate() if each.name == "morphgen-player"]
 
 

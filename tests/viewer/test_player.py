@@ -13,7 +13,7 @@ WAIT = 30
 
 
 class Counting:
-    """An episode of so many steps, each of which takes a while."""
+    """An episode with a fixed number of slow steps."""
 
     max_steps = 100
 

@@ -47,7 +47,7 @@ def wait_until(condition):
 
 
 def node(viewer, name):
-    """A node of the only browser's scene, as the server holds it."""
+    """Return a scene node of the only browser, as stored on the server."""
     (session,) = viewer.sessions.values()
     return session.client.scene._handle_from_node_name[name]
 

@@ -86,9 +86,9 @@ def test_configurations_are_restored_from_urls():
 def test_the_ellipsoid_has_the_inertia_of_the_link():
     a, b, c, m = 0.1, 0.2, 0.3, 2.0
     moments = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) * m / 5
-    found = inertia_ellipsoid(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
-    assert found is not None
-    sizes, axes = found
+    ellipsoid = inertia_ellipsoid(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
+    assert ellipsoid is not None
+    sizes, axes = ellipsoid
     rebuilt = axes @ np.diag(m / 5 * (np.sum(sizes**2) - sizes**2)) @ axes.T
     assert rebuilt == pytest.approx(np.diag(moments))
     assert np.linalg.det(axes) == pytest.approx(1)

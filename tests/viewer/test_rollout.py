@@ -51,7 +51,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def episode(files, cache):
-    """Two robots that reach: one composed, one from a bundle."""
+    """An episode of two reach robots: one composed, one from a bundle."""
     rollout = Rollout(RolloutConfig("reach", (CUBE, "robots/one"), "ik", 3), files)
     while rollout.advance():
         pass
@@ -143,11 +143,11 @@ def test_an_episode_at_its_start_can_be_saved(files, root, cache):
 
 
 def changed(path, **arrays):
-    """An episode's file with other arrays; None leaves one out."""
+    """Replace arrays of an episode file; None removes an array."""
     with np.load(path) as file:
-        found = {name: file[name] for name in file.files}
-    found |= {name.replace("_", "/", 1): values for name, values in arrays.items()}
-    np.savez(path, **{name: values for name, values in found.items() if values is not None})
+        contents = {name: file[name] for name in file.files}
+    contents |= {name.replace("_", "/", 1): values for name, values in arrays.items()}
+    np.savez(path, **{name: values for name, values in contents.items() if values is not None})
 
 
 @pytest.mark.parametrize(
