@@ -27,11 +27,6 @@ from morphgen.tasks.task import EnvSpec, GoalSet, TaskConfig
 
 GROUND_STEP = 1e-4
 """Resolution of the height of a lowered ground, so that all machines agree [m]."""
-_FILE_KEYS = {
-    "reach": {"max_episode_steps": "steps", "num_goals": "goals"},
-    "push": {"max_episode_steps": "steps", "num_goals": "starts"},
-}
-"""Keys in files of the config fields that have another name there."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +55,22 @@ class GoalConfig:
         """
         data = {}
         for name in dict.fromkeys((*TASKS.builtin, *(c.task for c in self.tasks), *used)):
-            keys = _FILE_KEYS.get(name, {})
-            constants = asdict(self.task_config(name))
+            config = self.task_config(name)
+            keys, constants = _file_keys(config), asdict(config)
             data[name] = {keys.get(field, field): value for field, value in constants.items()}
         return data
 
 
 def config_fields(task: str, constants: Mapping[str, Any]) -> dict[str, Any]:
     """Return a task's constants from a file by the names of the fields of its config."""
-    fields = {key: field for field, key in _FILE_KEYS.get(task, {}).items()}
+    fields = {key: field for field, key in _file_keys(TASKS[task].config_type).items()}
     return {fields.get(key, key): value for key, value in constants.items()}
+
+
+def _file_keys(config: TaskConfig | type[TaskConfig]) -> dict[str, str]:
+    """Return ``file_keys`` of a config, which tasks of other packages need not have."""
+    keys: dict[str, str] = getattr(config, "file_keys", {})
+    return keys
 
 
 def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...]:

@@ -18,7 +18,7 @@ from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Step
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.observation import Observation, ObservationConfig
-from morphgen.tasks.registry import TASKS, register_gym_envs
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
@@ -30,8 +30,6 @@ from morphgen.tasks.vector import (
 )
 
 RENDER_MODES = ("rgb_array",)
-
-register_gym_envs()
 
 
 class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):

@@ -19,7 +19,10 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.observation import Observation
+from morphgen.tasks.registry import register_gym_envs
 from morphgen.tasks.task import BOUND, ObservationField
+
+register_gym_envs()  # morphgen.tasks may have been imported before Gymnasium
 
 _INFO_KEYS = ("success", "distance", "score", "diverged")
 """Fields of a ``Step`` in ``infos``, besides the terms."""

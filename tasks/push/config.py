@@ -15,6 +15,8 @@ class PushConfig:
     """Push a block across a line; the episode ends when it is across (paper, B.3)."""
 
     task: ClassVar[str] = "push"
+    file_keys: ClassVar[dict[str, str]] = {"max_episode_steps": "steps", "num_goals": "starts"}
+    """Keys in files of the fields that have another name there."""
 
     max_episode_steps: int = 300
     """Time limit of an episode, 6 s [control steps]."""

@@ -14,6 +14,8 @@ class ReachConfig:
     """Bring the tool to a goal and keep it there; the episode does not end early (paper, B.3)."""
 
     task: ClassVar[str] = "reach"
+    file_keys: ClassVar[dict[str, str]] = {"max_episode_steps": "steps", "num_goals": "goals"}
+    """Keys in files of the fields that have another name there."""
 
     max_episode_steps: int = 300
     """Duration of an episode, 6 s [control steps]."""
