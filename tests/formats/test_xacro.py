@@ -308,7 +308,7 @@ def test_an_installed_file_that_includes_a_user_file_is_expanded_in_a_subprocess
             '<xacro:include filename="$(arg file)"/></xacro:if>'
         )
     )
-    monkeypatch.setattr(resolve, "_own_folders", lambda: (installed,))
+    monkeypatch.setattr(resolve, "_morphgen_folders", lambda: (installed,))
     asked = []
     run = xacro_process.run_in_child
     monkeypatch.setattr(
