@@ -241,7 +241,7 @@ def test_obstacles_may_surround_only_some_robots(agent, tmp_path):
 def test_one_robot_has_no_other_side(tmp_path):
     train(tmp_path, small_config(total_timesteps=32), execution=QUIET)
     assert len(evaluate_run(tmp_path, "train", EVAL, "deterministic")) == 1
-    with pytest.raises(TaskError, match="nothing to test on"):
+    with pytest.raises(TaskError, match="has no test robots"):
         evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
