@@ -39,7 +39,7 @@ class Layout:
     points: int
     """Points of the cloud, P; 0 without a cloud."""
     channels: tuple[str, ...]
-    """Those of ``CHANNELS`` that the observations have."""
+    """Names of the entries of ``CHANNELS`` that the observations contain."""
     tool: bool = False
     """Whether the observations have the tool's position."""
     fields: tuple[tuple[str, int, str], ...] = ()

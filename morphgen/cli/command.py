@@ -106,7 +106,7 @@ class Command:
     name: str
     """Word of the command line."""
     summary: str
-    """What the command does: a verb and its object, without a full stop."""
+    """Purpose of the command: a verb and its object, without a full stop."""
     options: Options = ()
     """Options and positional arguments."""
     run: Run | None = None

@@ -18,7 +18,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.xacro_functions import RefusedError
 
 REQUIREMENTS = {"rtb-data": "rtb-data==1.1.0", "example-robot-data": "example-robot-data"}
-"""What to install for each pip distribution that robots are read from."""
+"""pip requirement of each distribution that provides robot files."""
 
 _DATA_ROOTS = {
     "rtb-data": ("rtbdata/xacro", "rtbdata"),

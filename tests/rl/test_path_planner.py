@@ -132,7 +132,7 @@ def test_a_tree_that_cannot_grow_is_its_start():
 
 
 def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
-    """Of two goals the cheaper one is behind a wall without a gap."""
+    """A wall without a gap hides the cheaper one of two goals, so the path leads to the other."""
     walls = (
         Block((0.1, 4.5, 0.4), Pose((0.5, 0.0, 0.2))),
         Block((0.1, 1.0, 0.4), Pose((-0.3, 0.0, 0.2))),

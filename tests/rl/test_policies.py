@@ -25,7 +25,7 @@ MASKS = {
     "obstacles": "obstacle_mask",
     "points": "point_mask",
 }
-"""What hides rows of what."""
+"""Mask of the rows of each observation entry."""
 
 
 def observed(seed=0, *, extras=True):
