@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, number, option, path_option
 from morphgen.cli.progress import TrainingProgress
-from morphgen.cli.train import SIDES, SPLIT_HELP, require_split_for_options, robots_to_train
+from morphgen.cli.training_robots import (
+    GOAL_SEED,
+    SIDES,
+    require_split_for_options,
+    robots_to_train,
+    split_option,
+)
 from morphgen.errors import TaskError
 from morphgen.rl.baselines import BASELINES
 from morphgen.tasks.registry import default_simulator
@@ -29,14 +35,7 @@ if TYPE_CHECKING:
     option(
         "checkpoint", help=f"a checkpoint or a run folder; or a baseline: {', '.join(BASELINES)}"
     ),
-    option(
-        "--split",
-        dest="words",
-        nargs="+",
-        metavar="SPLIT",
-        default=[],
-        help=f"robots of a baseline, or other robots than the checkpoint's: {SPLIT_HELP}",
-    ),
+    split_option("robots of a baseline, or other robots than the checkpoint's"),
     option("--on", choices=SIDES, help="side of the split (default: both)"),
     opt.OBSTACLES,
     option(
@@ -56,7 +55,7 @@ if TYPE_CHECKING:
     opt.WORKERS,
     opt.DEVICE,
     opt.SEED,
-    number("--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0),
+    GOAL_SEED,
     path_option("--out", "FILE", "write a table: .csv, .json or .md"),
     *opt.LIBRARY_JSON,
     details="Scores have 95% bootstrap intervals over episodes. The score of reach is relative to "

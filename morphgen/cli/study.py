@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from morphgen.cli.command import command, flag, number, option, path_option
 from morphgen.cli.options import LIBRARY, RAY
 from morphgen.cli.progress import training_progress
-from morphgen.cli.train import TRAINING_OPTIONS, execution_config, robots_to_train, run_config
+from morphgen.cli.train import TRAINING_OPTIONS, execution_config, run_config
+from morphgen.cli.training_robots import robots_to_train
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
 from morphgen.tasks.registry import default_simulator
