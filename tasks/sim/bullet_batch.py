@@ -15,7 +15,7 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene
-from morphgen.tasks.sim.motor_law import MotorForces
+from morphgen.tasks.sim.motor_law import MotorForces, clamp
 
 MAX_VELOCITY = 1e4
 """Speed of joints and blocks [rad/s or m/s] and distance of blocks [m] that count as diverged."""
@@ -170,7 +170,7 @@ class BulletBatch:
         ends, last = self._undisturbed(desired)
         mean = (ends - self._positions) / (SUBSTEPS * TIMESTEP)
         commanded = self._measured + (mean - self._measured) / _MEAN_RESPONSE
-        commanded = np.clip(commanded, -self._fastest, self._fastest)
+        commanded = clamp(commanded, self._fastest)
         velocities: list[float] = commanded.tolist()
         limits = self._forces.limits(
             (desired - self._positions, desired - ends), (self._velocities, last)
@@ -212,7 +212,7 @@ class BulletBatch:
         q, v = self._positions, self._velocities
         for _ in range(SUBSTEPS):
             v = v + TIMESTEP * BANDWIDTH * (BANDWIDTH * (desired - q) - 2 * v)
-            v = np.clip(v, -self._fastest, self._fastest)
+            v = clamp(v, self._fastest)
             q = q + TIMESTEP * v
         return q, v
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
-from morphgen.tasks.sim.motor_law import GAIN, LAG, speed_limit
+from morphgen.tasks.sim.motor_law import GAIN, LAG, clamp, speed_limit
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World
 from morphgen.tasks.sim.mujoco_state import GatheredArrays
 from morphgen.typing import Array
@@ -99,7 +99,7 @@ class PositionControl:
             velocities: ``qvel`` of all environments, concatenated, and a zero.
             out: Receives the controls, shape (n, J).
         """
-        error = np.clip(targets - q, -self._farthest, self._farthest)
+        error = clamp(targets - q, self._farthest)
         mean_acceleration = BY_ERROR * error + BY_VELOCITY * qd
         self._acceleration[self._slots] = self._gains * mean_acceleration.ravel()[self._leaders]
         for model, data, force, acceleration in self._products:

@@ -62,7 +62,7 @@ class MujocoSimulation:
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
         self._state = state = MujocoState(self._worlds, self._data)
         self.q, self.qd = state.q, state.qd
-        self.block_pose, self.block_velocity = state.block_pose, state.block_velocity
+        self.block_pose = state.block_pose
         shape = self.q.shape
         self._control = PositionControl(self._worlds, self._data, shape[1])
         self._controls, self._targets = np.zeros(shape), np.zeros(shape)
@@ -83,6 +83,12 @@ class MujocoSimulation:
         self._state.read()
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
+
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Velocities of the blocks; see ``Simulation.block_velocity``."""
+        self._require_open()
+        return self._state.block_velocity
 
     def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
         """Put some environments at rest and clear their history; see ``Simulation.reset``.

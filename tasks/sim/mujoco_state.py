@@ -73,13 +73,30 @@ class MujocoState:
             self._pose_at[i, :3] = self._positions.begin[n + 2 * k] + np.arange(3)
             self._pose_at[i, 3:] = self._positions.begin[n + 2 * k + 1] + np.arange(4)
         self._has_blocks = bool(blocks)
-        self.q, self.qd = torch.zeros(n, joints), torch.zeros(n, joints)
-        self.block_pose, self.block_velocity = torch.zeros(n, 7), torch.zeros(n, 6)
+        self._q, self._qd = np.zeros((2, n, joints), np.float32)
+        self._block_pose = np.zeros((n, 7), np.float32)
+        self._exact_pose = np.zeros((n, 7))
+        self.q, self.qd = torch.from_numpy(self._q), torch.from_numpy(self._qd)
+        self.block_pose = torch.from_numpy(self._block_pose)
 
     @property
     def velocities(self) -> Array:
         """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
         return self._velocities.flat
+
+    @property
+    def block_velocity(self) -> torch.Tensor:
+        """Linear and angular velocities of the blocks in the world at the last ``read``, (n, 6)."""
+        if not self._has_blocks:
+            return torch.zeros(len(self._velocity_at), 6)
+        velocity = self._velocities.flat[self._velocity_at]
+        quaternion, angular = self._exact_pose[:, 3:], velocity[:, 3:]
+        # MuJoCo has a free body's angular velocity in the axes of the body: rotate it to the
+        # world, v' = v + w t + u x t with t = 2 u x v and the quaternion (w, u).
+        w, axis = quaternion[:, :1], quaternion[:, 1:]
+        twice = 2 * np.cross(axis, angular)
+        angular[:] = angular + w * twice + np.cross(axis, twice)
+        return torch.from_numpy(velocity.astype(np.float32))
 
     def joints(self) -> tuple[Array, Array]:
         """Return joint positions and velocities at the last ``read``, shape (n, J) each."""
@@ -89,19 +106,12 @@ class MujocoState:
         """Update the tensors from the data."""
         self._positions.read()
         self._velocities.read()
-        self.q.numpy()[:], self.qd.numpy()[:] = self.joints()
+        self._q[:], self._qd[:] = self.joints()
         if self._has_blocks:
-            pose = self._positions.flat[self._pose_at]
-            velocity = self._velocities.flat[self._velocity_at]
-            quaternion, angular = pose[:, 3:], velocity[:, 3:]
+            self._exact_pose = self._positions.flat[self._pose_at]
+            quaternion = self._exact_pose[:, 3:]
             quaternion[quaternion[:, 0] < 0] *= -1
-            self.block_pose.numpy()[:] = pose
-            # MuJoCo has a free body's angular velocity in the axes of the body: rotate it to the
-            # world, v' = v + w t + u x t with t = 2 u x v and the quaternion (w, u).
-            w, axis = quaternion[:, :1], quaternion[:, 1:]
-            twice = 2 * np.cross(axis, angular)
-            angular[:] = angular + w * twice + np.cross(axis, twice)
-            self.block_velocity.numpy()[:] = velocity
+            self._block_pose[:] = self._exact_pose
 
     def faults(self) -> dict[int, str]:
         """Return the environments that diverged, each with the reason.
