@@ -40,8 +40,9 @@ def _policy(text: str) -> str:
         type=_policy,
         default="random",
         metavar="POLICY",
-        help="the controller: zero (no action), random, ik (inverse kinematics, for reach), "
-        "scripted (for push), or a checkpoint or run folder",
+        help="the controller: zero (no action), random, jacobian (each joint along its own "
+        "Jacobian column, for reach), ik (inverse kinematics, for reach), scripted (for push); or "
+        "a checkpoint or run folder",
     ),
     path_option("--out", "FILE", "the video: .mp4 or .gif"),
     opt.sim_option(),

@@ -40,6 +40,7 @@ class Baseline:
 
 RANDOM = Baseline("random", "morphgen.rl.baselines.simple:Random")
 ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero")
+JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.jacobian:JacobianColumns", ("reach",))
 IK = Baseline("ik", "morphgen.rl.baselines.ik:InverseKinematics", ("reach",))
 SCRIPTED = Baseline("scripted", "morphgen.rl.baselines.scripted_push:ScriptedPush", ("push",))
 
@@ -49,6 +50,7 @@ BASELINES: Registry[Baseline] = Registry(
     {
         "random": f"{__name__}:RANDOM",
         "zero": f"{__name__}:ZERO",
+        "jacobian": f"{__name__}:JACOBIAN",
         "ik": f"{__name__}:IK",
         "scripted": f"{__name__}:SCRIPTED",
     },

@@ -73,7 +73,7 @@ def test_zero_policy_does_not_move(run):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("reach", "arm3-stick", "--policy", "scripted"), "valid: ik, zero, random"),
+        (("reach", "arm3-stick", "--policy", "scripted"), "valid: ik, jacobian, zero, random"),
         (("push", "prims", "--policy", "ik"), "valid: scripted, zero, random"),
         (("push", "prism"), "did you mean 'prims'?"),
         (("push", "prims", "--out", "film.avi"), "the name of a video ends in .mp4 or .gif"),

@@ -66,7 +66,7 @@ def results(cells):
 
 def test_a_cell_is_a_run_folder_with_scores(whole):
     names = [cell.agent for cell in whole]
-    assert names == ["random", "zero", "ik", "se", "se", "me-mlp", "me-mlp"]
+    assert names == ["random", "zero", "jacobian", "ik", "se", "se", "me-mlp", "me-mlp"]
     for cell in whole:
         scores = read_scores(cell)
         assert set(scores) == (set(MODES) if cell.config else {cell.agent})
@@ -105,8 +105,8 @@ def test_a_killed_study_resumes_where_it_stopped(whole, tmp_path):
     with pytest.raises(Killed):
         list(run_cells(cells, QUIET, show))
     done = [cell for cell in cells if read_scores(cell) is not None]
-    assert [cell.agent for cell in done] == ["random", "zero", "ik"]
-    first_robot = cells[3].folder / "robots" / begun[0][0].name
+    assert [cell.agent for cell in done] == ["random", "zero", "jacobian", "ik"]
+    first_robot = cells[4].folder / "robots" / begun[0][0].name
     kept = {cell.folder: tree(cell.folder) for cell in done} | {first_robot: tree(first_robot)}
     list(run_cells(cells, QUIET, show))
     assert [path for path, _ in begun].count(begun[0][0]) == 1
@@ -131,7 +131,7 @@ def test_a_cell_locked_by_another_process_is_done_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(study.time, "sleep", wait)
     order = [outcome.cell.agent for outcome in run_cells(cells, QUIET)]
-    assert order == ["zero", "ik", "random"]
+    assert order == ["zero", "jacobian", "ik", "random"]
     assert waits
 
 
@@ -250,10 +250,10 @@ def test_se_policies_trained_on_the_test_robots_are_resampled_independently(tmp_
 
 def test_missing_scores_are_shown_as_missing(tmp_path):
     cells = cells_in(tmp_path)
-    random, _, _, se0, se1, mlp0, mlp1 = cells
+    random, _, _, _, se0, se1, mlp0, mlp1 = cells
     own = {random: {"random": [score("train", 0.0), score("test", 0.0)]}}
     own |= by_hand([se0, se1, mlp0, mlp1], [(1, 3, 10), None, None, None])
-    own |= {cell: None for cell in cells[1:3]}
+    own |= {cell: None for cell in cells[1:4]}
     found = {cell: own[cell] for cell in cells}
     written = write_tables(tmp_path, found)
     assert [path.name for path in written] == [TABLE, DATA, ROBOTS, CURVES]

@@ -1,0 +1,54 @@
+"""The baseline ``jacobian`` of reach: each joint follows its own column of the tool's Jacobian.
+
+It has no parameters to learn and no memory, and joints do not know of each other. A policy that
+transfers to unseen robots must beat it.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from morphgen.model.kinematics_torch import frame_jacobian
+from morphgen.tasks.actions import encode_actions
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.observation import joint_to_link
+
+GAIN = 0.3
+"""Fraction of the error that a joint would remove in one control step if it acted alone. All joints
+act at once and lag behind their targets, so that 1 overshoots; tuned on arm3 and Panda."""
+MIN_COLUMN = 1e-4
+"""Jacobian columns shorter than this do not move the tool [m per rad, or m per m]."""
+
+
+class JacobianColumns:
+    """Moves each joint j by a_j = GAIN (J_j . e) / (|J_j|^2 s_j), clipped to [-1, 1].
+
+    J_j is the joint's column of the Jacobian, e the error from tool to goal, and s_j the joint's
+    largest step. Jacobian and error are those of the measured joint positions.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        """Ignore the seed: nothing is random."""
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return actions, shape (n, L)."""
+        tables, robots = task.robot_tables, task.env_robot_index
+        T_root_tool, J_root_tool = frame_jacobian(tables.tool_chain, robots, task.q)
+        error = task.field("goal")[:, :3] - T_root_tool[:, :3, 3]
+        steps = column_steps(J_root_tool[:, :3], error)
+        fractions = (GAIN * steps / tables.max_step[robots].clamp(min=1e-9)).clamp(-1, 1)
+        return encode_actions(joint_to_link(tables, robots, fractions), task.action_kind)
+
+
+def column_steps(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+    """Return the change of each joint that alone reduces the error most, shape (n, J).
+
+    It is the projection of the error on the joint's column; 0 for columns below ``MIN_COLUMN``.
+
+    Args:
+        J: Jacobians, shape (n, m, J).
+        error: Task-space errors, shape (n, m).
+    """
+    squares = J.square().sum(dim=1)
+    steps = (J * error[..., None]).sum(dim=1) / squares.clamp(min=MIN_COLUMN**2)
+    return torch.where(squares < MIN_COLUMN**2, torch.zeros_like(steps), steps)
