@@ -64,7 +64,8 @@ class Step:
 class TaskBatch:
     """Environments; each has a robot at a task, and its own stream of random numbers.
 
-    Robots stand at the origin of the world.
+    Robots stand at the origin of the world. The tensors of targets, actions, velocities and episode
+    steps are updated in place, so that NumPy views of them stay valid.
 
     Attributes:
         robot_tables: The robots as tensors.
@@ -77,6 +78,9 @@ class TaskBatch:
         max_episode_steps: Time limit of episodes, shape (n,) [control steps].
         episode_step: Control steps since the episode began, shape (n,), int64.
         targets: Targets of the independent joints, shape (n, J) [rad or m].
+        previous_action: Normalized actions of the last step, shape (n, L); 0 in a new episode.
+        previous_qd: Velocities of the independent joints after the last step, shape (n, J).
+        observation_config: Optional entries of observations.
         device: Device of all tensors.
     """
 
@@ -125,10 +129,10 @@ class TaskBatch:
         self._streams = _random_streams(seed, self._env_numbers)
         # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more
         self._num_sim_joints = simulation.q.shape[1]
-        self._qd = torch.zeros(n, robot_tables.max_joints, device=device)
-        self._previous_action = torch.zeros(n, robot_tables.max_links, device=device)
+        self.previous_qd = torch.zeros(n, robot_tables.max_joints, device=device)
+        self.previous_action = torch.zeros(n, robot_tables.max_links, device=device)
         self._lower, self._upper = robot_tables.lower[index], robot_tables.upper[index]
-        self._observe = observe or ObservationConfig()
+        self.observation_config = observe or ObservationConfig()
         self._tokens = LinkTokens(robot_tables, index)
         self._tool_positions = FramePositions(robot_tables.tool_chain, index)
         self._joint_targets = JointTargets(robot_tables, index, self.action_mask)
@@ -137,11 +141,11 @@ class TaskBatch:
             "links": robot_tables.link_mask[index],
             "actions": self.action_mask,
             **self.groups.masks,
-            **obstacle_tokens(scenes, self._observe.obstacles, device),
+            **obstacle_tokens(scenes, self.observation_config.obstacles, device),
         }
         self._points: PointClouds | None = None
-        if self._observe.points:
-            self._points = PointClouds(scenes, self._observe.points, device)
+        if self.observation_config.points:
+            self._points = PointClouds(scenes, self.observation_config.points, device)
             self._constant_entries["point_mask"] = self._points.mask
 
     @property
@@ -176,7 +180,7 @@ class TaskBatch:
         if spread:
             fractions = [stream.random() for stream in self._streams["random"]]
             fraction = torch.tensor(fractions, device=self.device)
-            self.episode_step = (fraction * self.max_episode_steps).long()
+            self.episode_step.copy_(fraction * self.max_episode_steps)
         return self.observe()
 
     def step(self, actions: torch.Tensor) -> Step:
@@ -190,7 +194,8 @@ class TaskBatch:
             SimulationError: If the simulator failed.
         """
         self._act(actions)
-        diverged = self._simulate()
+        diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        diverged[self.simulate()] = True
         self.episode_step += 1
         result = self._evaluate(diverged)
         timed_out = self.episode_step >= self.max_episode_steps
@@ -218,19 +223,44 @@ class TaskBatch:
             block_pose=block_pose,
         )
 
+    def simulate(self) -> list[int]:
+        """Step the simulation towards the targets; undo the step of environments that diverged.
+
+        Returns:
+            The environments that diverged.
+
+        Raises:
+            SimulationError: If the simulator failed.
+        """
+        q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
+        try:
+            self.simulation.step(self.targets[:, : self._num_sim_joints].contiguous())
+        except DivergedError as error:
+            diverged = list(error.reasons)
+            envs = torch.tensor(diverged, device=self.device)
+            self.simulation.reset(envs, q[envs], block[envs])
+            self.previous_qd[envs] = 0
+            return diverged
+        return []
+
     def observe(self) -> Observation:
         """Return the current observation, in tensors that the caller owns."""
-        observation = {
+        return {
             "tokens": self._tokens(self._q),
             **self.groups.fields(self.simulation.block_pose),
             **_copied(self._constant_entries),
+            **self.requested_entries(),
         }
-        if self._observe.velocity:
+
+    def requested_entries(self) -> Observation:
+        """Return the entries of the current observation that the configuration asks for."""
+        observation: Observation = {}
+        if self.observation_config.velocity:
             qd = self._padded(self.simulation.qd)
             observation["velocity"] = joint_to_link(self.robot_tables, self.env_robot_index, qd)
-        if self._observe.previous_action:
-            observation["previous_action"] = self._previous_action.clone()
-        if self._observe.tool:
+        if self.observation_config.previous_action:
+            observation["previous_action"] = self.previous_action.clone()
+        if self.observation_config.tool:
             observation["tool"] = self._tool_positions(self._q)
         if self._points is not None:
             observation["points"] = self._points(self.simulation.block_pose)
@@ -278,21 +308,8 @@ class TaskBatch:
         """Advance the joint targets by the decoded actions."""
         shape = (self.num_envs, self.robot_tables.max_links)
         normalized = decode_actions(actions, self.action_kind, shape, self.device)
-        self._previous_action = normalized * self.action_mask
-        self.targets = self._joint_targets(self.targets, self._previous_action)
-
-    def _simulate(self) -> torch.Tensor:
-        """Step the simulation, undo the step where it diverged; return where, shape (n,), bool."""
-        diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        q, block = self.simulation.q.clone(), self.simulation.block_pose.clone()
-        try:
-            self.simulation.step(self.targets[:, : self._num_sim_joints].contiguous())
-        except DivergedError as error:
-            envs = torch.tensor(list(error.reasons), device=self.device)
-            diverged[envs] = True
-            self.simulation.reset(envs, q[envs], block[envs])
-            self._qd[envs] = 0
-        return diverged
+        self.previous_action.copy_(normalized * self.action_mask)
+        self.targets.copy_(self._joint_targets(self.targets, self.previous_action))
 
     def _evaluate(self, diverged: torch.Tensor) -> BatchResult:
         """Let the tasks evaluate the step that was simulated."""
@@ -301,10 +318,10 @@ class TaskBatch:
             tool=self._tool_positions(q),
             block_pose=self.simulation.block_pose,
             limit_violation=limit_violation(q, self._lower, self._upper),
-            acceleration=row_sums((qd - self._qd).abs()) / CONTROL_PERIOD,
+            acceleration=row_sums((qd - self.previous_qd).abs()) / CONTROL_PERIOD,
             diverged=diverged,
         )
-        self._qd = qd.clone()
+        self.previous_qd.copy_(qd)
         return self.groups.evaluate(state)
 
     def _begin(self, envs: torch.Tensor) -> None:
@@ -319,8 +336,8 @@ class TaskBatch:
         self.simulation.reset(envs, q[:, : self._num_sim_joints].contiguous(), block_pose)
         self.targets[envs] = q
         self.episode_step[envs] = 0
-        self._qd[envs] = 0
-        self._previous_action[envs] = 0
+        self.previous_qd[envs] = 0
+        self.previous_action[envs] = 0
 
     @property
     def _q(self) -> torch.Tensor:
