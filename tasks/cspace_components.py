@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from morphgen.model.kinematics import (
     periodic_joints,
     random_configurations,
 )
-from morphgen.model.robot import TOOL, Pair, Robot
+from morphgen.model.robot import TOOL, Pair, Robot, sorted_pair
 from morphgen.typing import Array
 
 CELL = 0.1
@@ -76,7 +76,7 @@ def cspace_components(robot: Robot) -> tuple[JointPlane, ...]:
         pairs_of[driving_joints(robot, chains)].append((a, b))
     tool_joints = {*driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))}
     planes = [
-        _joint_plane(robot, checker, joints, pairs)
+        _joint_plane(robot, joints, pairs)
         for joints, pairs in pairs_of.items()
         if 0 < len(joints) <= 2 and {*joints} <= tool_joints
     ]
@@ -110,9 +110,7 @@ def _is_outside(plane: JointPlane, q: Array) -> bool:
     return True
 
 
-def _joint_plane(
-    robot: Robot, checker: SelfCollisionChecker, joints: tuple[int, ...], pairs: Sequence[Pair]
-) -> JointPlane | None:
+def _joint_plane(robot: Robot, joints: tuple[int, ...], pairs: Sequence[Pair]) -> JointPlane | None:
     """Return the plane of one or two joints; None if its free cells form one component."""
     columns = [*joints]
     lower, upper = joint_limits(robot).T[:, columns]
@@ -123,8 +121,9 @@ def _joint_plane(
     ]
     q = np.tile(robot.home, (int(count.prod()), 1))
     q[:, columns] = np.stack(np.meshgrid(*cell_centres, indexing="ij"), axis=-1).reshape(len(q), -1)
-    free = np.array([not contacts.keys() & {*pairs} for contacts in checker.penetrations(q)])
-    free = free.reshape(count)
+    names = [link.name for link in robot.links]
+    others = {sorted_pair(a, b) for a, b in combinations(names, 2)} - {*pairs}
+    free = SelfCollisionChecker(robot, sorted(others)).free(q).reshape(count)
     continuous = [robot.joints[robot.independent_joints[j]].kind == "continuous" for j in joints]
     components = _components(free, continuous)
     if components.max() < 2:

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Box, Pose, Shape, Sphere
-from morphgen.model.kinematics import joint_limits, random_configurations
+from morphgen.model.inertia import bounding_box
+from morphgen.model.kinematics import forward_kinematics, joint_limits, random_configurations
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot
 from morphgen.model.rotation import Vec3, normalize, to_rpy
 from morphgen.model.tree import rigid_groups
@@ -85,9 +86,7 @@ class FreeSpace:
             ValueError: If ``q`` or ``blocks`` has another shape or is not finite, or the scene has
                 no block.
         """
-        return np.array(
-            [not contacts for contacts in self._penetrations(q, blocks)], dtype=np.bool_
-        )
+        return self._checker.free(self._positions(q, blocks))
 
     def block_is_clear(self, blocks: ArrayLike) -> NDArray[np.bool_]:
         """Return at which poses the block penetrates neither an obstacle nor the robot's base.
@@ -101,14 +100,16 @@ class FreeSpace:
         Raises:
             ValueError: If ``blocks`` has another shape or is not finite, or the scene has no block.
         """
-        robot = self.scene.robot
+        robot, poses = self.scene.robot, np.asarray(blocks, dtype=np.float64)
         fixed_names = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
-        home = np.tile(robot.home, (len(np.asarray(blocks)), 1))
-        clear = [
+        self._require_blocks(poses, len(poses))
+        near = np.flatnonzero(_may_touch(self.scene, poses))
+        clear = np.ones(len(poses), dtype=np.bool_)
+        clear[near] = [
             not any(self._block in pair and fixed_names & {*pair} for pair in contacts)
-            for contacts in self._penetrations(home, blocks)
+            for contacts in self._penetrations(np.tile(robot.home, (len(near), 1)), poses[near])
         ]
-        return np.array(clear, dtype=np.bool_)
+        return clear
 
     def obstacle_hits(self, q: ArrayLike) -> NDArray[np.bool_]:
         """Return which obstacles the robot penetrates, whatever else collides.
@@ -186,6 +187,10 @@ class FreeSpace:
         self, q: ArrayLike, blocks: ArrayLike | None = None
     ) -> Iterator[dict[Pair, float]]:
         """Yield the penetration depths [m] by pair of links at each configuration."""
+        return self._checker.penetrations(self._positions(q, blocks))
+
+    def _positions(self, q: ArrayLike, blocks: ArrayLike | None) -> Array:
+        """Return joint positions of the robot with its surroundings, shape (n, dof + more)."""
         q = np.asarray(q, dtype=np.float64)
         robot = self.scene.robot
         if q.ndim != 2 or q.shape[1] != robot.dof:
@@ -193,15 +198,19 @@ class FreeSpace:
         if not np.isfinite(q).all():  # nothing collides there, which is not to be free
             raise ValueError(f"q of {robot.name} is not finite")
         slides = np.zeros((len(q), len(self._obstacles)))
-        return self._checker.penetrations(
-            np.concatenate([q, slides, self._block_joints(blocks, len(q))], axis=1)
-        )
+        return np.concatenate([q, slides, self._block_joints(blocks, len(q))], axis=1)
 
     def _block_joints(self, blocks: ArrayLike | None, n: int) -> Array:
         """Return the block's virtual joint positions, shape (n, 6), or (n, 0) without a block."""
         if blocks is None:
             return np.tile(_AWAY, (n, 1)) if self.scene.block else np.zeros((n, 0))
         blocks = np.asarray(blocks, dtype=np.float64)
+        self._require_blocks(blocks, n)
+        turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
+        return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
+
+    def _require_blocks(self, blocks: Array, n: int) -> None:
+        """Require n finite poses of the block, and a block."""
         if self.scene.block is None or blocks.shape != (n, 7):
             raise ValueError(
                 f"blocks have shape {blocks.shape}; {n} configurations need ({n}, 7), and a scene "
@@ -209,8 +218,6 @@ class FreeSpace:
             )
         if not np.isfinite(blocks).all():
             raise ValueError("a pose of the block is not finite")
-        turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
-        return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
 
 
 def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
@@ -224,6 +231,36 @@ def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
     outside = (q < low) | (q > high) | ~np.isfinite(q)
     for i, j in np.argwhere(outside).tolist():
         yield i, f"joint {names[j]!r} is at {q[i, j]:g}, outside ({low[j]:g}, {high[j]:g})"
+
+
+def _may_touch(scene: Scene, blocks: Array) -> NDArray[np.bool_]:
+    """Return where the block's sphere meets a box around the robot's base or an obstacle.
+
+    Args:
+        scene: The scene, with a block.
+        blocks: Poses of the block in the world, shape (n, 7).
+
+    Returns:
+        Shape (n,); False only where the block touches neither.
+    """
+    assert scene.block is not None
+    radius = float(np.linalg.norm(scene.block.size)) / 2
+    T_world_root, robot = scene.T_world_root.matrix, scene.robot
+    T_root_link = forward_kinematics(robot, np.array(robot.home))
+    boxes = [
+        (T_world_root @ T_root_link[robot.link_index[link.name]], bounding_box(link.collisions))
+        for link in rigid_groups(robot)[0].links
+        if link.collisions
+    ]
+    for obstacle in scene.obstacles:
+        half = np.array(obstacle.size) / 2
+        boxes.append((obstacle.pose.matrix, np.stack([-half, half])))
+    near = np.zeros(len(blocks), dtype=np.bool_)
+    for T_world_box, (low, high) in boxes:
+        centres = (blocks[:, :3] - T_world_box[:3, 3]) @ T_world_box[:3, :3]
+        gap = np.maximum(np.maximum(low - centres, centres - high), 0)
+        near |= np.linalg.norm(gap, axis=1) <= radius
+    return near
 
 
 def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Robot:

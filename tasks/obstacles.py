@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from morphgen.benchmark.workspace import workspace
+from morphgen.benchmark.workspace import tool_reach
 from morphgen.errors import BenchmarkError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
@@ -57,7 +57,8 @@ def draw_obstacles(
             f"{count} obstacles of size {size}: at least one, and 0 < lowest <= highest"
         )
     num_boxes = CANDIDATES * count
-    edges = rng.uniform(low, high, (num_boxes, 3)) * workspace(robot).reach
+    _, reach = tool_reach(robot)
+    edges = rng.uniform(low, high, (num_boxes, 3)) * reach
     turns = rng.uniform(-math.pi, math.pi, num_boxes)
     q, _ = FreeSpace(Scene(robot, ground=ground)).sample(PROBES + num_boxes, rng)
     tools = frame_pose(robot, q[PROBES:], TOOL)

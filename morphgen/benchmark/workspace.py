@@ -60,6 +60,22 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
         BenchmarkError: If the robot has no frame ``tool``, no joint moves it, or a joint has no
             range.
     """
+    points, centre, farthest = _tool_points(robot, samples)
+    return Workspace(_density(points / farthest), centre, farthest)
+
+
+def tool_reach(robot: Robot) -> tuple[Vec3, float]:
+    """Return the ``shoulder`` and the ``reach`` of a robot's ``workspace``.
+
+    Raises:
+        BenchmarkError: As ``workspace``.
+    """
+    _, centre, farthest = _tool_points(robot, SAMPLES)
+    return centre, farthest
+
+
+def _tool_points(robot: Robot, samples: int) -> tuple[Array, Vec3, float]:
+    """Return tool positions from the shoulder, (3, n), the shoulder and the largest distance."""
     chain = _tool_chain(robot)
     centre = shoulder(robot)
     T_shoulder_root = Pose(centre).inverse()
@@ -80,7 +96,7 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
             f"robot {robot.name!r}: its tool only turns about its own origin, so it has no "
             "workspace; place the frame 'tool' at the working point"
         )
-    return Workspace(_density(points / farthest), centre, farthest)
+    return points, centre, farthest
 
 
 def density_overlap(a: Workspace, b: Workspace) -> float:

@@ -12,7 +12,7 @@ from itertools import combinations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from morphgen.errors import RobotError
 from morphgen.model.kinematics import movable_positions, random_configurations
@@ -85,10 +85,52 @@ class SelfCollisionChecker:
             RobotError: If the contacts of one configuration do not fit into memory, or MuJoCo
                 finds no depth for two overlapping shapes. Raised while iterating.
         """
+        rows = self._require_rows(q)
+        return (self._test(positions) for positions in movable_positions(self._robot, rows))
+
+    def free(self, q: ArrayLike) -> NDArray[np.bool_]:
+        """Return which configurations have no penetration, as ``penetrations`` finds them.
+
+        Several times as fast as ``penetrations``, which says what penetrates.
+
+        Args:
+            q: Independent joint positions, shape (n, dof) [rad or m].
+
+        Returns:
+            Shape (n,).
+
+        Raises:
+            ValueError: As ``penetrations``.
+            RobotError: As ``penetrations``.
+        """
+        import mujoco
+
+        model, data, qpos = self._model, self._data, self._data.qpos
+        full = data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL]
+        positions = movable_positions(self._robot, self._require_rows(q))
+        free = np.ones(len(positions), dtype=np.bool_)
+        with capture_mujoco_warnings() as warnings:
+            for i, row in enumerate(positions):
+                qpos[self._qpos] = row
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_collision(model, data)
+                if warnings or full.number:  # the full test decides what to do about them
+                    warnings.clear()
+                    free[i] = not self._test(row)
+                elif data.ncon:
+                    free[i] = data.contact.dist.min() >= -PENETRATION
+        return free
+
+    def _require_rows(self, q: ArrayLike) -> Array:
+        """Return configurations as an array.
+
+        Raises:
+            ValueError: If it has not two axes.
+        """
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2:
             raise ValueError(f"q has shape {q.shape}; {self._robot.name} needs (n, dof)")
-        return (self._test(positions) for positions in movable_positions(self._robot, q))
+        return q
 
     def _test(self, positions: Array) -> dict[Pair, float]:
         import mujoco

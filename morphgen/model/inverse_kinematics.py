@@ -51,6 +51,7 @@ def solve_position_ik(
     iterations: int = 25,
     damping: float = DAMPING,
     max_step: float = MAX_STEP,
+    tolerance: float = 0.0,
 ) -> tuple[Array, Array]:
     """Move tools to positions by damped least squares, within the joint limits.
 
@@ -61,6 +62,7 @@ def solve_position_ik(
         iterations: Number of iterations.
         damping: See ``dls_step``.
         max_step: Largest change of a joint position in one iteration [rad or m].
+        tolerance: Distance at which a tool has arrived and its row iterates no more [m].
 
     Returns:
         Configurations, shape (n, dof), and the remaining position errors, shape (n, 3) [m].
@@ -70,10 +72,15 @@ def solve_position_ik(
     """
     low, high = joint_limits(robot).T
     q = np.clip(q, low, high)
+    rows = np.arange(len(q))
     for _ in range(iterations):
-        T_root_tool, J_root_tool = frame_jacobian(robot, q)
-        step = dls_step(J_root_tool[:, :3], positions - T_root_tool[:, :3, 3], damping)
-        q = np.clip(q + np.clip(step, -max_step, max_step), low, high)
+        T_root_tool, J_root_tool = frame_jacobian(robot, q[rows])
+        error = positions[rows] - T_root_tool[:, :3, 3]
+        if tolerance:
+            away = np.linalg.norm(error, axis=1) > tolerance
+            rows, error, J_root_tool = rows[away], error[away], J_root_tool[away]
+        step = dls_step(J_root_tool[:, :3], error, damping)
+        q[rows] = np.clip(q[rows] + np.clip(step, -max_step, max_step), low, high)
     return q, positions - frame_pose(robot, q)[:, :3, 3]
 
 

@@ -27,8 +27,8 @@ BEHIND = (0.1, 0.4, 0.8, 1.2, 1.6)
 They exceed the radius of the largest sphere, whose tool is at its bottom."""
 CLOSE = 1e-3
 """Largest distance of a tool from its goal along x and along y [m]."""
-NEAREST = 12
-"""Number of nearest sampled configurations from which inverse kinematics starts."""
+NEAREST = (1, 2, 3, 6)
+"""Numbers of nearest sampled configurations from which inverse kinematics starts, in turn."""
 
 _PROBES = 64
 """Number of blocks whose paths test a layout of obstacles."""
@@ -38,8 +38,15 @@ _BANK = 2048
 """Number of free configurations to collect."""
 _DRAWN, _ROUNDS = 65_536, 8
 """Configurations drawn per round, and number of rounds."""
+_FEW = 8192
+"""Number of configurations whose tools are computed at a time."""
+_ARRIVED = 1e-6
+"""Distance from its goal at which inverse kinematics leaves a tool [m]."""
 _LOW, _HIGH = 0.15, 0.85
 """Range of heights of the tool, in block edges."""
+
+
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,24 +110,51 @@ class FeasibilityTest:
         rows = np.flatnonzero(mask)
         if not len(rows):
             return
-        num_near, edge = min(NEAREST, len(self._bank_q)), self._region.edge
-        distance = np.linalg.norm(tool_xy[rows, None] - self._bank_tools[None, :, :2], axis=2)
-        start = np.argsort(distance, axis=1, kind="stable")[:, :num_near].ravel()
-        height = np.clip(self._bank_tools[start, 2] - self._ground, _LOW * edge, _HIGH * edge)
+        starts = _nearest(tool_xy[rows], self._bank_tools[:, :2], sum(NEAREST))
+        begin = 0
+        for count in NEAREST:  # most succeed from the nearest, which spares the others
+            missing = ~np.isfinite(q_out[rows, 0])
+            rows, starts = rows[missing], starts[missing]
+            candidates = starts[:, begin : begin + count]
+            begin += count
+            if not candidates.size:
+                return
+            q, free = self._solve(
+                candidates, tool_xy[rows], None if blocks is None else blocks[rows]
+            )
+            first, has_free = free.argmax(axis=1), free.any(axis=1)
+            q_out[rows[has_free]] = q[has_free, first[has_free]]
+
+    def _solve(
+        self, start: Indices, tool_xy: Array, blocks: Array | None
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Solve inverse kinematics for goals (m, 2) from k configurations of the bank each.
+
+        Args:
+            start: Indices of configurations, shape (m, k).
+            tool_xy: Positions of the tool on the ground plane, shape (m, 2) [m].
+            blocks: Poses of the block, shape (m, 7), or None.
+
+        Returns:
+            Configurations, shape (m, k, dof), and which of them are free and bring the tool to its
+            goal between the bottom and the top of the block, shape (m, k).
+        """
+        (m, k), edge = start.shape, self._region.edge
+        height = self._bank_tools[start.ravel(), 2] - self._ground
+        height = np.clip(height, _LOW * edge, _HIGH * edge)
         goals = np.concatenate(
-            [np.repeat(tool_xy[rows], num_near, axis=0), self._ground + height[:, None]], axis=1
+            [np.repeat(tool_xy, k, axis=0), self._ground + height[:, None]], axis=1
         )
-        q, error = solve_position_ik(self._robot, self._bank_q[start], goals)
+        q, error = solve_position_ik(
+            self._robot, self._bank_q[start.ravel()], goals, tolerance=_ARRIVED
+        )
         tool_z = height - error[:, 2]
         is_close = (np.abs(error[:, :2]) < CLOSE).all(axis=1)
         reached = is_close & (tool_z > 0) & (tool_z < edge)
-        is_free = np.zeros(len(q), dtype=np.bool_)
-        poses = None if blocks is None else np.repeat(blocks[rows], num_near, axis=0)[reached]
-        is_free[reached] = self._space.free(q[reached], poses)
-        free = is_free.reshape(len(rows), num_near)
-        first = free.argmax(axis=1)
-        has_free = free.any(axis=1)
-        q_out[rows[has_free]] = q.reshape(len(rows), num_near, -1)[has_free, first[has_free]]
+        free = np.zeros(len(q), dtype=np.bool_)
+        poses = None if blocks is None else np.repeat(blocks, k, axis=0)[reached]
+        free[reached] = self._space.free(q[reached], poses)
+        return q.reshape(m, k, -1), free.reshape(m, k)
 
 
 def path_is_clear(space: FreeSpace, region: Region, blocks: Array) -> NDArray[np.bool_]:
@@ -206,14 +240,54 @@ def sample_tools_in_box(
     kept, kept_tools = np.zeros((0, robot.dof)), np.zeros((0, 3))
     for _ in range(_ROUNDS):
         q = random_configurations(robot, _DRAWN, rng)
-        tools = frame_positions(robot, np.ascontiguousarray(q.T)).T
-        inside = np.flatnonzero(((tools > low) & (tools < high)).all(axis=1))[:_BANK]
+        tools, inside = _tools_in_box(robot, q, low, high)
         free = inside[space.free(q[inside])]
         kept = np.concatenate([kept, q[free]])
         kept_tools = np.concatenate([kept_tools, tools[free]])
         if len(kept) >= _BANK:
             break
     return kept[:_BANK], kept_tools[:_BANK]
+
+
+def _tools_in_box(robot: Robot, q: Array, low: Array, high: Array) -> tuple[Array, Indices]:
+    """Return tools of the first configurations, and which of these are in a box: ``_BANK`` at most.
+
+    Args:
+        robot: The robot.
+        q: Configurations, shape (n, dof).
+        low: Lowest corner of the box in the root frame, shape (3,) [m].
+        high: Highest corner of the box.
+
+    Returns:
+        Tool positions, shape (m, 3) [m], where m <= n, and increasing indices below m.
+    """
+    tools, inside = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
+    for begin in range(0, len(q), _FEW):
+        few = frame_positions(robot, np.ascontiguousarray(q[begin : begin + _FEW].T)).T
+        tools = np.concatenate([tools, few])
+        inside = np.append(inside, begin + np.flatnonzero(((few > low) & (few < high)).all(axis=1)))
+        if len(inside) >= _BANK:
+            break
+    return tools, inside[:_BANK]
+
+
+def _nearest(goals: Array, points: Array, count: int) -> Indices:
+    """Return the indices of the nearest points of each goal, in order, shape (n, at most count).
+
+    Args:
+        goals: Positions, shape (n, 2).
+        points: Positions, shape (m, 2).
+        count: Number of points for each goal.
+    """
+    count = min(count, len(points))
+    x, y = (goals[:, i, None] - points[:, i] for i in range(2))
+    distance = np.sqrt(x * x + y * y)
+    farthest = np.partition(distance, count - 1, axis=1)[:, count - 1 : count]
+    nearest = np.empty((len(goals), count), dtype=np.int64)
+    for i, row in enumerate(distance):  # points at equal distance in the order of their indices
+        candidates = np.flatnonzero(row <= farthest[i])
+        nearest[i] = candidates[np.argsort(row[candidates], kind="stable")][:count]
+    return nearest
 
 
 def _yaws(blocks: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morphgen.benchmark.workspace import workspace
+from morphgen.benchmark.workspace import tool_reach
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import (
     forward_kinematics,
@@ -73,14 +73,14 @@ def push_region(
         TaskError: If the tool cannot get down to the block, or cannot move along y.
         BenchmarkError: If the robot has no tool that moves.
     """
-    arm_workspace = workspace(robot)  # refuses a robot whose tool does not move
+    shoulder, arm_reach = tool_reach(robot)  # refuses a robot whose tool does not move
     tool_positions = _tool_positions(robot)
     size = float(rng.uniform(*config.block_size))
     slides = _num_slide_directions(robot)
     if slides:
         reach = float(np.ptp(tool_positions[1])) / 2 / (1.0 if slides == 2 else math.sqrt(2))
     else:
-        reach = effective_reach(arm_workspace.reach, arm_workspace.shoulder[2] - ground, size)
+        reach = effective_reach(arm_reach, shoulder[2] - ground, size)
     if not reach > 0:
         fault = "does not move along y" if slides else "does not get down to the ground"
         raise TaskError(f"robot {robot.name!r} cannot push: its tool {fault}")
@@ -89,8 +89,10 @@ def push_region(
     if slides == 2:
         x = (config.free_x[0] * scale, config.free_x[1] * scale)
     elif not slides and np.ptp(tool_positions[2]) > _LEVEL:
-        x0 = arm_workspace.shoulder[0]
-        x = (x0 + config.arm_x[0] * reach, x0 + config.arm_x[1] * reach)
+        x = (
+            shoulder[0] + config.arm_x[0] * reach,
+            shoulder[0] + config.arm_x[1] * reach,
+        )
     else:
         x = _tool_x_range(robot, ground, edge)
     y = ((config.start - config.start_depth) * scale, config.start * scale)

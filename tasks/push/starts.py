@@ -25,8 +25,6 @@ TRIES = 30
 RESTS = 1e-6
 """Largest height above the ground of a block that stands on it [m]."""
 
-_CHUNK = 32
-"""Poses of the block that are tested at a time."""
 _CONFIGURATIONS = 1000
 """Free configurations to test for a start before giving up."""
 
@@ -135,7 +133,7 @@ def _feasible(
     refusals: Counter[str] = Counter()
     tried = 0
     while tried < TRIES * needed:
-        blocks = draw_blocks(region, ground, _CHUNK, rng)
+        blocks = draw_blocks(region, ground, needed, rng)
         result = test(blocks)
         for block, is_clear, behind, across in zip(
             blocks, result.path_is_clear, result.behind, result.across, strict=True

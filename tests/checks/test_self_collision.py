@@ -210,6 +210,21 @@ def test_configurations_of_the_wrong_shape_are_an_error():
             checker.penetrations(q)
 
 
+def test_free_is_where_nothing_penetrates():
+    robot = arm()
+    checker = SelfCollisionChecker(robot, ())
+    q = random_configurations(robot, 100, np.random.default_rng(0))
+    free = checker.free(q)
+    assert free.tolist() == [not contacts for contacts in checker.penetrations(q)]
+    touching = SelfCollisionChecker(slides(0.0, 0.1)).free(
+        [[0.0, -0.5 * PENETRATION], [0.0, -0.01]]
+    )
+    assert touching.tolist() == [True, False]
+    assert checker.free(np.zeros((0, robot.dof))).tolist() == []
+    with pytest.raises(ValueError, match="q has shape"):
+        checker.free(q[0])
+
+
 def test_a_heap_of_overlapping_links_fits_into_memory():
     robot = slides(*[0.0] * 40)
     (found,) = penetrations(robot, [robot.home])
@@ -232,6 +247,9 @@ def test_a_configuration_is_perturbed_where_epa_fails(monkeypatch, tmp_path, cap
     (found,) = penetrations(slides(0.0, 0.08), [[0.0, 0.0]])
     assert found == {("ball0", "ball1"): pytest.approx(0.02)}
     assert given_up == [0.0, 1e-9]
+    given_up.clear()
+    assert SelfCollisionChecker(slides(0.0, 0.08)).free([[0.0, 0.0]]).tolist() == [False]
+    assert len(given_up) == 2
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from helpers.kinematic_backends import BACKENDS, backend
 from helpers.robots import arm
 from helpers.scenes import robot
+from morphgen.model import inverse_kinematics
 from morphgen.model.inverse_kinematics import solve_pose_ik
 from morphgen.model.inverse_kinematics_torch import pose_ik_step, solve_position_ik
 from morphgen.model.kinematics import (
@@ -77,6 +78,19 @@ def test_position_ik_reports_the_error_of_unreachable_goals(kinematics):
     assert np.abs(error[0]).max() < 1e-4
     assert goals - error == pytest.approx(frame_pose(UR5, q)[:, :3, 3], abs=1e-5)
     assert np.linalg.norm(error[1]) > 7
+
+
+def test_position_ik_leaves_rows_that_have_arrived():
+    q = random_configurations(PANDA, 20, np.random.default_rng(0))
+    goals = frame_pose(PANDA, q)[:, :3, 3] + np.linspace(0, 0.1, 20)[:, None]
+    solve = inverse_kinematics.solve_position_ik
+    loose, error = solve(PANDA, q, goals, tolerance=0.01)
+    tight, _ = solve(PANDA, q, goals)
+    near = np.linalg.norm(goals - frame_pose(PANDA, q)[:, :3, 3], axis=1) <= 0.01
+    np.testing.assert_array_equal(loose[near], q[near])
+    assert 0 < near.sum() < len(q)
+    assert np.median(np.linalg.norm(error, axis=1)) <= 0.01
+    assert not np.allclose(loose, tight, atol=1e-6)
 
 
 def test_numpy_and_torch_ik_agree():

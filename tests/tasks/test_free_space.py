@@ -301,3 +301,15 @@ def test_non_finite_input_is_rejected(value):
         space.block_is_clear(gone)
     with pytest.raises(ValueError, match="not finite"):
         space.obstacle_hits(lost)
+
+
+def test_block_clearance_far_away_equals_the_full_test():
+    """Poses whose block is surely far from everything fixed are not tested one by one."""
+    wall = Block((0.2, 0.4, 0.2), Pose.from_xyz_rpy((1.6, 0.0, 0.1), (0.0, 0.0, 0.5)))
+    space = pushed(obstacles=(wall,))
+    rng = np.random.default_rng(0)
+    blocks = np.array([block_at(*rng.uniform((-2, 0), (2, 0.4)), yaw=yaw) for yaw in range(200)])
+    away = np.tile([[1.0]], (len(blocks), 1))  # no block is as high as the ball at its limit
+    clear = space.block_is_clear(blocks)
+    assert clear.tolist() == space.free(away, blocks).tolist()
+    assert 0 < clear.sum() < len(clear)
