@@ -25,7 +25,7 @@ from morphgen.rl.scores import Score
 from morphgen.rl.training import checkpoint_files
 from morphgen.tasks.env_specs import GoalConfig, default_configs
 from morphgen.tasks.make import batch_from_specs
-from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
+from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator, evaluation_simulator
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 MAX_ENVS_PER_ROBOT = 34
@@ -338,9 +338,9 @@ def _score(
 def eval_config_of(
     config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1
 ) -> EvalConfig:
-    """Return the config to evaluate a run in its simulator and tasks.
+    """Return the config to evaluate a run in its tasks, and its simulator if that has contacts.
 
     The number of goals per robot is the tasks' default, whatever the run was trained with.
     """
     tasks = tuple(replace(task, num_goals=type(task)().num_goals) for task in config.tasks)
-    return EvalConfig(episodes, config.sim, seed, workers, tasks)
+    return EvalConfig(episodes, evaluation_simulator(config.sim), seed, workers, tasks)

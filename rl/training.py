@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from morphgen.errors import TaskError
 from morphgen.formats.files import locked_folder
@@ -28,6 +27,7 @@ from morphgen.rl.runs import (
     require_open,
     write_checkpoint,
 )
+from morphgen.tasks.device import batch_device, require_device
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.make import batch_from_specs
 
@@ -175,21 +175,6 @@ def require_runnable(config: RunConfig) -> None:
     config.ppo.minibatch_size(config.num_envs)
 
 
-def require_device(name: str) -> None:
-    """Require a device that torch can use: ``cpu``, ``cuda``, or such as ``cuda:1``.
-
-    Raises:
-        TaskError: If the name is invalid, or this machine has no such device.
-    """
-    kind, _, number = name.partition(":")
-    if name != "cpu" and (kind != "cuda" or not (number or "0").isdecimal()):
-        raise TaskError(f"unknown device {name!r}; valid: cpu, cuda, or such as cuda:1")
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise TaskError(f"--device {name}: this machine has no CUDA device")
-    if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
-        raise TaskError(f"--device {name}: there are {torch.cuda.device_count()} CUDA devices")
-
-
 def checkpoint_files(path: Path) -> Iterator[Path]:
     """Yield the checkpoint files of a run.
 
@@ -244,6 +229,7 @@ def _learner(part: Subrun, execution: ExecutionConfig) -> Iterator[Learner]:
         observe=interface.channels,
         workers=execution.workers,
         max_links=interface.max_links,
+        device=batch_device(config.sim, config.device),
         library=map(Path, config.source.library),
     )
     try:

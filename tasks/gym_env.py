@@ -18,7 +18,7 @@ from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Step
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.observation import Observation, ObservationConfig
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
@@ -108,7 +108,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             hint = nearest(render_mode, RENDER_MODES)
             raise TaskError(f"unknown render mode {render_mode!r}{hint}")
-        self._contacts = contacts or Contacts()
+        sim = sim or default_simulator()
+        self._self_collision = (contacts or Contacts()).self_collision
+        self._self_collision &= SIMULATORS[sim].simulates_contacts
         config_type = TASKS[task].config_type
         if config is not None and not isinstance(config, config_type):
             raise TaskError(
@@ -130,7 +132,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             sim=sim,
             kind=kind,
             observe=observe,
-            contacts=self._contacts,
+            contacts=contacts,
             max_links=max_links,
         )
         self.env_spec = self.batch.specs[0]
@@ -162,7 +164,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         next_has_begun = self._final_state is not None and seed is None
         observation = self.batch.observe() if next_has_begun else self.batch.reset(seed)
         self._running, self._final_state, self._was_reset = True, None, True
-        info = {"self_collision": self._contacts.self_collision}
+        info = {"self_collision": self._self_collision}
         return self._without_padding(observation), info
 
     def step(
@@ -243,5 +245,5 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             "score": float(step.score[0]),
             "diverged": bool(step.diverged[0]),
             "terms": {name: float(term[0]) for name, term in step.terms.items()},
-            "self_collision": self._contacts.self_collision,
+            "self_collision": self._self_collision,
         }

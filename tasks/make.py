@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
 
+import torch
+
 from morphgen.benchmark.split import Side, Split
 from morphgen.benchmark.tokens import MAX_LINKS
 from morphgen.errors import TaskError, nearest
@@ -14,11 +16,12 @@ from morphgen.model.robot import Robot
 from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.device import require_simulator_device
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.registry import SIMULATORS, default_simulator
+from morphgen.tasks.registry import SIMULATORS, default_simulator, installed_simulators
 from morphgen.tasks.robot_tables import build_robot_tables
-from morphgen.tasks.sim.base import Contacts
+from morphgen.tasks.sim.base import Contacts, Simulator
 from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
@@ -39,6 +42,7 @@ class BatchOptions(TypedDict, total=False):
     observe: ObservationConfig | None
     max_links: int | None
     first: int
+    device: str
 
 
 def make_batch(
@@ -152,6 +156,7 @@ def batch_from_specs(
     observe: ObservationConfig | None = None,
     max_links: int | None = None,
     first: int = 0,
+    device: str = "cpu",
     library: Iterable[Path] = (),
 ) -> TaskBatch:
     """Make a batch of environments from their specifications.
@@ -159,8 +164,8 @@ def batch_from_specs(
     Args:
         specs: Specifications; environment i has specification i modulo their number.
         num_envs: Number of environments, n.
-        sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
-            ``default_simulator()``.
+        sim: Name of a simulator: ``pybullet``, ``mujoco``, ``kinematic`` (which has no contacts)
+            or another of ``SIMULATORS``; by default ``default_simulator()``.
         seed: Seed of the episodes.
         kind: Actions are ``continuous``, in [-1, 1], or ``discrete``, indices of ``BINS``.
         workers: Number of processes of PyBullet, or of threads of MuJoCo.
@@ -169,6 +174,7 @@ def batch_from_specs(
         max_links: Number of links, L, that observations and actions are padded to; by default the
             paper's 23, or the links of the largest robot if it has more.
         first: Number of the first environment, where a batch is made in parts.
+        device: Device of all tensors, such as ``cuda``; ``pybullet`` and ``mujoco`` need ``cpu``.
         library: Folders of your own parts.
 
     Raises:
@@ -187,14 +193,17 @@ def batch_from_specs(
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
     simulator = SIMULATORS[sim or default_simulator()]
+    require_simulator_device(simulator.name, device)
+    _require_contacts(simulator, specs)
     robots = [spec.robot for spec in specs]
     if max_links is None:
         max_links = max(MAX_LINKS, *(len(robot.links) for robot in robots))
     tables = build_robot_tables(
-        robots, default_library(tuple(library)).folders, max_links=max_links
+        robots, default_library(tuple(library)).folders, max_links=max_links, device=device
     )
     env_robot_index = [(first + i) % len(specs) for i in range(num_envs)]
-    simulation = simulator.load([specs[i].scene for i in env_robot_index], contacts, workers)
+    scenes = [specs[i].scene for i in env_robot_index]
+    simulation = simulator.load(scenes, contacts, workers, torch.device(device))
     return TaskBatch(
         tables,
         specs,
@@ -205,6 +214,24 @@ def batch_from_specs(
         seed=seed,
         first=first,
     )
+
+
+def _require_contacts(simulator: Simulator, specs: Sequence[EnvSpec]) -> None:
+    """Require a simulator with contacts if a scene has something to touch.
+
+    Raises:
+        TaskError: If a scene has a block or obstacles that the simulator would ignore.
+    """
+    if simulator.simulates_contacts:
+        return
+    for spec in specs:
+        if spec.scene.block is not None or spec.scene.obstacles:
+            thing = "a block" if spec.scene.block is not None else "obstacles"
+            others = installed_simulators(lambda other: other.simulates_contacts)
+            raise TaskError(
+                f"simulator {simulator.name!r} has no contacts, and {spec.task} of "
+                f"{spec.robot.name!r} has {thing}; expected simulator {' or '.join(others)}"
+            )
 
 
 def _require_env_for_each(num_envs: int, num_robots: int) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import MissingDependencyError, TaskError, nearest
 
 if TYPE_CHECKING:
     from morphgen.tasks.sim.base import Simulator
@@ -122,6 +123,7 @@ SIMULATORS: Registry[Simulator] = Registry(
     {
         "pybullet": "morphgen.tasks.sim.bullet:SIMULATOR",
         "mujoco": "morphgen.tasks.sim.mujoco_sim:SIMULATOR",
+        "kinematic": "morphgen.tasks.sim.kinematic:SIMULATOR",
     },
 )
 """Simulators; see ``morphgen.tasks.sim.base.Simulator``."""
@@ -137,6 +139,24 @@ def default_simulator() -> str:
         return "pybullet"
     logging.getLogger(__name__).warning("PyBullet is not installed; using simulator MuJoCo")
     return "mujoco"
+
+
+def installed_simulators(condition: Callable[[Simulator], bool] = lambda _: True) -> list[str]:
+    """Return the names of the simulators that are installed and meet a condition."""
+    names = []
+    for name in SIMULATORS:
+        with suppress(MissingDependencyError):
+            if condition(SIMULATORS[name]):
+                names.append(name)
+    return names
+
+
+def evaluation_simulator(name: str) -> str:
+    """Return the simulator that judges policies trained in a simulator.
+
+    It is the same one, or MuJoCo if that one simulates no contacts.
+    """
+    return name if SIMULATORS[name].simulates_contacts else "mujoco"
 
 
 def register_gym_envs() -> None:

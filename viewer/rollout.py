@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from morphgen.errors import MissingDependencyError, MorphgenError, TaskError, nearest
+from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
@@ -23,7 +23,7 @@ from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import Interface, read_checkpoint
 from morphgen.tasks.env_specs import load_robot
 from morphgen.tasks.gym_env import TaskEnv
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import TASKS, installed_simulators
 from morphgen.tasks.renderer import render_state
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.viewer.episode import Array, Episode, Track
@@ -160,11 +160,7 @@ class Rollout:
 
 def simulators() -> list[str]:
     """Return the names of the installed simulators, MuJoCo first."""
-    names = []
-    for name in SIMULATORS:
-        with contextlib.suppress(MissingDependencyError):
-            names.append(SIMULATORS[name].name)
-    return sorted(names, key=lambda name: name != "mujoco")
+    return sorted(installed_simulators(), key=lambda name: name != "mujoco")
 
 
 def resolve_policy(policy: str, task: str, files: FileAccess) -> str:

@@ -108,7 +108,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     from morphgen.rl.evaluation import eval_config_of, evaluate_checkpoints, evaluate_run
     from morphgen.rl.inference import MODES
     from morphgen.rl.runs import read_checkpoint
-    from morphgen.rl.training import checkpoint_files, require_device
+    from morphgen.rl.training import checkpoint_files
+    from morphgen.tasks.device import require_device
 
     require_split_for_options(args)
     require_device(args.device)

@@ -122,8 +122,8 @@ def play(args: argparse.Namespace) -> None:
     ),
     *opt.LIBRARY_JSON,
     details="Environments of one robot are stepped with random actions. Environment steps are at "
-    "50 Hz, physics steps at 200 Hz. The share of the simulator is its own step alone, if it runs "
-    "in one process or thread.",
+    "50 Hz, physics steps at 200 Hz. The share of the simulator is its library's step alone, if it "
+    "has one that runs in one process or thread.",
     examples=(
         "speed reach arm=ur5 ee=plane --envs 128 --sim mujoco",
         "speed push arm=panda ee=panda_hand --workers 2",
@@ -150,8 +150,8 @@ def speed(args: argparse.Namespace) -> None:
             library=args.library,
         )
     with closing(batch), status(args, "measuring"):
-        module, step = SIMULATORS[sim].native_step
-        native_steps = [(import_module(module), step)] if args.workers == 1 else []
+        step = SIMULATORS[sim].native_step
+        native_steps = [(import_module(step[0]), step[1])] if step and args.workers == 1 else []
         result = measure_speed(batch, args.seconds, own=native_steps)
 
     def text() -> str:

@@ -15,7 +15,7 @@ from morphgen.cli.train import TRAINING_OPTIONS, execution_config, run_config
 from morphgen.cli.training_robots import robots_to_train
 from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
-from morphgen.tasks.registry import default_simulator
+from morphgen.tasks.registry import default_simulator, evaluation_simulator
 
 if TYPE_CHECKING:
     from morphgen.rl.study import Cell
@@ -80,7 +80,8 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     from morphgen.rl.evaluation import EvalConfig, episodes_for
     from morphgen.rl.robot_source import other_side
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
-    from morphgen.rl.training import require_device, require_runnable, subruns_of
+    from morphgen.rl.training import require_runnable, subruns_of
+    from morphgen.tasks.device import require_device
     from morphgen.tasks.env_specs import default_configs
 
     if args.gpus is not None and args.ray is None:
@@ -89,7 +90,8 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
         require_device(args.device)
     episode_steps = max(config.max_episode_steps for config in default_configs())
     eval_config = EvalConfig(
-        episodes_for(args.eval_steps, episode_steps), args.sim or default_simulator()
+        episodes_for(args.eval_steps, episode_steps),
+        evaluation_simulator(args.sim or default_simulator()),
     )
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)

@@ -121,11 +121,16 @@ class Simulator:
 
     name: str
     """Name in the registry and on the command line."""
-    load: Callable[[Sequence[Scene], Contacts | None, int], Simulation]
-    """Function that loads a scene for each environment, with contacts and a number of workers.
+    load: Callable[[Sequence[Scene], Contacts | None, int, torch.device], Simulation]
+    """Function that loads a scene for each environment.
 
+    Its arguments are the scenes, the contacts, the number of workers and the device of the tensors.
     It raises a SimulationError if the simulator cannot hold a scene."""
-    native_step: tuple[str, str]
-    """Module and function of the library's own step, which ``speed`` measures."""
+    native_step: tuple[str, str] | None
+    """Module and function of the library's own step, which ``speed`` measures; None without one."""
     max_envs: int
     """Largest number of environments to hold at once, where work can be divided."""
+    devices: tuple[str, ...] = ("cpu",)
+    """Types of the devices that its tensors can be on, as of ``torch.device.type``."""
+    simulates_contacts: bool = True
+    """Whether it simulates contacts; otherwise it takes no scenes with a block or obstacles."""

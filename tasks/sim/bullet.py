@@ -252,7 +252,7 @@ def _free(
 
 SIMULATOR = Simulator(
     "pybullet",
-    lambda scenes, contacts, workers: BulletSimulation(scenes, contacts, processes=workers),
+    lambda scenes, contacts, workers, _: BulletSimulation(scenes, contacts, processes=workers),
     native_step=("pybullet", "stepSimulation"),
     max_envs=128,  # an environment takes 36 MB
 )

@@ -27,6 +27,23 @@ other simulators.
 """
 
 
+def _control_step_matrix() -> Array:
+    """Return ``CONTROL_STEP``: the matrix of a physics step to the power of ``SUBSTEPS``."""
+    keep, pull = 1 - 2 * BANDWIDTH * TIMESTEP, BANDWIDTH**2 * TIMESTEP
+    step = np.array([[1 - TIMESTEP * pull, -TIMESTEP * keep], [pull, keep]])
+    return np.linalg.matrix_power(step, SUBSTEPS)
+
+
+CONTROL_STEP = _control_step_matrix()
+"""Matrix A of a control step with a constant target: (error, velocity) at the end are A times those
+at the beginning, shape (2, 2).
+
+A physics step is v' = v + dt (omega^2 e - 2 omega v), q' = q + dt v', as in MuJoCo. Tools that
+follow the exact solution of the differential equation are several times as far from MuJoCo's, which
+``tests/tasks/test_kinematic_sim.py`` checks.
+"""
+
+
 def speed_limit(joint: Joint) -> float:
     """Return the largest speed of a joint [rad/s or m/s]."""
     return joint.velocity or (FASTEST_SLIDE if joint.kind == "prismatic" else FASTEST_TURN)

@@ -8,23 +8,15 @@ import mujoco
 import numpy as np
 
 from morphgen.model.dynamics import BANDWIDTH
-from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
-from morphgen.tasks.sim.motor_law import GAIN, LAG, clamp, speed_limit
+from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.sim.motor_law import CONTROL_STEP, GAIN, LAG, clamp, speed_limit
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World
 from morphgen.tasks.sim.mujoco_state import GatheredArrays
 from morphgen.typing import Array
 
-
-def _mean_acceleration() -> tuple[float, float]:
-    """Return the mean acceleration over a control step per unit of initial error and velocity."""
-    keep, pull = 1 - 2 * BANDWIDTH * TIMESTEP, BANDWIDTH**2 * TIMESTEP
-    step = np.array([[1 - TIMESTEP * pull, -TIMESTEP * keep], [pull, keep]])
-    _, (by_error, by_velocity) = np.linalg.matrix_power(step, SUBSTEPS).tolist()
-    period = TIMESTEP * SUBSTEPS
-    return by_error / period, (by_velocity - 1) / period
-
-
-BY_ERROR, BY_VELOCITY = _mean_acceleration()
+BY_ERROR = CONTROL_STEP[1, 0] / CONTROL_PERIOD
+BY_VELOCITY = (CONTROL_STEP[1, 1] - 1) / CONTROL_PERIOD
+"""Mean acceleration in a control step per unit of initial error and initial velocity."""
 
 
 class PositionControl:

@@ -12,7 +12,7 @@ def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
-@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco", "kinematic"])
 def test_speed_prints_rates_and_shares(sim, capsys):
     words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]
     assert main([*words, "--json"]) == 0
@@ -45,6 +45,10 @@ def test_robots_above_the_default_max_links_can_be_measured(capsys):
             "argument --workers: 0: expected a whole number, 1 or more",
         ),
         (["reach", "ur55-plane"], "'ur55' is not a part"),
+        (
+            ["push", "prims", "--sim", "kinematic"],
+            "has no contacts, and push of 'prims' has a block",
+        ),
     ],
 )
 def test_invalid_arguments_are_rejected(words, named, capsys):

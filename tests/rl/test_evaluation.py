@@ -248,6 +248,7 @@ def test_one_robot_has_no_other_side(tmp_path):
 def test_eval_config_has_the_simulator_and_tasks_of_the_run(run):
     config, _ = read_checkpoint(run)
     assert eval_config_of(config, 3) == EvalConfig(3, "mujoco")
+    assert eval_config_of(replace(config, sim="kinematic"), 3).sim == "mujoco"
     with pytest.raises(TaskError, match="0 episodes"):
         EvalConfig(episodes=0)
     with pytest.raises(TaskError, match="a seed from 0 to"):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.joint_targets import SECOND, smooth_walk
 from helpers.scenes import push_scene, robot
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, joint_limits
-from morphgen.tasks.robot_tables import STEP_SLIDE, STEP_TURN
+from morphgen.model.kinematics import frame_pose
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
@@ -18,7 +18,6 @@ from morphgen.tasks.sim.bullet import BulletSimulation
 
 SIMULATIONS = (MujocoSimulation, BulletSimulation)
 IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
-SECOND = round(1 / CONTROL_PERIOD)
 
 SOME = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm3", "prims", "chain beads=2")
 OF_THE_PAPER = (
@@ -41,26 +40,6 @@ OF_THE_PAPER = (
 )
 FAST = [pytest.param(words, id=words) for words in SOME]
 SLOW = [pytest.param(words, id=words, marks=pytest.mark.slow) for words in OF_THE_PAPER]
-
-
-def largest_steps(body):
-    """Return the largest target change per step in the benchmark, shape (dof,)."""
-    joints = [body.joints[k] for k in body.independent_joints]
-    most = [STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN for joint in joints]
-    fast = [(joint.velocity or np.inf) * CONTROL_PERIOD for joint in joints]
-    return np.minimum(most, fast)
-
-
-def smooth_walk(body, seed, steps=SECOND):
-    """Targets that start at home and drift, slowly turning, as fast as the benchmark lets them."""
-    rng = np.random.default_rng(seed)
-    target, action, path = np.array(body.home), np.zeros(body.dof), []
-    for _ in range(steps):
-        action = 0.9 * action + 0.3 * rng.normal(size=body.dof)
-        moved = target + largest_steps(body) * np.clip(action, -1, 1)
-        target = np.clip(moved, *joint_limits(body).T)
-        path.append(target)
-    return np.array(path)
 
 
 def begun(simulation, scene, q, contacts=None):

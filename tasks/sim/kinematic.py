@@ -1,0 +1,195 @@
+"""Joint motion without contacts: the law of position control for all environments at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from morphgen.errors import SimulationError
+from morphgen.model.robot import Robot
+from morphgen.tasks.sim.base import Contacts, Scene, Simulator
+from morphgen.tasks.sim.motor_law import CONTROL_STEP, LAG, speed_limit
+from morphgen.typing import Array
+
+UNLIMITED = (-np.inf, np.inf)
+"""Position limits of joints without any [rad or m]."""
+NO_CONTACTS = Contacts(scene=False, self_collision=False)
+"""The only contacts that this simulator can be asked for."""
+
+
+class KinematicSimulation:
+    """Environments whose joints follow the control law exactly; a ``Simulation``.
+
+    Joints move as those of ``MujocoSimulation`` do in free space: critically damped, with the same
+    physics steps, and with the error limited to ``LAG`` times the joint's speed limit. A control
+    step is one linear map of error and velocity, ``CONTROL_STEP``. It costs a few tensor operations
+    for all environments, on the CPU or a GPU. All are elementwise, so that each environment gives
+    the same bits whatever else is in the batch. Tools stay within 1 cm of MuJoCo's for 1 s in free
+    space, as long as no motor would be at its effort limit.
+
+    Nothing collides: links pass through each other and through the ground. So there are no blocks
+    and no obstacles. Motors have no effort limits, and links no inertia: where a real motor would
+    be too weak, as when fast joints turn back at once, MuJoCo's joints lag behind these.
+
+    Joints stay within their limits. Targets are clamped to them, and the response of the law to an
+    impulse is never negative: a joint that starts at rest never passes the farthest target.
+
+    Attributes:
+        scenes: Scene of each environment.
+        device: Device of all tensors.
+        q: Positions of the independent joints, shape (n, J) [rad or m].
+        qd: Velocities of the independent joints, shape (n, J) [rad/s or m/s].
+        block_pose: Zeros, shape (n, 7): there are no blocks.
+        block_velocity: Zeros, shape (n, 6).
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        contacts: Contacts | None = None,
+        *,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Put every robot at home.
+
+        Args:
+            scenes: Scene of each environment.
+            contacts: ``NO_CONTACTS``, which is also the default.
+            device: Device of all tensors.
+
+        Raises:
+            SimulationError: If a scene has a block or obstacles, or contacts are requested.
+            ValueError: If there are no scenes.
+        """
+        if not scenes:
+            raise ValueError("there are no scenes; expected one or more")
+        if contacts not in (None, NO_CONTACTS):
+            raise SimulationError(
+                f"simulator 'kinematic' has no contacts: {contacts}; expected {NO_CONTACTS}"
+            )
+        for env, scene in enumerate(scenes):
+            if scene.block is not None or scene.obstacles:
+                thing = "a block" if scene.block is not None else "obstacles"
+                raise SimulationError(
+                    f"environment {env} (robot {scene.robot.name!r}): the scene has {thing}, and "
+                    "simulator 'kinematic' has no contacts; expected another simulator"
+                )
+        self.scenes = tuple(scenes)
+        self.device = torch.device(device)
+        robots = {id(scene.robot): scene.robot for scene in scenes}
+        row_of_robot = {key: row for row, key in enumerate(robots)}
+        rows = np.array([row_of_robot[id(scene.robot)] for scene in scenes])
+        table = torch.from_numpy(_joint_table(list(robots.values()))[:, rows]).to(self.device)
+        self.q, self._lower, self._upper, self._farthest = table.float().contiguous()
+        self._is_joint = self._farthest > 0
+        n = len(scenes)
+        self.qd = torch.zeros_like(self.q)
+        self.block_pose = torch.zeros(n, 7, device=self.device)
+        self.block_velocity = torch.zeros(n, 6, device=self.device)
+        self._closed = False
+
+    def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
+        """Put some environments at rest; see ``Simulation.reset``.
+
+        Raises:
+            ValueError: If a shape is wrong, an environment does not exist, or a position is not
+                finite; then nothing has changed.
+            SimulationError: If the simulation is closed.
+        """
+        self._require_open()
+        k, (n, joints) = len(envs), self.q.shape
+        if q.shape != (k, joints) or block_pose.shape != (k, 7):
+            raise ValueError(
+                f"reset of {k} environments to q of shape {tuple(q.shape)} and blocks of shape "
+                f"{tuple(block_pose.shape)}; expected ({k}, {joints}) and ({k}, 7)"
+            )
+        if k and not (0 <= int(envs.min()) <= int(envs.max()) < n):
+            raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
+        positions = torch.where(self._is_joint[envs], q, 0.0)
+        if (row := _first_not_finite(positions)) is not None:
+            env = int(envs[row])
+            raise ValueError(f"{self._label(env)}: reset to q {q[row].tolist()}")
+        self.q[envs], self.qd[envs] = positions, 0.0
+
+    def step(self, targets: torch.Tensor) -> None:
+        """Advance all environments by one control step; see ``Simulation.step``.
+
+        Raises:
+            ValueError: If the shape is wrong or a target is not finite; then nothing has moved.
+            SimulationError: If the simulation is closed.
+        """
+        self._require_open()
+        if targets.shape != self.q.shape:
+            raise ValueError(
+                f"targets have shape {tuple(targets.shape)}; expected {tuple(self.q.shape)}"
+            )
+        targets = torch.where(self._is_joint, targets, 0.0)
+        if (env := _first_not_finite(targets)) is not None:
+            raise ValueError(f"{self._label(env)}: targets {targets[env].tolist()} are not finite")
+        error = torch.clamp(targets, self._lower, self._upper) - self.q
+        error = torch.clamp(error, -self._farthest, self._farthest)
+        (error_to_error, velocity_to_error), (by_error, by_velocity) = CONTROL_STEP.tolist()
+        # The error that remains is that of a target which may be nearer than the real one.
+        self.q += (1 - error_to_error) * error - velocity_to_error * self.qd
+        self.qd = by_error * error + by_velocity * self.qd
+
+    def close(self) -> None:
+        """End the simulation; a second call does nothing."""
+        self._closed = True
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise SimulationError("the simulation is closed")
+
+    def _label(self, env: int) -> str:
+        return f"environment {env} (robot {self.scenes[env].robot.name!r})"
+
+
+def _joint_table(robots: Sequence[Robot]) -> Array:
+    """Return constants of the independent joints of R robots, padded with zeros, shape (4, R, J).
+
+    They are home position, lower and upper limit, and the largest error [rad or m].
+    """
+    table = np.zeros((4, len(robots), max(robot.dof for robot in robots)))
+    for row, robot in enumerate(robots):
+        joints = [robot.joints[k] for k in robot.independent_joints]
+        table[0, row, : robot.dof] = robot.home
+        limits = [
+            UNLIMITED if joint.is_continuous else joint.limits or UNLIMITED for joint in joints
+        ]
+        table[1:3, row, : robot.dof] = np.array(limits).reshape(-1, 2).T
+        table[3, row, : robot.dof] = [LAG * speed_limit(joint) for joint in joints]
+    return table
+
+
+def _first_not_finite(rows: torch.Tensor) -> int | None:
+    """Return the first row of a matrix that has a number which is not finite, or None."""
+    finite = torch.isfinite(rows)
+    return None if bool(finite.all()) else int((~finite).any(dim=1).int().argmax())
+
+
+def _load(
+    scenes: Sequence[Scene], contacts: Contacts | None, workers: int, device: torch.device
+) -> KinematicSimulation:
+    """Load scenes; see ``Simulator.load``.
+
+    Raises:
+        SimulationError: If a scene has contacts, or there are several workers.
+    """
+    if workers != 1:
+        raise SimulationError(
+            f"simulator 'kinematic' steps all environments at once: {workers} workers; expected 1"
+        )
+    return KinematicSimulation(scenes, contacts, device=device)
+
+
+SIMULATOR = Simulator(
+    "kinematic",
+    _load,
+    native_step=None,
+    max_envs=65_536,
+    devices=("cpu", "cuda"),
+    simulates_contacts=False,
+)

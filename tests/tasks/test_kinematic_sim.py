@@ -1,0 +1,412 @@
+"""Kinematic simulation: agreement with MuJoCo, limits, resets and reproducibility."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from helpers.goal_sets import draw_spec
+from helpers.joint_targets import SECOND, full_speed, smooth_walk
+from helpers.robots import arm, finger
+from helpers.scenes import push_scene, reach_scene, real_arm_scene, robot
+from morphgen.errors import SimulationError, TaskError
+from morphgen.model.dynamics import BANDWIDTH
+from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
+from morphgen.rl.baselines import BASELINES
+from morphgen.rl.rollouts import run_episodes
+from morphgen.tasks.device import batch_device
+from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.make import batch_from_specs, make_batch
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import SIMULATORS, evaluation_simulator, installed_simulators
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts, Scene
+from morphgen.tasks.sim.kinematic import NO_CONTACTS, KinematicSimulation
+from morphgen.tasks.sim.motor_law import LAG, speed_limit
+from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
+
+REVOLUTE, FINGERS = "arm=ur5 ee=plane", "arm=panda ee=panda_hand"
+MIMIC, PRISMATIC, MIXED = "arm=arm3 ee=claw", "prims", "chain beads=2"
+ROBOTS = (REVOLUTE, FINGERS, MIMIC, PRISMATIC, MIXED)
+NEAR = 0.01
+"""Largest distance of tools from MuJoCo's [m]."""
+CONFIG = replace(ReachConfig(), num_goals=20)
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+def reset(sim, q, envs=None):
+    """Put environments at rest, by default all of them."""
+    envs = torch.arange(len(sim.scenes)) if envs is None else torch.tensor(envs)
+    q = torch.as_tensor(q, dtype=torch.float32)
+    sim.reset(envs.to(sim.device), q.to(sim.device), torch.zeros(len(envs), 7, device=sim.device))
+
+
+def follow(sim, targets):
+    """Return the positions after every step from home in simulations of one robot, (T, dof)."""
+    home = sim.scenes[0].robot.home
+    reset(sim, [list(home)])
+    path = []
+    for target in torch.from_numpy(targets).float():
+        sim.step(target[None])
+        path.append(sim.q[0].double().numpy().copy())
+    sim.close()
+    return np.array(path)
+
+
+def in_free_space(simulation, body, targets):
+    return follow(simulation([Scene(body, ground=None)], NO_CONTACTS), targets)
+
+
+def exact_law(body, targets):
+    """Return positions by the exact solution of the critically damped differential equation."""
+    q, qd, path = np.array(body.home), np.zeros(body.dof), []
+    decay, lag = np.exp(-BANDWIDTH * CONTROL_PERIOD), BANDWIDTH * CONTROL_PERIOD
+    for target in targets:
+        error = target - q
+        q = target - decay * ((1 + lag) * error - CONTROL_PERIOD * qd)
+        qd = decay * (BANDWIDTH * lag * error + (1 - lag) * qd)
+        path.append(q)
+    return np.array(path)
+
+
+def largest_tool_distance(body, a, b):
+    tools = [frame_pose(body, path)[:, :3, 3] for path in (a, b)]
+    return np.linalg.norm(tools[0] - tools[1], axis=1).max()
+
+
+@pytest.mark.parametrize("words", ROBOTS)
+@pytest.mark.parametrize("path", [smooth_walk, full_speed])
+def test_all_links_stay_within_a_centimetre_of_mujoco(words, path):
+    body = robot(words)
+    for seed in range(3):
+        targets = path(body, seed)
+        ours, mujoco = (
+            forward_kinematics(body, in_free_space(simulation, body, targets))[..., :3, 3]
+            for simulation in (KinematicSimulation, MujocoSimulation)
+        )
+        assert np.linalg.norm(ours - mujoco, axis=-1).max() < NEAR
+        assert np.linalg.norm(mujoco - mujoco[0], axis=-1).max() > 0.05
+
+
+@pytest.mark.parametrize("words", ["cubes", MIXED])
+def test_distant_targets_are_approached_as_fast_as_in_mujoco(words):
+    body = robot(words)
+    lower, upper = joint_limits(body).T
+    targets = np.tile(lower + 0.9 * (upper - lower), (SECOND, 1))
+    ours, mujoco = (
+        in_free_space(simulation, body, targets)
+        for simulation in (KinematicSimulation, MujocoSimulation)
+    )
+    assert largest_tool_distance(body, ours, mujoco) < NEAR
+    limits = np.array([speed_limit(body.joints[k]) for k in body.independent_joints])
+    speeds = np.abs(np.diff(ours, axis=0)).max(axis=0) / CONTROL_PERIOD
+    assert (speeds < 4 / 3 * limits).all()
+    assert (speeds > limits).any()
+
+
+def test_substeps_of_the_law_match_mujoco_better_than_its_exact_solution():
+    for words in (REVOLUTE, PRISMATIC, MIXED):
+        body = robot(words)
+        targets = smooth_walk(body, seed=0)
+        mujoco = in_free_space(MujocoSimulation, body, targets)
+        ours = in_free_space(KinematicSimulation, body, targets)
+        exact = exact_law(body, targets)
+        distance = largest_tool_distance(body, ours, mujoco)
+        assert distance < largest_tool_distance(body, exact, mujoco) / 2
+
+
+def test_steady_motion_lags_by_the_law():
+    body = finger(2.0)
+    speed = 0.5 * np.array([speed_limit(body.joints[k]) for k in body.independent_joints])
+    targets = np.array(body.home) + np.outer(np.arange(1, 41), speed * CONTROL_PERIOD)
+    sim = KinematicSimulation([Scene(body)])
+    path = follow(sim, targets)
+    lag = (targets[-1] - path[-1]) / speed
+    assert (lag > 0).all()
+    assert (lag + CONTROL_PERIOD < LAG * 1.01).all()
+    np.testing.assert_allclose((path[-1] - path[-2]) / CONTROL_PERIOD, speed, rtol=1e-4)
+
+
+@pytest.mark.parametrize("words", ROBOTS)
+def test_joints_stay_within_their_limits(words):
+    body = robot(words)
+    lower, upper = joint_limits(body).T
+    sim = KinematicSimulation([Scene(body)] * 8)
+    rng = np.random.default_rng(0)
+    reset(sim, rng.uniform(lower, upper, (8, body.dof)))
+    lowest, highest = sim.q.clone(), sim.q.clone()
+    for step in range(300):
+        if step % 15 == 0:  # far beyond the limits
+            targets = torch.from_numpy(rng.choice([-10.0, 10.0], (8, body.dof))).float()
+        sim.step(targets)
+        lowest, highest = torch.minimum(lowest, sim.q), torch.maximum(highest, sim.q)
+    bounded = [not body.joints[k].is_continuous for k in body.independent_joints]
+    assert (lowest.numpy() >= lower - 1e-6)[:, bounded].all()
+    assert (highest.numpy() <= upper + 1e-6)[:, bounded].all()
+    assert (highest - lowest > 0.01).all()
+
+
+def test_joints_without_limits_turn_on():
+    joints = {joint.name: joint for joint in arm().joints}
+    body = replace(
+        arm(),
+        joints=tuple(
+            replace(joint, kind="continuous", limits=None) if name == "elbow" else joint
+            for name, joint in joints.items()
+        ),
+    )
+    elbow = [body.joints[k].name for k in body.independent_joints].index("elbow")
+    sim = KinematicSimulation([Scene(body)])
+    targets = torch.tensor([body.home]).float()
+    for _ in range(300):
+        targets[0, elbow] += 0.03
+        sim.step(targets)
+    assert sim.q[0, elbow] > 2 * np.pi
+
+
+def scenes_without_things():
+    return [reach_scene(), replace(push_scene(), block=None, obstacles=()), real_arm_scene()]
+
+
+def test_environments_give_the_same_bits_alone_and_in_any_batch():
+    scenes = scenes_without_things()
+    joints = max(scene.robot.dof for scene in scenes)
+    starts = [(*scene.robot.home, *[0.0] * (joints - scene.robot.dof)) for scene in scenes]
+    changes = np.random.default_rng(0).uniform(-0.3, 0.3, (SECOND, joints))
+
+    def paths(order):
+        sim = KinematicSimulation([scenes[i] for i in order])
+        width = sim.q.shape[1]
+        start = np.array([starts[i][:width] for i in order])
+        reset(sim, start)
+        states = []
+        for change in changes[:, :width]:
+            sim.step(torch.from_numpy(start + change).float())
+            states.append(torch.stack([sim.q, sim.qd], dim=1).clone())
+        return {i: torch.stack(states)[:, row] for row, i in enumerate(order)}
+
+    together = paths([2, 0, 1] * 11)
+    for i, scene in enumerate(scenes):
+        alone, dof = paths([i])[i], scene.robot.dof
+        assert torch.equal(alone[..., :dof], together[i][..., :dof])
+        assert not together[i][..., dof:].any()
+
+
+def test_padding_of_targets_and_starts_is_ignored():
+    sim = KinematicSimulation(scenes_without_things())
+    targets = sim.q + 0.1
+    targets[~sim._is_joint] = torch.nan
+    sim.step(targets)
+    assert sim.q.isfinite().all()
+    reset(sim, targets[:1], [0])
+    assert sim.q.isfinite().all()
+
+
+def test_reset_puts_only_the_named_environments_at_rest():
+    sim = KinematicSimulation([reach_scene()] * 4)
+    home = sim.q.clone()
+    for _ in range(5):
+        sim.step(home + 0.2)
+    moved, speed = sim.q.clone(), sim.qd.clone()
+    assert (speed.abs().sum(dim=1) > 0).all()
+    reset(sim, home[:2] + 0.05, [2, 0])
+    assert torch.equal(sim.q[[0, 2]], home[:2] + 0.05)
+    assert not sim.qd[[0, 2]].any()
+    assert torch.equal(sim.q[[1, 3]], moved[[1, 3]])
+    assert torch.equal(sim.qd[[1, 3]], speed[[1, 3]])
+    sim.step(sim.q.clone())
+    assert torch.equal(sim.q[[0, 2]], home[:2] + 0.05)
+
+
+def test_robots_are_at_home_before_the_first_reset():
+    sim = KinematicSimulation(scenes_without_things())
+    for env, scene in enumerate(sim.scenes):
+        dof = scene.robot.dof
+        assert sim.q[env, :dof].tolist() == pytest.approx(scene.robot.home)
+        assert not sim.q[env, dof:].any()
+    assert sim.q.dtype == sim.qd.dtype == sim.block_pose.dtype == torch.float32
+    assert sim.block_pose.shape == (3, 7)
+    assert sim.block_velocity.shape == (3, 6)
+
+
+class CountOperations(TorchDispatchMode):
+    """Counts the tensor operations within a ``with`` block."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_number_of_operations_is_independent_of_the_number_of_environments():
+    counts = []
+    for n in (2, 200):
+        sim = KinematicSimulation([reach_scene()] * n)
+        envs, q, block = torch.arange(n), sim.q.clone(), sim.block_pose.clone()
+        with CountOperations() as counter:
+            sim.step(q)
+            sim.reset(envs, q, block)
+        counts.append(counter.count)
+    assert counts[0] == counts[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("scene", "thing"),
+    [
+        (push_scene(), "a block"),
+        (replace(push_scene(), block=None), "obstacles"),
+    ],
+)
+def test_scenes_with_something_to_touch_are_refused(scene, thing):
+    with pytest.raises(SimulationError, match=f"environment 1 .*has {thing}"):
+        KinematicSimulation([reach_scene(), scene])
+
+
+def test_requested_contacts_are_refused():
+    for contacts in (Contacts(), Contacts(scene=False), Contacts(self_collision=False)):
+        with pytest.raises(SimulationError, match="has no contacts"):
+            KinematicSimulation([reach_scene()], contacts)
+    KinematicSimulation([reach_scene()], NO_CONTACTS)
+
+
+def test_invalid_arguments_are_rejected_and_change_nothing():
+    sim = KinematicSimulation([reach_scene()] * 2)
+    q, block = sim.q.clone(), sim.block_pose
+    with pytest.raises(ValueError, match="there are no scenes"):
+        KinematicSimulation([])
+    with pytest.raises(ValueError, match=r"targets have shape \(1, "):
+        sim.step(q[:1])
+    with pytest.raises(ValueError, match=r"environment 1 .*not finite"):
+        sim.step(torch.stack([q[0] + 1, q[1] * torch.nan]))
+    with pytest.raises(ValueError, match=r"expected \(1, "):
+        sim.reset(torch.tensor([0]), q, block)
+    with pytest.raises(ValueError, match="there are 2"):
+        sim.reset(torch.tensor([0, 2]), q, block)
+    with pytest.raises(ValueError, match=r"environment 0 .*reset to q"):
+        sim.reset(torch.tensor([1, 0]), torch.stack([q[0] + 1, q[1] * torch.inf]), block)
+    assert torch.equal(sim.q, q)
+    sim.close()
+    sim.close()
+    with pytest.raises(SimulationError, match="closed"):
+        sim.step(q)
+    with pytest.raises(SimulationError, match="closed"):
+        sim.reset(torch.arange(2), q, block)
+
+
+@pytest.fixture(scope="module")
+def specs(tmp_path_factory):
+    cache = tmp_path_factory.mktemp("goals")
+    return [draw_spec(robot(words), CONFIG, cache=cache) for words in ("arm3", REVOLUTE, PRISMATIC)]
+
+
+def make_kinematic(specs, num_envs, **options):
+    return batch_from_specs(specs, num_envs, sim="kinematic", **options)
+
+
+def rollout(batch, steps=40):
+    """Return all numbers of steps with random actions of each environment, as bytes."""
+    n, L = batch.action_mask.shape
+    with closing(batch):
+        batch.reset()
+        actions = 2 * torch.rand(steps, L, generator=torch.Generator().manual_seed(0)) - 1
+        results = [batch.step(action.expand(n, L).to(batch.device)) for action in actions]
+    keys = sorted(results[0].observation)
+    rows = [
+        torch.cat(
+            [step.reward[:, None], step.q, step.distance[:, None]]
+            + [step.observation[key].float().reshape(n, -1) for key in keys],
+            dim=1,
+        )
+        for step in results
+    ]
+    return torch.stack(rows).cpu().numpy()
+
+
+def test_batches_reproduce_to_the_byte(specs):
+    first = rollout(make_kinematic(specs, 12, seed=3))
+    assert first.tobytes() == rollout(make_kinematic(specs, 12, seed=3)).tobytes()
+    assert first.tobytes() != rollout(make_kinematic(specs, 12, seed=4)).tobytes()
+    part = rollout(make_kinematic(specs, 3, seed=3, first=6))
+    assert first[:, 6:9].tobytes() == part.tobytes()
+
+
+def test_inverse_kinematics_reaches_its_goals(specs):
+    with closing(make_kinematic(specs, 12)) as batch:
+        episodes = run_episodes(batch, BASELINES["ik"].make(0), 1)
+    assert len(episodes) == 12
+    assert all(episode.success for episode in episodes)
+    assert max(episode.distance for episode in episodes) < 0.01
+
+
+def test_single_environments_report_no_self_collision(tmp_path):
+    config = replace(ReachConfig(), num_goals=2)
+    with closing(
+        TaskEnv("reach", robot("cubes"), sim="kinematic", config=config, cache=tmp_path)
+    ) as env:
+        _, info = env.reset(seed=0)
+        observation, *_, step_info = env.step(env.action_space.sample())
+    assert not info["self_collision"]
+    assert not step_info["self_collision"]
+    assert observation in env.observation_space
+
+
+def test_kinematic_is_a_registered_simulator_that_mujoco_judges():
+    assert "kinematic" in SIMULATORS.builtin
+    assert {"mujoco", "kinematic"} <= set(installed_simulators())
+    assert evaluation_simulator("kinematic") == "mujoco"
+    for name in ("mujoco", "pybullet"):
+        assert evaluation_simulator(name) == name
+
+
+def test_batches_with_something_to_touch_are_refused(tmp_path):
+    body = robot("prims")
+    configs = (replace(PushConfig(), num_goals=2), replace(ReachConfig(), num_goals=2))
+    for task, obstacles, thing in (("push", False, "a block"), ("reach", True, "obstacles")):
+        with pytest.raises(TaskError, match=f"{task} of .* has {thing}; .*pybullet or mujoco"):
+            make_batch(
+                task,
+                [body],
+                1,
+                obstacles=obstacles,
+                sim="kinematic",
+                configs=configs,
+                cache=tmp_path,
+            )
+
+
+def test_invalid_batch_options_are_rejected(specs):
+    with pytest.raises(SimulationError, match="2 workers; expected 1"):
+        make_kinematic(specs, 3, workers=2)
+    with pytest.raises(TaskError, match="unknown device 'tpu'"):
+        make_kinematic(specs, 3, device="tpu")
+
+
+def test_devices_of_batches(specs, monkeypatch):
+    assert batch_device("kinematic", "cuda:1") == "cuda:1"
+    assert batch_device("mujoco", "cuda") == "cpu"
+    if not torch.cuda.is_available():
+        with pytest.raises(TaskError, match="this machine has no CUDA device"):
+            make_kinematic(specs, 3, device="cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(TaskError, match="device 'cuda'; expected device cpu, or simulator kinem"):
+        batch_from_specs(specs, 3, sim="mujoco", device="cuda")
+
+
+@needs_cuda
+def test_cuda_batches_follow_those_of_the_cpu(specs):
+    cpu, cuda = (rollout(make_kinematic(specs, 12, device=name)) for name in ("cpu", "cuda"))
+    np.testing.assert_allclose(cuda, cpu, atol=1e-3)
+    again = rollout(make_kinematic(specs, 12, device="cuda"))
+    assert again.tobytes() == cuda.tobytes()
+
+
+@needs_cuda
+def test_inverse_kinematics_reaches_its_goals_on_cuda(specs):
+    with closing(make_kinematic(specs, 12, device="cuda")) as batch:
+        episodes = run_episodes(batch, BASELINES["ik"].make(0), 1)
+    assert all(episode.success for episode in episodes)
