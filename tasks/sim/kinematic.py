@@ -36,6 +36,8 @@ class KinematicSimulation:
     Joints stay within their limits. Targets are clamped to them, and the response of the law to an
     impulse is never negative: a joint that starts at rest never passes the farthest target.
 
+    Tensors are updated in place.
+
     Attributes:
         scenes: Scene of each environment.
         device: Device of all tensors.
@@ -133,7 +135,7 @@ class KinematicSimulation:
         (error_to_error, velocity_to_error), (by_error, by_velocity) = CONTROL_STEP.tolist()
         # The error that remains is that of a target which may be nearer than the real one.
         self.q += (1 - error_to_error) * error - velocity_to_error * self.qd
-        self.qd = by_error * error + by_velocity * self.qd
+        self.qd.mul_(by_velocity).add_(by_error * error)
 
     def close(self) -> None:
         """End the simulation; a second call does nothing."""
