@@ -12,14 +12,18 @@ from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields
 from morphgen.rl.aliases import current_name
 from morphgen.rl.config import NUMBERS, PolicyConfig, PPOConfig
+from morphgen.tasks.observation import CHANNELS
 from morphgen.tasks.registry import TASKS
 
+OBSERVATION_SWITCHES = tuple(name.replace("_", "-") for name in CHANNELS)
+"""Names of observation channels on the command line."""
 SWITCHES = (
-    *("symlog", "slow-critic", "task-reweighting", "curriculum"),
-    *("discrete", "fixed-deviation", "mask-morphology", "tool-position"),
+    *("symlog", "slow-critic", "task-reweighting", "robot-advantages", "joint-entropy"),
+    *("curriculum", "discrete", "fixed-deviation", "mask-morphology", "tool-position"),
+    *("normalize", *OBSERVATION_SWITCHES),
 )
 """Names of switches on the command line, in the order in which a spec prints them: first those of
-``PPOConfig``, then those of ``PolicyConfig``."""
+``PPOConfig``, then those of ``PolicyConfig``, then observation channels."""
 ABLATION = (
     "se-symlog-slow-critic-discrete",
     "se-symlog-slow-critic-discrete@test",
@@ -116,7 +120,13 @@ def configs_of(
     network = AGENTS[spec.agent].config
     values = dict(changes)
     for name, on in spec.switches.items():
-        values[current_name(name.replace("-", "_"))] = on
+        if name not in OBSERVATION_SWITCHES:
+            values[current_name(name.replace("-", "_"))] = on
+    values["observe"] = tuple(
+        channel
+        for channel, name in zip(CHANNELS, OBSERVATION_SWITCHES, strict=True)
+        if spec.switches.get(name, False)
+    )
 
     def values_for(config: type[PolicyConfig | PPOConfig | NetworkConfig]) -> dict[str, Any]:
         names = {field.name for field in fields(config)}

@@ -63,7 +63,8 @@ def _layout(stored: Mapping[str, Any], where: str) -> Layout:
     """Return the stored layout, if it is valid."""
     layout = Layout(**read_fields(stored, Layout, where))
     sizes = {name: getattr(layout, name) for name in ("links", "token", "obstacles", "points")}
-    for name, size in [*sizes.items(), *(field[:2] for field in layout.fields)]:
+    named = [*sizes.items(), *(field[:2] for field in layout.fields), *layout.vectors]
+    for name, size in named:
         if not 0 <= size <= MAX_ROWS:
             raise TaskError(f"{where}: {name} {size}: expected 0 to {MAX_ROWS:,}")
     return layout

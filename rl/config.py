@@ -11,6 +11,7 @@ import msgspec
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS, NetworkConfig
 from morphgen.tasks.actions import ActionKind
+from morphgen.tasks.observation import CHANNELS, observation_config
 
 MAX_NUM_STEPS = 16_384
 """Largest rollout length per environment; a rollout is held in memory."""
@@ -31,6 +32,10 @@ class PolicyConfig:
     """Hide all of the link tokens except the codes of the joint positions; ``se`` always does."""
     tool_position: bool = False
     """Show the tool's position to the networks (ours; the paper's policies have to infer it)."""
+    observe: tuple[str, ...] = ()
+    """Further observation channels, of ``morphgen.tasks.observation.CHANNELS``, in that order."""
+    normalize: bool = False
+    """Normalize the kinematic channels by their running means and variances."""
     network: NetworkConfig | None = None
     """Sizes of the agent's networks; by default those of the agent's module."""
 
@@ -41,6 +46,7 @@ class PolicyConfig:
             TaskError: If the agent is unknown, or the sizes are those of another agent.
         """
         config = AGENTS[self.agent].config
+        observation_config(self.observe)  # raises if a channel is unknown
         if self.fixed_std and self.discrete:
             raise TaskError(
                 "fixed-deviation: discrete actions have no deviation; it goes with --no-discrete"
@@ -57,6 +63,12 @@ class PolicyConfig:
     def kind(self) -> ActionKind:
         """Kind of the actions."""
         return "discrete" if self.discrete else "continuous"
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Observation channels that the policy needs, those of its agent included."""
+        needed = {*self.observe, *AGENTS[self.agent].channels}
+        return tuple(name for name in CHANNELS if name in needed)
 
     @property
     def hides_morphology(self) -> bool:
@@ -169,6 +181,12 @@ class PPOConfig:
     lag of one update here: returns would be made of the values of the last update but one."""
     task_reweighting: bool = False
     """Weight the robots randomly, with new weights for every gradient step (paper: "random")."""
+    robot_advantages: bool = False
+    """Normalize advantages robot by robot instead of over all robots: robots with small rewards
+    learn as much as the others (ours)."""
+    joint_entropy: bool = False
+    """Let the entropy bonus be the mean over a robot's joints instead of their sum, so that it
+    weighs the same for robots of any size (ours)."""
     curriculum: bool = True
     """Move the line of the push task from near to far during training; reach has no curriculum
     (paper)."""

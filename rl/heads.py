@@ -101,5 +101,10 @@ class MaskedMultiDiscrete:
 Head = MaskedGaussian | MaskedMultiDiscrete
 
 
+def joint_entropy(head: Head) -> torch.Tensor:
+    """Return the mean entropy of a joint's action [nats], shape (n,)."""
+    return head.entropy() / head.mask.sum(dim=-1).clamp(min=1)
+
+
 def _sum(per_link: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     return torch.where(mask, per_link, 0.0).sum(dim=-1)

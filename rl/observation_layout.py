@@ -11,16 +11,19 @@ from torch.nn import functional
 
 from morphgen.errors import TaskError
 from morphgen.rl.heads import REST
+from morphgen.tasks.kinematic_channels import KINEMATIC_CHANNELS
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.task import STANDARD_FIELDS
 
 CHANNELS = ("velocity", "previous_action")
 """Optional channels with one number per link, in the order in which networks concatenate them."""
-LINK_ROWS = ("tokens", "links", "actions", *CHANNELS)
+LINK_ROWS = ("tokens", "links", "actions", *CHANNELS, *KINEMATIC_CHANNELS)
 """Channels that have a row for each link."""
+TREE = ("joints", "joint_parents", "joint_relations")
+"""Entries of ``morphgen.tasks.observation.tree_entries``."""
 KNOWN = {
-    *(*LINK_ROWS, "tool", "points", "point_mask", "obstacles", "obstacle_mask"),
+    *(*LINK_ROWS, *TREE, "tool", "points", "point_mask", "obstacles", "obstacle_mask"),
     *(name for field in STANDARD_FIELDS for name in (field.name, field.mask)),
 }
 """Entries of observations that networks encode in their own way."""
@@ -44,11 +47,15 @@ class Layout:
     """Whether the observations have the tool's position."""
     fields: tuple[tuple[str, int, str], ...] = ()
     """Name, size and mask of the fields that tasks of other packages declare, by name."""
+    vectors: tuple[tuple[str, int], ...] = ()
+    """Name and size of the kinematic channels, which have a vector per link."""
+    tree: bool = False
+    """Whether the observations have the entries of ``TREE``."""
 
     def as_data(self) -> dict[str, Any]:
-        """Return plain data for a checkpoint; without ``fields`` if there are none."""
-        data = asdict(self)
-        return data if self.fields else {k: v for k, v in data.items() if k != "fields"}
+        """Return plain data for a checkpoint; without the entries of newer versions if unused."""
+        unused = [name for name in ("fields", "vectors", "tree") if not getattr(self, name)]
+        return {name: value for name, value in asdict(self).items() if name not in unused}
 
 
 def layout_of(observation: Observation) -> Layout:
@@ -65,6 +72,10 @@ def layout_of(observation: Observation) -> Layout:
         channels=tuple(name for name in CHANNELS if name in observation),
         tool="tool" in observation,
         fields=_declared_fields(observation),
+        vectors=tuple(
+            (name, observation[name].shape[2]) for name in KINEMATIC_CHANNELS if name in observation
+        ),
+        tree=TREE[0] in observation,
     )
 
 
@@ -95,8 +106,11 @@ def _declared_fields(observation: Observation) -> tuple[tuple[str, int, str], ..
 
 def layout_from(stored: Mapping[str, Any]) -> Layout:
     """Return the layout that ``Layout.as_data`` made a dictionary of."""
-    fields = tuple(tuple(field) for field in stored.get("fields", ()))
-    return Layout(**{**stored, "channels": tuple(stored["channels"]), "fields": fields})
+    lists = {
+        name: tuple(tuple(entry) for entry in stored.get(name, ()))
+        for name in ("fields", "vectors")
+    }
+    return Layout(**{**stored, "channels": tuple(stored["channels"]), **lists})
 
 
 def require_layout(stored: Layout, observed: Layout, what: str) -> None:

@@ -11,6 +11,7 @@ from morphgen.rl.agents import AGENTS
 from morphgen.rl.agents.encoder import Network
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.heads import Head, MaskedGaussian, MaskedMultiDiscrete, bounded_log_std
+from morphgen.rl.normalizer import RunningNormalizer
 from morphgen.rl.observation_layout import Layout, last_link
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.observation import Observation
@@ -29,12 +30,14 @@ class Actor(nn.Module):
         with torch.no_grad():
             self.network.last.weight.div_(self.scale)
         if not config.discrete:
-            self.raw_log_std = nn.Parameter(
-                torch.zeros(layout.links), requires_grad=not config.fixed_std
-            )
+            rows = 1 if self.network.shares_joints else layout.links
+            self.raw_log_std = nn.Parameter(torch.zeros(rows), requires_grad=not config.fixed_std)
+        self.normalizer = RunningNormalizer(layout) if config.normalize else None
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return numbers for ``head``: (n, L, 11) for discrete actions, else (n, L, 1), float32."""
+        if self.normalizer is not None:
+            observation = self.normalizer(observation)
         numbers: torch.Tensor = self.scale * self.network(observation).float()
         return torch.where(observation["actions"][..., None], numbers, 0.0)
 
@@ -56,9 +59,12 @@ class Critic(nn.Module):
     def __init__(self, config: PolicyConfig, layout: Layout) -> None:
         super().__init__()
         self.network: Network = AGENTS[config.agent].network(config, layout, 1, per_link=False)
+        self.normalizer = RunningNormalizer(layout) if config.normalize else None
 
     def forward(self, observation: Observation) -> torch.Tensor:
         """Return values, shape (n,), float32."""
+        if self.normalizer is not None:
+            observation = self.normalizer(observation)
         values: torch.Tensor = self.network(observation).float()
         return values[:, 0]
 
@@ -67,12 +73,16 @@ def make_networks(config: PolicyConfig, layout: Layout, seed: int) -> tuple[Acto
     """Build an actor and a critic on the CPU; the same seed gives the same weights.
 
     Raises:
-        TaskError: If the config asks for the tool's position and the observations lack it, or the
-            other way round.
+        TaskError: If the config asks for other observation channels than the layout has.
     """
     if config.tool_position != layout.tool:
         shown = "show" if layout.tool else "do not show"
         raise TaskError(f"tool_position {config.tool_position}: the environments {shown} it")
+    observed = {*layout.channels, *(name for name, _ in layout.vectors)}
+    observed |= {"tree"} if layout.tree else set()
+    missing = sorted(set(config.channels) - {"points", "no_state"} - observed)
+    if missing:
+        raise TaskError(f"observation channels {', '.join(missing)}: the environments lack them")
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(
             int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> 1)

@@ -20,8 +20,10 @@ from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from morphgen.errors import TaskError
+from morphgen.rl.advantages import gae, normalized_advantages
 from morphgen.rl.compiled import prepared
 from morphgen.rl.config import PolicyConfig, PPOConfig
+from morphgen.rl.heads import joint_entropy
 from morphgen.rl.metrics import Metrics, UpdateMetrics, explained_variance
 from morphgen.rl.observation_layout import layout_of, pad_links, truncate_links
 from morphgen.rl.policies import make_networks, rows_needed
@@ -261,7 +263,8 @@ class Learner:
         actor_group["lr"], critic_group["lr"] = learning_rate * self.actor_lr_scale, learning_rate
 
         values, advantages, returns = self._compute_returns()
-        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        robots = self.env_robot_index.expand_as(advantages) if config.robot_advantages else None
+        advantages = normalized_advantages(advantages, robots)
         observations = {name: buffer.flatten(0, 1) for name, buffer in self.observations.items()}
         transitions = {
             "action": self.actions.flatten(0, 1),
@@ -290,6 +293,9 @@ class Learner:
                 ema_update(self.target_critic, self.critic, config.slow_decay)
                 metrics.append(torch.stack([*loss_metrics, *norms]))
 
+        for network in (self.actor, self.critic, self.target_critic):
+            if network.normalizer is not None:
+                network.normalizer.update(observations)
         means = dict(zip(LEARN_METRICS, torch.stack(metrics).mean(dim=0).tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         explained = float(explained_variance(values, returns))
@@ -311,7 +317,7 @@ class Learner:
         head = self.actor.distribution(observations)
         log_ratio = head.log_prob(minibatch["action"]) - minibatch["log_prob"]
         policy = policy_loss(log_ratio, minibatch["advantage"], self.config.clip_coef)
-        entropy = head.entropy()
+        entropy = joint_entropy(head) if self.config.joint_entropy else head.entropy()
         value_error = matching_loss if self.config.symlog else half_square
         value = value_error(self.critic(observations), minibatch["return"])
         weights = robot_weights[minibatch["robot"]]
@@ -333,41 +339,6 @@ class Learner:
         normal = torch.empty(self.num_robots, device=self.device)
         normal.normal_(generator=self.generators["weights"])
         return self.num_robots * torch.softmax(normal, dim=0)
-
-
-def gae(
-    rewards: torch.Tensor,
-    values: torch.Tensor,
-    next_values: torch.Tensor,
-    terminated: torch.Tensor,
-    truncated: torch.Tensor,
-    *,
-    gamma: float,
-    gae_lambda: float,
-) -> torch.Tensor:
-    """Return advantages by generalised estimation (Schulman et al. 2016, equation 16).
-
-    After a termination the return is zero. After a truncation it is the value of the episode's last
-    observation (Pardo et al. 2018), and the sum stops there. The critic learns advantages plus
-    values. All tensors have the shape (T, n).
-
-    Args:
-        rewards: Rewards of T control steps in n environments.
-        values: Values of the observations that were acted upon.
-        next_values: Values of the observations that the actions led to, before any new episode.
-        terminated: Where the task ended the episode, bool.
-        truncated: Where the time limit ended the episode, bool.
-        gamma: Discount factor.
-        gae_lambda: Weight of longer estimates.
-    """
-    delta = rewards + gamma * torch.where(terminated, 0.0, next_values) - values
-    carry = gamma * gae_lambda * (~(terminated | truncated)).to(delta.dtype)
-    advantages = torch.empty_like(delta)
-    advantage = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        advantage = delta[t] + carry[t] * advantage
-        advantages[t] = advantage
-    return advantages
 
 
 def policy_loss(log_ratio: torch.Tensor, advantage: torch.Tensor, clip_coef: float) -> torch.Tensor:

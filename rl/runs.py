@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from morphgen.rl.config import PolicyConfig, PPOConfig, policy_from, read_fields
 from morphgen.rl.robot_source import RobotSource, most_obstacles
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.env_specs import GoalConfig, config_fields, default_configs, task_configs
-from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 from morphgen.tasks.task import TaskConfig
 
@@ -95,7 +95,8 @@ class RunConfig:
     def interface(self) -> Interface:
         """Actions and observations of the policy."""
         obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
-        channels = ObservationConfig(tool=self.policy.tool_position, obstacles=obstacles)
+        channels = observation_config(self.policy.channels, obstacles=obstacles)
+        channels = replace(channels, tool=channels.tool or self.policy.tool_position)
         return Interface(self.policy.kind, self.max_links, channels)
 
     def as_data(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import torch
 from morphgen.errors import DivergedError, TaskError
 from morphgen.model.kinematics_torch import FramePositions
 from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
+from morphgen.tasks.kinematic_channels import KinematicChannels
 from morphgen.tasks.observation import (
     LinkTokens,
     Observation,
@@ -19,11 +20,12 @@ from morphgen.tasks.observation import (
     PointClouds,
     joint_to_link,
     obstacle_tokens,
+    tree_entries,
 )
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
-from morphgen.tasks.task import EnvSpec, TaskState
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Scene, Simulation
+from morphgen.tasks.task import OBJECT, EnvSpec, TaskState
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
 
@@ -141,8 +143,14 @@ class TaskBatch:
             "links": robot_tables.link_mask[index],
             "actions": self.action_mask,
             **self.groups.masks,
-            **obstacle_tokens(scenes, self.observation_config.obstacles, device),
+            **self._obstacle_entries(scenes),
         }
+        if self.observation_config.tree:
+            self._constant_entries |= tree_entries(robot_tables, index, self.action_mask)
+        self._kinematics: KinematicChannels | None = None
+        if names := self.observation_config.kinematic_channels:
+            has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
+            self._kinematics = KinematicChannels(robot_tables, index, names, has_block=has_block)
         self._points: PointClouds | None = None
         if self.observation_config.points:
             self._points = PointClouds(scenes, self.observation_config.points, device)
@@ -255,6 +263,8 @@ class TaskBatch:
     def requested_entries(self) -> Observation:
         """Return the entries of the current observation that the configuration asks for."""
         observation: Observation = {}
+        if not self.observation_config.state:
+            observation["object"] = torch.zeros(self.num_envs, OBJECT.size, device=self.device)
         if self.observation_config.velocity:
             qd = self._padded(self.simulation.qd)
             observation["velocity"] = joint_to_link(self.robot_tables, self.env_robot_index, qd)
@@ -262,6 +272,10 @@ class TaskBatch:
             observation["previous_action"] = self.previous_action.clone()
         if self.observation_config.tool:
             observation["tool"] = self._tool_positions(self._q)
+        if self._kinematics is not None:
+            block_pose = self.simulation.block_pose
+            goals = self.groups.tool_targets(block_pose)
+            observation |= self._kinematics(self._q, self.targets, goals, block_pose)
         if self._points is not None:
             observation["points"] = self._points(self.simulation.block_pose)
         return observation
@@ -303,6 +317,13 @@ class TaskBatch:
     def close(self) -> None:
         """Free the simulation."""
         self.simulation.close()
+
+    def _obstacle_entries(self, scenes: Sequence[Scene]) -> Observation:
+        """Return tokens and mask of the obstacles; without state they are all padding."""
+        entries = obstacle_tokens(scenes, self.observation_config.obstacles, self.device)
+        if self.observation_config.state:
+            return entries
+        return {name: torch.zeros_like(values) for name, values in entries.items()}
 
     def _act(self, actions: torch.Tensor) -> None:
         """Advance the joint targets by the decoded actions."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from morphgen.benchmark.token_layout import FREQUENCIES, POSITION
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, nearest
 from morphgen.model.rotation_torch import matrix_from_quaternion
+from morphgen.tasks.kinematic_channels import KINEMATIC_CHANNELS
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Block, Scene
 
@@ -20,15 +22,23 @@ Observation = dict[str, torch.Tensor]
 ``obstacle_mask`` (n, O) bool; the fields of tasks with their masks, of ``task.STANDARD_FIELDS``:
 ``goal`` (n, 7), ``object`` (n, 13) and ``line`` (n, 1), ``goal_mask`` and ``object_mask`` (n,)
 bool. On request: ``velocity`` (n, L), ``previous_action`` (n, L), ``tool`` (n, 3), ``points``
-(n, P, 3) and ``point_mask`` (n, P) bool."""
+(n, P, 3) and ``point_mask`` (n, P) bool, the channels of ``kinematic_channels``, (n, L, size), and
+the entries of ``tree_entries``."""
 
 NOISE = 0.005
 """Standard deviation of a point's position along each axis, as of a depth camera [m]."""
 
 
+NUM_POINTS = 128
+"""Number of points of a cloud that is asked for by name."""
+
+
 @dataclass(frozen=True)
 class ObservationConfig:
-    """Entries of an observation that are off by default; the paper uses only the points."""
+    """Entries of an observation; the paper uses none of those that are off by default but points.
+
+    ``observation_config`` makes one of names, such as those of ``morphgen train --observe``.
+    """
 
     velocity: bool = False
     """Whether to observe the velocities of the links' independent joints [rad/s or m/s]."""
@@ -38,6 +48,20 @@ class ObservationConfig:
     """Whether to observe the position of the tool in the world [m]."""
     points: int = 0
     """Number of points of a point cloud of block and obstacles."""
+    lag: bool = False
+    """Whether to observe how far joints are behind their targets; see ``kinematic_channels``."""
+    joint: bool = False
+    """Whether to observe position, limits and largest step of joints in physical units."""
+    poses: bool = False
+    """Whether to observe the poses of links, and tool and target points relative to them."""
+    jacobian: bool = False
+    """Whether to observe the tool's Jacobian and its products with the errors."""
+    dls: bool = False
+    """Whether to observe a damped least-squares step towards the targets."""
+    tree: bool = False
+    """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
+    state: bool = True
+    """Whether to observe block and obstacles as boxes; without it they need points."""
     obstacles: int = 0
     """Minimum number of obstacle rows, for policies that meet more obstacles elsewhere."""
 
@@ -48,6 +72,43 @@ class ObservationConfig:
                 f"observation of {self.points} points and {self.obstacles} obstacles; "
                 "expected 0 or more"
             )
+        if not self.state and not self.points:
+            raise TaskError("observation without state: expected points, which replace it")
+
+    @property
+    def kinematic_channels(self) -> tuple[str, ...]:
+        """Names of the channels that come from ``kinematic_channels``."""
+        return tuple(name for name in KINEMATIC_CHANNELS if getattr(self, name))
+
+
+CHANNELS = (
+    *KINEMATIC_CHANNELS,
+    *("velocity", "previous_action", "tree", "points", "no_state"),
+)
+"""Channels of observations that can be asked for by name; ``no_state`` hides what it names."""
+
+
+def observation_config(names: Collection[str], *, obstacles: int = 0) -> ObservationConfig:
+    """Return the config of observations with some entries of ``CHANNEL_NAMES``.
+
+    Args:
+        names: The entries; ``points`` are ``NUM_POINTS``, and ``no_state`` hides the state.
+        obstacles: Minimum number of obstacle rows.
+
+    Raises:
+        TaskError: If a name is unknown, or the state is hidden without points.
+    """
+    config = ObservationConfig(obstacles=obstacles)
+    for name in names:
+        if name not in CHANNELS:
+            raise TaskError(f"unknown observation channel {name!r}{nearest(name, CHANNELS)}")
+        change: dict[str, Any] = {name: True}
+        if name == "points":
+            change = {"points": NUM_POINTS}
+        elif name == "no_state":
+            continue  # below, once points are known
+        config = replace(config, **change)
+    return replace(config, state=False) if "no_state" in names else config
 
 
 class LinkTokens:
@@ -119,6 +180,52 @@ def obstacle_tokens(scenes: Sequence[Scene], min_rows: int, device: torch.device
             mask[i, k] = True
     tokens = box_tokens(pose, size) * mask[..., None]
     return {"obstacles": tokens.to(device), "obstacle_mask": mask.to(device)}
+
+
+MAX_TREE_DISTANCE = 8
+"""Largest number of joints between two joints that observations tell apart."""
+TREE_RELATIONS = 4 * (MAX_TREE_DISTANCE + 1)
+"""Number of relations between two joints; see ``tree_entries``."""
+
+
+def tree_entries(
+    tables: RobotTables, env_robot_index: torch.Tensor, action_mask: torch.Tensor
+) -> Observation:
+    """Return how the joints that actions move are connected, for K joints with padding.
+
+    Args:
+        tables: The robots.
+        env_robot_index: Robot of each environment, shape (n,), int64.
+        action_mask: Links whose joint obeys actions, shape (n, L), bool.
+
+    Returns:
+        ``joints`` (n, K): the link of each joint, root first, -1 for padding. ``joint_parents``
+        (n, K): the place in ``joints`` of the joint above, -1 without one. ``joint_relations``
+        (n, K, K): a number below ``TREE_RELATIONS`` for each pair, its distance in joints up to
+        ``MAX_TREE_DISTANCE``, plus a multiple of ``MAX_TREE_DISTANCE + 1`` that says whether the
+        second joint is the first one, above it, below it, or on another branch. All int64.
+    """
+    K = int(action_mask.sum(dim=1).max())
+    order = (~action_mask).int().argsort(dim=1, stable=True)[:, :K]
+    exists = torch.gather(action_mask, 1, order)
+    rows = torch.arange(len(order), device=order.device)[:, None]
+    # above[i, a]: joint a is joint i or above it; links come after their parents
+    ancestors = tables.ancestors[env_robot_index]
+    above = ancestors[rows[..., None], order[:, :, None], order[:, None, :]]
+    above &= exists[:, :, None] & exists[:, None, :]
+    depth = above.sum(dim=2)
+    common = (above.float() @ above.float().transpose(1, 2)).long()
+    distance = (depth[:, :, None] + depth[:, None, :] - 2 * common).clamp(max=MAX_TREE_DISTANCE)
+    same = torch.eye(K, dtype=torch.bool, device=order.device)
+    kind = torch.where(above, 1, torch.where(above.transpose(1, 2), 2, 3))
+    kind = torch.where(same, 0, kind)
+    is_parent = above & (depth[:, :, None] - depth[:, None, :] == 1)
+    parents = torch.where(is_parent.any(dim=2), is_parent.int().argmax(dim=2), -1)
+    return {
+        "joints": torch.where(exists, order, -1),
+        "joint_parents": parents,
+        "joint_relations": distance + (MAX_TREE_DISTANCE + 1) * kind,
+    }
 
 
 class PointClouds:

@@ -43,6 +43,10 @@ class RobotTables:
     """Upper limits of the independent joints, shape (R, J) [rad or m]; padding is 0."""
     max_step: torch.Tensor
     """Largest change of a target per control step, shape (R, J) [rad or m]; padding is 0."""
+    is_prismatic: torch.Tensor
+    """Independent joints that slide, shape (R, J), bool."""
+    effort: torch.Tensor
+    """Largest forces of the independent joints, shape (R, J) [N m or N]; 0 for none and padding."""
     home: torch.Tensor
     """Home configurations, shape (R, J) [rad or m]; padding is 0."""
     moves_tool: torch.Tensor
@@ -55,6 +59,8 @@ class RobotTables:
     """Links whose joint turns without limits, so that its position wraps, shape (R, L), bool."""
     movable_links: torch.Tensor
     """Links that a joint moves, mimic joints included, shape (R, L), bool."""
+    ancestors: torch.Tensor
+    """Whether link j is link i or a link between it and the root, shape (R, L, L), bool."""
     tool_chain: FrameChain
     """Joints between root and tool of each robot."""
 
@@ -123,14 +129,15 @@ def _table_rows(
 ) -> dict[str, NDArray[Any]]:
     """Return one robot's row of each table."""
     rows: dict[str, NDArray[Any]] = {
-        name: np.zeros(num_joints) for name in ("lower", "upper", "max_step", "home")
+        name: np.zeros(num_joints) for name in ("lower", "upper", "max_step", "effort", "home")
     }
     rows |= {name: np.zeros(max_links, dtype=bool) for name in ("wraps", "movable_links")}
     rows["joint_of_link"] = np.full(max_links, -1)
     rows["link_of_joint"] = np.zeros(num_joints, dtype=np.int64)
     rows["position_gain"] = np.zeros((max_links, num_joints))
     rows["position_offset"] = np.zeros(max_links)
-    rows["moves_tool"] = np.zeros(num_joints, dtype=bool)
+    rows |= {name: np.zeros(num_joints, dtype=bool) for name in ("moves_tool", "is_prismatic")}
+    rows["ancestors"] = np.eye(max_links, dtype=bool)
 
     link_tokens = tokens(robot, token_shapes(robot, folders), max_links=max_links)
     rows["tokens"], rows["link_mask"] = pad_tokens(link_tokens, max_links)
@@ -145,7 +152,10 @@ def _table_rows(
         max_step = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
         if joint.velocity:
             max_step = min(max_step, joint.velocity * CONTROL_PERIOD)
-        rows["max_step"][i] = max_step
+        rows["max_step"][i], rows["is_prismatic"][i] = max_step, joint.kind == "prismatic"
+        rows["effort"][i] = joint.effort or 0.0
+    for i, parent in enumerate(robot.parents[1:], start=1):  # parents come before their children
+        rows["ancestors"][i] |= rows["ancestors"][parent]
 
     # Tokens code a joint position p scaled to [-1, 1]; p = mimic_matrix q + mimic_offset.
     mimic_matrix, mimic_offset = robot.mimic_map

@@ -203,6 +203,23 @@ class StepResult:
     """Weighted reward terms by name, each of shape (k,); the reward is their sum."""
 
 
+@dataclass(frozen=True, eq=False)
+class ToolTargets:
+    """Points and orientations that tasks want the tool at, in the root frame: n environments.
+
+    They are for observation channels such as ``jacobian``; evaluation does not depend on them.
+    """
+
+    points: torch.Tensor
+    """Target points, in the order in which the tool should visit them, shape (n, P, 3) [m]."""
+    exists: torch.Tensor
+    """Points that an environment's task has, shape (n, P), bool."""
+    rotations: torch.Tensor | None = None
+    """Orientations for the tool at the first point, shape (n, 3, 3); None if no task wants one."""
+    has_rotation: torch.Tensor | None = None
+    """Environments whose task wants an orientation, shape (n,), bool; None if none does."""
+
+
 class TaskEnvs(ABC):
     """The environments of one task in a batch, k rows; only ``begin`` may loop over them."""
 
@@ -232,6 +249,18 @@ class TaskEnvs(ABC):
         Args:
             block_pose: Pose of the block, shape (k, 7).
         """
+
+    def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
+        """Return points that the tool should visit, shape (k, P, 3) [m]; P is 0 by default.
+
+        Args:
+            block_pose: Pose of the block, shape (k, 7).
+        """
+        return block_pose.new_zeros(len(block_pose), 0, 3)
+
+    def target_rotations(self) -> torch.Tensor | None:
+        """Return orientations for the tool, shape (k, 3, 3); None if the task wants none."""
+        return None
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of each of the task's markers in an environment, shape (7,) each."""

@@ -19,6 +19,7 @@ from morphgen.tasks.task import (
     Task,
     TaskEnvs,
     TaskState,
+    ToolTargets,
 )
 
 
@@ -176,6 +177,31 @@ class TaskGroups:
                 else:
                     values[name][group.rows] = value
         return values
+
+    def tool_targets(self, block_pose: torch.Tensor) -> ToolTargets:
+        """Return the points and orientations that the tasks want the tool at.
+
+        Args:
+            block_pose: Pose of the block, shape (n, 7); zeros if there is none.
+        """
+        n, device = len(self._row), self._row.device
+        groups = list(self._groups.values())
+        task_points = [group.envs.target_points(block_pose[group.rows]) for group in groups]
+        num_points = max(points.shape[1] for points in task_points)
+        points = torch.zeros(n, num_points, 3, device=device)
+        exists = torch.zeros(n, num_points, dtype=torch.bool, device=device)
+        rotations, has_rotation = None, None
+        for group, values in zip(groups, task_points, strict=True):
+            points[group.rows, : values.shape[1]] = values
+            exists[group.rows, : values.shape[1]] = True
+            task_rotations = group.envs.target_rotations()
+            if task_rotations is not None:
+                if rotations is None or has_rotation is None:
+                    rotations = torch.eye(3, device=device).repeat(n, 1, 1)
+                    has_rotation = torch.zeros(n, dtype=torch.bool, device=device)
+                rotations[group.rows] = task_rotations
+                has_rotation[group.rows] = True
+        return ToolTargets(points, exists, rotations, has_rotation)
 
     def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of each marker of an environment's task, shape (7,) each."""

@@ -19,7 +19,7 @@ from morphgen.cli.training_robots import (
     robots_to_train,
     split_option,
 )
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.tasks.registry import TASKS, default_simulator
 
@@ -39,6 +39,9 @@ SWITCHES = {
     "fixed-deviation": "keep the initial standard deviation of continuous actions (default: off)",
     "mask-morphology": "hide the robot's morphology from the agent (default: off)",
     "tool-position": "add the tool's position to the observations (default: off)",
+    "normalize": "normalize the kinematic channels of observations (default: off)",
+    "robot-advantages": "normalize advantages robot by robot (default: off)",
+    "joint-entropy": "weigh the mean entropy of the joints instead of their sum (default: off)",
 }
 NETWORK_SWITCHES = {
     "bf16": "run the networks in bfloat16",
@@ -92,6 +95,13 @@ TRAINING_OPTIONS = (
     *(flag(f"--{name}", help) for name, help in NETWORK_SWITCHES.items()),
 )
 """Options of the commands that train from random weights."""
+OBSERVE = option(
+    "--observe",
+    metavar="A,B,...",
+    default="",
+    help="further channels of the observations: lag, joint, poses, jacobian, dls, velocity, "
+    "previous-action, points, no-state",
+)
 RESUME = flag("--resume", "continue the run in the output folder")
 
 
@@ -108,6 +118,7 @@ RESUME = flag("--resume", "continue the run in the output folder")
     path_option("--out", "DIR", "run folder (default: runs/SPLIT/AGENT/seedN)"),
     RESUME,
     *(on_off(name, help) for name, help in SWITCHES.items()),
+    OBSERVE,
     *TRAINING_OPTIONS,
     opt.LIBRARY,
     details="The algorithm is PPO. The policy is written to the run folder. With --resume, an "
@@ -191,12 +202,16 @@ def agent_spec(args: argparse.Namespace) -> AgentSpec:
     Raises:
         TaskError: If the agent is unknown.
     """
-    from morphgen.rl.agent_spec import parse_agent
+    from morphgen.rl.agent_spec import OBSERVATION_SWITCHES, parse_agent
 
     values = {name: getattr(args, name.replace("-", "_")) for name in SWITCHES}
     spec = parse_agent(args.agent)
     switches = {name: value for name, value in values.items() if value is not None}
-    return replace(spec, switches={**spec.switches, **switches})
+    observed = [name for name in args.observe.split(",") if name]
+    for name in observed:
+        if name not in OBSERVATION_SWITCHES:
+            raise TaskError(f"--observe {name}{nearest(name, OBSERVATION_SWITCHES)}")
+    return replace(spec, switches={**spec.switches, **switches, **dict.fromkeys(observed, True)})
 
 
 def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:

@@ -55,6 +55,8 @@ class Agent:
     """Train one policy for each robot of a split, instead of one policy for all of them."""
     proprioceptive_only: bool = False
     """Hide the robot's morphology from the networks; joint positions stay visible."""
+    channels: tuple[str, ...] = ()
+    """Observation channels that the networks need, of ``morphgen.tasks.observation.CHANNELS``."""
 
     @property
     def config(self) -> type[NetworkConfig]:
@@ -71,11 +73,17 @@ class Agent:
 SE = Agent("se", "morphgen.rl.agents.mlp", per_robot=True, proprioceptive_only=True)
 ME_MLP = Agent("me-mlp", "morphgen.rl.agents.mlp")
 ME_TF = Agent("me-tf", "morphgen.rl.agents.transformer")
+ME_GRAPH = Agent("me-graph", "morphgen.rl.agents.graph", channels=("tree",))
 
 AGENTS: Registry[Agent] = Registry(
     "agent",
     "morphgen.agents",
-    {"se": f"{__name__}:SE", "me-mlp": f"{__name__}:ME_MLP", "me-tf": f"{__name__}:ME_TF"},
+    {
+        "se": f"{__name__}:SE",
+        "me-mlp": f"{__name__}:ME_MLP",
+        "me-tf": f"{__name__}:ME_TF",
+        "me-graph": f"{__name__}:ME_GRAPH",
+    },
 )
 """Agents by name: ``se`` (single embodiment) learns one robot, ``me-...`` (multi) learn many."""
 

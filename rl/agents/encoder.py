@@ -36,6 +36,8 @@ class Network(nn.Module, ABC):
     """Whether the network needs all rows of links; otherwise rows that no robot uses are cut."""
     logit_scale = 1.0
     """Factor on the actor's logits."""
+    shares_joints = False
+    """Whether all joints share the weights of the head, and the standard deviation of actions."""
 
     @abstractmethod
     def __init__(self, config: PolicyConfig, layout: Layout, outputs: int, per_link: bool) -> None:
@@ -60,17 +62,22 @@ class Entities(nn.Module):
     proportional to it, so that the initial policy is smooth.
 
     The tool's position is part of the goal's and of the object's vector, so that the distance left
-    is a difference of numbers within one vector.
+    is a difference of numbers within one vector. Without ``links`` only the other entities are
+    encoded, for networks that encode links in their own way.
     """
 
-    def __init__(self, layout: Layout, features: int, *, proprioceptive_only: bool) -> None:
+    def __init__(
+        self, layout: Layout, features: int, *, proprioceptive_only: bool, links: bool = True
+    ) -> None:
         super().__init__()
         self.columns = POSITION.columns if proprioceptive_only else slice(0, layout.token)
         """Columns of the link tokens that are encoded."""
-        link = self.columns.stop - self.columns.start + len(layout.channels)
+        vectors = sum(size for _, size in layout.vectors)
+        link = self.columns.stop - self.columns.start + len(layout.channels) + vectors
         self.tool = layout.tool
         tool = 3 * layout.tool
-        sizes = {"links": link, "goal": 7 + tool, "object": 13 + tool, "line": 1}
+        sizes = {"links": link} if links else {}
+        sizes |= {"goal": 7 + tool, "object": 13 + tool, "line": 1}
         if layout.obstacles:
             sizes["obstacles"] = 13
         self.cloud: nn.Module | None = None
@@ -79,7 +86,7 @@ class Entities(nn.Module):
                 nn.Linear(3, features), nn.SiLU(), nn.Linear(features, features)
             )
             sizes["cloud"] = features
-        self.channels = layout.channels
+        self.channels, self.vectors = layout.channels, tuple(name for name, _ in layout.vectors)
         self.fields = layout.fields
         # Numbered, as the names of fields may be unfit for modules.
         extra = {f"field{i}": size for i, (_, size, _) in enumerate(self.fields)}
@@ -87,13 +94,8 @@ class Entities(nn.Module):
         self.project = nn.ModuleDict(
             {name: nn.Linear(size, features, bias=False) for name, size in sizes.items()}
         )
-        smooth = torch.ones(link)
-        first = POSITION.start - self.columns.start
-        smooth[first : first + POSITION.size] = torch.from_numpy(
-            FREQUENCIES[0] / FREQUENCIES
-        ).repeat(2)
-        with torch.no_grad():
-            next(self.project["links"].parameters()).mul_(smooth)
+        if links:
+            smooth_position_code(self.project["links"], POSITION.start - self.columns.start)
         self.kinds = tuple(name for name in (*ENTITIES, *extra) if name in sizes)
         """Name of each row of ``kind``."""
         self.kind = nn.Parameter(0.02 * torch.randn(len(self.kinds), features))
@@ -112,12 +114,9 @@ class Entities(nn.Module):
 
     def _entries(self, observation: Observation) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Return values (n, k, size) and masks (n, k) of each kind."""
-        extra = [observation[name][..., None] for name in self.channels]
-        links = torch.cat([observation["tokens"][..., self.columns], *extra], dim=-1)
         tool = [observation["tool"]] if self.tool else []
         reach, push = observation["goal_mask"][:, None], observation["object_mask"][:, None]
         entries = {
-            "links": (links, observation["links"]),
             "goal": (torch.cat([observation["goal"], *tool], dim=-1)[:, None], reach),
             "object": (torch.cat([observation["object"], *tool], dim=-1)[:, None], push),
             "line": (observation["line"][:, None], push),
@@ -126,12 +125,29 @@ class Entities(nn.Module):
                 for i, (name, _, mask) in enumerate(self.fields)
             },
         }
+        if "links" in self.project:
+            extra = [observation[name][..., None] for name in self.channels]
+            extra += [observation[name] for name in self.vectors]
+            links = torch.cat([observation["tokens"][..., self.columns], *extra], dim=-1)
+            entries["links"] = (links, observation["links"])
         if "obstacles" in self.project:
             entries["obstacles"] = (observation["obstacles"], observation["obstacle_mask"])
         if self.cloud is not None:
             points, mask = observation["points"], observation["point_mask"]
             entries["cloud"] = _max_pool(self.cloud, points, mask)
         return entries
+
+
+def smooth_position_code(layer: nn.Module, first: int) -> None:
+    """Scale the initial weights of a layer's inputs that are the code of joint positions.
+
+    Args:
+        layer: A linear layer.
+        first: Number of the first of these inputs.
+    """
+    scale = torch.from_numpy(FREQUENCIES[0] / FREQUENCIES).float().repeat(2)
+    with torch.no_grad():
+        next(layer.parameters())[:, first : first + POSITION.size].mul_(scale)
 
 
 def last_layer(inputs: int, outputs: int) -> nn.Linear:

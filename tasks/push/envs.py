@@ -15,6 +15,9 @@ from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.rows import padded_rows, row_norms
 from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
 
+GAP = 0.05
+"""Distance from a face of the block to the point before contact [m], tuned on arm3 and ee-arm."""
+
 
 class PushEnvs(TaskEnvs):
     """Environments that push the blocks of their robots' push sets."""
@@ -73,6 +76,14 @@ class PushEnvs(TaskEnvs):
     def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the block and the line."""
         return {"object": box_tokens(block_pose, self._size), "line": self.line[:, None]}
+
+    def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
+        """Return a point behind the block, its centre, and its centre beyond the line."""
+        centre = block_pose[:, :3]
+        behind, beyond = centre.clone(), centre.clone()
+        behind[:, 1] -= self._size[:, 1] / 2 + GAP
+        beyond[:, 1] = self.line + GAP
+        return torch.stack([behind, centre, beyond], dim=1)
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the line."""

@@ -69,6 +69,10 @@ class ReachEnvs(TaskEnvs):
         """Return the goal."""
         return {"goal": self.goal}
 
+    def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
+        """Return the position of the goal."""
+        return self.goal[:, None, :3]
+
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the goal."""
         return {"goal": np.array(self.goal[row].cpu().numpy())}

@@ -14,7 +14,8 @@ SMALL = PPOConfig(total_timesteps=4 * 8 * 8, num_steps=8, epochs=2, minibatches=
 
 
 def learner(batch=None, *, agent="me-mlp", seed=0, discrete=True, device="cpu", **changes):
-    batch = batch or OnALine(8, kind="discrete" if discrete else "continuous")
+    kind = "discrete" if discrete else "continuous"
+    batch = batch or OnALine(8, kind=kind, tree=agent == "me-graph")
     policy = PolicyConfig(agent=agent, discrete=discrete)
     return Learner(batch, policy, replace(SMALL, **changes), seed=seed, device=device)
 

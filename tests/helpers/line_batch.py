@@ -1,10 +1,13 @@
 """The smallest batch to learn from: a point on a line with full robot observations."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import torch
 
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step
+from morphgen.tasks.observation import tree_entries
 
 LINKS = 4
 STRIDE = 0.25
@@ -17,7 +20,8 @@ class OnALine:
     line, and reaching it ends the episode.
     """
 
-    def __init__(self, num_envs, *, kind="discrete", seed=0, horizon=12):
+    def __init__(self, num_envs, *, kind="discrete", seed=0, horizon=12, tree=False):
+        self.tree = tree
         self.num_envs, self.action_kind, self.horizon = num_envs, kind, horizon
         self.device = torch.device("cpu")
         self.env_robot_index = torch.arange(num_envs) % 2
@@ -85,7 +89,13 @@ class OnALine:
             "line": torch.where(self.pushes, self.goal, 0.0)[:, None],
             "obstacles": torch.zeros(n, 0, 13),
             "obstacle_mask": torch.zeros(n, 0, dtype=torch.bool),
+            **(self._tree_entries() if self.tree else {}),
         }
+
+    def _tree_entries(self):
+        """The one joint that actions move has no other above it."""
+        tables = SimpleNamespace(ancestors=torch.eye(LINKS, dtype=torch.bool).expand(2, -1, -1))
+        return tree_entries(tables, self.env_robot_index, self.action_mask)
 
     def advance(self, progress):
         self.progress.append(progress)

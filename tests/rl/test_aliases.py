@@ -9,7 +9,6 @@ import torch
 from helpers.runs import EVAL, QUIET, equal, small_config, weights
 from morphgen.errors import TaskError
 from morphgen.rl.agent_spec import parse_constants
-from morphgen.rl.agents import AGENTS
 from morphgen.rl.aliases import ALIASES, current_policy
 from morphgen.rl.config import PPOConfig, policy_from
 from morphgen.rl.runs import CHECKPOINT, CONFIG, read_checkpoint, read_config
@@ -92,7 +91,7 @@ def test_a_run_of_format_2_is_read_and_resumed_to_the_same_weights(tmp_path, age
     assert equal(weights(old), weights(whole))
 
 
-@pytest.mark.parametrize("agent", list(AGENTS))
+@pytest.mark.parametrize("agent", list(OTHER_SIZES))
 def test_sizes_of_other_agents_are_left_out(agent):
     policy = small_config(agent=agent).policy
     assert policy_from(current_policy(old_policy(asdict(policy)))) == policy

@@ -41,7 +41,7 @@ CONFIG = PPOConfig(total_timesteps=64, num_steps=8, epochs=1, minibatches=2)
 
 @pytest.mark.parametrize("agent", list(AGENTS))
 def test_a_declared_field_reaches_the_networks_and_the_checkpoint(windy, agent):
-    learner = Learner(WindyLine(8), PolicyConfig(agent), CONFIG)
+    learner = Learner(WindyLine(8, tree=agent == "me-graph"), PolicyConfig(agent), CONFIG)
     assert learner.layout.fields == (("wind", 3, "goal_mask"),)
     learner.iterate()
     state = state_of(learner)

@@ -1,6 +1,7 @@
 """Masked entries change no actions, values or gradients; other entries do."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from morphgen.rl.agents.encoder import Entities
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.observation_layout import layout_of, pad_links, require_layout, truncate_links
 from morphgen.rl.policies import make_networks, rows_needed
+from morphgen.tasks.observation import tree_entries
 
 N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
 COUNT = torch.tensor([6, 4, 1, 3])
@@ -19,6 +21,8 @@ MASKS = {
     "tokens": "links",
     "velocity": "links",
     "previous_action": "links",
+    "lag": "links",
+    "jacobian": "links",
     "goal": "goal_mask",
     "object": "object_mask",
     "line": "object_mask",
@@ -50,13 +54,21 @@ def observed(seed=0, *, extras=True):
         "line": normal(N, 1),
         "obstacles": normal(N, OBSTACLES, 13),
         "obstacle_mask": torch.tensor([[1, 0, 1], [1, 1, 1], [0, 1, 0], [0, 0, 0]]).bool(),
+        **chain_entries(actions),
     }
     if extras:
         found["velocity"], found["previous_action"] = normal(N, LINKS), normal(N, LINKS)
         found["points"], found["tool"] = normal(N, POINTS, 3), normal(N, 3)
         found["point_mask"] = torch.tensor([True, True, False, True])[:, None].repeat(1, POINTS)
         found["point_mask"][0, 5:] = False
+        found["lag"], found["jacobian"] = normal(N, LINKS, 1), normal(N, LINKS, 20)
     return found
+
+
+def chain_entries(actions):
+    """Return the tree of robots whose links follow each other, for movable links (n, L)."""
+    chain = torch.ones(LINKS, LINKS).tril().bool().expand(len(actions), -1, -1)
+    return tree_entries(SimpleNamespace(ancestors=chain), torch.arange(len(actions)), actions)
 
 
 def mask_of(seen, name):
@@ -136,12 +148,15 @@ def test_gradients_are_zero_in_the_padding_and_only_there(agent, discrete):
         seen[name].requires_grad_()
     _, log_prob, value = outputs(*networks(agent, seen, discrete=discrete), seen)
     (log_prob + value).sum().backward()
+    read = seen["actions"] if agent == "me-graph" else seen["links"]
     for name in MASKS:
         assert not seen[name].grad[~mask_of(seen, name)].any(), name
-        if name not in ("tokens", "points"):
+        if MASKS[name] == "links" and name != "tokens":
+            assert seen[name].grad[read].all(), name
+        elif name not in ("tokens", "points"):
             assert seen[name].grad[mask_of(seen, name)].all(), name
     of_links = seen["tokens"].grad.abs().sum(dim=-1)
-    assert of_links[seen["links"]].all()
+    assert of_links[read].all()
     assert seen["points"].grad[0].any()
 
 
@@ -224,7 +239,7 @@ def test_masked_points_change_nothing(agent):
         torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
 
 
-@agents
+@pytest.mark.parametrize("agent", [name for name in AGENTS if name != "me-graph"])
 def test_absent_entities_are_encoded_as_zeros(agent):
     seen = observed()
     vectors, mask = networks(agent, seen)[0].network.entities(seen)

@@ -1,0 +1,352 @@
+"""Observation channels of a robot's kinematics: a vector for each link.
+
+All positions and directions are in the root frame. Joint frames are canonical: their z axis is the
+joint's axis, so that equal joints look equal whatever convention the robot's file has. Numbers are
+scaled to about one by the constants below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from morphgen.benchmark.token_layout import GEOMETRY, SHAPE_POSE
+from morphgen.model.inverse_kinematics_torch import dls_step
+from morphgen.model.kinematics_torch import (
+    compile_tree,
+    forward_kinematics,
+    frame_jacobian,
+    frame_pose,
+    joint_axes,
+)
+from morphgen.model.rotation_torch import matrix_from_quaternion, rotvec_from_matrix, skew
+from morphgen.tasks.robot_tables import RobotTables
+from morphgen.tasks.task import ToolTargets
+
+KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls")
+"""Names of the channels, in the order in which networks concatenate them."""
+MAX_LAG = 3.0
+"""Bound of the observed lag [largest steps]; no joint in free motion is further behind."""
+STEPS_TO_LIMIT = 10.0
+"""Distance to a joint limit that counts as far [largest steps]."""
+STEP_SCALE = 5.0
+"""Factor on the largest step of a joint [1/rad or 1/m]: 0.2 rad become one."""
+POSITION_SCALE = 3.0
+"""Factor on vectors to targets [1/m]: a third of a metre becomes one."""
+COLUMN_SCALE = 20.0
+"""Factor on the tool's displacement by the largest step of a joint [1/m]: 5 cm become one."""
+ROTATION_SCALE = 5.0
+"""Factor on the tool's rotation by the largest step of a joint [1/rad]: 0.2 rad become one."""
+GAINS = (0.25, 1.0, 4.0)
+"""Gains of a wanted joint step, in largest steps, before it is squashed by tanh: the highest one
+resolves the last millimetres, the lowest one distances of many steps."""
+SINGULAR = 1e-4
+"""Added to the squared length of a Jacobian column, so that short ones ask for no large step."""
+NEAR = 1e-3
+"""Distance below which the logarithm of a distance hardly changes [m or rad]."""
+ROTATION_LENGTH = 0.3
+"""Length by which rotation errors are multiplied to compare with position errors [m/rad]."""
+DAMPING = 0.03
+"""Damping of the least squares of ``dls``, in units of the Jacobian's singular values [m/rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Quantities that several channels are computed from; n environments, J joints."""
+
+    q: torch.Tensor
+    """Joint positions, shape (n, J) [rad or m]."""
+    targets: torch.Tensor
+    """Joint targets, shape (n, J) [rad or m]."""
+    T_root_tool: torch.Tensor
+    """Pose of the tool, shape (n, 4, 4)."""
+    J_root_tool: torch.Tensor
+    """Jacobian of the tool at ``q``, shape (n, 6, J)."""
+    T_root_target: torch.Tensor
+    """Pose that the tool will have once the joints are at their targets, shape (n, 4, 4)."""
+    T_root_link: torch.Tensor | None
+    """Poses of the links, shape (n, L, 4, 4), if a channel needs them."""
+    goals: ToolTargets
+    block_pose: torch.Tensor
+    """Poses of the blocks, shape (n, 7)."""
+
+
+class KinematicChannels:
+    """The kinematic channels of a batch's environments, each of shape (n, L, size).
+
+    P is the number of target points of the tasks (``Task.num_target_points``); R is 1 if a task
+    wants an orientation of the tool, else 0; B is 1 if a scene has a block, else 0.
+
+    ``lag`` (1)
+        Target minus position of the link's joint, in largest steps.
+    ``joint`` (10)
+        Position, its sine and cosine (zero for prismatic joints), both limits, largest step,
+        logarithm of the effort, prismatic or not, and closeness to both limits.
+    ``poses`` (12 + 3 P)
+        Origin, x and z axes of the canonical joint frame, and vectors from the origin to the tool
+        and to the target points; also for links without a joint.
+    ``jacobian`` (7 + 13 P + 8 R + 11 B)
+        Displacement and rotation of the tool by the joint's largest step, and the length of the
+        displacement. For each target point: the error, and twice the product of Jacobian column
+        and error (``_products``), for the tool where it is and for the tool where it will be once
+        the joints are at their targets. For an orientation: the error and the product. For the
+        block: the same from the robot's nearest point, and that point's displacement.
+    ``dls`` (3 (P + R))
+        The joint's share of a damped least-squares step of all joints (Wampler 1986) towards each
+        target point, and towards the first one with its orientation, at three gains.
+
+    Links without an independent joint have zeros, except in ``poses``.
+    """
+
+    def __init__(
+        self,
+        tables: RobotTables,
+        env_robot_index: torch.Tensor,
+        names: Sequence[str],
+        *,
+        has_block: torch.Tensor,
+    ) -> None:
+        """Gather the tables of every environment.
+
+        Args:
+            tables: The robots.
+            env_robot_index: Robot of each environment, shape (n,), int64.
+            names: Channels to compute, of ``KINEMATIC_CHANNELS``.
+            has_block: Environments with a block, shape (n,), bool.
+        """
+        index = env_robot_index
+        self._names, self._index, self._tables = tuple(names), index, tables
+        self._has_block = has_block if bool(has_block.any()) else None
+        self._joint = tables.joint_of_link[index]
+        self._lower, self._upper = tables.lower[index], tables.upper[index]
+        self._max_step = tables.max_step[index]
+        # Padding has a largest step of zero; its columns are zero, too.
+        self._per_step = 1 / self._max_step.clamp(min=1e-6)
+        self._effort = tables.effort[index].clamp(min=NEAR).log() / 5
+        self._is_prismatic = tables.is_prismatic[index].float()
+        needs_links = "poses" in names or ("jacobian" in names and self._has_block is not None)
+        self._tree = (
+            compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)
+            if needs_links
+            else None
+        )
+        if self._tree is not None:
+            self._R_joint_canonical = _rotation_from_z(self._tree.joints.axis)[index]
+            self._ancestors = tables.ancestors[index]
+            tokens = tables.tokens[index]
+            self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
+            self._shape_pose = tokens[..., SHAPE_POSE.columns]
+
+    def __call__(
+        self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, block_pose: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Return the channels by name.
+
+        Args:
+            q: Positions of the independent joints, shape (n, J) [rad or m].
+            targets: Their targets, shape (n, J) [rad or m].
+            goals: Points and orientations that the tasks want the tool at.
+            block_pose: Poses of the blocks, shape (n, 7).
+        """
+        chain, index, tree = self._tables.tool_chain, self._index, self._tree
+        T_root_tool, J_root_tool = frame_jacobian(chain, index, q)
+        state = _State(
+            q=q,
+            targets=targets,
+            T_root_tool=T_root_tool,
+            J_root_tool=J_root_tool,
+            T_root_target=frame_pose(chain, index, targets),
+            T_root_link=None if tree is None else forward_kinematics(tree, index, q),
+            goals=goals,
+            block_pose=block_pose,
+        )
+        channels = {
+            "lag": self._lag,
+            "joint": self._joint_state,
+            "poses": self._poses,
+            "jacobian": self._jacobian,
+            "dls": self._dls,
+        }
+        return {name: channels[name](state) for name in self._names}
+
+    def _lag(self, state: _State) -> torch.Tensor:
+        lag = (state.targets - state.q) * self._per_step
+        return self._at_links(lag.clamp(-MAX_LAG, MAX_LAG)[..., None])
+
+    def _joint_state(self, state: _State) -> torch.Tensor:
+        q, turns = state.q, 1 - self._is_prismatic
+        far = STEPS_TO_LIMIT
+        columns = (
+            q,
+            torch.sin(q) * turns,
+            torch.cos(q) * turns,
+            self._lower,
+            self._upper,
+            STEP_SCALE * self._max_step,
+            self._effort,
+            self._is_prismatic,
+            1 - ((self._upper - q) * self._per_step / far).clamp(0, 1),
+            1 - ((q - self._lower) * self._per_step / far).clamp(0, 1),
+        )
+        return self._at_links(torch.stack(columns, dim=-1))
+
+    def _poses(self, state: _State) -> torch.Tensor:
+        T_root_link = state.T_root_link
+        assert T_root_link is not None
+        R_root_joint = T_root_link[..., :3, :3] @ self._R_joint_canonical
+        origins = T_root_link[..., :3, 3]
+        to_tool = state.T_root_tool[:, None, :3, 3] - origins
+        to_points = (state.goals.points[:, None] - origins[:, :, None]).flatten(2)
+        vectors = POSITION_SCALE * torch.cat([origins, to_tool, to_points], dim=-1)
+        poses = torch.cat([R_root_joint[..., 0], R_root_joint[..., 2], vectors], dim=-1)
+        return poses * self._tables.link_mask[self._index][..., None]
+
+    def _jacobian(self, state: _State) -> torch.Tensor:
+        linear, angular = state.J_root_tool[:, :3], state.J_root_tool[:, 3:]
+        goals, step = state.goals, self._max_step[:, None]
+        tool, later_tool = state.T_root_tool[:, :3, 3], state.T_root_target[:, :3, 3]
+        displacement = COLUMN_SCALE * linear * step
+        columns = [displacement, ROTATION_SCALE * angular * step]
+        columns.append(torch.linalg.vector_norm(displacement, dim=1, keepdim=True))
+        for point, exists in zip(goals.points.unbind(1), goals.exists.unbind(1), strict=True):
+            error = (point - tool) * exists[:, None]
+            later_error = (point - later_tool) * exists[:, None]
+            columns.append(self._at_joints(POSITION_SCALE * error))
+            columns += [self._products(linear, error), self._products(linear, later_error)]
+        if goals.rotations is not None:
+            error = _rotation_error(goals, state.T_root_tool)
+            columns += [self._at_joints(error), self._products(angular, error)]
+        if self._has_block is not None:
+            point, J_root_point = self._nearest_point(state)
+            error = (state.block_pose[:, :3] - point) * self._has_block[:, None]
+            columns.append(self._at_joints(POSITION_SCALE * error))
+            columns += [COLUMN_SCALE * J_root_point * step, self._products(J_root_point, error)]
+        return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
+
+    def _dls(self, state: _State) -> torch.Tensor:
+        goals, J = state.goals, state.J_root_tool
+        later_tool = state.T_root_target[:, :3, 3]
+        errors = (goals.points - later_tool[:, None]) * goals.exists[..., None]
+        columns = [self._dls_step(J[:, :3], error, state.targets) for error in errors.unbind(1)]
+        if goals.rotations is not None:
+            rotation_error = ROTATION_LENGTH * _rotation_error(goals, state.T_root_target)
+            scaled = torch.cat([J[:, :3], ROTATION_LENGTH * J[:, 3:]], dim=1)
+            error = torch.cat([errors[:, 0], rotation_error], dim=1)
+            columns.append(self._dls_step(scaled, error, state.targets))
+        return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
+
+    def _dls_step(
+        self, J: torch.Tensor, error: torch.Tensor, targets: torch.Tensor
+    ) -> torch.Tensor:
+        """Return damped least-squares steps at the gains, shape (n, 3, J), in largest steps.
+
+        Joints whose targets would leave the limits are held in a second pass, so that the others
+        take over their share.
+        """
+        first = targets + dls_step(J, error, DAMPING)
+        free = (first >= self._lower) & (first <= self._upper)
+        step = dls_step(J * free[:, None], error, DAMPING) * self._per_step
+        return torch.stack([torch.tanh(gain * step) for gain in GAINS], dim=1)
+
+    def _products(self, J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+        """Return products of Jacobian columns and an error, shape (n, 5, J).
+
+        They are the steps that would reduce the error by each joint alone, at the gains; the cosine
+        of the angle between column and error; and the logarithm of the error's length.
+
+        Args:
+            J: Jacobians of three coordinates, shape (n, 3, J).
+            error: Errors in these coordinates, shape (n, 3).
+        """
+        along = (J * error[..., None]).sum(dim=1)
+        squares = J.square().sum(dim=1)
+        step = along / (squares + SINGULAR) * self._per_step
+        length = torch.linalg.vector_norm(error, dim=1)[:, None]
+        cosine = along / (squares.sqrt() * length + SINGULAR)
+        log_length = ((length + NEAR).log() / 2).expand_as(cosine)
+        steps = [torch.tanh(gain * step) for gain in GAINS]
+        return torch.stack([*steps, cosine, log_length], dim=1)
+
+    def _nearest_point(self, state: _State) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the robot's point that is nearest to the block, and its Jacobian.
+
+        Links are bounded by the boxes around their collision shapes' primitives. Mimic joints do
+        not count as parts of their leaders.
+
+        Returns:
+            Points, shape (n, 3) [m], and their Jacobians at the independent joints, (n, 3, J).
+        """
+        T_root_link, tree = state.T_root_link, self._tree
+        assert T_root_link is not None
+        assert tree is not None
+        rows = torch.arange(len(state.q), device=state.q.device)
+        R_root_shape = T_root_link[..., :3, :3] @ matrix_from_quaternion(self._shape_pose[..., 3:])
+        centres = T_root_link[..., :3, 3] + (
+            T_root_link[..., :3, :3] @ self._shape_pose[..., :3, None]
+        ).squeeze(-1)
+        to_block = (state.block_pose[:, None, :3] - centres)[..., None]
+        local = (R_root_shape.transpose(-1, -2) @ to_block).squeeze(-1)
+        inside = local.clamp(-self._half_extents, self._half_extents)
+        points = centres + (R_root_shape @ inside[..., None]).squeeze(-1)
+        distance = torch.linalg.vector_norm(points - state.block_pose[:, None, :3], dim=-1)
+        has_shape = self._half_extents.amax(dim=-1) > 0
+        link = torch.where(has_shape, distance, torch.inf).argmin(dim=1)
+        point = points[rows, link]
+
+        origins, axes = joint_axes(tree, self._index, T_root_link)
+        link_of_joint = self._tables.link_of_joint[self._index]
+        at_joint = rows[:, None], link_of_joint
+        lever = point[:, None] - origins[at_joint]
+        axis = axes[at_joint]
+        prismatic = self._is_prismatic[..., None] > 0
+        columns = torch.where(prismatic, axis, torch.linalg.cross(axis, lever))
+        moves = torch.gather(self._ancestors[rows, link], 1, link_of_joint)
+        return point, (columns * moves[..., None]).transpose(1, 2)
+
+    def _at_joints(self, vectors: torch.Tensor) -> torch.Tensor:
+        """Repeat vectors (n, k) for every independent joint, shape (n, k, J)."""
+        return vectors[..., None].expand(-1, -1, self._max_step.shape[1])
+
+    def _at_links(self, values: torch.Tensor) -> torch.Tensor:
+        """Return values of joints (n, J, k) at the links that they move, shape (n, L, k)."""
+        index = self._joint.clamp(min=0)[..., None].expand(-1, -1, values.shape[-1])
+        return torch.gather(values, 1, index) * (self._joint >= 0)[..., None]
+
+
+def _rotation_error(goals: ToolTargets, T_root_tool: torch.Tensor) -> torch.Tensor:
+    """Return rotation vectors from the tool to its goal, shape (n, 3) [rad]; zeros without one."""
+    assert goals.rotations is not None
+    assert goals.has_rotation is not None
+    R_error = goals.rotations @ T_root_tool[:, :3, :3].transpose(1, 2)
+    return rotvec_from_matrix(R_error) * goals.has_rotation[:, None]
+
+
+def _rotation_from_z(axes: torch.Tensor) -> torch.Tensor:
+    """Return the smallest rotations that turn z into unit vectors (..., 3), shape (..., 3, 3).
+
+    For the opposite of z it is half a turn about x.
+    """
+    z = torch.zeros_like(axes)
+    z[..., 2] = 1
+    cross, cosine = torch.linalg.cross(z, axes), axes[..., 2]
+    K = skew(cross)
+    opposite = cosine < -1 + 1e-6
+    factor = 1 / torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
+    eye = torch.eye(3, device=axes.device)
+    R = eye + K + K @ K * factor[..., None, None]
+    half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], device=axes.device))
+    return torch.where(opposite[..., None, None], half_turn, R)
+
+
+def _half_extents(geometry: torch.Tensor) -> torch.Tensor:
+    """Return half the edges of the boxes around primitives, shape (..., 3) [m].
+
+    Args:
+        geometry: Columns ``GEOMETRY`` of tokens, shape (..., 6).
+    """
+    sphere, cylinder, box, a, b, c = geometry.unbind(-1)
+    half = torch.stack([a, b, c * sphere + c / 2 * (cylinder + box)], dim=-1)
+    half[..., :2] *= (1 - box / 2)[..., None]
+    return half * (sphere + cylinder + box)[..., None]
