@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from morphgen.errors import DivergedError, TaskError
-from morphgen.model.kinematics_torch import FramePositions
+from morphgen.model.kinematics_torch import FramePositions, frame_pose
 from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
 from morphgen.tasks.kinematic_channels import KinematicChannels
 from morphgen.tasks.observation import (
@@ -61,6 +61,9 @@ class Step:
     """Joint positions after the action, also where an episode ended, shape (n, J) [rad or m]."""
     block_pose: torch.Tensor
     """Poses of the blocks after the action, also where an episode ended, shape (n, 7)."""
+    angle: torch.Tensor | None = None
+    """Angle from success, such as between tool and goal, shape (n,) [rad]; nan where the task wants
+    no orientation, None if no task wants one."""
 
 
 class TaskBatch:
@@ -229,6 +232,7 @@ class TaskBatch:
             terms=result.terms,
             q=q,
             block_pose=block_pose,
+            angle=result.angle,
         )
 
     def simulate(self) -> list[int]:
@@ -341,9 +345,15 @@ class TaskBatch:
             limit_violation=limit_violation(q, self._lower, self._upper),
             acceleration=row_sums((qd - self.previous_qd).abs()) / CONTROL_PERIOD,
             diverged=diverged,
+            tool_rotation=self._tool_rotation(q) if self.groups.needs_tool_rotation else None,
         )
         self.previous_qd.copy_(qd)
         return self.groups.evaluate(state)
+
+    def _tool_rotation(self, q: torch.Tensor) -> torch.Tensor:
+        """Return the rotation matrices of the tools, shape (n, 3, 3)."""
+        T_root_tool = frame_pose(self.robot_tables.tool_chain, self.env_robot_index, q)
+        return T_root_tool[:, :3, :3]
 
     def _begin(self, envs: torch.Tensor) -> None:
         """Begin episodes in the environments with these indices, shape (k,), int64."""

@@ -43,9 +43,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
     of a joint's largest step, in [-1, 1]; discrete ones are indices of
     ``morphgen.tasks.actions.BINS``.
 
-    ``info`` has ``success``, ``distance``, ``score``, ``diverged`` and ``terms`` (see ``Step``),
-    and ``self_collision``: whether links collide with each other in this environment. Episodes end
-    by themselves: no time limit wrapper is needed.
+    ``info`` has ``success``, ``distance``, ``score``, ``diverged``, ``terms``, for goals that
+    are poses ``angle`` (see ``Step``), and ``self_collision``: whether links collide with each
+    other in this environment. Episodes end by themselves: no time limit wrapper is needed.
 
     ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
 
@@ -239,7 +239,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         }
 
     def _info(self, step: Step) -> dict[str, Any]:
+        angle = {} if step.angle is None else {"angle": float(step.angle[0])}
         return {
+            **angle,
             "success": bool(step.success[0]),
             "distance": float(step.distance[0]),
             "score": float(step.score[0]),

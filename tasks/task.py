@@ -52,7 +52,7 @@ class TaskConfig(Protocol):
 
 
 def require_task_config(config: TaskConfig) -> None:
-    """Require valid values of the constants that every task has, and only finite numbers.
+    """Require valid values of the constants that every task has, and only finite numbers or text.
 
     Raises:
         TaskError: If a constant is out of its range.
@@ -60,6 +60,8 @@ def require_task_config(config: TaskConfig) -> None:
     name = type(config).__name__
     for field in fields(config):
         value = getattr(config, field.name)
+        if isinstance(value, str):
+            continue
         numbers = value if isinstance(value, tuple) else (value,)
         if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
             raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
@@ -185,6 +187,8 @@ class TaskState:
     """Sum over joints of the absolute mean acceleration in the step, shape (k,)."""
     diverged: torch.Tensor
     """Whether the simulation diverged, shape (k,), bool; such a step is never a success."""
+    tool_rotation: torch.Tensor | None = None
+    """Rotation matrix of the tool, shape (k, 3, 3); None if no task ``needs_tool_rotation``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +205,8 @@ class StepResult:
     """Score of the step, shape (k,); see ``Task.episode_score``."""
     terms: dict[str, torch.Tensor]
     """Weighted reward terms by name, each of shape (k,); the reward is their sum."""
+    angle: torch.Tensor | None = None
+    """Angle from success, shape (k,) [rad]; None if the task wants no orientation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +228,9 @@ class ToolTargets:
 
 class TaskEnvs(ABC):
     """The environments of one task in a batch, k rows; only ``begin`` may loop over them."""
+
+    needs_tool_rotation: bool = False
+    """Whether ``evaluate`` needs ``TaskState.tool_rotation``."""
 
     @abstractmethod
     def begin(

@@ -23,7 +23,7 @@ from morphgen.tasks.task import (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class BatchResult(StepResult):
     """Results of a step for all environments of a batch."""
 
@@ -46,6 +46,7 @@ class TaskGroups:
 
     Attributes:
         max_episode_steps: Time limit of episodes, shape (n,) [control steps].
+        needs_tool_rotation: Whether a task needs the rotation of the tool in its state.
         moves_fingers: Whether actions move joints beyond the tool, shape (n,), bool.
         observation_fields: The standard fields, and those that the tasks declare.
         masks: Which environments have the fields of each mask, shape (n,) each, bool.
@@ -88,6 +89,9 @@ class TaskGroups:
             self.moves_fingers[rows] = task.moves_fingers
         task_fields = (field for group in self._groups.values() for field in group.task.fields)
         self.observation_fields = tuple(dict.fromkeys((*STANDARD_FIELDS, *task_fields)))
+        self.needs_tool_rotation = any(
+            group.envs.needs_tool_rotation for group in self._groups.values()
+        )
         self.masks = {
             mask: torch.zeros(n, dtype=torch.bool, device=device)
             for mask in dict.fromkeys(field.mask for field in self.observation_fields)
@@ -155,6 +159,7 @@ class TaskGroups:
                 for name in names
             },
             reward=self._scatter(rows, rewards),
+            angle=self._scatter_angles(rows, [result.angle for result in group_results]),
         )
 
     def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -235,9 +240,22 @@ class TaskGroups:
         """Return the rows of a step's state that belong to a group."""
         if len(self._groups) == 1:
             return state
-        return TaskState(
-            **{field.name: getattr(state, field.name)[group.rows] for field in fields(state)}
-        )
+        values: dict[str, Any] = {field.name: getattr(state, field.name) for field in fields(state)}
+        for name, value in values.items():
+            values[name] = None if value is None else value[group.rows]
+        return TaskState(**values)
+
+    def _scatter_angles(
+        self, rows: Sequence[torch.Tensor], angles: Sequence[torch.Tensor | None]
+    ) -> torch.Tensor | None:
+        """Return angles of the batch, nan where a task has none; None if no task has any."""
+        if all(angle is None for angle in angles):
+            return None
+        batch_angles = torch.full(self._row.shape, torch.nan, device=self._row.device)
+        for group_rows, angle in zip(rows, angles, strict=True):
+            if angle is not None:
+                batch_angles[group_rows] = angle
+        return batch_angles
 
     def _scatter(
         self, rows: Sequence[torch.Tensor], values: Sequence[torch.Tensor]

@@ -85,9 +85,9 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
     Where an episode ends, the next begins in the same step (``AutoresetMode.SAME_STEP``):
     ``infos["final_obs"]`` is then an array of observations, with None where no episode ended, and
     ``infos["final_info"]`` has the infos of the last step. Every step has ``success``,
-    ``distance``, ``score``, ``diverged`` and ``terms`` (see ``Step``), each with its mask, such as
-    ``_success``: the environments whose episode goes on, or in ``final_info`` those whose episode
-    ended.
+    ``distance``, ``score``, ``diverged``, ``terms`` and, for goals that are poses, ``angle`` (see
+    ``Step``), each with its mask, such as ``_success``: the environments whose episode goes on, or
+    in ``final_info`` those whose episode ended.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -169,7 +169,8 @@ def task_vector(
 
 def _infos(step: Step, where: Array) -> dict[str, Any]:
     """Return the infos of a step, each with the mask of the environments that have it."""
-    infos = _masked({name: _numpy(getattr(step, name)) for name in _INFO_KEYS}, where)
+    names = _INFO_KEYS if step.angle is None else (*_INFO_KEYS, "angle")
+    infos = _masked({name: _numpy(getattr(step, name)) for name in names}, where)
     terms = _masked({name: _numpy(values) for name, values in step.terms.items()}, where)
     return infos | {"terms": terms, "_terms": where.copy()}
 

@@ -38,6 +38,15 @@ def skew(v: torch.Tensor) -> torch.Tensor:
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*x.shape, 3, 3)
 
 
+def angle_between(A: torch.Tensor, B: torch.Tensor) -> torch.Tensor:
+    """Return the angles between rotation matrices (n, 3, 3), shape (n,) [rad].
+
+    The Frobenius norm of A - B is sqrt(8) sin(angle / 2), which is well-conditioned at 0.
+    """
+    norm = (A - B).double().square().sum(dim=(1, 2)).sqrt().float()
+    return 2 * torch.asin((norm / 8**0.5).clamp(max=1))
+
+
 def rotvec_from_matrix(R: torch.Tensor) -> torch.Tensor:
     """Return rotation vectors, angle times axis, (n, 3) [rad] of rotation matrices (n, 3, 3).
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, nearest
+from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.task import require_task_config
 
 
@@ -36,6 +38,20 @@ class ReachConfig:
     """Factor c of the score -c d^2 of a step at distance d from the goal (released evaluation)."""
     score_near: float = 200.0
     """Score of a step near the goal (released evaluation)."""
+    goal: str = "position"
+    """What has to be reached, one of ``GOAL_KINDS``: the goal's position (paper), or its pose. The
+    goal sets are the same: each goal is a full pose, which a configuration reaches."""
+    near_angle: float = math.radians(10)
+    """With goal ``pose``: angle between tool and goal that counts as success, together with
+    ``near`` (ours) [rad]."""
+    rotation_weight: float = 1.0
+    """With goal ``pose``: weight of the angle between tool and goal, which is converted to a
+    distance by ``metres_per_radian`` (ours)."""
+
+    @property
+    def metres_per_radian(self) -> float:
+        """Distance that weighs as much as an angle of 1 rad: both tolerances weigh the same [m]."""
+        return self.near / self.near_angle
 
     def __post_init__(self) -> None:
         """Require constants that describe a reach.
@@ -46,3 +62,7 @@ class ReachConfig:
         require_task_config(self)
         if not self.near > 0:
             raise TaskError(f"near {self.near:g}: expected a positive distance [m]")
+        if self.goal not in GOAL_KINDS:
+            raise TaskError(f"unknown goal of reach {self.goal!r}{nearest(self.goal, GOAL_KINDS)}")
+        if not 0 < self.near_angle <= math.pi:
+            raise TaskError(f"near_angle {self.near_angle:g}: expected more than 0, up to pi [rad]")

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
+from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.rows import padded_rows, row_norms
 from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
@@ -39,6 +40,8 @@ class ReachEnvs(TaskEnvs):
         """Goal pose of the tool, shape (k, 7)."""
         self.goal_configuration = torch.zeros(len(env_spec_index), num_joints, device=device)
         """Joint positions that bring the tool to its goal, shape (k, J)."""
+        self.needs_tool_rotation = self._config.goal == "pose"
+        self._goal_rotation = torch.eye(3, device=device).repeat(len(env_spec_index), 1, 1)
 
     def begin(
         self, rows: torch.Tensor, random: Sequence[np.random.Generator]
@@ -52,18 +55,36 @@ class ReachEnvs(TaskEnvs):
         start, goal = torch.tensor(np.array(pairs), device=spec.device).T
         self.goal_configuration[rows] = self._q[spec, goal]
         self.goal[rows] = self._poses[spec, goal]
+        if self.needs_tool_rotation:
+            self._goal_rotation[rows] = matrix_from_quaternion(self.goal[rows, 3:])
         return self._q[spec, start], torch.zeros(len(rows), 7, device=spec.device)
 
     def evaluate(self, state: TaskState) -> StepResult:
         """Compare the tool with its goal."""
         distance = row_norms(state.tool - self.goal[:, :3])
+        angle = self._angle(state)
+        terms = reach_terms(
+            self._config, distance, state.limit_violation, state.acceleration, angle
+        )
         return StepResult(
-            success=(distance < self._config.near) & ~state.diverged,
+            success=is_near(self._config, distance, angle) & ~state.diverged,
             terminated=torch.zeros_like(state.diverged),
             distance=distance,
-            score=anybody_score(self._config, distance),
-            terms=reach_terms(self._config, distance, state.limit_violation, state.acceleration),
+            score=anybody_score(self._config, distance, angle),
+            terms=terms,
+            angle=angle,
         )
+
+    def _angle(self, state: TaskState) -> torch.Tensor | None:
+        """Return the angles between tools and goals, shape (k,); None for goals of positions."""
+        if not self.needs_tool_rotation:
+            return None
+        assert state.tool_rotation is not None
+        return angle_between(state.tool_rotation, self._goal_rotation)
+
+    def target_rotations(self) -> torch.Tensor | None:
+        """Return the goals' rotation matrices, shape (k, 3, 3); None for goals of positions."""
+        return self._goal_rotation if self.needs_tool_rotation else None
 
     def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the goal."""
@@ -78,29 +99,54 @@ class ReachEnvs(TaskEnvs):
         return {"goal": np.array(self.goal[row].cpu().numpy())}
 
 
+def is_near(
+    config: ReachConfig, distance: torch.Tensor, angle: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return whether tools are at their goals, shape (k,), bool.
+
+    Args:
+        config: Tolerances of success.
+        distance: Distance between tool and goal, shape (k,) [m].
+        angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
+    """
+    near = distance < config.near
+    return near if angle is None else near & (angle < config.near_angle)
+
+
 def reach_terms(
     config: ReachConfig,
     distance: torch.Tensor,
     limit_violation: torch.Tensor,
     acceleration: torch.Tensor,
+    angle: torch.Tensor | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Return the reward terms of reach (paper, tables of reward terms).
+    """Return the reward terms of reach (paper, tables of reward terms; ``rotation`` is ours).
 
     Args:
-        config: Weights, and the distance of success.
+        config: Weights, and the tolerances of success.
         distance: Distance between tool and goal, shape (k,) [m].
         limit_violation: See ``TaskState``, shape (k,).
         acceleration: See ``TaskState``, shape (k,).
+        angle: See ``is_near``; without it there is no term ``rotation``.
     """
-    return {
+    terms = {
         "joint_limits": -config.joint_limit_weight * limit_violation,
         "joint_acceleration": -config.joint_acceleration_weight * acceleration,
         "distance": -config.distance_weight * distance,
-        "near": config.near_weight * (distance < config.near).float(),
+        "near": config.near_weight * is_near(config, distance, angle).float(),
     }
+    if angle is not None:
+        terms["rotation"] = -config.rotation_weight * config.metres_per_radian * angle
+    return terms
 
 
-def anybody_score(config: ReachConfig, distance: torch.Tensor) -> torch.Tensor:
-    """Return the score of a step, shape (k,): a bonus where near, else the squared distance."""
+def anybody_score(
+    config: ReachConfig, distance: torch.Tensor, angle: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return the score of a step, shape (k,): a bonus where near, else the squared distance.
+
+    For the arguments see ``is_near``.
+    """
     far = -config.score_square * distance.square()
-    return torch.where(distance < config.near, torch.full_like(far, config.score_near), far)
+    bonus = torch.full_like(far, config.score_near)
+    return torch.where(is_near(config, distance, angle), bonus, far)
