@@ -11,8 +11,9 @@ from torch import nn
 
 from morphgen.errors import TaskError
 from morphgen.rl.config import PPOConfig, policy_from
-from morphgen.rl.observation_layout import layout_from, require_layout
+from morphgen.rl.observation_layout import last_link, layout_from, layout_of, require_layout
 from morphgen.rl.ppo import Learner
+from morphgen.tasks.batch import TaskBatch
 
 
 def state_of(learner: Learner) -> dict[str, Any]:
@@ -72,6 +73,29 @@ def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
     _require_networks(learner, state)
     for name, network in _networks(learner).items():
         network.load_state_dict(state[name])
+
+
+def use_batch(learner: Learner, batch: TaskBatch) -> None:
+    """Continue with other environments; all of them begin new episodes.
+
+    Raises:
+        TaskError: If there are more or fewer environments, or their actions or observations differ.
+    """
+    observation = batch.observe()
+    require_layout(learner.layout, layout_of(observation), "the learner")
+    if (batch.num_envs, batch.action_kind) != (learner.batch.num_envs, learner.policy.kind):
+        raise TaskError(
+            f"{batch.num_envs} environments with {batch.action_kind} actions; expected "
+            f"{learner.batch.num_envs} with {learner.policy.kind} actions"
+        )
+    if (links := last_link(observation)) > learner.num_link_rows:
+        raise TaskError(
+            f"a robot has {links} links; the learner has room for {learner.num_link_rows}"
+        )
+    learner.batch = batch
+    learner.env_robot_index = batch.env_robot_index.to(learner.device)
+    learner.num_robots = int(batch.env_robot_index.max()) + 1
+    learner.restart_episodes()
 
 
 def _networks(learner: Learner) -> dict[str, nn.Module]:

@@ -24,7 +24,8 @@ class UpdateMetrics:
     score: float
     """Mean task score of a control step."""
     scores: tuple[float, ...]
-    """Mean score of each robot; nan for one without an environment."""
+    """Mean score of each robot, or of the robots of each grammar if they are drawn; nan for one
+    without an environment."""
     success: float
     """Share of successes among the episodes that ended in the rollout; nan if none did."""
     episodes: int

@@ -51,6 +51,7 @@ class Learner:
         *,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        least_links: int = 0,
     ) -> None:
         """Build networks, optimiser and buffers, and begin episodes in the batch.
 
@@ -60,10 +61,10 @@ class Learner:
             config: Hyperparameters.
             seed: Seed of weights, actions, minibatches and random weights of robots.
             device: Device of networks and rollouts; the batch may be on another.
+            least_links: Links of the largest robot of later batches; see ``use_batch``.
 
         Raises:
-            TaskError: If the batch takes other actions, or rollouts cannot be split into
-                minibatches.
+            TaskError: If the batch takes other actions, or minibatches would differ in size.
         """
         if batch.action_kind != policy.kind:
             raise TaskError(
@@ -78,7 +79,7 @@ class Learner:
         self._observation: Observation | None = None
         observation = self._current_observation()
         self.layout = layout_of(observation)
-        self._num_link_rows = rows_needed(policy, observation)
+        self.num_link_rows = max(rows_needed(policy, observation), least_links)
 
         network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
         actor, critic = make_networks(policy, self.layout, network_seed)
@@ -168,7 +169,7 @@ class Learner:
 
     def _network_input(self, observation: Observation) -> Observation:
         """Return an observation with the rows of links that the networks need, on their device."""
-        needed = truncate_links(observation, self._num_link_rows)
+        needed = truncate_links(observation, self.num_link_rows)
         return {name: value.to(self.device) for name, value in needed.items()}
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Sources of robots for training and evaluation: the robots of a split, or one robot."""
+"""Sources of robots for training and evaluation: a split, one robot, or robots of grammars."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from morphgen.benchmark.robot_hash import robot_hash
 from morphgen.benchmark.split import Member, Side, Split, compose_member
-from morphgen.benchmark.split_file import parse_split, split_text
+from morphgen.benchmark.split_file import parse_split, read_split, split_text
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
@@ -24,13 +24,14 @@ class RobotSource:
     """Robots with their tasks, described by text alone, so that a run's folder describes them."""
 
     name: str
-    """Name of the split, or words that describe one robot, or the path of its file."""
+    """Name of the split, or words that describe one robot, or the path of its file, or the grammars
+    with the number of robots of each."""
     split: str = ""
-    """Text of the split's file; empty for one robot."""
+    """Text of the split's file; empty without a split."""
     task: str | None = None
-    """Task of the one robot; a split has a task for each of its robots."""
+    """Task of all robots; None for a split, which has a task for each of them."""
     obstacles: bool = False
-    """Whether the one robot is among obstacles."""
+    """Whether the robots are among obstacles; a split says it for each of them."""
     side: Side = "train"
     """Side of the split."""
     robot_hash: str = ""
@@ -43,6 +44,15 @@ class RobotSource:
     """Folder where the split is built with the goal sets to use; without it goals are sampled."""
     library: tuple[str, ...] = ()
     """Folders with further parts."""
+    grammars: tuple[tuple[str, int], ...] = ()
+    """Grammars, by name or path, and the number of robots to draw from each; see
+    ``morphgen.rl.drawn_robots``."""
+    draw_seed: int = 0
+    """Seed of the drawn robots: they are those of ``morphgen sample --seed``."""
+    held_out: tuple[str, ...] = ()
+    """Splits whose test robots are not drawn, besides the splits that morphgen ships."""
+    drawn_hash: str = ""
+    """Hash of the drawn robots; empty until they are drawn."""
 
 
 def split_source(
@@ -124,10 +134,12 @@ def other_side(source: RobotSource, side: Side) -> RobotSource:
     """Return a whole side of the same split.
 
     Raises:
-        TaskError: If it is one robot, which has no other side.
+        TaskError: If it is no split, and so has no other side.
     """
     if source.split:
         return replace(source, side=side, member=None)
+    if side == "test" and source.grammars:
+        raise _without_sides(source)
     if side == "test":
         raise TaskError(f"{source.name!r} is one robot and not a split: it has no test robots")
     return source
@@ -152,17 +164,17 @@ def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
 
 
 def require_links(source: RobotSource, max_links: int) -> None:
-    """Require that a policy trained on one side of a split can be tested on the other.
+    """Require that a policy can be tested on the other side of a split, or on held-out robots.
 
     Raises:
-        BenchmarkError: If a robot of the other side has more links.
+        BenchmarkError: If a robot there has more links than ``max_links``.
         MorphgenError: If a robot cannot be built.
     """
-    if not source.split:
-        return
-    library = default_library(tuple(map(Path, source.library)))
     side: Side = "test" if source.side == "train" else "train"
-    for member in members(other_side(source, side)):
+    others = members(other_side(source, side)) if source.split else ()
+    held_out = (member for name in source.held_out for member in read_split(name).test)
+    library = default_library(tuple(map(Path, source.library)))
+    for member in (*others, *held_out):
         links = len(compose_member(member, library).links)
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
@@ -175,9 +187,12 @@ def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
         config: Constants of the tasks; the seed is the source's.
 
     Raises:
+        TaskError: If the robots are drawn from grammars.
         MorphgenError: If a robot cannot be built, has another hash than in the split, or cannot do
             its task.
     """
+    if source.grammars:
+        raise _without_sides(source)
     config = replace(config, seed=source.goal_seed)
     if source.split:
         own = replace(source, split="", member=None)
@@ -188,6 +203,13 @@ def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
     if source.robot_hash not in ("", robot_hash(robot)):
         raise TaskError(f"{source.name}: the robot has changed since the run began")
     return [env_spec(robot, source.task, config, obstacles=source.obstacles)]
+
+
+def _without_sides(source: RobotSource) -> TaskError:
+    return TaskError(
+        f"the training robots {source.name} are drawn from grammars and have no test side: name "
+        "other robots with --split"
+    )
 
 
 @lru_cache(maxsize=64)

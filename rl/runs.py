@@ -68,6 +68,9 @@ class RunConfig:
     timesteps (as in the paper), instead of an equal share of them."""
     max_links: int = MAX_LINKS
     """Number of links that observations and actions are padded to; no robot may have more."""
+    slice_updates: int = 0
+    """Updates after which the next of the drawn robots take the places of the last ones, if there
+    are more robots than environments; 0 if all robots have environments at all times."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Configs of the tasks; a file has an entry for each, under the name of the task."""
 
@@ -85,6 +88,8 @@ class RunConfig:
             raise TaskError(f"unknown simulator {self.sim!r}{nearest(self.sim, SIMULATORS)}")
         if self.max_links < 2:
             raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
+        if self.slice_updates < 0:
+            raise TaskError(f"--slice-updates {self.slice_updates}: expected 0 or more")
 
     @property
     def num_updates(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,12 +12,13 @@ import numpy as np
 from morphgen.errors import TaskError
 from morphgen.formats.files import locked_folder
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.learner_state import load_networks, state_of
+from morphgen.rl.drawn_robots import num_drawn, write_drawn
+from morphgen.rl.learner_state import load_networks, state_of, use_batch
 from morphgen.rl.learner_state import resume as resume_learner
 from morphgen.rl.metrics import UpdateMetrics
 from morphgen.rl.ppo import Learner
 from morphgen.rl.recorders import recording, require_wandb
-from morphgen.rl.robot_source import members, require_links, single_members, specs_of
+from morphgen.rl.robot_source import members, require_links, single_members
 from morphgen.rl.runs import (
     CHECKPOINT,
     RunConfig,
@@ -27,9 +28,8 @@ from morphgen.rl.runs import (
     require_open,
     write_checkpoint,
 )
-from morphgen.tasks.device import batch_device, require_device
-from morphgen.tasks.env_specs import GoalConfig
-from morphgen.tasks.make import batch_from_specs
+from morphgen.rl.training_batches import TrainingBatches, num_slices
+from morphgen.tasks.device import require_device
 
 MIN_CHECKPOINT_STEPS, MAX_CHECKPOINT_STEPS = 1500, 3000
 """Bounds of the interval between checkpoints [control steps per environment]: 5 and 10 episodes.
@@ -142,25 +142,36 @@ def train(
                 continue
             if not holds:
                 require_links(config.source, config.max_links)
-            with _learner(part, execution) as learner:
+            batches = TrainingBatches(part.config, workers=execution.workers)
+            with _learner(part, batches) as learner:
                 if not holds:
                     folder.mkdir(parents=True, exist_ok=True)
                     held.enter_context(hold(folder))
                     open_run(folder, config, resume=resume)
                     holds = True
                 open_run(part.folder, part.config, resume=True)
-                _learn(learner, part, execution, show(part) if show else None)
+                if batches.drawn is not None:
+                    write_drawn(part.folder, part.config.source, batches.drawn)
+                _learn(learner, batches, part, execution, show(part) if show else None)
     return parts
 
 
 def require_runnable(config: RunConfig) -> None:
     """Require timesteps for at least one update, and an environment for every robot.
 
+    Drawn robots may have environments one after another; see ``RunConfig.slice_updates``.
+
     Raises:
-        TaskError: If there are fewer, or a rollout cannot be split into equal minibatches.
+        TaskError: If there are fewer, or a rollout cannot be split into equal minibatches, or the
+            agent is for single robots and the robots are drawn.
     """
-    robots = len(members(config.source))
-    if config.num_envs < robots:
+    robots = len(members(config.source)) or num_drawn(config.source)
+    if config.source.grammars and AGENTS[config.policy.agent].per_robot:
+        raise TaskError(
+            f"--agent {config.policy.agent}: learns one robot; --robots {config.source.name} needs "
+            "an agent of many"
+        )
+    if config.num_envs < robots and not config.slice_updates:
         raise TaskError(
             f"--envs {config.num_envs}: fewer than the {robots} robots, each of which has one"
         )
@@ -171,6 +182,13 @@ def require_runnable(config: RunConfig) -> None:
             f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}{share}: an update "
             f"takes {update_timesteps:,} transitions ({config.ppo.num_steps} steps of every "
             "environment)"
+        )
+    slices = -(-config.num_updates // config.slice_updates) if config.slice_updates else 1
+    if slices < num_slices(config):
+        raise TaskError(
+            f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}: only "
+            f"{slices * config.num_envs} of {robots} robots would be trained on; use more --steps "
+            "or --envs, or a lower --slice-updates"
         )
     config.ppo.minibatch_size(config.num_envs)
 
@@ -216,35 +234,33 @@ def updates_between(config: RunConfig) -> int:
 
 
 @contextmanager
-def _learner(part: Subrun, execution: ExecutionConfig) -> Iterator[Learner]:
+def _learner(part: Subrun, batches: TrainingBatches) -> Iterator[Learner]:
     """Build the learner of a part, and resume its checkpoint if there is one."""
-    config, interface = part.config, part.config.interface
-    specs = specs_of(config.source, GoalConfig(tasks=config.tasks))
-    batch = batch_from_specs(
-        specs,
-        config.num_envs,
-        sim=config.sim,
-        seed=config.seed,
-        kind=interface.kind,
-        observe=interface.channels,
-        workers=execution.workers,
-        max_links=interface.max_links,
-        device=batch_device(config.sim, config.device),
-        library=map(Path, config.source.library),
-    )
-    try:
-        learner = Learner(batch, config.policy, config.ppo, seed=config.seed, device=config.device)
-        if (part.folder / CHECKPOINT).is_file():
-            resume_learner(learner, read_checkpoint(part.folder)[1])
+    config, state = part.config, None
+    if (part.folder / CHECKPOINT).is_file():
+        state = read_checkpoint(part.folder)[1]
+    with closing(batches):
+        learner = Learner(
+            batches.make(state["update"] if state else 0),
+            config.policy,
+            config.ppo,
+            seed=config.seed,
+            device=config.device,
+            least_links=batches.most_links,
+        )
+        if state:
+            resume_learner(learner, state)
         elif config.initial_checkpoint:
             load_networks(learner, read_checkpoint(Path(config.initial_checkpoint))[1])
         yield learner
-    finally:
-        batch.close()
 
 
 def _learn(
-    learner: Learner, part: Subrun, execution: ExecutionConfig, show: ShowMetrics | None
+    learner: Learner,
+    batches: TrainingBatches,
+    part: Subrun,
+    execution: ExecutionConfig,
+    show: ShowMetrics | None,
 ) -> None:
     """Make the remaining updates of a part; record their metrics and write its checkpoints."""
     interval = updates_between(part.config)
@@ -257,8 +273,13 @@ def _learn(
     ) as recorders:
         while not learner.done:
             metrics = learner.iterate()
+            scores = batches.recorded_scores(metrics.scores, learner.update)
+            metrics = replace(metrics, scores=scores)
             for recorder in recorders:
                 recorder.record(metrics)
+            if batches.changes_at(learner.update):
+                use_batch(learner, batches.make(learner.update))
+            # A checkpoint has the state of the batch that the run continues with.
             left = learner.num_updates - learner.update
             if not left or (learner.update % interval == 0 and left >= interval):
                 write_checkpoint(part.folder, part.config, state_of(learner))

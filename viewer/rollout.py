@@ -17,6 +17,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.drawn_robots import FILE, read_drawn
 from morphgen.rl.play import interface_of, make_controller, require_policy
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
@@ -200,13 +201,19 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
 
     Returns:
         Task of the first robot; whether any robot had obstacles, because then the policy observes
-        them; names and URIs of all robots.
+        them; names and URIs of all robots, or none if they were drawn and their list is missing.
 
     Raises:
         MorphgenError: If the file is not a checkpoint, or its robot cannot be read or composed.
     """
-    source = read_checkpoint(_checkpoint_path(policy, BASELINES, files))[0].source
+    path = _checkpoint_path(policy, BASELINES, files)
+    source = read_checkpoint(path)[0].source
     rows = members(source)
+    if source.grammars:
+        folder = path if path.is_dir() else path.parent
+        rows = read_drawn(folder) if (folder / FILE).is_file() else ()
+        if not rows:
+            return str(source.task), source.obstacles, []
     if rows:
         robots = [(row.name, f"{DERIVATION}{row.derivation}") for row in rows]
         return rows[0].task, any(row.obstacles for row in rows), robots

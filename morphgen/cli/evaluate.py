@@ -126,6 +126,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
     config = replace(config, sim=args.sim or config.sim)
     results: dict[str, list[Score]] = {}
+    if args.words and run.source.grammars:
+        _warn_of_drawn(files[0].parent, _sources(args))
     for mode in (args.mode,) if args.mode else MODES:
         scores = results[mode] = []
         if args.words:
@@ -139,6 +141,19 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
             progress = display.evaluation(f"{mode} on {side}")
             scores += evaluate_run(path, side, config, mode, device=args.device, progress=progress)
     return results
+
+
+def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
+    """Say which of the robots to evaluate were among the drawn robots of a run."""
+    from morphgen.rl.drawn_robots import FILE, trained_on
+
+    if not (folder / FILE).is_file():
+        unknown = "it is unknown whether the policy was trained on any of these robots"
+        print(f"morphgen: {folder} has no {FILE}: {unknown}", file=sys.stderr)
+        return
+    names = [name for source in sources for name in trained_on(folder, source)]
+    if names:
+        print(f"morphgen: the policy was trained on {', '.join(names)}", file=sys.stderr)
 
 
 def _sides(args: argparse.Namespace, *, has_test: bool) -> tuple[Side, ...]:

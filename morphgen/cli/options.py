@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
-from morphgen.errors import FormatError, GrammarError, MorphgenError
+from morphgen.errors import FormatError, MorphgenError
 from morphgen.tasks.registry import SIMULATORS, TASKS
 
 if TYPE_CHECKING:
@@ -147,13 +147,12 @@ def load_grammar_named(name: str, library: Library, *, sound: bool = False) -> G
     Raises:
         GrammarError: If the grammar is unknown, malformed, or ``sound`` and it has faults.
     """
-    from morphgen.grammar.analysis import check_grammar
+    from morphgen.grammar.analysis import load_sound_grammar
     from morphgen.grammar.grammar_file import find_grammar, load_grammar
 
-    grammar = load_grammar(find_grammar(name, library.folders), library.folders)
-    if sound and (faults := check_grammar(grammar, library)):
-        raise GrammarError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
-    return grammar
+    if sound:
+        return load_sound_grammar(name, library)
+    return load_grammar(find_grammar(name, library.folders), library.folders)
 
 
 def reject_idle(options: dict[str, Any], reason: str) -> None:

@@ -12,10 +12,14 @@ from morphgen.cli import options as opt
 from morphgen.cli.command import Option, command, flag, number, option, path_option, repeated
 from morphgen.cli.progress import status, training_progress
 from morphgen.cli.training_robots import (
+    DRAWN_OPTIONS,
     GOAL_SEED,
     SIDES,
     SPLIT_HELP,
+    draw_robots,
+    require_robots_for_options,
     require_split_for_options,
+    robots_to_draw,
     robots_to_train,
     split_option,
 )
@@ -117,6 +121,7 @@ RESUME = flag("--resume", "continue the run in the output folder")
     opt.OBSTACLES,
     path_option("--out", "DIR", "run folder (default: runs/SPLIT/AGENT/seedN)"),
     RESUME,
+    *DRAWN_OPTIONS,
     *(on_off(name, help) for name, help in SWITCHES.items()),
     OBSERVE,
     *TRAINING_OPTIONS,
@@ -126,6 +131,7 @@ RESUME = flag("--resume", "continue the run in the output folder")
     examples=(
         "train interpolation/arm3/reach --agent me-tf --sim mujoco",
         "train arm=ur5 ee=stick task=reach --agent se",
+        "train task=reach --robots arm3:300,chain:300 --agent me-tf --workers 4",
     ),
 )
 def train(args: argparse.Namespace) -> None:
@@ -133,9 +139,16 @@ def train(args: argparse.Namespace) -> None:
     with status(args, "loading"):
         from morphgen.rl.robot_source import other_side
 
+    require_robots_for_options(args)
     with status(args, "reading the robots"):
-        source = other_side(robots_to_train(args.words, args), args.on)
         spec = agent_spec(args)
+        if args.robots is None:
+            source = other_side(robots_to_train(args.words, args), args.on)
+        else:
+            source = robots_to_draw(args)
+    if source.grammars:
+        config = _drawn_config(source, spec, args)
+    else:
         config = run_config(source, spec, args)
     _require_used(config, args)
     folder = args.out or Path("runs") / _folder_name(source) / str(spec) / f"seed{args.seed}"
@@ -240,6 +253,32 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     )
 
 
+def _drawn_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
+    """Draw the robots of a source; return the configuration of a run.
+
+    Raises:
+        TaskError: If a number is out of its range or has no effect.
+        MorphgenError: If a robot cannot be drawn.
+    """
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.token_layout import MAX_LINKS
+    from morphgen.rl.training_batches import default_slice_updates, num_slices
+    from morphgen.tasks.env_specs import GoalConfig
+
+    tasks = _task_configs(source, args.train_goals)
+    source, most_links = draw_robots(source, GoalConfig(tasks=tasks), args)
+    held_out_links = (read_split(name).max_links for name in source.held_out)
+    max_links = args.max_links or max(MAX_LINKS, most_links, *held_out_links)
+    args = argparse.Namespace(**{**vars(args), "max_links": max_links})
+    config = run_config(source, spec, args)
+    if args.slice_updates is not None and num_slices(config) == 1:
+        raise TaskError(
+            f"--slice-updates {args.slice_updates}: {source.name} has an environment for every "
+            "robot at all times"
+        )
+    return replace(config, slice_updates=args.slice_updates or default_slice_updates(config))
+
+
 def _max_links(source: RobotSource) -> int:
     """Return the number of links that observations are padded to, unless ``--max-links`` is given.
 
@@ -327,6 +366,7 @@ def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
         num_envs=args.envs,
         device=args.device,
         initial_checkpoint=str(file.resolve()),
+        slice_updates=0,
     )
 
 

@@ -1,16 +1,21 @@
-"""The robots that commands train and evaluate on: a split, or one robot with its task."""
+"""The robots that commands train and evaluate on: a split, one robot, or robots of grammars."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from morphgen.cli.command import Option, number, option
+from morphgen.cli.command import Option, number, option, repeated
+from morphgen.cli.options import reject_idle
+from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.tasks.registry import TASKS
 
 if TYPE_CHECKING:
     from morphgen.rl.robot_source import RobotSource
+    from morphgen.tasks.env_specs import GoalConfig
 
 SPLIT_HELP = (
     "name of a split, its file or built folder; or a robot and its task, such as arm=ur5 ee=stick "
@@ -20,6 +25,27 @@ SIDES = ["train", "test"]
 GOAL_SEED = number(
     "--goal-seed", "with --split: seed of all goals (default: as shipped, else 0)", least=0
 )
+
+DRAWN_OPTIONS = (
+    option(
+        "--robots",
+        metavar="GRAMMAR:N,...",
+        help="train on N robots drawn from each grammar, such as arm3:300,chain:300; the test "
+        "robots of the splits of morphgen are never drawn",
+    ),
+    number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0),
+    repeated(
+        "--held-out",
+        "with --robots: a further split whose test robots are never drawn",
+        metavar="SPLIT",
+    ),
+    number(
+        "--slice-updates",
+        "with more --robots than --envs: number of updates after which the next robots take the "
+        "environments (default: those of two episodes)",
+    ),
+)
+"""Options of robots that are drawn from grammars."""
 
 
 def split_option(purpose: str) -> Option:
@@ -89,3 +115,63 @@ def robots_to_train(words: list[str], args: argparse.Namespace) -> RobotSource:
             )
         seed = shipped_seed
     return split_source(split, side=args.on, goal_seed=seed, goals=goal_folder, library=library)
+
+
+def robots_to_draw(args: argparse.Namespace) -> RobotSource:
+    """Return the source that ``--robots`` describes; none of its robots is drawn yet.
+
+    Raises:
+        TaskError: If the positional arguments are not a task, or ``--on`` is given.
+        MorphgenError: If a grammar or a split is unknown or faulty.
+    """
+    from morphgen.rl.drawn_robots import drawn_source
+
+    choices = " or ".join(f"task={name}" for name in TASKS)
+    words, task = " ".join(args.words), args.words[0].removeprefix("task=")
+    if words != f"task={task}":
+        raise TaskError(f"{words}: with --robots, name the task and nothing else: {choices}")
+    if args.on != "train":
+        raise TaskError(f"--on {args.on}: drawn robots have no sides; --on goes with a split")
+    TASKS[task]  # raises if the task is unknown
+    return drawn_source(
+        args.robots,
+        task,
+        seed=args.robot_seed or 0,
+        held_out=args.held_out,
+        obstacles=args.obstacles,
+        goal_seed=args.goal_seed or 0,
+        library=args.library,
+    )
+
+
+def draw_robots(
+    source: RobotSource, config: GoalConfig, args: argparse.Namespace
+) -> tuple[RobotSource, int]:
+    """Draw the robots of a source and print how many were skipped.
+
+    Returns:
+        The source with the hash of its robots, and the number of links of the largest one.
+    """
+    from morphgen.rl.drawn_robots import draw
+
+    with bar(args, "drawing robots and their goals") as update:
+        robots = draw(source, config, jobs=args.workers, progress=update)
+    if robots.skipped:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
+        print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
+    return replace(source, drawn_hash=robots.hash), robots.most_links
+
+
+def require_robots_for_options(args: argparse.Namespace) -> None:
+    """Require ``--robots`` with the other options of drawn robots.
+
+    Raises:
+        MorphgenError: If it is missing.
+    """
+    if args.robots is None:
+        given = {
+            "--robot-seed": args.robot_seed is not None,
+            "--held-out": bool(args.held_out),
+            "--slice-updates": args.slice_updates is not None,
+        }
+        reject_idle(given, "only with --robots")

@@ -10,7 +10,7 @@ from itertools import islice
 from morphgen.errors import CompositionError, GrammarError
 from morphgen.grammar.compose import part_values, require_root
 from morphgen.grammar.derive import argument, require_no_arguments, require_part
-from morphgen.grammar.grammar_file import Grammar
+from morphgen.grammar.grammar_file import Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.limits import MAX_FAULTS, MAX_PARTS
 from morphgen.grammar.part import load_part
@@ -52,6 +52,18 @@ def check_grammar(grammar: Grammar, library: Library) -> list[str]:
     if not faults:
         faults += _structure_faults(grammar, library)
     return [*faults, *_unreachable(grammar), *_unused(grammar)]
+
+
+def load_sound_grammar(name: str, library: Library) -> Grammar:
+    """Return a grammar by its name or file, and require that it has no faults.
+
+    Raises:
+        GrammarError: If the grammar is unknown or malformed, or ``check_grammar`` finds a fault.
+    """
+    grammar = load_grammar(find_grammar(name, library.folders), library.folders)
+    if faults := check_grammar(grammar, library):
+        raise GrammarError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
+    return grammar
 
 
 def variables(grammar: Grammar) -> list[Variable]:

@@ -1,0 +1,120 @@
+"""``morphgen train --robots``: training on robots that are drawn from grammars."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from helpers.runs import small_split
+from helpers.splits import member, split
+from morphgen.benchmark.split import Member
+from morphgen.benchmark.split_file import write_split
+from morphgen.grammar.library import default_library
+from morphgen.rl.drawn_robots import FILE, read_drawn
+from morphgen.rl.recorders import read_metrics
+from morphgen.rl.runs import read_checkpoint, read_config
+from morphgen.viewer.robot_uri import DERIVATION, FileAccess
+from morphgen.viewer.rollout import training_robots
+
+SMALL = ("--sim", "mujoco", "--envs", "4", "--train-goals", "3", "--no-tensorboard")
+SMALL += ("--set", "num_steps=8", "--set", "minibatches=2", "--set", "epochs=1")
+SMALL += ("--set", "mlp_width=8", "--agent", "me-mlp")
+RUN = ("train", "task=reach", *SMALL, "--robots")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+
+@pytest.mark.slow
+def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, tmp_path):
+    code, out, err = run(*RUN, "cubes:3,stick:2", "--steps", "192")
+    folder = Path("runs/cubes-3-stick-2-reach/me-mlp/seed0")
+    assert (code, out) == (0, f"{folder}/checkpoint.pt\n")
+    assert "cubes:3,stick:2: update 6 of 6, 192 steps, score -" in err
+    config = read_config(folder)
+    assert (config.source.grammars, config.source.draw_seed) == ((("cubes", 3), ("stick", 2)), 0)
+    assert (config.slice_updates, config.max_links) == (3, 23)
+    assert {config.tasks[0].num_goals, config.tasks[1].num_goals} == {3}
+    robots = read_drawn(folder)
+    assert [each.name for each in robots] == [
+        *("cubes-000000", "cubes-000001", "cubes-000002"),
+        *("stick-000000", "stick-000001"),
+    ]
+    assert config.source.drawn_hash == json.loads((folder / FILE).read_text())["hash"]
+    assert [len(each["scores"]) for each in read_metrics(folder)] == [2] * 6
+    assert run(*RUN, "cubes:3,stick:2", "--steps", "192", "--resume")[0] == 0
+    code, _, err = run(*RUN, "cubes:3,stick:2", "--steps", "192", "--resume", "--robot-seed", "1")
+    assert (code, "has another run" in err) == (2, True)
+
+    write_split(small_split(), tmp_path / "own.yaml")
+    evaluation = ("--episodes", "1", "--mode", "deterministic")
+    code, out, err = run("eval", folder, "--split", "own.yaml", "--on", "test", *evaluation)
+    assert (code, err) == (0, "")
+    assert "gantry-plane" in out
+    known = Member("known", "cubes", robots[1].derivation, "reach", False, robots[1].robot_hash)
+    write_split(split((member("base=planar ee=cube"),), (known,)), tmp_path / "known.yaml")
+    code, _, err = run("eval", folder, "--split", "known.yaml", "--on", "test", *evaluation)
+    assert (code, err) == (0, "morphgen: the policy was trained on known\n")
+    code, out, _ = run("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
+    assert (code, out[:10]) == (0, "episode 1:")
+
+    files = FileAccess(default_library().folders, (tmp_path,), tmp_path / "none")
+    listed = [(each.name, f"{DERIVATION}{each.derivation}") for each in robots]
+    assert training_robots(str(folder), files) == ("reach", False, listed)
+    (folder / FILE).unlink()
+    assert training_robots(f"{folder}/checkpoint.pt", files) == ("reach", False, [])
+    code, _, err = run("eval", folder, "--split", "own.yaml", "--on", "test", *evaluation)
+    assert code == 0
+    assert f"{folder} has no robots.json: it is unknown whether" in err
+
+
+def test_held_out_robots_are_skipped_and_fit_the_observations(run, tmp_path):
+    run(*RUN, "cubes:2", "--steps", "32", "--out", "free")
+    for words in (("eval", "free"), ("eval", "free", "--on", "test"), ("finetune", "free")):
+        code, _, err = run(*words)
+        assert code == 2
+        assert "robots cubes:2 are drawn from grammars and have no test side" in err
+        assert "with --split" in err
+    (_, second) = read_drawn(Path("free"))
+    test = Member("known", "cubes", second.derivation, "reach", False, second.robot_hash)
+    large = split((member("base=planar ee=cube"),), (test,), provenance={"max_links": 25})
+    write_split(large, tmp_path / "own.yaml")
+    options = ("--held-out", "own.yaml", "--steps", "32", "--out", "run")
+    code, _, err = run(*RUN, "cubes:2", *options)
+    assert code == 0
+    assert "morphgen: robots that were skipped: 1 held out\n" in err
+    assert [each.name for each in read_drawn(Path("run"))] == ["cubes-000000", "cubes-000002"]
+    config = read_config(Path("run"))
+    assert config.source.held_out == (str(tmp_path / "own.yaml"),)
+    assert (config.slice_updates, config.max_links) == (0, 25)
+    assert read_checkpoint(Path("run"))[1]["layout"]["links"] == 25
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((*RUN, "cubes"), "--robots cubes: 'cubes' is not a grammar and a number of robots"),
+        ((*RUN, "none:3"), "unknown grammar 'none'"),
+        (("train", "planar-cube", *RUN[1:], "cubes:2"), "name the task and nothing else"),
+        (("train", "interpolation/arm3/reach", "--robots", "cubes:2"), "name the task and nothing"),
+        (("train", "task=rich", "--robots", "cubes:2"), "unknown task 'rich'"),
+        ((*RUN, "cubes:2", "--on", "test"), "--on test: drawn robots have no sides"),
+        ((*RUN, "cubes:2", "--held-out", "none"), "none: no such file, and no split of this name"),
+        ((*RUN, "cubes:2", "--slice-updates", "3"), "has an environment for every robot"),
+        ((*RUN, "cubes:6", "--steps", "32"), "only 4 of 6 robots would be trained on"),
+        ((*RUN, "chain:4", "--max-links", "6"), "links, more than max_links 6"),
+        ((*RUN, "cubes:2", "--agent", "se"), "--agent se: learns one robot"),
+        (("train", "planar-cube", "task=reach", "--held-out", "own.yaml"), "only with --robots"),
+        (("train", "planar-cube", "task=reach", "--robot-seed", "0"), "only with --robots"),
+        (("train", "planar-cube", "task=reach", "--slice-updates", "1"), "only with --robots"),
+    ],
+)
+def test_invalid_arguments_are_rejected_in_one_line(refused, words, message):
+    assert message in refused(*words)
