@@ -60,9 +60,7 @@ def require_task_config(config: TaskConfig) -> None:
     name = type(config).__name__
     for field in fields(config):
         value = getattr(config, field.name)
-        if isinstance(value, str):
-            continue
-        numbers = value if isinstance(value, tuple) else (value,)
+        numbers = () if isinstance(value, str) else value if isinstance(value, tuple) else (value,)
         if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
             raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
     for field_name, minimum in (("max_episode_steps", 1), ("num_goals", 1), ("obstacles", 0)):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from morphgen.model.inverse_kinematics_torch import solve_position_ik
+from morphgen.model.inverse_kinematics_torch import solve_pose_ik, solve_position_ik
 from morphgen.rl.baselines.path_planner import (
     Path,
     PathFollower,
@@ -15,6 +15,7 @@ from morphgen.rl.baselines.path_planner import (
     Tree,
     fractions_towards,
 )
+from morphgen.rl.baselines.reach_goals import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
@@ -30,11 +31,12 @@ TREE_ITERATIONS = 200
 ITERATIONS = 60
 """Iterations of inverse kinematics."""
 DAMPING = 0.05
-"""Damping of the least squares [joint units per metre]."""
+"""Damping of the least squares [joint units per metre]; a radian counts as the goal's
+``metres_per_radian``."""
 MAX_STEP = 0.5
 """Largest change of a joint in one iteration [rad or m]."""
 CLOSE = 0.003
-"""Distance of tool and goal that counts as solved [m]."""
+"""Distance of tool and goal that counts as solved [m]; angles count as above."""
 
 
 class InverseKinematics:
@@ -102,19 +104,7 @@ class InverseKinematics:
                 nodes = np.array(tree.nodes)
                 rows = torch.randint(len(nodes), (STARTS,), generator=self._generator)
                 starts[:, i, : nodes.shape[1]] = torch.from_numpy(nodes[rows.numpy()])
-        rows = robots.repeat(STARTS)
-        q, error = solve_position_ik(
-            task.robot_tables.tool_chain,
-            rows,
-            starts.flatten(0, 1),
-            task.field("goal")[envs, :3].repeat(STARTS, 1),
-            (task.robot_tables.lower[rows], task.robot_tables.upper[rows]),
-            iterations=ITERATIONS,
-            damping=DAMPING,
-            max_step=MAX_STEP,
-        )
-        q = q.view_as(starts)
-        distance = torch.linalg.vector_norm(error, dim=1).view(STARTS, -1)
+        q, distance = _solve_ik(task, envs, starts)
         steps = ((q - now) / task.robot_tables.max_step[robots].clamp(min=1e-9)).abs().amax(dim=2)
         # Solutions come before all others, by control steps; others by their distance.
         order = torch.where(distance < CLOSE, steps, 1e9 * (1 + distance)).argsort(dim=0)
@@ -137,6 +127,45 @@ class InverseKinematics:
         if len(goals):
             return planner.plan_rrt(start, goals, attempt=attempt)
         return planner.plan_rrt(start, goals, attempt=attempt, iterations=TREE_ITERATIONS)
+
+
+def _solve_ik(
+    task: TaskBatch, envs: torch.Tensor, starts: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return configurations (S, n, J) and distances from the goals (S, n) [m] from starts.
+
+    The distance from a goal that is a pose is the larger one of position and rotation.
+    """
+    tables, goals = task.robot_tables, reach_goals(task)
+    rows = task.env_robot_index[envs].repeat(len(starts))
+    limits = tables.lower[rows], tables.upper[rows]
+    positions = goals.positions[envs].repeat(len(starts), 1)
+    if goals.rotations is None:
+        q, error = solve_position_ik(
+            tables.tool_chain,
+            rows,
+            starts.flatten(0, 1),
+            positions,
+            limits,
+            iterations=ITERATIONS,
+            damping=DAMPING,
+            max_step=MAX_STEP,
+        )
+    else:
+        q, error = solve_pose_ik(
+            tables.tool_chain,
+            rows,
+            starts.flatten(0, 1),
+            positions,
+            goals.rotations[envs].repeat(len(starts), 1, 1),
+            limits,
+            rotation_weight=goals.metres_per_radian,
+            iterations=ITERATIONS,
+            damping=DAMPING,
+            max_step=MAX_STEP,
+        )
+    norms = torch.linalg.vector_norm(error.view(len(rows), -1, 3), dim=2)
+    return q.view_as(starts), norms.amax(dim=1).view(len(starts), -1)
 
 
 def random_starts(task: TaskBatch, envs: torch.Tensor, generator: torch.Generator) -> torch.Tensor:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import torch
 
+from morphgen.model.inverse_kinematics_torch import pose_task
 from morphgen.model.kinematics_torch import frame_jacobian
+from morphgen.rl.baselines.reach_goals import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.observation import joint_to_link
@@ -17,14 +19,15 @@ GAIN = 0.3
 """Fraction of the error that a joint would remove in one control step if it acted alone. All joints
 act at once and lag behind their targets, so that 1 overshoots; tuned on arm3 and Panda."""
 MIN_COLUMN = 1e-4
-"""Jacobian columns shorter than this do not move the tool [m per rad, or m per m]."""
+"""Jacobian columns shorter than this do not move the tool [m per rad or m per m]."""
 
 
 class JacobianColumns:
     """Moves each joint j by a_j = GAIN (J_j . e) / (|J_j|^2 s_j), clipped to [-1, 1].
 
     J_j is the joint's column of the Jacobian, e the error from tool to goal, and s_j the joint's
-    largest step. Jacobian and error are those of the measured joint positions.
+    largest step. Jacobian and error are those of the measured joint positions. They have 3 rows, or
+    6 for goals that are poses, where ``ReachConfig.metres_per_radian`` converts rotations.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -34,8 +37,13 @@ class JacobianColumns:
         """Return actions, shape (n, L)."""
         tables, robots = task.robot_tables, task.env_robot_index
         T_root_tool, J_root_tool = frame_jacobian(tables.tool_chain, robots, task.q)
-        error = task.field("goal")[:, :3] - T_root_tool[:, :3, 3]
-        steps = column_steps(J_root_tool[:, :3], error)
+        goals = reach_goals(task)
+        if goals.rotations is None:
+            J, error = J_root_tool[:, :3], goals.positions - T_root_tool[:, :3, 3]
+        else:
+            goal = goals.positions, goals.rotations, goals.metres_per_radian
+            J, error = pose_task(T_root_tool, J_root_tool, *goal)
+        steps = column_steps(J, error)
         fractions = (GAIN * steps / tables.max_step[robots].clamp(min=1e-9)).clamp(-1, 1)
         return encode_actions(joint_to_link(tables, robots, fractions), task.action_kind)
 

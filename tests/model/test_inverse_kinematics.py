@@ -12,15 +12,18 @@ from helpers.robots import arm
 from helpers.scenes import robot
 from morphgen.model import inverse_kinematics
 from morphgen.model.inverse_kinematics import solve_pose_ik
-from morphgen.model.inverse_kinematics_torch import pose_ik_step, solve_position_ik
+from morphgen.model.inverse_kinematics_torch import pose_ik_step, pose_task, solve_position_ik
+from morphgen.model.inverse_kinematics_torch import solve_pose_ik as solve_poses
 from morphgen.model.kinematics import (
     driving_joints,
     frame_pose,
     joint_limits,
     random_configurations,
 )
+from morphgen.model.kinematics_torch import frame_jacobian as frame_jacobians
 from morphgen.model.kinematics_torch import frame_pose as frame_poses
 from morphgen.model.rotation_torch import (
+    angle_between,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotvec_from_matrix,
@@ -138,6 +141,47 @@ class Stepper:
         return pose_ik_step(
             self.chain, self.robot_index, q, positions, rotations, self.limits, **options
         )
+
+
+def test_poses_are_reached_from_random_starts_within_the_limits():
+    """Also by robots with fewer than 6 joints: the goals are poses of configurations."""
+    goals, starts = 8, 16
+    solver = Stepper(*np.repeat(range(len(ROBOTS)), goals * starts))
+    low, high = solver.limits
+    random = torch.rand(2, *low.shape, generator=torch.Generator().manual_seed(0))
+    goal_q = (low + (high - low) * random[0])[::starts].repeat_interleave(starts, 0)
+    positions, rotations = solver.poses(goal_q)
+    q, error = solve_poses(
+        solver.chain,
+        solver.robot_index,
+        low + (high - low) * random[1],
+        positions,
+        rotations,
+        solver.limits,
+        rotation_weight=0.2,
+        iterations=60,
+        damping=0.05,
+        max_step=0.5,
+    )
+    assert ((low <= q) & (q <= high)).all()
+    reached, turned = solver.poses(q)
+    assert torch.allclose(error[:, :3], positions - reached, atol=1e-5)
+    angle = 0.2 * angle_between(turned, rotations)
+    assert torch.allclose(error[:, 3:].norm(dim=1), angle, atol=2e-3)
+    solved = (error.norm(dim=1) < 3e-3).view(len(ROBOTS), goals, starts).any(dim=2)
+    assert (solved.sum(dim=1) >= goals - 1).all()
+
+
+def test_near_a_pose_its_error_is_the_jacobian_times_the_change_of_the_joints():
+    solver = Stepper(0, 1, 2, 3, 4)
+    change = 0.01 * torch.rand(solver.home.shape, generator=torch.Generator().manual_seed(0))
+    q = solver.home + 0.1
+    positions, rotations = solver.poses(q + change)
+    T_J = frame_jacobians(solver.chain, solver.robot_index, q)
+    J, error = pose_task(*T_J, positions, rotations, 0.3)
+    predicted = (J @ change[..., None])[..., 0]
+    assert torch.allclose(predicted, error, atol=3e-4)
+    assert (error[:, 3:].norm(dim=1) > 5e-4).all()
 
 
 def test_rotation_uses_the_null_space_of_the_position_task():

@@ -1,5 +1,7 @@
 """The baseline ``ik`` reaches goals along collision-free paths; results of episodes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -47,6 +49,13 @@ def test_random_starts_do_not_move_fingers(made):
 @pytest.mark.parametrize("words", [CLAW, CHAIN])
 def test_goals_are_reached_by_robots_whose_links_obstruct_each_other(made, words):
     batch = made(words, 8)
+    episodes = run_episodes(batch, InverseKinematics(0), 1)
+    assert sum(episode.success for episode in episodes) >= 7
+
+
+@pytest.mark.parametrize("words", [CLAW, "prims"])
+def test_poses_are_reached(made, words):
+    batch = made(words, 8, configs=(replace(REACH, goal="pose"),))
     episodes = run_episodes(batch, InverseKinematics(0), 1)
     assert sum(episode.success for episode in episodes) >= 7
 

@@ -1,5 +1,7 @@
 """The baseline ``jacobian``: each joint follows its own Jacobian column, whatever the robot."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -64,6 +66,27 @@ def test_different_robots_reach_in_one_batch(made):
     success = [[e.success for e in episodes if e.robot_index == i] for i in range(2)]
     assert all(success[0])
     assert sum(success[1]) >= 5
+
+
+def test_orientations_are_approached_where_goals_are_poses(made):
+    """A ball on a gantry turns about two axes: each joint has a column of its own."""
+    pose = replace(REACH, goal="pose")
+    batch = made(["prims"], 12, configs=(pose,))
+    episodes = run_episodes(batch, JacobianColumns(), 1)
+    by_position = made(["prims"], 12, configs=(pose,))
+    blind = run_episodes(by_position, PositionOnly(), 1)
+    assert sum(e.success for e in episodes) > sum(e.success for e in blind) + 2
+
+
+class PositionOnly(JacobianColumns):
+    """Acts as if the goals of a batch were positions."""
+
+    def act(self, task):
+        envs = task.groups["reach"]
+        envs.needs_tool_rotation = False
+        actions = super().act(task)
+        envs.needs_tool_rotation = True
+        return actions
 
 
 def test_discrete_actions_are_bins(made):
