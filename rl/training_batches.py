@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from morphgen.benchmark.token_layout import require_max_links
+from morphgen.model.kinematics import driving_joints
+from morphgen.model.robot import TOOL, Robot
 from morphgen.rl.drawn_robots import DrawnRobots, draw, num_drawn
 from morphgen.rl.robot_source import specs_of
 from morphgen.rl.runs import RunConfig
@@ -20,6 +23,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.device import batch_device
 from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.make import batch_from_specs
+from morphgen.tasks.registry import TASKS
 
 SLICE_STEPS = 600
 """Default time that a slice of the robots is trained on [control steps per environment]: two
@@ -61,6 +65,13 @@ def slice_of(num_robots: int, size: int, number: int, seed: int) -> list[int]:
     return robots
 
 
+def num_actuated(robot: Robot, task: str) -> int:
+    """Return the number of joints that actions move."""
+    if TASKS[task].moves_fingers:
+        return robot.dof
+    return len(driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link)))
+
+
 class TrainingBatches:
     """Makes the batches of a run; batches and their seeds depend on the config only.
 
@@ -91,6 +102,10 @@ class TrainingBatches:
             links = len(spec.robot.links)
             require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)
         self.most_links = max(len(spec.robot.links) for spec in self._specs)
+        self._channels = config.interface.channels
+        if config.slice_updates:
+            joints = max(num_actuated(spec.robot, spec.task) for spec in self._specs)
+            self._channels = replace(self._channels, tree_joints=joints)
 
     def make(self, update: int) -> TaskBatch:
         """Return a new batch, with which the run continues after so many updates.
@@ -113,7 +128,7 @@ class TrainingBatches:
             sim=config.sim,
             seed=seed,
             kind=interface.kind,
-            observe=interface.channels,
+            observe=self._channels,
             workers=self._workers,
             max_links=interface.max_links,
             device=batch_device(config.sim, config.device),

@@ -149,7 +149,9 @@ class TaskBatch:
             **self._obstacle_entries(scenes),
         }
         if self.observation_config.tree:
-            self._constant_entries |= tree_entries(robot_tables, index, self.action_mask)
+            self._constant_entries |= tree_entries(
+                robot_tables, index, self.action_mask, self.observation_config.tree_joints
+            )
         self._kinematics: KinematicChannels | None = None
         if names := self.observation_config.kinematic_channels:
             has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)

@@ -64,6 +64,8 @@ class ObservationConfig:
     """Whether to observe block and obstacles as boxes; without it they need points."""
     obstacles: int = 0
     """Minimum number of obstacle rows, for policies that meet more obstacles elsewhere."""
+    tree_joints: int = 0
+    """Minimum number of joints of ``tree_entries``, for batches after which others have more."""
 
     def __post_init__(self) -> None:
         """Require counts."""
@@ -189,7 +191,10 @@ TREE_RELATIONS = 4 * (MAX_TREE_DISTANCE + 1)
 
 
 def tree_entries(
-    tables: RobotTables, env_robot_index: torch.Tensor, action_mask: torch.Tensor
+    tables: RobotTables,
+    env_robot_index: torch.Tensor,
+    action_mask: torch.Tensor,
+    least_joints: int = 0,
 ) -> Observation:
     """Return how the joints that actions move are connected, for K joints with padding.
 
@@ -197,6 +202,7 @@ def tree_entries(
         tables: The robots.
         env_robot_index: Robot of each environment, shape (n,), int64.
         action_mask: Links whose joint obeys actions, shape (n, L), bool.
+        least_joints: Minimum of K.
 
     Returns:
         ``joints`` (n, K): the link of each joint, root first, -1 for padding. ``joint_parents``
@@ -205,7 +211,7 @@ def tree_entries(
         ``MAX_TREE_DISTANCE``, plus a multiple of ``MAX_TREE_DISTANCE + 1`` that says whether the
         second joint is the first one, above it, below it, or on another branch. All int64.
     """
-    K = int(action_mask.sum(dim=1).max())
+    K = max(int(action_mask.sum(dim=1).max()), least_joints)
     order = (~action_mask).int().argsort(dim=1, stable=True)[:, :K]
     exists = torch.gather(action_mask, 1, order)
     rows = torch.arange(len(order), device=order.device)[:, None]

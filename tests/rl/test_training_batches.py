@@ -13,6 +13,7 @@ from helpers.runs import QUIET, equal, small_config, weights
 from helpers.splits import member, split
 from morphgen.benchmark.split_file import write_split
 from morphgen.errors import BenchmarkError, TaskError
+from morphgen.rl.config import PolicyConfig
 from morphgen.rl.drawn_robots import FILE, draw, drawn_source
 from morphgen.rl.learner_state import use_batch
 from morphgen.rl.recorders import read_metrics
@@ -21,14 +22,17 @@ from morphgen.rl.training import train
 from morphgen.rl.training_batches import (
     TrainingBatches,
     default_slice_updates,
+    num_actuated,
     num_slices,
     slice_of,
 )
-from morphgen.tasks.env_specs import GoalConfig
+from morphgen.tasks.env_specs import GoalConfig, load_robot
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.robot_tables import build_robot_tables
 
-TASKS = (ReachConfig(num_goals=3), PushConfig())
+CONFIGS = (ReachConfig(num_goals=3), PushConfig())
 
 
 class StoppedError(Exception):
@@ -46,7 +50,7 @@ def drawn_config(request="cubes:4,stick:2", *, updates=24, slice_updates=4, **mo
     """Return a run of four environments, on six robots by default."""
     source = drawn_source(request, "reach", **more)
     config = small_config(source, total_timesteps=updates * 4 * 8)
-    return replace(config, tasks=TASKS, slice_updates=slice_updates)
+    return replace(config, tasks=CONFIGS, slice_updates=slice_updates)
 
 
 def run(folder, config, stop=None):
@@ -86,7 +90,7 @@ def test_a_slice_lasts_two_episodes_or_less_in_a_short_run():
 
 def test_batches_have_the_robots_of_their_slice():
     config = drawn_config()
-    robots = draw(config.source, GoalConfig(tasks=TASKS))
+    robots = draw(config.source, GoalConfig(tasks=CONFIGS))
     batches = TrainingBatches(config)
     assert batches.most_links == 5
     seen = []
@@ -130,6 +134,31 @@ def test_a_resumed_run_ends_with_the_same_weights(tmp_path, stops):
     assert {len(each["scores"]) for each in untimed(tmp_path / "whole")} == {2}
 
 
+def test_slices_may_differ_in_their_largest_robot(tmp_path):
+    # Two of them at a time: a slice has the stick, with one joint more, or it has not.
+    config = drawn_config("cubes:4,stick:1", updates=8, slice_updates=2)
+    policy = PolicyConfig("me-graph", observe=("joint", "jacobian"), normalize=True)
+    config = replace(config, policy=policy, num_envs=2)
+    config = replace(config, ppo=replace(config.ppo, total_timesteps=8 * 2 * 8))
+    batches = TrainingBatches(config)
+    observations = [batches.make(update).observe() for update in (0, 2, 4)]
+    batches.close()
+    assert len({len(observation["links"].any(0).nonzero()) for observation in observations}) == 2
+    assert {observation["joints"].shape for observation in observations} == {(2, 3)}
+    with pytest.raises(StoppedError):
+        run(tmp_path / "cut", config, 5)
+    run(tmp_path / "cut", config)
+    run(tmp_path / "whole", config)
+    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+def test_actuated_joints_are_counted_as_batches_do(task):
+    robots = [load_robot(name) for name in ("planar-cube", "nlink", "arm3", "arm=ur5 ee=rethink")]
+    mask = build_robot_tables(robots).action_mask(fingers=TASKS[task].moves_fingers)
+    assert [num_actuated(robot, task) for robot in robots] == mask.sum(dim=1).tolist()
+
+
 def test_the_order_of_robots_changes_the_weights(tmp_path):
     run(tmp_path / "a", drawn_config(updates=8))
     run(tmp_path / "b", drawn_config(updates=8, slice_updates=2))
@@ -171,7 +200,7 @@ def test_runs_that_would_leave_robots_out_are_refused(tmp_path):
 
 def test_a_run_of_other_robots_is_not_resumed(tmp_path):
     config = drawn_config(updates=8)
-    source = replace(config.source, drawn_hash=draw(config.source, GoalConfig(tasks=TASKS)).hash)
+    source = replace(config.source, drawn_hash=draw(config.source, GoalConfig(tasks=CONFIGS)).hash)
     run(tmp_path / "run", replace(config, source=source))
     for other in (drawn_config(updates=8, seed=1), drawn_config("cubes:5,stick:2", updates=8)):
         with pytest.raises(TaskError, match="has another run: source"):
