@@ -1,6 +1,7 @@
-"""Environment steps per second of raw PyBullet, morphgen, panda-gym and MuJoCo in one run.
+"""Environment steps per second of raw PyBullet, panda-gym and morphgen's simulators in one run.
 
     python benchmarks/env_speed.py [--envs 128] [--seconds 4] [--rounds 3] [--json rows.json]
+        [--only TEXT]
 
 Reach and push of a Panda with its hand, and reach of a UR5 with a plate, with collision shapes of
 fitted primitives. All rows of morphgen use the same random actions and whole episodes. A control
@@ -19,8 +20,13 @@ step has four physics steps of 5 ms. Rows of a task:
 - panda-gym with its own scene and observation, joint control and the same physics steps: one
   environment in one process, and one in each of two processes (Gymnasium's vector environments).
 
+Then reach of the ten arm3 of `interpolation/arm3/reach`, on which agents train, with 160 and 4,096
+environments (`--only arm3` measures these alone): MuJoCo in one thread, the same in a scene without
+contacts, and the simulator `kinematic`. These rows have one thread and count CPU time.
+
 Every round measures all rows in turn, so that other load on the machine affects all rows. The
-figures are medians over the rounds. "of raw" is the ratio to raw PyBullet of the same task.
+figures are medians over the rounds. "of first" is the ratio to the first row of the same case: raw
+PyBullet, or MuJoCo for the ten arm3.
 
 panda-gym comes with `pip install morphgen[bench]`; without it its rows are missing.
 """
@@ -48,7 +54,8 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.tasks.make import make_batch
+from morphgen.benchmark.split_file import read_split
+from morphgen.tasks.make import make_batch, make_split_batch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
@@ -63,6 +70,10 @@ CASES: tuple[tuple[str, str, str], ...] = (
 )
 """Task, robot, and the panda-gym environment of the same task."""
 RAW = "raw PyBullet"
+TEN_ARMS = "interpolation/arm3/reach"
+"""Split whose ten robots to train on are stepped together."""
+TEN_ARMS_ENVS = (160, 4096)
+NOTHING_TOUCHES = Contacts(scene=False, self_collision=False)
 EPISODE = ReachConfig.max_episode_steps
 """Episode length [control steps]; every row runs whole episodes."""
 
@@ -83,24 +94,31 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=4.0, help="of every row in every round")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path, help="also write the rows here")
+    parser.add_argument("--only", default="", help="text in the names of the cases to measure")
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = [row for case in CASES for row in _rows(*case, args.envs)]
+    rows += [row for envs in TEN_ARMS_ENVS for row in _ten_arms_rows(envs)]
+    rows = [row for row in rows if args.only in row.case]
+    if not rows:
+        parser.error(f"--only {args.only}: no case has this text in its name")
+    first = {row.case: row.name for row in reversed(rows)}
     found: dict[tuple[str, str], list[float]] = {(row.case, row.name): [] for row in rows}
     for _ in range(args.rounds):
         for row in tqdm(rows, unit="row"):
             found[row.case, row.name].append(row.rate(args.seconds))
     medians = {key: statistics.median(rates) for key, rates in found.items()}
     table = [
-        (case, name, rate, rate / medians[case, RAW]) for (case, name), rate in medians.items()
+        (case, name, rate, rate / medians[case, first[case]])
+        for (case, name), rate in medians.items()
     ]
     if args.json:
         text = json.dumps(
-            [dict(zip(("case", "name", "rate", "of_raw"), row, strict=True)) for row in table],
+            [dict(zip(("case", "name", "rate", "of_first"), row, strict=True)) for row in table],
             indent=1,
         )
         args.json.write_text(text + "\n", encoding="utf-8")
-    headers = ("task", "with", "env-steps/s", "of raw")
+    headers = ("task", "with", "env-steps/s", "of first")
     print(tabulate(table, headers, floatfmt=("", "", ",.0f", ".2f")))
     if find_spec("panda_gym") is None:
         print("panda-gym is not installed: no peer in this run (pip install 'morphgen[bench]')")
@@ -129,7 +147,7 @@ def _rows(task: str, robot: str, peer: str, envs: int) -> list[Row]:
         Row(
             case,
             "morphgen, MuJoCo, 1 thread, nothing touches",
-            partial(_ours, task, robot, envs, sim="mujoco", contacts=Contacts(False, False)),
+            partial(_ours, task, robot, envs, sim="mujoco", contacts=NOTHING_TOUCHES),
         ),
     ]
     if peer:
@@ -142,6 +160,24 @@ def _rows(task: str, robot: str, peer: str, envs: int) -> list[Row]:
             name = f"panda-gym, {count} process" + ("es" if count > 1 else "")
             rows.append(Row(case, name, partial(_peer, peer, count)))
     return rows
+
+
+def _ten_arms_rows(envs: int) -> list[Row]:
+    case = f"reach, ten arm3, {envs} environments"
+    rates = {
+        "MuJoCo, 1 thread": partial(_ten_arms, envs, sim="mujoco"),
+        "MuJoCo, 1 thread, nothing touches": partial(
+            _ten_arms, envs, sim="mujoco", contacts=NOTHING_TOUCHES
+        ),
+        "kinematic": partial(_ten_arms, envs, sim="kinematic"),
+    }
+    return [Row(case, f"morphgen, {name}", rate) for name, rate in rates.items()]
+
+
+def _ten_arms(envs: int, seconds: float, sim: str, contacts: Contacts | None = None) -> float:
+    split = read_split(TEN_ARMS)
+    with closing(make_split_batch(split, "train", envs, sim=sim, contacts=contacts)) as batch:
+        return measure_speed(batch, seconds, clock=time.process_time).steps_per_second
 
 
 def _ours(

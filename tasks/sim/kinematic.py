@@ -133,7 +133,7 @@ class KinematicSimulation:
         error = torch.clamp(targets, self._lower, self._upper) - self.q
         error = torch.clamp(error, -self._farthest, self._farthest)
         (error_to_error, velocity_to_error), (by_error, by_velocity) = CONTROL_STEP.tolist()
-        # The error that remains is that of a target which may be nearer than the real one.
+        # A clamped error is that of a nearer target, towards which the joint moves in this step.
         self.q += (1 - error_to_error) * error - velocity_to_error * self.qd
         self.qd.mul_(by_velocity).add_(by_error * error)
 
