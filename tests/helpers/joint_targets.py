@@ -28,6 +28,12 @@ def smooth_walk(body, seed, steps=SECOND):
     return _integrated(body, actions)
 
 
+def random_walk(body, seed, steps=SECOND):
+    """Targets of independent random actions, as those of a policy that has learned nothing."""
+    rng = np.random.default_rng(seed)
+    return _integrated(body, rng.uniform(-1, 1, (steps, body.dof)))
+
+
 def full_speed(body, seed, steps=SECOND):
     """Targets that move from home in one direction as fast as the benchmark lets them."""
     rng = np.random.default_rng(seed)

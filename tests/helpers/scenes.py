@@ -7,6 +7,26 @@ from morphgen.model.geometry import Pose, Shape, Sphere
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.tasks.sim.base import Block, Scene
 
+PAPER_ROBOTS = (
+    "arm=ur5 ee=stick",
+    "arm=ur5 ee=sake_ez",
+    "arm=ur5 ee=rethink",
+    "arm=kinova_gen3 ee=robotiq_2f85",
+    "arm=jaco2 ee=jaco_fingers",
+    "arm=xarm7 ee=robotiq_2f85",
+    "arm=lwr ee=panda_hand",
+    "arm=yumi_right ee=yumi_gripper",
+    "arm=widowx ee=widowx_gripper",
+    "arm5",
+    "stick",
+    "nlink",
+    "cubes",
+    "prims prim=cylinder",
+    "prims prim=sphere",
+    "chain beads=3",
+)
+"""Robots of the paper besides those of fast tests."""
+
 
 @cache
 def robot(request):

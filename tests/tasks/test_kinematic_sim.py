@@ -9,9 +9,9 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from helpers.goal_sets import draw_spec
-from helpers.joint_targets import SECOND, full_speed, smooth_walk
+from helpers.joint_targets import SECOND, full_speed, random_walk, smooth_walk
 from helpers.robots import arm, finger
-from helpers.scenes import push_scene, reach_scene, real_arm_scene, robot
+from helpers.scenes import PAPER_ROBOTS, push_scene, reach_scene, real_arm_scene, robot
 from morphgen.errors import SimulationError, TaskError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
@@ -89,6 +89,19 @@ def test_all_links_stay_within_a_centimetre_of_mujoco(words, path):
         )
         assert np.linalg.norm(ours - mujoco, axis=-1).max() < NEAR
         assert np.linalg.norm(mujoco - mujoco[0], axis=-1).max() > 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", PAPER_ROBOTS)
+def test_tools_of_the_papers_robots_stay_within_a_centimetre_of_mujoco(words):
+    body = robot(words)
+    for seed in range(3):
+        targets = random_walk(body, seed)
+        ours, mujoco = (
+            in_free_space(simulation, body, targets)
+            for simulation in (KinematicSimulation, MujocoSimulation)
+        )
+        assert largest_tool_distance(body, ours, mujoco) < NEAR
 
 
 @pytest.mark.parametrize("words", ["cubes", MIXED])

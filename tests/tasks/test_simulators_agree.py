@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.joint_targets import SECOND, smooth_walk
-from helpers.scenes import push_scene, robot
+from helpers.scenes import PAPER_ROBOTS, push_scene, robot
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block, Contacts, Scene
@@ -20,26 +20,8 @@ SIMULATIONS = (MujocoSimulation, BulletSimulation)
 IN_FREE_SPACE = Contacts(scene=False, self_collision=False)
 
 SOME = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm3", "prims", "chain beads=2")
-OF_THE_PAPER = (
-    "arm=ur5 ee=stick",
-    "arm=ur5 ee=sake_ez",
-    "arm=ur5 ee=rethink",
-    "arm=kinova_gen3 ee=robotiq_2f85",
-    "arm=jaco2 ee=jaco_fingers",
-    "arm=xarm7 ee=robotiq_2f85",
-    "arm=lwr ee=panda_hand",
-    "arm=yumi_right ee=yumi_gripper",
-    "arm=widowx ee=widowx_gripper",
-    "arm5",
-    "stick",
-    "nlink",
-    "cubes",
-    "prims prim=cylinder",
-    "prims prim=sphere",
-    "chain beads=3",
-)
 FAST = [pytest.param(words, id=words) for words in SOME]
-SLOW = [pytest.param(words, id=words, marks=pytest.mark.slow) for words in OF_THE_PAPER]
+SLOW = [pytest.param(words, id=words, marks=pytest.mark.slow) for words in PAPER_ROBOTS]
 
 
 def begun(simulation, scene, q, contacts=None):
