@@ -22,7 +22,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from statistics import mean
 
@@ -41,7 +40,7 @@ from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.env_specs import member_spec
 from morphgen.tasks.make import batch_from_specs
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import TASKS, installed_simulators
 
 Row = dict[str, float | str]
 
@@ -83,12 +82,13 @@ def main() -> int:
     parser.add_argument("--only", default="", help="robots whose name matches this expression")
     parser.add_argument("--envs", type=int, default=8)
     parser.add_argument("--episodes", type=int, default=2, help="of each environment")
-    parser.add_argument("--sims", default=",".join(SIMULATORS))
+    parser.add_argument("--sims", default="pybullet,mujoco")
     parser.add_argument("--obstacles", action="store_true")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
-    sims = tuple(sim for sim in SIMULATORS if sim in args.sims.split(",") and find_spec(sim))
+    requested, installed = args.sims.split(","), installed_simulators()
+    sims = tuple(sim for sim in requested if sim in installed)
     members = [
         member
         for member in _members()
@@ -109,8 +109,8 @@ def main() -> int:
             rows.append({"robot": "mean", "task": task, **means})
     _write(args.json, rows)
     print(tabulate(rows, headers="keys", floatfmt=".2f"))
-    for sim in SIMULATORS:
-        if sim not in sims:
+    for sim in requested:
+        if sim not in installed:
             print(f"{sim}: left out")
     return 0
 

@@ -245,10 +245,18 @@ def test_one_robot_has_no_other_side(tmp_path):
         evaluate_run(tmp_path, "test", EVAL, "deterministic")
 
 
+def test_runs_without_contacts_are_evaluated_with_them(tmp_path):
+    run_config = replace(small_config(total_timesteps=32), sim="kinematic")
+    train(tmp_path, run_config, execution=QUIET)
+    config = eval_config_of(run_config, 1)
+    assert config.sim == "mujoco"
+    (score,) = evaluate_run(tmp_path, "train", config, "deterministic")
+    assert score.episodes == 1
+
+
 def test_eval_config_has_the_simulator_and_tasks_of_the_run(run):
     config, _ = read_checkpoint(run)
     assert eval_config_of(config, 3) == EvalConfig(3, "mujoco")
-    assert eval_config_of(replace(config, sim="kinematic"), 3).sim == "mujoco"
     with pytest.raises(TaskError, match="0 episodes"):
         EvalConfig(episodes=0)
     with pytest.raises(TaskError, match="a seed from 0 to"):
