@@ -89,6 +89,7 @@ def write_scores(path: Path, scores_by_mode: Scores) -> None:
 
 
 def _row(mode: str, score: Score) -> tuple[str, ...]:
+    angle = "" if math.isnan(score.angle) else f", {math.degrees(score.angle):.1f} deg"
     interval = "" if math.isnan(score.low) else f"{score.low:.2f} to {score.high:.2f}"
     return (
         score.robot,
@@ -100,5 +101,5 @@ def _row(mode: str, score: Score) -> tuple[str, ...]:
         f"{score.success:.0%}",
         f"{score.raw:.2f}",
         f"{score.random:.2f}",
-        f"{score.distance:.3f} m",
+        f"{score.distance:.3f} m{angle}",
     )

@@ -332,6 +332,7 @@ def _score(
         distance=distance,
         relative_distance=distance / reach(spec.robot) if task.relative_distance else math.nan,
         unstable=sum(episode.unstable for episode in episodes),
+        angle=float(np.mean([episode.angle for episode in episodes])),
     )
 
 

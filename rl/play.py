@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.baselines import BASELINES, baselines_for
+from morphgen.rl.evaluation import eval_config_of
 from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.rollouts import Controller, Episode
 from morphgen.rl.runs import Interface, read_checkpoint
+from morphgen.tasks.env_specs import GoalConfig
 from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.renderer import Frame
 from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.task import TaskConfig
 
 STRIDE = 2
 """Control steps between two frames."""
@@ -49,6 +53,18 @@ def interface_of(name: str) -> Interface:
         return Interface()
     run, _ = read_checkpoint(Path(name))
     return run.interface
+
+
+def task_config_of(name: str, task: str) -> TaskConfig:
+    """Return the constants of a task that a checkpoint's policy is evaluated with, else defaults.
+
+    Raises:
+        TaskError: If the file is not a checkpoint.
+    """
+    if not _is_file(name):
+        return GoalConfig().task_config(task)
+    run, _ = read_checkpoint(Path(name))
+    return GoalConfig(tasks=eval_config_of(run, 1).tasks).task_config(task)
 
 
 def make_controller(name: str, env: TaskEnv, seed: int) -> Controller:
@@ -115,7 +131,7 @@ def play(
                 yield from _shown(env)
         score = TASKS[env.task].episode_score(sum(scores), scores[-1], len(scores))
         facts = info["success"], info["distance"], score, len(scores), info["diverged"]
-        report(Episode(0, 0, *facts))
+        report(Episode(0, 0, *facts, info.get("angle", math.nan)))
 
 
 def _is_file(policy: str) -> bool:

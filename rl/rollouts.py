@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -38,6 +39,8 @@ class Episode:
     """Length of the episode [control steps]."""
     unstable: bool
     """Whether the episode ended because the simulation diverged."""
+    angle: float = math.nan
+    """Angle from success at the end [rad]; nan if the task wants no orientation."""
 
     @property
     def seconds(self) -> float:
@@ -92,6 +95,7 @@ def run_episodes(
                         TASKS[batch.specs[robot_indices[env]].task].episode_score(*numbers),
                         int(steps[env]),
                         bool(step.diverged[env]),
+                        math.nan if step.angle is None else float(step.angle[env]),
                     )
                 )
                 done += 1

@@ -44,6 +44,8 @@ class Score:
     """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
     unstable: int = 0
     """Number of episodes that ended because the simulation diverged."""
+    angle: float = math.nan
+    """Mean angle from success at the end of an episode [rad]; nan without orientation."""
 
 
 def scores_to_json(scores: Sequence[Score]) -> list[dict[str, Any]]:

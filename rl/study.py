@@ -7,7 +7,7 @@ import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -34,6 +34,8 @@ from morphgen.rl.robot_source import RobotSource, members, other_side, tasks_of
 from morphgen.rl.runs import RunConfig, require_open
 from morphgen.rl.scores import Score, score_from_json, scores_to_json
 from morphgen.rl.training import ExecutionConfig, ShowMetrics, Subrun, train
+from morphgen.tasks.env_specs import GoalConfig, task_configs
+from morphgen.tasks.registry import TASKS
 
 SCORES = "scores.json"
 POLL = 2.0
@@ -130,14 +132,27 @@ def read_scores(cell: Cell) -> dict[str, list[Score]] | None:
             mode: [score_from_json(record) for record in records]
             for mode, records in data["scores"].items()
         }
-        stored = data["eval"], renamed("source", data["source"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        source = RobotSource(**renamed("source", data["source"]))
+        stored = _plain([_with_defaults(data["eval"]), asdict(source)])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, TaskError) as error:
         raise FormatError(f"{path}: not the scores of a cell: {error}") from error
-    expected = json.loads(json.dumps([cell.eval_config.as_data(), asdict(cell.source)]))
+    expected = _plain([cell.eval_config.as_data(), asdict(cell.source)])
     for what, theirs, ours in zip(("evaluation", "set of robots"), stored, expected, strict=True):
         if theirs != ours:
             raise TaskError(f"{path}: of another {what}; delete it, or name another --out")
     return scores
+
+
+def _with_defaults(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stored evaluation with the defaults of constants that tasks did not have then."""
+    constants = {name: values for name, values in stored.items() if name in TASKS}
+    return {**stored, **GoalConfig(tasks=task_configs(constants)).as_data()}
+
+
+def _plain(values: Sequence[object]) -> list[Any]:
+    """Return values as JSON reads them: lists instead of tuples."""
+    plain: list[Any] = json.loads(json.dumps(values))
+    return plain
 
 
 def require_cells(cells: Sequence[Cell]) -> None:

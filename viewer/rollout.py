@@ -18,7 +18,7 @@ from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.drawn_robots import FILE, read_drawn
-from morphgen.rl.play import interface_of, make_controller, require_policy
+from morphgen.rl.play import interface_of, make_controller, require_policy, task_config_of
 from morphgen.rl.robot_source import members
 from morphgen.rl.rollouts import Controller
 from morphgen.rl.runs import Interface, read_checkpoint
@@ -243,6 +243,7 @@ def _start_robot(
         obstacles=config.obstacles,
         kind=interface.kind,
         observe=interface.channels,
+        config=task_config_of(policy, config.task),
         max_links=interface.max_links,
         library=files.library_folders,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
     from morphgen.rl.robot_source import RobotSource
     from morphgen.rl.scores import Score
+    from morphgen.tasks.task import TaskConfig
 
 
 @command(
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
         ),
     ),
     opt.sim_option("that of the training"),
+    opt.goal_option("that of the training, or position for a baseline"),
     opt.WORKERS,
     opt.DEVICE,
     opt.SEED,
@@ -83,6 +86,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
     from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
+    from morphgen.tasks.env_specs import default_configs
 
     name = args.checkpoint
     if not args.words:
@@ -91,7 +95,11 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
         raise TaskError(f"{'--mode' if args.mode else '--device'} is for policies; {name} has none")
     sources = _sources(args)
     config = EvalConfig(
-        _num_episodes(args), args.sim or default_simulator(), args.seed, args.workers
+        _num_episodes(args),
+        args.sim or default_simulator(),
+        args.seed,
+        args.workers,
+        _with_goal(default_configs(), sources, args),
     )
     return {
         name: [
@@ -124,14 +132,16 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
                 file=sys.stderr,
             )
     config = eval_config_of(run, _num_episodes(args), seed=args.seed, workers=args.workers)
-    config = replace(config, sim=args.sim or config.sim)
+    sources = _sources(args) if args.words else [run.source]
+    tasks = _with_goal(config.tasks, sources, args)
+    config = replace(config, sim=args.sim or config.sim, tasks=tasks)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
-        _warn_of_drawn(files[0].parent, _sources(args))
+        _warn_of_drawn(files[0].parent, sources)
     for mode in (args.mode,) if args.mode else MODES:
         scores = results[mode] = []
         if args.words:
-            for source in _sources(args):
+            for source in sources:
                 progress = display.evaluation(f"{mode} on {source.side}")
                 scores += evaluate_checkpoints(
                     files, source, config, mode, device=args.device, progress=progress
@@ -167,6 +177,15 @@ def _sources(args: argparse.Namespace) -> list[RobotSource]:
 
     source = robots_to_train(args.words, argparse.Namespace(**{**vars(args), "on": "train"}))
     return [other_side(source, side) for side in _sides(args, has_test=bool(source.split))]
+
+
+def _with_goal(
+    configs: Iterable[TaskConfig], sources: list[RobotSource], args: argparse.Namespace
+) -> tuple[TaskConfig, ...]:
+    """Return configs with the goal of ``--goal``, which must be for a robot of the sources."""
+    from morphgen.rl.robot_source import tasks_of
+
+    return opt.with_goal(configs, args.goal, (task for each in sources for task in tasks_of(each)))
 
 
 def _num_episodes(args: argparse.Namespace) -> int:

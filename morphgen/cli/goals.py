@@ -35,9 +35,10 @@ HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certifi
     opt.SEED,
     flag("--certify", "verify every goal with the configuration that it was sampled from"),
     *opt.JOBS_LIBRARY_JSON,
-    details="Goals of reach and starts of push are kept in the cache. Run the command again to "
-    "continue an interrupted one. The exit code is 1 if a robot has too few goals, or if a goal "
-    "fails --certify.",
+    details="Goals of reach and starts of push are kept in the cache. The goals of reach are full "
+    "poses, so the sets are the same for --goal position and --goal pose of other commands. Run "
+    "the command again to continue an interrupted one. The exit code is 1 if a robot has too few "
+    "goals, or if a goal fails --certify.",
     examples=("goals extrapolation/arms/reach --certify", "goals arm=ur5 ee=plane --task reach"),
 )
 def goals(args: argparse.Namespace) -> int:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from morphgen.cli.command import Option, flag, number, option, path_option, repeated
-from morphgen.errors import FormatError, MorphgenError
+from morphgen.errors import FormatError, MorphgenError, TaskError
+from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import SIMULATORS, TASKS
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from morphgen.grammar.library import Library
     from morphgen.grammar.robot_source import RobotSource
     from morphgen.model.robot import Robot
+    from morphgen.tasks.task import TaskConfig
 
 
 ROBOT_HELP = (
@@ -75,6 +78,39 @@ def sim_option(default: str = "pybullet if installed, else mujoco") -> Option:
         choices=SIMULATORS,
         metavar="SIM",
         help=f"{names} (default: {default})",
+    )
+
+
+def goal_option(default: str = GOAL_KINDS[0]) -> Option:
+    """Return the option ``--goal``, which ``with_goal`` evaluates; None if it is not given."""
+    return option(
+        "--goal",
+        choices=GOAL_KINDS,
+        help="reach: the goal's position, within 3 cm, or its pose, within 3 cm and 10 degrees "
+        f"(default: {default})",
+    )
+
+
+def with_goal(
+    configs: Iterable[TaskConfig], goal: str | None, tasks: Iterable[str]
+) -> tuple[TaskConfig, ...]:
+    """Return configs of tasks with the goal of reach that ``--goal`` names; None changes nothing.
+
+    Raises:
+        TaskError: If a goal is named and none of the robots' tasks is reach.
+    """
+    from morphgen.tasks.reach.config import ReachConfig
+
+    if goal is None:
+        return tuple(configs)
+    if ReachConfig.task not in (names := tuple(dict.fromkeys(tasks))):
+        raise TaskError(
+            f"--goal {goal} is for task {ReachConfig.task}; the robots are there to "
+            f"{' and '.join(names)}"
+        )
+    return tuple(
+        replace(config, goal=goal) if isinstance(config, ReachConfig) else config
+        for config in configs
     )
 
 

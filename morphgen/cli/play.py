@@ -7,6 +7,7 @@ import itertools
 from collections import deque
 from contextlib import closing
 from importlib import import_module
+from math import degrees, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,6 +47,7 @@ def _policy(text: str) -> str:
     ),
     path_option("--out", "FILE", "the video: .mp4 or .gif"),
     opt.sim_option(),
+    opt.goal_option("that of the checkpoint, else position"),
     number("--episodes", "number of episodes", default=1),
     opt.SEED,
     OBSTACLES,
@@ -64,7 +66,14 @@ def _policy(text: str) -> str:
 def play(args: argparse.Namespace) -> None:
     """Run the episodes, print a line for each, and write the video."""
     with status(args, "loading"):
-        from morphgen.rl.play import FPS, interface_of, make_controller, play, require_policy
+        from morphgen.rl.play import (
+            FPS,
+            interface_of,
+            make_controller,
+            play,
+            require_policy,
+            task_config_of,
+        )
         from morphgen.tasks.gym_env import TaskEnv
         from morphgen.tasks.renderer import require_video_path, write_video
 
@@ -72,13 +81,16 @@ def play(args: argparse.Namespace) -> None:
     if args.out is not None:
         require_video_path(args.out)
     interface = interface_of(args.policy)
+    task_config = task_config_of(args.policy, args.task)
+    (config,) = opt.with_goal([task_config], args.goal, [args.task])
     robot, target = " ".join(args.words), TASKS[args.task].target
     episodes = itertools.count(1)
 
     def report(episode: Episode) -> None:
+        angle = "" if isnan(episode.angle) else f" and {degrees(episode.angle):.1f} degrees"
         print_line(
             f"episode {next(episodes)}: {'success' if episode.success else 'failure'}, "
-            f"{episode.distance:.3f} m from the {target}, score {episode.score:.2f}, "
+            f"{episode.distance:.3f} m{angle} from the {target}, score {episode.score:.2f}, "
             f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}"
         )
 
@@ -90,6 +102,7 @@ def play(args: argparse.Namespace) -> None:
             obstacles=args.obstacles,
             kind=args.kind or interface.kind,
             observe=interface.channels,
+            config=config,
             max_links=interface.max_links,
             library=args.library,
             render_mode=None if args.out is None else "rgb_array",

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option
-from morphgen.cli.options import LIBRARY, RAY
 from morphgen.cli.progress import training_progress
 from morphgen.cli.train import TRAINING_OPTIONS, execution_config, run_config
 from morphgen.cli.training_robots import robots_to_train
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     path_option("--out", "DIR", "output folder", default=Path("study")),
     number("--eval-steps", "number of control steps of each robot's evaluation", default=10_000),
     flag("--report", "only write tables and curves of the finished cells"),
-    RAY,
+    opt.RAY,
     option(
         "--gpus",
         type=float,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
         help="with --ray: GPUs per cell (default: 1 with --device cuda, else 0)",
     ),
     *TRAINING_OPTIONS,
-    LIBRARY,
+    opt.LIBRARY,
     details="A cell is an agent with a seed on a split, or a baseline on a split. The command "
     "trains and evaluates each cell, and writes tables and curves. Finished cells are skipped; "
     "several processes with one folder share the work. The exit code is 1 if a cell failed.",
@@ -78,7 +79,7 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     """
     from morphgen.rl.agent_spec import parse_agents
     from morphgen.rl.evaluation import EvalConfig, episodes_for
-    from morphgen.rl.robot_source import other_side
+    from morphgen.rl.robot_source import other_side, tasks_of
     from morphgen.rl.study import agent_cell, baseline_cells, matched_budget
     from morphgen.rl.training import require_runnable, subruns_of
     from morphgen.tasks.device import require_device
@@ -89,15 +90,16 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     if args.ray is None and not args.report:
         require_device(args.device)
     episode_steps = max(config.max_episode_steps for config in default_configs())
-    eval_config = EvalConfig(
-        episodes_for(args.eval_steps, episode_steps),
-        evaluation_simulator(args.sim or default_simulator()),
-    )
+    num_episodes = episodes_for(args.eval_steps, episode_steps)
+    sim = evaluation_simulator(args.sim or default_simulator())
     args.on, args.obstacles, args.seed = "train", False, 0
     agents, seeds = parse_agents(args.agents), _seeds(args.seeds)
     cells: list[Cell] = []
     for name in dict.fromkeys(args.words):
         source = robots_to_train([name], args)
+        sides = tasks_of(source), tasks_of(other_side(source, "test"))
+        tasks = opt.with_goal(default_configs(), args.goal, chain(*sides))
+        eval_config = EvalConfig(num_episodes, sim, tasks=tasks)
         cells += baseline_cells(args.out, source, eval_config)
         for label, spec, side in agents:
             config = run_config(other_side(source, side), spec, args)

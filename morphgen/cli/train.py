@@ -85,6 +85,7 @@ TRAINING_OPTIONS = (
     number(
         "--goal-seed", "seed of all goals (default: as shipped with the split, else 0)", least=0
     ),
+    opt.goal_option(),
     number(
         "--train-goals",
         "number of goals of reach, or starts of push, per robot in training; evaluations "
@@ -151,7 +152,8 @@ def train(args: argparse.Namespace) -> None:
     else:
         config = run_config(source, spec, args)
     _require_used(config, args)
-    folder = args.out or Path("runs") / _folder_name(source) / str(spec) / f"seed{args.seed}"
+    name = _folder_name(source) + "-pose" * (args.goal == "pose")
+    folder = args.out or Path("runs") / name / str(spec) / f"seed{args.seed}"
     _train(folder, config, args)
 
 
@@ -165,6 +167,7 @@ def train(args: argparse.Namespace) -> None:
     opt.SEED,
     opt.sim_option("that of the training"),
     GOAL_SEED,
+    opt.goal_option("that of the training"),
     path_option(
         "--out", "DIR", "run folder (default: finetuned/SIDE-seedN in the folder of the checkpoint)"
     ),
@@ -249,7 +252,7 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
         device=args.device,
         full_budget=args.whole and AGENTS[spec.agent].per_robot,
         max_links=args.max_links or _max_links(source),
-        tasks=_task_configs(source, args.train_goals),
+        tasks=_task_configs(source, args),
     )
 
 
@@ -265,7 +268,7 @@ def _drawn_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace
     from morphgen.rl.training_batches import default_slice_updates, num_slices
     from morphgen.tasks.env_specs import GoalConfig
 
-    tasks = _task_configs(source, args.train_goals)
+    tasks = _task_configs(source, args)
     source, most_links = draw_robots(source, GoalConfig(tasks=tasks), args)
     held_out_links = (read_split(name).max_links for name in source.held_out)
     max_links = args.max_links or max(MAX_LINKS, most_links, *held_out_links)
@@ -295,18 +298,19 @@ def _max_links(source: RobotSource) -> int:
     return max(MAX_LINKS, len(robot.links))
 
 
-def _task_configs(source: RobotSource, num_goals: int | None) -> tuple[TaskConfig, ...]:
-    """Return the configurations of the tasks; with the goals of evaluations if None is given.
+def _task_configs(source: RobotSource, args: argparse.Namespace) -> tuple[TaskConfig, ...]:
+    """Return the configurations of the tasks from ``--goal`` and ``--train-goals``.
 
     Raises:
-        TaskError: If the split ships its own goals.
+        TaskError: If the split ships its own goals, or no robot has the task of ``--goal``.
     """
     from morphgen.rl.robot_source import tasks_of
 
-    names = dict.fromkeys((*TASKS.builtin, *tasks_of(source)))
-    configs: list[TaskConfig] = [TASKS[name].config_type() for name in names]
+    tasks, num_goals = tasks_of(source), args.train_goals
+    names = dict.fromkeys((*TASKS.builtin, *tasks))
+    configs = opt.with_goal((TASKS[name].config_type() for name in names), args.goal, tasks)
     if num_goals is None:
-        return tuple(configs)
+        return configs
     if source.goal_dir:
         raise TaskError(
             f"--train-goals {num_goals}: {source.goal_dir} ships the goals to train on; name the "
@@ -343,7 +347,7 @@ def _require_used(config: RunConfig, args: argparse.Namespace) -> None:
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
     from morphgen.rl.agent_spec import parse_constants
     from morphgen.rl.config import PPOConfig
-    from morphgen.rl.robot_source import other_side
+    from morphgen.rl.robot_source import other_side, tasks_of
     from morphgen.rl.runs import read_checkpoint
 
     initial, _ = read_checkpoint(file)
@@ -367,6 +371,7 @@ def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
         device=args.device,
         initial_checkpoint=str(file.resolve()),
         slice_updates=0,
+        tasks=opt.with_goal(initial.tasks, args.goal, tasks_of(source)),
     )
 
 

@@ -54,6 +54,15 @@ def test_scripted_policy_pushes_before_the_time_limit_and_is_recorded(run, tmp_p
     assert 0 <= frames / fps - float(seconds) <= 0.08
 
 
+def test_baselines_play_with_goals_that_are_poses(run):
+    words = ("play", "reach", "arm3-stick", "--policy", "ik", "--sim", "mujoco", "--goal", "pose")
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    result, angle = re.match(r"episode 1: (\w+), .* m and (.*) degrees from the goal", out).groups()
+    assert result == "success"
+    assert float(angle) < 10
+
+
 def test_episodes_differ_and_are_reproducible(run):
     words = ("play", "reach", "arm3-stick", "--sim", "mujoco", "--episodes", "2", "--obstacles")
     outs = [run(*words, "--seed", seed, "--kind", "discrete")[1] for seed in (1, 1, 2)]

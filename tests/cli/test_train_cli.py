@@ -104,6 +104,32 @@ def test_policy_with_tool_position_is_evaluated_and_played(run):
     assert (code, out[:11]) == (0, "episode 1: ")
 
 
+def test_the_goal_of_the_training_is_that_of_all_commands_on_its_policy(run, tmp_path):
+    quick = ("--steps", "32", "--no-tensorboard")
+    assert run(*RUN, *quick, "--goal", "pose")[0] == 0
+    folder = tmp_path / "runs" / "planar-cube-reach-pose" / "me-mlp" / "seed0"
+    (reach,) = [each for each in read_config(folder).tasks if each.task == "reach"]
+    assert reach.goal == "pose"
+    _, _, err = run(*RUN, *quick, "--resume", "--out", folder)
+    assert "has another run: reach.goal pose, not position" in err
+
+    words = ("eval", folder, "--episodes", "1", "--mode", "deterministic", "--json")
+    angles = [
+        json.loads(run(*words, *options)[1])["deterministic"][0]["angle"]
+        for options in ((), ("--goal", "pose"), ("--goal", "position"))
+    ]
+    assert angles[0] == angles[1] > 0
+    assert angles[2] is None
+
+    words = ("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
+    assert re.search(r"\d m and \d+\.\d degrees from the goal", run(*words)[1])
+    assert "degrees" not in run(*words, "--goal", "position")[1]
+
+    words = ("finetune", folder, "--on", "train", "--envs", "4", *ROLLOUT, *quick)
+    assert run(*words, "--out", "tuned")[0] == 0
+    assert [c for c in read_config(tmp_path / "tuned").tasks if c.task == "reach"] == [reach]
+
+
 def test_play_uses_the_given_checkpoint(run):
     outs = []
     for seed in (0, 1):
@@ -267,15 +293,16 @@ def test_study_prints_a_table(run, split_yaml, tmp_path):
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
     code, out, _ = run(*words, "--report")
     assert code == 0
-    assert out.count("missing") == 5 * 6 + 2
+    assert out.count("missing") == 6 * 6 + 2
     assert not list((tmp_path / "study").glob("mine/**/scores.json"))
     code, out, err = run(*words)
     assert code == 0
     assert "missing" not in out
-    assert "7 of 7: " in err
-    assert [line.split("|")[1].strip() for line in out.splitlines()[4:11]] == [
+    assert "8 of 8: " in err
+    assert [line.split("|")[1].strip() for line in out.splitlines()[4:12]] == [
         "random",
         "zero",
+        "jacobian",
         "ik",
         "me-mlp",
         "me-mlp",
@@ -344,6 +371,11 @@ def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_pat
         ((*RUN, "--set", "mlp_layers=0"), "mlp_layers 0: expected 1 or more"),
         (("train", "interpolation/arm3/reach", "--envs", "9"), "fewer than the 10 robots"),
         (("eval", "ik"), "name its robots with --split"),
+        (
+            ("eval", "random", "--split", "prims", "task=push", "--goal", "pose"),
+            "--goal pose is for task reach; the robots are there to push",
+        ),
+        ((*RUN, "--goal", "poses"), "invalid choice: 'poses'"),
         (
             ("eval", "ik", "--split", "planar-cube", "task=reach", "--mode", "stochastic"),
             "--mode is for policies",
