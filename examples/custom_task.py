@@ -12,7 +12,7 @@ Worker processes do not run the script. A package declares its tasks as entry po
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -46,6 +46,8 @@ class FollowConfig:
     """Distance between tool and goal that counts as success [m]."""
     obstacles: int = 0
     obstacle_size: tuple[float, float] = (0.06, 0.15)
+    train_layouts: int = 1
+    eval_layouts: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,8 @@ class FollowSet:
     accepted: int
     seed: int
     obstacles: tuple[Block, ...] = ()
+    layouts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 7)))
+    usable: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
 
 
 class FollowEnvs(TaskEnvs):
@@ -76,7 +80,7 @@ class FollowEnvs(TaskEnvs):
         self.first = torch.zeros(len(spec), 7, device=spec.device)
         self.time = torch.zeros(len(spec), device=spec.device)
 
-    def begin(self, rows, random):
+    def begin(self, rows, random, layouts):
         """Begin at a start of the robot's set, the tool at the goal."""
         spec = self.spec[rows]
         pairs = zip(random, spec.tolist(), strict=True)

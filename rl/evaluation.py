@@ -291,6 +291,7 @@ def _run_all(
             observe=interface.channels,
             workers=config.workers,
             max_links=interface.max_links,
+            layouts="eval",
             library=library,
         )
 

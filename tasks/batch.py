@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 
 from morphgen.errors import DivergedError, TaskError
 from morphgen.model.kinematics_torch import FramePositions, frame_pose
 from morphgen.tasks.actions import ActionKind, JointTargets, decode_actions
+from morphgen.tasks.episode_layouts import EpisodeLayouts
 from morphgen.tasks.kinematic_channels import KinematicChannels
 from morphgen.tasks.observation import (
     LinkTokens,
@@ -19,12 +19,13 @@ from morphgen.tasks.observation import (
     ObservationConfig,
     PointClouds,
     joint_to_link,
-    obstacle_tokens,
     tree_entries,
 )
+from morphgen.tasks.obstacles import LayoutSide
+from morphgen.tasks.random_streams import random_streams
 from morphgen.tasks.robot_tables import RobotTables
 from morphgen.tasks.rows import limit_violation, row_sums
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Scene, Simulation
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Simulation
 from morphgen.tasks.task import OBJECT, EnvSpec, TaskState
 from morphgen.tasks.task_groups import BatchResult, TaskGroups
 
@@ -84,6 +85,7 @@ class TaskBatch:
         episode_step: Control steps since the episode began, shape (n,), int64.
         targets: Targets of the independent joints, shape (n, J) [rad or m].
         previous_action: Normalized actions of the last step, shape (n, L); 0 in a new episode.
+        layouts: Layouts of the obstacles in the running episodes.
         previous_qd: Velocities of the independent joints after the last step, shape (n, J).
         observation_config: Optional entries of observations.
         device: Device of all tensors.
@@ -100,6 +102,7 @@ class TaskBatch:
         observe: ObservationConfig | None = None,
         seed: int = 0,
         first: int = 0,
+        layouts: LayoutSide = "train",
     ) -> None:
         """Gather the tables of all environments; ``reset`` begins the episodes.
 
@@ -113,6 +116,8 @@ class TaskBatch:
             seed: Seed of all episodes.
             first: Number of the first environment. An environment's episodes depend on its number
                 and the seed only, whatever batch it is in.
+            layouts: Layouts of obstacles that episodes draw from: those of training or of
+                evaluation.
 
         Raises:
             TaskError: If a task is unknown, has different constants, or too few goals of a robot.
@@ -131,13 +136,14 @@ class TaskBatch:
         self.targets = torch.zeros(n, robot_tables.max_joints, device=device)
         self.episode_step = torch.zeros(n, dtype=torch.int64, device=device)
         self._env_numbers = range(first, first + n)
-        self._streams = _random_streams(seed, self._env_numbers)
+        self._streams = random_streams(seed, self._env_numbers)
         # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more
         self._num_sim_joints = simulation.q.shape[1]
         self.previous_qd = torch.zeros(n, robot_tables.max_joints, device=device)
         self.previous_action = torch.zeros(n, robot_tables.max_links, device=device)
         self._lower, self._upper = robot_tables.lower[index], robot_tables.upper[index]
         self.observation_config = observe or ObservationConfig()
+        self.layouts = EpisodeLayouts(self.specs, index, layouts, self.observation_config)
         self._tokens = LinkTokens(robot_tables, index)
         self._tool_positions = FramePositions(robot_tables.tool_chain, index)
         self._joint_targets = JointTargets(robot_tables, index, self.action_mask)
@@ -146,7 +152,7 @@ class TaskBatch:
             "links": robot_tables.link_mask[index],
             "actions": self.action_mask,
             **self.groups.masks,
-            **self._obstacle_entries(scenes),
+            **self.layouts.entries,
         }
         if self.observation_config.tree:
             self._constant_entries |= tree_entries(
@@ -188,7 +194,7 @@ class TaskBatch:
                 that they do not all end at the same step; for learners.
         """
         if seed is not None:
-            self._streams = _random_streams(seed, self._env_numbers)
+            self._streams = random_streams(seed, self._env_numbers)
         self._begin(torch.arange(self.num_envs, device=self.device))
         if spread:
             fractions = [stream.random() for stream in self._streams["random"]]
@@ -324,13 +330,6 @@ class TaskBatch:
         """Free the simulation."""
         self.simulation.close()
 
-    def _obstacle_entries(self, scenes: Sequence[Scene]) -> Observation:
-        """Return tokens and mask of the obstacles; without state they are all padding."""
-        entries = obstacle_tokens(scenes, self.observation_config.obstacles, self.device)
-        if self.observation_config.state:
-            return entries
-        return {name: torch.zeros_like(values) for name, values in entries.items()}
-
     def _act(self, actions: torch.Tensor) -> None:
         """Advance the joint targets by the decoded actions."""
         shape = (self.num_envs, self.robot_tables.max_links)
@@ -361,12 +360,19 @@ class TaskBatch:
         """Begin episodes in the environments with these indices, shape (k,), int64."""
         q = torch.zeros(len(envs), self.robot_tables.max_joints, device=self.device)
         block_pose = torch.zeros(len(envs), 7, device=self.device)
-        for rows, (task_q, task_block_pose) in self.groups.begin(envs, self._streams["random"]):
+        streams = self._streams["random"]
+        self.layouts.draw(envs.tolist(), streams)
+        for rows, (task_q, task_block_pose) in self.groups.begin(
+            envs, streams, self.layouts.current
+        ):
             q[rows], block_pose[rows] = task_q, task_block_pose
         if self._points is not None:
             for env in envs.tolist():
-                self._points.begin(env, self._streams["points"][env])
-        self.simulation.reset(envs, q[:, : self._num_sim_joints].contiguous(), block_pose)
+                stream = self._streams["points"][env]
+                self._points.begin(env, stream, self.layouts.obstacles(env))
+        sim_q = q[:, : self._num_sim_joints].contiguous()
+        obstacles = (self.layouts.poses[envs],) if self.layouts.any else ()
+        self.simulation.reset(envs, sim_q, block_pose, *obstacles)
         self.targets[envs] = q
         self.episode_step[envs] = 0
         self.previous_qd[envs] = 0
@@ -385,14 +391,3 @@ class TaskBatch:
 
 def _copied(observation: Observation) -> Observation:
     return {name: values.clone() for name, values in observation.items()}
-
-
-def _random_streams(seed: int, env_numbers: Sequence[int]) -> dict[str, list[np.random.Generator]]:
-    """Return random streams of episodes and of points, one of each for every environment number."""
-    return {
-        name: [
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, *suffix)))
-            for number in env_numbers
-        ]
-        for name, suffix in (("random", ()), ("points", (0,)))
-    }

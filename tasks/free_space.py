@@ -88,6 +88,18 @@ class FreeSpace:
         """
         return self._checker.free(self._positions(q, blocks))
 
+    def place_obstacles(self, poses: Sequence[Pose]) -> None:
+        """Move the obstacles of the scene to other poses in the world.
+
+        Args:
+            poses: A pose for each obstacle.
+        """
+        moved = zip(self.scene.obstacles, poses, strict=True)
+        obstacles = tuple(replace(obstacle, pose=pose) for obstacle, pose in moved)
+        self.scene = replace(self.scene, obstacles=obstacles)
+        for name, pose in zip(self._obstacles, poses, strict=True):
+            self._checker.place(name, pose)
+
     def block_is_clear(self, blocks: ArrayLike) -> NDArray[np.bool_]:
         """Return at which poses the block penetrates neither an obstacle nor the robot's base.
 
@@ -288,8 +300,10 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Ro
         static_links.append(ground)
         new_joints.append(Joint(joint_name("ground"), "fixed", world.name, ground.name))
     for name, obstacle in zip(obstacles, scene.obstacles, strict=True):
-        static_links.append(Link(name, collisions=(Shape(Box(obstacle.size), obstacle.pose),)))
-        slide = Joint(joint_name(name), "prismatic", world.name, name, limits=(0.0, 0.0))
+        static_links.append(Link(name, collisions=(Shape(Box(obstacle.size)),)))
+        slide = Joint(
+            joint_name(name), "prismatic", world.name, name, obstacle.pose, limits=(0.0, 0.0)
+        )
         new_joints.append(slide)
     ignored = [*untested_pairs(robot), *combinations([link.name for link in static_links], 2)]
     block_links: list[Link] = []

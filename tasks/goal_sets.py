@@ -71,7 +71,8 @@ def goal_set(
     robot_digest = robot_hash(robot, visuals=False)
     index = robot.link_index
     ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)
-    boxes = [config.obstacles, *map(float, config.obstacle_size)] if obstacles else None
+    layouts = config.train_layouts, config.eval_layouts
+    boxes = [config.obstacles, *map(float, config.obstacle_size), *layouts] if obstacles else None
     constants = [*task.key_parts(config), boxes]
     parts = [task.goal_format, robot_digest, ignored, *constants, seed, float(ground)]
     key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError, nearest
 from morphgen.model.robot import Robot
+from morphgen.processes import Progress, no_progress
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Step
 from morphgen.tasks.make import make_batch
 from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.obstacles import LayoutSide
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
@@ -68,6 +70,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         *,
         sim: str | None = None,
         obstacles: bool = False,
+        layouts: LayoutSide = "train",
         kind: ActionKind = "continuous",
         observe: ObservationConfig | None = None,
         contacts: Contacts | None = None,
@@ -76,6 +79,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         cache: Path | None = None,
         library: Iterable[Path] = (),
         max_links: int | None = None,
+        progress: Progress = no_progress,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
@@ -89,6 +93,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             sim: Name of a simulator, such as ``pybullet`` or ``mujoco``; by default
                 ``default_simulator()``.
             obstacles: Whether there are obstacles.
+            layouts: Layouts of obstacles that episodes draw from: those of training or of
+                evaluation.
             kind: Actions are ``continuous`` or ``discrete``.
             observe: Optional entries of observations.
             contacts: Pairs of things that collide; by default everything.
@@ -98,6 +104,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             library: Folders of your own parts.
             max_links: Number that link indices in tokens are relative to; by default the paper's
                 23, or the links of the robot if it has more.
+            progress: Called with the number of robots whose goal set is ready, and their total.
             render_mode: ``rgb_array`` or None.
             size: Width and height of rendered pictures [pixels].
 
@@ -125,6 +132,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             [robot],
             1,
             obstacles=obstacles,
+            layouts=layouts,
             goal_seed=goal_seed,
             configs=() if config is None else (config,),
             cache=cache,
@@ -134,6 +142,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             observe=observe,
             contacts=contacts,
             max_links=max_links,
+            progress=progress,
         )
         self.env_spec = self.batch.specs[0]
         robot_links = self.env_spec.robot.joints

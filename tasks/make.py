@@ -19,6 +19,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.device import require_simulator_device
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.obstacles import LayoutSide
 from morphgen.tasks.registry import SIMULATORS, default_simulator, installed_simulators
 from morphgen.tasks.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import Contacts, Simulator
@@ -42,6 +43,7 @@ class BatchOptions(TypedDict, total=False):
     observe: ObservationConfig | None
     max_links: int | None
     first: int
+    layouts: LayoutSide
     device: str
 
 
@@ -156,6 +158,7 @@ def batch_from_specs(
     observe: ObservationConfig | None = None,
     max_links: int | None = None,
     first: int = 0,
+    layouts: LayoutSide = "train",
     device: str = "cpu",
     library: Iterable[Path] = (),
 ) -> TaskBatch:
@@ -174,6 +177,7 @@ def batch_from_specs(
         max_links: Number of links, L, that observations and actions are padded to; by default the
             paper's 23, or the links of the largest robot if it has more.
         first: Number of the first environment, where a batch is made in parts.
+        layouts: Layouts of obstacles that episodes draw from: those of training or of evaluation.
         device: Device of all tensors, such as ``cuda``; ``pybullet`` and ``mujoco`` need ``cpu``.
         library: Folders of your own parts.
 
@@ -213,6 +217,7 @@ def batch_from_specs(
         observe=observe,
         seed=seed,
         first=first,
+        layouts=layouts,
     )
 
 

@@ -249,28 +249,32 @@ class PointClouds:
             device: Device of the tensors.
         """
         n = len(scenes)
-        self._boxes = [
-            ([scene.block] if scene.block is not None else []) + list(scene.obstacles)
-            for scene in scenes
-        ]
-        self._has_block = [scene.block is not None for scene in scenes]
+        self._blocks = [[] if scene.block is None else [scene.block] for scene in scenes]
         self._num_points = num_points
         self._local = torch.zeros(n, num_points, 3, device=device)
         self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
-        has_boxes = torch.tensor([bool(boxes) for boxes in self._boxes], device=device)
+        has_boxes = torch.tensor(
+            [scene.block is not None or bool(scene.obstacles) for scene in scenes], device=device
+        )
         self.mask = has_boxes[:, None].repeat(1, num_points)
         """Existing points, shape (n, P), bool."""
 
-    def begin(self, env: int, rng: np.random.Generator) -> None:
-        """Draw the points of an episode, uniformly over the surfaces of all boxes."""
-        boxes = self._boxes[env]
+    def begin(self, env: int, rng: np.random.Generator, obstacles: Sequence[Block] = ()) -> None:
+        """Draw the points of an episode, uniformly over the surfaces of all boxes.
+
+        Args:
+            env: Environment whose episode begins.
+            rng: Its source of random numbers.
+            obstacles: Its obstacles.
+        """
+        boxes = [*self._blocks[env], *obstacles]
         if not boxes:
             return
         areas = np.array([_face_areas(box).sum() for box in boxes])
         box_index = rng.choice(len(boxes), self._num_points, p=areas / areas.sum())
         local = np.array([_surface_point(boxes[k], rng) for k in box_index])
         local += rng.normal(0.0, NOISE, local.shape)
-        on_block = (box_index == 0) & self._has_block[env]
+        on_block = (box_index == 0) & bool(self._blocks[env])
         for row in np.flatnonzero(~on_block):
             local[row] = boxes[box_index[row]].pose.apply(tuple(local[row]))
         self._local[env] = torch.from_numpy(local).to(self._local)

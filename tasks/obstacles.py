@@ -1,94 +1,243 @@
-"""Obstacles: random boxes in a robot's workspace that leave it room to move."""
+"""Obstacles: boxes in a robot's workspace, whose layouts vary over episodes.
+
+The sizes of a robot's boxes are fixed. A layout is a pose for each of them, such that the robot has
+room to move; see ``draw_layouts``. Training draws its episodes from some layouts, evaluation from
+others.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morphgen.benchmark.workspace import tool_reach
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.task import GoalSet, TaskConfig
+from morphgen.typing import Array
+
+LayoutSide = Literal["train", "eval"]
+"""Layouts that episodes draw from: those of training, or those of evaluation."""
+Usable = Callable[[FreeSpace], NDArray[np.bool_]]
+"""Function that returns which goals a scene leaves possible, shape (G,)."""
 
 KEPT = 0.5
-"""Fraction of otherwise free configurations that obstacles must leave free."""
+"""Fraction of otherwise free configurations that a layout must leave free."""
 PROBES = 128
 """Number of free configurations that test it."""
 CANDIDATES = 16
-"""Number of random boxes per required one."""
+"""Number of random poses of a box before its layout is drawn anew."""
+ATTEMPTS = 16
+"""Number of times that a layout is drawn before giving up."""
+KEPT_GOALS = 0.25
+"""Fraction of the first ``FIRST_GOALS`` goals of a set that a layout must leave possible."""
+FIRST_GOALS = 20
+"""Only these goals decide about a layout, so that a larger set has the same layouts."""
+
+_AWAY = Pose((0.0, 0.0, -1e4))
+"""Pose of boxes without one: far below everything; ``FreeSpace`` keeps its block far above."""
 
 
-def draw_obstacles(
-    robot: Robot,
-    count: int,
-    size: tuple[float, float],
-    rng: np.random.Generator,
-    *,
-    ground: float = 0.0,
+def draw_boxes(
+    robot: Robot, count: int, size: tuple[float, float], rng: np.random.Generator
 ) -> tuple[Block, ...]:
-    """Draw random boxes around positions of the tool.
+    """Draw the sizes of a robot's obstacles.
 
     Edges are uniform in ``size`` times the reach, the largest distance of the tool from the robot's
     shoulder (``workspace``), which depends neither on a pedestal nor on the position of a rail.
-    Each box is centred on the tool at a random free configuration and turned about the vertical at
-    random; one that would cut the ground rests on it. Boxes are accepted in the order in which they
-    are drawn, unless the robot with its base touches them at home, or they and those before leave
-    less than ``KEPT`` of the free configurations. Boxes may overlap.
 
     Args:
         robot: The robot, with a tool.
         count: Number of boxes.
         size: Range of their edge lengths, relative to the reach.
         rng: Source of random numbers.
-        ground: Height of the ground in the root frame [m].
 
     Raises:
-        BenchmarkError: If count or size is invalid, the robot has no workspace or hardly a free
-            configuration, or too few of the boxes can be accepted.
-        MeshError: If a collision mesh cannot be read.
+        BenchmarkError: If count or size is invalid, or the robot has no workspace.
     """
     low, high = size
     if count < 1 or not 0 < low <= high < math.inf:
         raise BenchmarkError(
             f"{count} obstacles of size {size}: at least one, and 0 < lowest <= highest"
         )
-    num_boxes = CANDIDATES * count
     _, reach = tool_reach(robot)
-    edges = rng.uniform(low, high, (num_boxes, 3)) * reach
-    turns = rng.uniform(-math.pi, math.pi, num_boxes)
-    q, _ = FreeSpace(Scene(robot, ground=ground)).sample(PROBES + num_boxes, rng)
-    tools = frame_pose(robot, q[PROBES:], TOOL)
-    boxes = [
-        _box(position, edge, turn, ground)
-        for position, edge, turn in zip(
-            tools[:, :3, 3].tolist(), edges.tolist(), turns, strict=True
-        )
-    ]
-    space = FreeSpace(Scene(robot, obstacles=tuple(boxes), ground=ground))
-    at_home = space.obstacle_hits([robot.home])[0]
-    hits = space.obstacle_hits(q[:PROBES])
-    accepted: list[Block] = []
-    blocked = np.zeros(PROBES, dtype=np.bool_)
-    for box, home, hit in zip(boxes, at_home, hits.T, strict=True):
-        if len(accepted) < count and not home and np.mean(~(blocked | hit)) >= KEPT:
-            accepted.append(box)
-            blocked |= hit
-    if len(accepted) < count:
-        raise BenchmarkError(
-            f"robot {robot.name!r}: of {num_boxes} boxes in its workspace only "
-            f"{len(accepted)} are clear "
-            f"of it at home and leave {KEPT:.0%} of its free configurations; {count} are asked "
-            "for: take fewer or smaller obstacles"
-        )
-    return tuple(accepted)
+    edges = (rng.uniform(low, high, (count, 3)) * reach).tolist()
+    return tuple(Block((a, b, c)) for a, b, c in edges)
 
 
-def _box(centre: list[float], size: list[float], turn: float, ground: float) -> Block:
+def draw_layouts(
+    space: FreeSpace, counts: tuple[int, int], seeds: np.random.SeedSequence, usable: Usable
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Draw poses of a robot's obstacles around positions of its tool.
+
+    Each box is centred on the tool at a random free configuration and turned about the vertical at
+    random; one that would cut the ground rests on it. Poses are accepted in the order in which they
+    are drawn, unless the robot with its base touches the box at home, or the boxes so far leave
+    less than ``KEPT`` of the free configurations. A layout is accepted if it leaves ``KEPT_GOALS``
+    of the goals. Boxes may overlap. Fewer layouts of a kind are the beginning of more.
+
+    Args:
+        space: The robot with its obstacles, at any poses, and its ground; it is left with the
+            first layout.
+        counts: Numbers of layouts for training and for evaluation.
+        seeds: Source of all random numbers.
+        usable: Which goals the obstacles leave possible.
+
+    Returns:
+        Poses in the world, in single precision, as simulators have them: x, y, z, qw, qx, qy, qz of
+        L layouts of O boxes, those for training first, shape (L, O, 7); and which goals they leave
+        possible, shape (L, G).
+
+    Raises:
+        BenchmarkError: If a layout cannot be drawn, or the robot has hardly a free configuration.
+        MeshError: If a collision mesh cannot be read.
+    """
+    probe_seeds, *side_seeds = seeds.spawn(3)
+    plain = FreeSpace(replace(space.scene, obstacles=(), block=None))
+    probes, _ = plain.sample(PROBES, np.random.default_rng(probe_seeds))
+    layouts, masks = [], []
+    for side, count in zip(side_seeds, counts, strict=True):
+        for child in side.spawn(count):
+            layout, mask = _draw_layout(space, plain, probes, np.random.default_rng(child), usable)
+            layouts.append(layout)
+            masks.append(mask)
+    space.place_obstacles(poses_of(layouts[0]))
+    return np.array(layouts), np.array(masks)
+
+
+def _draw_layout(
+    space: FreeSpace, plain: FreeSpace, probes: Array, rng: np.random.Generator, usable: Usable
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Draw one layout, shape (O, 7), and which goals it leaves possible, shape (G,)."""
+    most = 0
+    for _ in range(ATTEMPTS):
+        layout = _draw_poses(space, plain, probes, rng)
+        if layout is None:
+            continue
+        space.place_obstacles(poses_of(layout))
+        mask = usable(space)
+        count = int(mask[:FIRST_GOALS].sum())
+        if count >= fewest_goals(len(mask)):
+            return layout, mask
+        most = max(most, count)
+    raise BenchmarkError(
+        f"robot {space.scene.robot.name!r}: each of {ATTEMPTS} random layouts of "
+        f"{len(space.scene.obstacles)} obstacles touches it at home, or leaves less than "
+        f"{KEPT:.0%} of its free configurations, or of its first {FIRST_GOALS} goals only {most} "
+        "or fewer: take fewer or smaller obstacles"
+    )
+
+
+def fewest_goals(num_goals: int) -> int:
+    """Return how many of the first goals of a set a layout must leave possible, 2 or more."""
+    return min(num_goals, max(2, math.ceil(KEPT_GOALS * min(num_goals, FIRST_GOALS))))
+
+
+def _draw_poses(
+    space: FreeSpace, plain: FreeSpace, probes: Array, rng: np.random.Generator
+) -> Array | None:
+    """Draw poses of all boxes, shape (O, 7); None if a box has none among ``CANDIDATES``."""
+    robot, ground = space.scene.robot, space.scene.ground
+    boxes = space.scene.obstacles
+    poses = [_AWAY] * len(boxes)
+    for i, box in enumerate(boxes):
+        q, _ = plain.sample(CANDIDATES, rng)
+        tools = frame_pose(robot, q, TOOL)[:, :3, 3].tolist()
+        turns = rng.uniform(-math.pi, math.pi, CANDIDATES).tolist()
+        for tool, turn in zip(tools, turns, strict=True):
+            poses[i] = _box_pose(tool, box, turn, ground)
+            space.place_obstacles(poses)
+            if space.obstacle_hits([robot.home])[0, i]:
+                continue
+            left = probes[space.free(probes)]
+            if len(left) >= KEPT * PROBES:
+                probes = left
+                break
+        else:
+            return None
+    return np.array([[*pose.position, *pose.quaternion] for pose in poses])
+
+
+def _box_pose(centre: list[float], box: Block, turn: float, ground: float | None) -> Pose:
+    """Return the pose of a box at a point, or on the ground above it, in single precision."""
     x, y, z = centre
-    a, b, c = size
-    position = (x, y, max(z, ground + c / 2))
-    return Block((a, b, c), Pose.from_xyz_rpy(position, (0.0, 0.0, float(turn))))
+    if ground is not None:
+        z = max(z, ground + box.size[2] / 2)
+    row = [x, y, z, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+    return poses_of(np.array([row], dtype=np.float32))[0]
+
+
+def poses_of(layout: NDArray[np.floating]) -> list[Pose]:
+    """Return the poses of a layout, shape (O, 7)."""
+    return [Pose((x, y, z), (w, a, b, c)) for x, y, z, w, a, b, c in layout.tolist()]
+
+
+def place_boxes(boxes: Sequence[Block], layout: NDArray[np.floating]) -> tuple[Block, ...]:
+    """Return boxes at the poses of a layout, shape (O, 7)."""
+    placed = zip(boxes, poses_of(layout), strict=True)
+    return tuple(replace(box, pose=pose) for box, pose in placed)
+
+
+def layouts_of(config: TaskConfig, side: LayoutSide) -> range:
+    """Return the indices of the layouts of a goal set that episodes draw from.
+
+    Raises:
+        TaskError: If the side is unknown.
+    """
+    ranges = {
+        "train": range(config.train_layouts),
+        "eval": range(config.train_layouts, config.train_layouts + config.eval_layouts),
+    }
+    if side not in ranges:
+        raise TaskError(f"unknown layouts {side!r}; valid: {', '.join(ranges)}")
+    return ranges[side]
+
+
+def layout_faults(
+    goals: GoalSet, robot: Robot, scene: Scene, usable: Usable, *, block: Block | None = None
+) -> list[str]:
+    """Return the faults of a set's layouts, a line each.
+
+    Args:
+        goals: The set.
+        robot: The robot.
+        scene: Ground and obstacles of its scene.
+        usable: Which goals the obstacles leave possible.
+        block: Block of the scene.
+
+    Returns:
+        Obstacles that are not those of the scene; arrays of a wrong shape; a box that touches the
+        robot at home; a goal that its layout does not leave possible; too few goals.
+    """
+    if scene.obstacles != goals.obstacles:
+        return ["the obstacles of the scene are not those of the goal set"]
+    shape = (len(goals.layouts), len(goals.obstacles), 7)
+    if goals.layouts.shape != shape or goals.usable.shape != (shape[0], len(goals.q)):
+        return [
+            f"layouts of shape {goals.layouts.shape} and goals that they leave possible of shape "
+            f"{goals.usable.shape} are not those of {shape[1]} obstacles and {len(goals.q)} goals"
+        ]
+    if not goals.obstacles:
+        return []
+    if not shape[0] or place_boxes(goals.obstacles, goals.layouts[0]) != goals.obstacles:
+        return ["the obstacles are not at the poses of the first layout"]
+    faults = []
+    space = FreeSpace(replace(scene, robot=robot, block=block))
+    for k, layout in enumerate(goals.layouts):
+        space.place_obstacles(poses_of(layout))
+        if space.obstacle_hits([robot.home]).any():
+            faults.append(f"layout {k}: the robot at home is in collision")
+        blocked = goals.usable[k] & ~usable(space)
+        faults += [f"layout {k}: goal {i} is blocked" for i in np.flatnonzero(blocked).tolist()]
+        if goals.usable[k].sum() < fewest_goals(len(goals.q)):
+            faults.append(f"layout {k}: it leaves {goals.usable[k].sum()} goals, too few")
+    return faults

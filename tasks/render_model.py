@@ -16,7 +16,7 @@ from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
-from morphgen.tasks.sim.base import Scene
+from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 
@@ -41,6 +41,8 @@ class RenderModel:
     """Indices of the robot's movable joints in ``qpos``."""
     mocap: dict[str, int]
     """Mocap indices of the markers and, if there is one, of ``block``."""
+    obstacles: list[int]
+    """Mocap indices of the obstacles."""
     points: Array
     """Points that must be in view, shape (n, 3) [m]."""
 
@@ -60,17 +62,23 @@ def render_model(
         MeshError: If a mesh cannot be read.
     """
     robot = scene.robot
-    corners = []
-    for obstacle in scene.obstacles:
-        T = obstacle.pose.matrix
-        corners.append(_SIGNS * obstacle.size @ T[:3, :3].T + T[:3, 3])
     points = np.concatenate(
-        [np.zeros((1, 3)), *corners, points, _robot_corners(robot, configurations)]
+        [
+            np.zeros((1, 3)),
+            box_corners(scene.obstacles),
+            points,
+            _robot_corners(robot, configurations),
+        ]
     )
     if scene.ground is not None:
         points = points[points[:, 2] >= scene.ground - 1e-6]
     spec = to_spec(_visible(robot))
     _add_surroundings(spec, scene, float(np.ptp(points, axis=0).max()))
+    obstacles = []
+    for obstacle in scene.obstacles:
+        obstacles.append(spec.worldbody.add_body(mocap=True))
+        obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
+        _add_box(obstacles[-1], obstacle.size, _OBSTACLE)
     bodies = {}
     if scene.block is not None:
         bodies[BLOCK] = spec.worldbody.add_body(mocap=True)
@@ -80,7 +88,17 @@ def render_model(
     model = spec.compile()
     at = [int(model.joint(robot.joints[k].name).qposadr[0]) for k in robot.movable_joints]
     mocap = {name: int(model.body_mocapid[body.id]) for name, body in bodies.items()}
-    return RenderModel(model, np.array(at, dtype=np.int64), mocap, points)
+    obstacle_rows = [int(model.body_mocapid[body.id]) for body in obstacles]
+    return RenderModel(model, np.array(at, dtype=np.int64), mocap, obstacle_rows, points)
+
+
+def box_corners(boxes: Sequence[Block]) -> Array:
+    """Return the corners of boxes in the world, shape (8 boxes, 3) [m]."""
+    corners = [np.zeros((0, 3))]
+    for box in boxes:
+        T = box.pose.matrix
+        corners.append(_SIGNS * box.size @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(corners)
 
 
 def _visible(robot: Robot) -> Robot:
@@ -95,7 +113,7 @@ def _visible(robot: Robot) -> Robot:
 
 
 def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
-    """Add sky, light, ground and obstacles."""
+    """Add sky, light and ground."""
     spec.add_texture(
         name="morphgen/sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -115,9 +133,6 @@ def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
     )
     if scene.ground is not None:
         _add_ground(spec, scene.ground)
-    for obstacle in scene.obstacles:
-        geom = _add_box(spec.worldbody, obstacle.size, _OBSTACLE)
-        geom.pos, geom.quat = obstacle.pose.position, obstacle.pose.quaternion
 
 
 def _add_ground(spec: mujoco.MjSpec, height: float) -> None:

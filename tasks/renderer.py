@@ -22,8 +22,9 @@ from morphgen.formats.files import replacing_file
 from morphgen.formats.picture import gl_context
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.obstacles import place_boxes
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.render_model import BLOCK, render_model
+from morphgen.tasks.render_model import BLOCK, box_corners, render_model
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec, Marker
 
@@ -59,6 +60,8 @@ class RenderState:
     """Pose of the block, (x, y, z, qw, qx, qy, qz), or None."""
     markers: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     """Poses of the markers by name; markers without a pose are invisible."""
+    obstacles: NDArray[np.float32] | None = None
+    """Poses of the obstacles, shape (O, 7); None for those of the scene."""
 
 
 class Renderer:
@@ -116,7 +119,12 @@ class Renderer:
         task = TASKS[spec.task]
         configurations = np.concatenate([[spec.robot.home], spec.goals.q[:_NUM_STARTS]])
         markers = task.markers(spec.config, spec.goals)
-        return cls(spec.scene, markers, configurations, task.points_in_view(spec.goals), size)
+        corners = [
+            box_corners(place_boxes(spec.scene.obstacles, layout))
+            for layout in (spec.goals.layouts if spec.scene.obstacles else ())
+        ]
+        points = np.concatenate([task.points_in_view(spec.goals), *corners])
+        return cls(spec.scene, markers, configurations, points, size)
 
     def frame(self, state: RenderState) -> Frame:
         """Render a state.
@@ -137,6 +145,9 @@ class Renderer:
         for name, index in self._model.mocap.items():
             pose = np.asarray(poses.get(name, _AWAY))
             data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
+        if state.obstacles is not None:
+            for index, pose in zip(self._model.obstacles, state.obstacles, strict=True):
+                data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -168,7 +179,10 @@ def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
     spec = batch.specs[int(batch.env_robot_index[env])]
     block = None if spec.scene.block is None else _copied(batch.simulation.block_pose[env])
     return RenderState(
-        _copied(batch.q[env, : spec.robot.dof]), block, batch.groups.marker_poses(env)
+        _copied(batch.q[env, : spec.robot.dof]),
+        block,
+        batch.groups.marker_poses(env),
+        _copied(batch.layouts.poses[env, : len(spec.scene.obstacles)]),
     )
 
 

@@ -37,7 +37,7 @@ from morphgen.tasks.task import EnvSpec, GoalSet
 GOALS = "goals"
 """Name of the folder of goal sets in a built split."""
 INDEX = "index.json"
-FORMAT = 1
+FORMAT = 2
 
 _README = """\
 # Goal sets
@@ -48,6 +48,8 @@ that the set follows from), seed, number of goals, configurations tried and acce
 file.
 
 {tasks}- `obstacles` (m, 12) and `block` (12,): edges, pose, mass and friction of boxes
+- `layouts` (L, m, 7): poses of the obstacles in each layout, those for training first, and `usable`
+  (L, n): which goals or starts a layout leaves possible
 
 Poses are x, y, z, qw, qx, qy, qz in the world, whose origin is the robot's root; metres and rad.
 
@@ -325,7 +327,8 @@ def _parse_index(index: Mapping[str, Any], folder: Path) -> SplitGoals:
     """Return the goal sets that the index of a folder lists."""
     if index["format"] != FORMAT:
         raise BenchmarkError(
-            f"{folder / INDEX}: format {index['format']!r}; this version reads {FORMAT}"
+            f"{folder / INDEX}: format {index['format']!r}; this version reads {FORMAT}: build the "
+            "goal sets again with morphgen split build --goals"
         )
     for task in TASKS.builtin:
         index[task]  # a KeyError if it is missing

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from math import isfinite
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.sim.base import Block, Scene
@@ -50,28 +48,13 @@ class TaskConfig(Protocol):
     def obstacle_size(self) -> tuple[float, float]:
         """Range of the edge lengths of these boxes, relative to the robot's reach."""
 
+    @property
+    def train_layouts(self) -> int:
+        """Number of layouts of these boxes that training draws its episodes from."""
 
-def require_task_config(config: TaskConfig) -> None:
-    """Require valid values of the constants that every task has, and only finite numbers or text.
-
-    Raises:
-        TaskError: If a constant is out of its range.
-    """
-    name = type(config).__name__
-    for field in fields(config):
-        value = getattr(config, field.name)
-        numbers = () if isinstance(value, str) else value if isinstance(value, tuple) else (value,)
-        if not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
-            raise TaskError(f"{name}: {field.name} {value!r}: expected finite numbers")
-    for field_name, minimum in (("max_episode_steps", 1), ("num_goals", 1), ("obstacles", 0)):
-        value = getattr(config, field_name)
-        if not isinstance(value, int) or value < minimum:
-            raise TaskError(f"{name}: {field_name} {value!r}: expected an integer >= {minimum}")
-    low, high = config.obstacle_size
-    if not 0 < low <= high:
-        raise TaskError(
-            f"{name}: obstacle_size {config.obstacle_size}: expected 0 < lowest <= highest"
-        )
+    @property
+    def eval_layouts(self) -> int:
+        """Number of further layouts that evaluation draws its episodes from."""
 
 
 class GoalSet(Protocol):
@@ -101,7 +84,15 @@ class GoalSet(Protocol):
 
     @property
     def obstacles(self) -> tuple[Block, ...]:
-        """Boxes in the robot's workspace."""
+        """Boxes in the robot's workspace, at the poses of the first layout."""
+
+    @property
+    def layouts(self) -> Array:
+        """Poses of the boxes in the world in each layout, those for training first, (L, O, 7)."""
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Whether each layout leaves each goal possible, shape (L, G)."""
 
     @property
     def tried(self) -> int:
@@ -232,13 +223,18 @@ class TaskEnvs(ABC):
 
     @abstractmethod
     def begin(
-        self, rows: torch.Tensor, random: Sequence[np.random.Generator]
+        self,
+        rows: torch.Tensor,
+        random: Sequence[np.random.Generator],
+        layouts: Sequence[int | None],
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Begin episodes.
 
         Args:
             rows: Indices below k of environments whose episodes begin, shape (m,), int64.
             random: Random number generator of each of these environments.
+            layouts: Layout of the obstacles in each of them, an index of ``GoalSet.layouts``, or
+                None without obstacles.
 
         Returns:
             Joint positions at the start, shape (m, J), and poses of the block, shape (m, 7), zeros

@@ -112,13 +112,17 @@ class TaskGroups:
         return mask
 
     def begin(
-        self, envs: torch.Tensor, random: Sequence[np.random.Generator]
+        self,
+        envs: torch.Tensor,
+        random: Sequence[np.random.Generator],
+        layouts: Sequence[int | None],
     ) -> Iterator[tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]]:
         """Begin episodes.
 
         Args:
             envs: Environments whose episodes begin, shape (m,), int64.
             random: A stream of random numbers for each environment of the batch.
+            layouts: Layout of the obstacles in each environment of the batch, or None without.
 
         Yields:
             For each task, its rows in ``envs``, and the result of ``TaskEnvs.begin``.
@@ -128,7 +132,8 @@ class TaskGroups:
             if len(rows):
                 task_envs = envs[rows]
                 streams = [random[i] for i in task_envs.tolist()]
-                yield rows, group.envs.begin(self._row[task_envs], streams)
+                task_layouts = [layouts[i] for i in task_envs.tolist()]
+                yield rows, group.envs.begin(self._row[task_envs], streams, task_layouts)
 
     def evaluate(self, state: TaskState) -> BatchResult:
         """Evaluate a step of all environments."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.errors import RobotError
+from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
 from morphgen.model.tree import RigidGroup, rigid_groups
@@ -69,6 +70,17 @@ class SelfCollisionChecker:
             np.intp,
         )
         self._perturbation = np.linspace(1.0, 0.5, len(self._qpos))
+
+    def place(self, link: str, T_parent_joint: Pose) -> None:
+        """Move the joint of a link in its parent, from now on.
+
+        Args:
+            link: Name of the link.
+            T_parent_joint: New pose of its joint.
+        """
+        body = self._model.body(str(self._robot.link_index[link])).id
+        self._model.body_pos[body] = T_parent_joint.position
+        self._model.body_quat[body] = T_parent_joint.quaternion
 
     def penetrations(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
         """Test configurations, one at a time as the result is iterated.

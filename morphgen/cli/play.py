@@ -100,6 +100,7 @@ def play(args: argparse.Namespace) -> None:
             robot,
             sim=args.sim,
             obstacles=args.obstacles,
+            layouts="eval",
             kind=args.kind or interface.kind,
             observe=interface.channels,
             config=config,

@@ -19,6 +19,7 @@ from morphgen.rl.baselines.reach_goals import reach_goals
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
@@ -49,14 +50,14 @@ class InverseKinematics:
     def __init__(self, seed: int) -> None:
         self._seed, self._generator = seed, torch.Generator().manual_seed(seed)
         self._specs: Sequence[EnvSpec] = ()
+        self._planners: dict[tuple[int, int | None], PathPlanner] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
         """Return a step along the paths, shape (n, L); all joints move in proportion."""
         if self._specs is not task.specs:
             self._specs = task.specs
-            self._spaces = [FreeSpace(spec.scene) for spec in task.specs]
-            self._planners = [self._planner(task, i) for i in range(len(task.specs))]
+            self._planners = {}
         if self._task is not task:
             self._task, self._follower = task, PathFollower(task)
         new = torch.nonzero(task.episode_step == 0)[:, 0]
@@ -65,14 +66,22 @@ class InverseKinematics:
         self._follower.advance()
         return encode_actions(fractions_towards(task, self._follower.waypoint), task.action_kind)
 
-    def _planner(self, task: TaskBatch, robot: int) -> PathPlanner:
+    def _planner(self, task: TaskBatch, env: int) -> PathPlanner:
+        """Return the planner of an environment's robot among its obstacles."""
+        robot = int(task.env_robot_index[env])
+        key = robot, task.layouts.current[env]
+        if key not in self._planners:
+            self._planners[key] = self._new_planner(task, robot, task.layouts.scene(env))
+        return self._planners[key]
+
+    def _new_planner(self, task: TaskBatch, robot: int, scene: Scene) -> PathPlanner:
         dof = task.specs[robot].robot.dof
         step, movable = (
             task.robot_tables.max_step[robot, :dof],
             task.robot_tables.moves_tool[robot, :dof],
         )
         seed = int(np.random.SeedSequence([self._seed, robot]).generate_state(1)[0])
-        return PathPlanner(self._spaces[robot], _array(step), seed, movable.cpu().numpy())
+        return PathPlanner(FreeSpace(scene), _array(step), seed, movable.cpu().numpy())
 
     def _plan(self, task: TaskBatch, envs: torch.Tensor) -> None:
         """Plan a path in some environments."""
@@ -118,8 +127,8 @@ class InverseKinematics:
         self, task: TaskBatch, env: int, goals: Array, attempt: int
     ) -> tuple[Path | None, Tree | None]:
         """Return a free path to one of the goals or None, and the tree of RRT-Connect if it ran."""
-        robot = int(task.env_robot_index[env])
-        planner, goals = self._planners[robot], goals[self._spaces[robot].free(goals)]
+        robot, planner = int(task.env_robot_index[env]), self._planner(task, env)
+        goals = goals[planner.space.free(goals)]
         start = _array(task.targets[env, : task.specs[robot].robot.dof])
         path = planner.plan_straight(start, goals)
         if path:

@@ -180,7 +180,7 @@ class PathPlanner:
             seed: Seed of random configurations.
             movable: Joints that a path may move, shape (dof,); by default all.
         """
-        self._space, self._step, self._seed = space, step, seed
+        self.space, self._step, self._seed = space, step, seed
         self._limits = joint_limits(space.scene.robot)
         self._movable = np.ones(len(step), dtype=np.bool_) if movable is None else movable
 
@@ -278,7 +278,7 @@ class PathPlanner:
     def _free_fraction(self, start: Array, end: Array, block: Array | None) -> float:
         count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)
-        free = self._space.free(line, None if block is None else np.tile(block, (count, 1)))
+        free = self.space.free(line, None if block is None else np.tile(block, (count, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
 

@@ -24,7 +24,7 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.feasibility import sample_tools_in_box
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.robot_tables import RobotTables
-from morphgen.tasks.sim.base import GRAVITY
+from morphgen.tasks.sim.base import GRAVITY, Scene
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
@@ -154,12 +154,18 @@ class PushPlanner:
     """Plans pushes of one robot and its block."""
 
     def __init__(
-        self, spec: EnvSpec, tables: RobotTables, robot: int, rng: np.random.Generator
+        self,
+        spec: EnvSpec,
+        scene: Scene,
+        tables: RobotTables,
+        robot: int,
+        rng: np.random.Generator,
     ) -> None:
         """Collect free configurations with a low tool in the region of the push.
 
         Args:
-            spec: Robot, scene and starts of the task push.
+            spec: Robot and starts of the task push.
+            scene: Scene of the robot, with the obstacles of an episode.
             tables: Kinematics of the robots of a batch.
             robot: Index of the robot in the batch.
             rng: Source of random configurations.
@@ -175,7 +181,7 @@ class PushPlanner:
         self._friction = starts.block.friction * starts.block.mass * GRAVITY
         self._stiffness = np.array([gain.stiffness for gain in actuation(self._robot)])
         self._idle = ~tables.moves_tool[robot, : self._robot.dof].cpu().numpy()
-        self._space = FreeSpace(spec.scene)
+        self._space = FreeSpace(scene)
         step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
         self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
         edge, first, last = self._edge, starts.blocks.min(axis=0), starts.blocks.max(axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -54,7 +55,7 @@ class ScriptedPush:
         """Set up; plans depend on the seed, the robot, its starts and the state of the episode."""
         self._seed = seed
         self._specs: Sequence[EnvSpec] = ()
-        self._planners: dict[int, PushPlanner] = {}
+        self._planners: dict[tuple[int, int | None], PushPlanner] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
@@ -102,13 +103,15 @@ class ScriptedPush:
 
     def _plan(self, task: TaskBatch, env: int, block: torch.Tensor) -> None:
         """Make a plan in one environment; block is the pose of its block, shape (7,)."""
-        robot = int(task.env_robot_index[env])
-        if robot not in self._planners:
+        robot, _ = key = _robot_and_layout(task, env)
+        if key not in self._planners:
             rng = np.random.default_rng([self._seed, robot])
-            self._planners[robot] = PushPlanner(task.specs[robot], task.robot_tables, robot, rng)
+            self._planners[key] = PushPlanner(
+                task.specs[robot], task.layouts.scene(env), task.robot_tables, robot, rng
+            )
         q = task.targets[env, : task.specs[robot].robot.dof].double().cpu().numpy()
         steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
-        plan = self._planners[robot].plan(
+        plan = self._planners[key].plan(
             q, block.double().cpu().numpy(), int(self._num_plans[env]), steps_left
         )
         self._num_plans[env] += 1
@@ -141,12 +144,13 @@ class ScriptedPush:
     def _blocked(self, task: TaskBatch) -> torch.Tensor:
         """Return where a pushing arm's targets collide with anything but the block, (n,), bool."""
         blocked = torch.zeros_like(self._active)
-        for robot, planner in self._planners.items():
-            envs = torch.nonzero(self._active & self.pushing & (task.env_robot_index == robot))[
-                :, 0
-            ]
+        envs_of = defaultdict[tuple[int, int | None], list[int]](list)
+        for env in torch.nonzero(self._active & self.pushing)[:, 0].tolist():
+            envs_of[_robot_and_layout(task, env)].append(env)
+        for (robot, layout), envs in envs_of.items():
             q = task.targets[envs, : task.specs[robot].robot.dof].double().cpu().numpy()
-            blocked[envs] = ~torch.from_numpy(planner.free(q)).to(blocked.device)
+            free = self._planners[robot, layout].free(q)
+            blocked[envs] = ~torch.from_numpy(free).to(blocked.device)
         return blocked
 
     def _push(self, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
@@ -179,3 +183,8 @@ class ScriptedPush:
         stuck = self.pushing & (dy > 0) & (short > 0.8 * SPEED)
         self._stuck = torch.where(stuck, self._stuck + 1, 0)
         return targets
+
+
+def _robot_and_layout(task: TaskBatch, env: int) -> tuple[int, int | None]:
+    """Return the indices of an environment's robot and of the layout of its obstacles."""
+    return int(task.env_robot_index[env]), task.layouts.current[env]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError
-from morphgen.tasks.task import require_task_config
+from morphgen.tasks.config_checks import require_task_config
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,10 @@ class PushConfig:
     """Number of boxes if obstacles are requested."""
     obstacle_size: tuple[float, float] = (0.06, 0.15)
     """Range of the edge lengths of these boxes, relative to the robot's reach."""
+    train_layouts: int = 20
+    """Number of layouts of these boxes for training."""
+    eval_layouts: int = 10
+    """Number of further layouts for evaluation."""
     curriculum_steps: int = 50
     """Number of equal steps in which the line moves during the first half of the training."""
     curriculum_start: float = 0.1

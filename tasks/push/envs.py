@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet
-from morphgen.tasks.rows import padded_rows, row_norms
+from morphgen.tasks.rows import goal_choices, padded_rows, row_norms
 from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
 
 GAP = 0.05
@@ -30,7 +30,7 @@ class PushEnvs(TaskEnvs):
         sets: list[PushStartSet] = [spec.goals for spec in specs]  # type: ignore[misc]
         device = env_spec_index.device
         self._env_spec_index = env_spec_index
-        self._count = [len(pushes.q) for pushes in sets]
+        self._choices = [goal_choices(pushes) for pushes in sets]
         self._q = padded_rows([pushes.q for pushes in sets], num_joints, device)
         self._blocks = padded_rows([pushes.blocks for pushes in sets], 7, device)
         self._final_line = torch.tensor([pushes.line for pushes in sets], device=device)[
@@ -48,13 +48,16 @@ class PushEnvs(TaskEnvs):
         """Current y that the block must cross, shape (k,) [m]."""
 
     def begin(
-        self, rows: torch.Tensor, random: Sequence[np.random.Generator]
+        self,
+        rows: torch.Tensor,
+        random: Sequence[np.random.Generator],
+        layouts: Sequence[int | None],
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw starts of the robots' sets: configurations and poses of blocks."""
+        """Draw starts of the robots' sets that the layout leaves possible."""
         spec = self._env_spec_index[rows]
         drawn = [
-            int(stream.integers(self._count[i]))
-            for stream, i in zip(random, spec.tolist(), strict=True)
+            int(self._choices[i][layout][stream.integers(len(self._choices[i][layout]))])
+            for stream, i, layout in zip(random, spec.tolist(), layouts, strict=True)
         ]
         start = torch.tensor(drawn, device=spec.device)
         return self._q[spec, start], self._blocks[spec, start]

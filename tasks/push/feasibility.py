@@ -7,21 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError
 from morphgen.model.inverse_kinematics import solve_position_ik
 from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.obstacles import draw_obstacles
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.region import Region, draw_blocks, yawed
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.push.region import Region, yawed
 from morphgen.typing import Array
 
-LAYOUTS = 8
-"""Number of obstacle layouts to draw before giving up."""
-KEPT = 0.5
-"""Fraction of the paths that are clear without obstacles that must stay clear with them."""
 BEHIND = (0.1, 0.4, 0.8, 1.2, 1.6)
 """Distances of the tool behind the block's rearmost point, in block edges, in the order of trial.
 They exceed the radius of the largest sphere, whose tool is at its bottom."""
@@ -30,8 +22,6 @@ CLOSE = 1e-3
 NEAREST = (1, 2, 3, 6)
 """Numbers of nearest sampled configurations from which inverse kinematics starts, in turn."""
 
-_PROBES = 64
-"""Number of blocks whose paths test a layout of obstacles."""
 _SPACING = 0.125
 """Distance of the tested poses on a path, in block edges."""
 _BANK = 2048
@@ -88,7 +78,7 @@ class FeasibilityTest:
             blocks: Poses of blocks that stand on the ground, shape (n, 7).
         """
         n, edge = len(blocks), self._region.edge
-        clear = path_is_clear(self._space, self._region, blocks)
+        clear = path_is_clear(self._space, self._region.line, blocks)
         behind, across = (np.full((n, self._robot.dof), np.nan) for _ in range(2))
         if len(self._bank_q):
             at_line = blocks[:, :2].copy()
@@ -157,67 +147,27 @@ class FeasibilityTest:
         return q.reshape(m, k, -1), free.reshape(m, k)
 
 
-def path_is_clear(space: FreeSpace, region: Region, blocks: Array) -> NDArray[np.bool_]:
+def path_is_clear(space: FreeSpace, line: float, blocks: Array) -> NDArray[np.bool_]:
     """Return whether the paths of blocks are clear of obstacles and base, even if they turn.
 
     Args:
         space: The robot with its obstacles and block.
-        region: Region of the blocks, where the paths end.
+        line: y where the paths end [m].
         blocks: Poses at the start, shape (n, 7).
 
     Returns:
         Shape (n,).
     """
-    parts = int((region.line - region.y[0]) / (_SPACING * region.edge)) + 2
+    assert space.scene.block is not None
+    step = _SPACING * space.scene.block.size[1]
+    parts = int((line - blocks[:, 1].min()) / step) + 2
     turned = blocks.copy()
     turned[:, 3:] = yawed(_yaws(blocks) + np.pi / 4)
     poses = np.tile(np.stack([blocks, turned]), (parts, 1, 1, 1))
-    poses[..., 1] = np.linspace(blocks[:, 1], region.line, parts)[:, None]
+    advance = step * np.arange(parts)[:, None]
+    poses[..., 1] = np.minimum(blocks[:, 1] + advance, line)[:, None]
     return np.asarray(
         space.block_is_clear(poses.reshape(-1, 7)).reshape(-1, len(blocks)).all(axis=0)
-    )
-
-
-def clear_obstacles(
-    robot: Robot,
-    config: PushConfig,
-    region: Region,
-    block: Block,
-    ground: float,
-    seeds: np.random.SeedSequence,
-) -> tuple[Block, ...]:
-    """Draw obstacles as ``draw_obstacles`` does that leave most paths of the block clear.
-
-    Args:
-        robot: The robot.
-        config: Number and size of the obstacles.
-        region: Region of the block.
-        block: The block.
-        ground: Height of the ground in the root frame [m].
-        seeds: Source of all random numbers.
-
-    Raises:
-        TaskError: If each of ``LAYOUTS`` layouts leaves less than ``KEPT`` of the paths clear.
-        BenchmarkError: If obstacles cannot be placed at all.
-    """
-    probe_seeds, *layouts = seeds.spawn(LAYOUTS + 1)
-    probes = draw_blocks(region, ground, _PROBES, np.random.default_rng(probe_seeds))
-
-    def num_clear(obstacles: tuple[Block, ...]) -> int:
-        space = FreeSpace(Scene(robot, block=block, obstacles=obstacles, ground=ground))
-        return int(path_is_clear(space, region, probes).sum())
-
-    needed = KEPT * num_clear(())
-    for layout in layouts:
-        rng = np.random.default_rng(layout)
-        obstacles = draw_obstacles(
-            robot, config.obstacles, config.obstacle_size, rng, ground=ground
-        )
-        if num_clear(obstacles) >= needed:
-            return obstacles
-    raise TaskError(
-        f"robot {robot.name!r}: each of {LAYOUTS} layouts of {config.obstacles} obstacles stands "
-        f"in more than {1 - KEPT:.0%} of the block's ways: take fewer or smaller obstacles"
     )
 
 

@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace, outside_limits
+from morphgen.tasks.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.feasibility import CLOSE, FeasibilityTest, clear_obstacles
+from morphgen.tasks.push.feasibility import CLOSE, FeasibilityTest, path_is_clear
 from morphgen.tasks.push.region import Region, draw_blocks, push_region
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
@@ -40,7 +42,7 @@ class PushStartSet:
     key: str
     """Hash of everything that the set depends on: 64 hexadecimal digits."""
     q: Array
-    """Free configurations at the start, shape (S, dof) [rad or m]."""
+    """Configurations at the start, free without obstacles, shape (S, dof) [rad or m]."""
     blocks: Array
     """Poses of the block at the start in the world: (x, y, z, qw, qx, qy, qz), shape (S, 7)."""
     block: Block
@@ -52,6 +54,11 @@ class PushStartSet:
     ground: float
     """Height of the ground [m]."""
     obstacles: tuple[Block, ...]
+    """Boxes at the poses of the first layout."""
+    layouts: Array
+    """Poses of the boxes in each layout, those for training first, shape (L, O, 7)."""
+    usable: NDArray[np.bool_]
+    """Which starts are feasible in each layout, by their certificates, shape (L, S)."""
     tried: int
     """Number of tested poses of the block."""
     accepted: int
@@ -79,38 +86,52 @@ def sample_starts(
 ) -> PushStartSet:
     """Sample a robot's push set; see ``Task.sample``.
 
-    Blocks stand on the ground in the ``push_region``, turned at random. A pose is feasible if no
-    obstacle or base is on the straight path along y across the line, and if there are free
+    Blocks stand on the ground in the ``push_region``, turned at random. A pose is feasible if the
+    base is not on the straight path along y across the line, and if there are free
     configurations with the tool behind the block and with the tool on the line, both at the height
     of the block. Start configurations are uniform within the joint limits; those that collide, also
-    with the block, are drawn again.
+    with the block, are drawn again. Obstacles do not matter: each of their layouts leaves some of
+    the starts feasible.
 
     Raises:
-        TaskError: If the robot cannot push, too few poses are feasible, or every layout of
-            obstacles blocks most paths.
-        BenchmarkError: If the robot has no tool that moves, or hardly a free configuration.
+        TaskError: If the robot cannot push, or too few poses are feasible.
+        BenchmarkError: If the robot has no tool that moves, or hardly a free configuration, or
+            obstacles block most starts.
         MeshError: If a mesh cannot be read.
     """
     region_seeds, test_seeds, block_seeds, start_seeds, obstacle_seeds = seeds.spawn(5)
     region = push_region(robot, config, ground, np.random.default_rng(region_seeds))
     edge = region.edge
     block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
-    boxes: tuple[Block, ...] = ()
-    if obstacles:
-        boxes = clear_obstacles(robot, config, region, block, ground, obstacle_seeds)
-    space = FreeSpace(Scene(robot, block=block, obstacles=boxes, ground=ground))
+    space = FreeSpace(Scene(robot, block=block, ground=ground))
     test = FeasibilityTest(space, region, np.random.default_rng(test_seeds))
     starts, tried = _feasible(robot, config.num_goals, region, test, ground, block_seeds)
     blocks, behind, across = (np.array(column) for column in zip(*starts, strict=True))
     x, y, z, qw, qx, qy, qz = blocks[0].tolist()
+    q = _starts(space, blocks, start_seeds)
+    boxes: tuple[Block, ...] = ()
+    layouts, usable = np.zeros((0, 0, 7)), np.zeros((0, len(q)), dtype=np.bool_)
+    if obstacles:
+        size_seeds, layout_seeds = obstacle_seeds.spawn(2)
+        count, size = config.obstacles, config.obstacle_size
+        boxes = draw_boxes(robot, count, size, np.random.default_rng(size_seeds))
+        layouts, usable = draw_layouts(
+            FreeSpace(Scene(robot, block=block, obstacles=boxes, ground=ground)),
+            (config.train_layouts, config.eval_layouts),
+            layout_seeds,
+            lambda space: _feasible_starts(space, region.line, q, blocks, behind, across),
+        )
+        boxes = place_boxes(boxes, layouts[0])
     return PushStartSet(
-        q=_starts(space, blocks, start_seeds),
+        q=q,
         blocks=blocks,
         block=replace(block, pose=Pose((x, y, z), (qw, qx, qy, qz))),
         line=region.line,
         scale=region.scale,
         ground=ground,
         obstacles=boxes,
+        layouts=layouts,
+        usable=usable,
         tried=tried,
         accepted=len(starts),
         behind=behind,
@@ -160,6 +181,26 @@ def _feasible(
     )
 
 
+def _feasible_starts(
+    space: FreeSpace, line: float, q: Array, blocks: Array, behind: Array, across: Array
+) -> NDArray[np.bool_]:
+    """Return which starts the obstacles leave feasible, by their certificates, shape (n,).
+
+    Args:
+        space: The robot with its obstacles and block.
+        line: y that the block's centre must cross [m].
+        q: Configurations at the start, shape (n, dof).
+        blocks: Poses of the block at the start, shape (n, 7).
+        behind: Configurations with the tool behind the block, shape (n, dof).
+        across: Configurations with the tool on the line, shape (n, dof).
+    """
+    feasible = path_is_clear(space, line, blocks)
+    for configurations, poses in ((q, blocks), (behind, blocks), (across, None)):
+        rows = np.flatnonzero(feasible)
+        feasible[rows] = space.free(configurations[rows], None if poses is None else poses[rows])
+    return feasible
+
+
 def _starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) -> Array:
     """Return a free configuration for each block, shape (n, dof); they do not depend on n."""
     starts = []
@@ -189,9 +230,10 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
         scene: Ground and obstacles; the block is the set's.
 
     Returns:
-        Faults, a line each: a block that does not stand on the ground, is past the line or in an
-        obstacle or the base; a configuration out of limits or in collision; a certificate whose
-        tool is not behind the block, or not on the line; a set of another robot or other obstacles.
+        Faults, a line each: a block that does not stand on the ground, is past the line or in the
+        base; a configuration out of limits or in collision; a certificate whose tool is not behind
+        the block, or not on the line; a set of another robot or other obstacles; see also
+        ``layout_faults``.
 
     Raises:
         FormatError: If MJCF cannot express the robot.
@@ -211,12 +253,18 @@ def certify_starts(pushes: PushStartSet, robot: Robot, scene: Scene) -> list[str
         return [f"arrays {shapes} are not starts of robot {robot.name!r} with {robot.dof} joints"]
     if not all(np.isfinite(q).all() for q in (*configurations.values(), pushes.blocks)):
         return ["not all numbers are finite"]
-    faults = []
-    if scene.obstacles != pushes.obstacles:
-        faults.append("the obstacles of the scene are not those of the push set")
+    faults = layout_faults(
+        pushes,
+        robot,
+        scene,
+        lambda space: _feasible_starts(
+            space, pushes.line, pushes.q, pushes.blocks, pushes.behind, pushes.across
+        ),
+        block=pushes.block,
+    )
     for name, q in configurations.items():
         faults += [f"start {i}: {name}: {reason}" for i, reason in outside_limits(robot, q)]
-    space = FreeSpace(replace(scene, robot=robot, block=pushes.block))
+    space = FreeSpace(replace(scene, robot=robot, block=pushes.block, obstacles=()))
     faults += _misplaced_blocks(pushes, space)
     for name, q in configurations.items():
         free = space.free(q, None if q is pushes.across else pushes.blocks)
@@ -233,7 +281,7 @@ def _misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
     for i in np.flatnonzero(pushes.blocks[:, 1] >= pushes.line).tolist():
         yield f"start {i}: the block is across the line already"
     for i in np.flatnonzero(~space.block_is_clear(pushes.blocks)).tolist():
-        yield f"start {i}: the block is in an obstacle or the base"
+        yield f"start {i}: the block is in the base"
 
 
 def _misplaced_tools(pushes: PushStartSet, robot: Robot) -> Iterator[str]:

@@ -29,8 +29,8 @@ class Push(Task[PushConfig, PushStartSet]):
     name = "push"
     config_type = PushConfig
     goal_set_type = PushStartSet
-    goal_format = 2
-    cache_folder = "pushes-3"
+    goal_format = 3
+    cache_folder = "pushes-4"
     fields = (OBJECT, LINE)
     moves_fingers = True
     relative_to_random = False

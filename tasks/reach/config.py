@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError, nearest
+from morphgen.tasks.config_checks import require_task_config
 from morphgen.tasks.reach import GOAL_KINDS
-from morphgen.tasks.task import require_task_config
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,10 @@ class ReachConfig:
     """Number of boxes if obstacles are requested."""
     obstacle_size: tuple[float, float] = (0.06, 0.15)
     """Range of the edge lengths of these boxes, relative to the robot's reach."""
+    train_layouts: int = 20
+    """Number of layouts of these boxes for training."""
+    eval_layouts: int = 10
+    """Number of further layouts for evaluation."""
     joint_limit_weight: float = 1.0
     joint_acceleration_weight: float = 1e-5
     distance_weight: float = 1.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.rows import padded_rows, row_norms
+from morphgen.tasks.rows import goal_choices, padded_rows, row_norms
 from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
 
 
@@ -33,7 +33,7 @@ class ReachEnvs(TaskEnvs):
             if len(goals.q) < 2:
                 raise TaskError(f"robot {goals.robot!r}: {len(goals.q)} goals; expected 2 or more")
         device = env_spec_index.device
-        self._count = [len(goals.q) for goals in sets]
+        self._choices = [goal_choices(goals) for goals in sets]
         self._q = padded_rows([goals.q for goals in sets], num_joints, device)
         self._poses = padded_rows([goals.goal_poses for goals in sets], 7, device)
         self.goal = torch.zeros(len(env_spec_index), 7, device=device)
@@ -44,13 +44,16 @@ class ReachEnvs(TaskEnvs):
         self._goal_rotation = torch.eye(3, device=device).repeat(len(env_spec_index), 1, 1)
 
     def begin(
-        self, rows: torch.Tensor, random: Sequence[np.random.Generator]
+        self,
+        rows: torch.Tensor,
+        random: Sequence[np.random.Generator],
+        layouts: Sequence[int | None],
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw a start and another goal of each robot's set."""
+        """Draw a start and another goal of each robot's set that the layout leaves free."""
         spec = self._env_spec_index[rows]
         pairs = [
-            stream.choice(self._count[i], size=2, replace=False)
-            for stream, i in zip(random, spec.tolist(), strict=True)
+            stream.choice(self._choices[i][layout], size=2, replace=False)
+            for stream, i, layout in zip(random, spec.tolist(), layouts, strict=True)
         ]
         start, goal = torch.tensor(np.array(pairs), device=spec.device).T
         self.goal_configuration[rows] = self._q[spec, goal]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.model.geometry import Pose
@@ -17,7 +18,7 @@ from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.cspace_components import cspace_components, in_other_component
 from morphgen.tasks.free_space import FreeSpace, outside_limits
-from morphgen.tasks.obstacles import draw_obstacles
+from morphgen.tasks.obstacles import draw_boxes, draw_layouts, layout_faults, place_boxes
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
@@ -37,11 +38,17 @@ class ReachGoalSet:
     key: str
     """Hash of everything that the set depends on: 64 hexadecimal digits."""
     q: Array
-    """Free configurations in the main component of C-space, shape (G, dof) [rad or m]."""
+    """Configurations in the main component of C-space, shape (G, dof) [rad or m]: free without
+    obstacles."""
     poses: Array
     """Tool poses of the configurations in the root frame: (x, y, z, qw, qx, qy, qz), qw >= 0,
     shape (G, 7)."""
     obstacles: tuple[Block, ...]
+    """Boxes at the poses of the first layout."""
+    layouts: Array
+    """Poses of the boxes in each layout, those for training first, shape (L, O, 7)."""
+    usable: NDArray[np.bool_]
+    """Which configurations are free in each layout, shape (L, G)."""
     tried: int
     """Number of tested random configurations."""
     accepted: int
@@ -65,23 +72,40 @@ def sample_goals(
 ) -> ReachGoalSet:
     """Sample a robot's goal set; see ``Task.sample``.
 
-    Configurations are uniform within the joint limits. Those that collide, also with the ground or
-    an obstacle, and those outside of the main component of free C-space (``cspace_components``) are
-    drawn again.
+    Configurations are uniform within the joint limits. Those that collide, also with the ground,
+    and those outside of the main component of free C-space (``cspace_components``) are drawn again.
+    Obstacles do not matter: each of their layouts leaves some of the configurations free.
     """
-    goals_rng, obstacles_rng = (np.random.default_rng(child) for child in seeds.spawn(2))
-    blocks: tuple[Block, ...] = ()
-    if obstacles:
-        count, size = config.obstacles, config.obstacle_size
-        blocks = draw_obstacles(robot, count, size, obstacles_rng, ground=ground)
-    space = FreeSpace(Scene(robot, obstacles=blocks, ground=ground))
+    goals_seeds, obstacle_seeds = seeds.spawn(2)
+    goals_rng = np.random.default_rng(goals_seeds)
+    space = FreeSpace(Scene(robot, ground=ground))
     planes = cspace_components(robot)
     q, tried = space.sample(
         config.num_goals, goals_rng, lambda q: not in_other_component(planes, q).any()
     )
     poses = _pose_rows(frame_pose(robot, q, TOOL))
+    boxes: tuple[Block, ...] = ()
+    layouts, usable = np.zeros((0, 0, 7)), np.zeros((0, len(q)), dtype=np.bool_)
+    if obstacles:
+        size_seeds, layout_seeds = obstacle_seeds.spawn(2)
+        count, size = config.obstacles, config.obstacle_size
+        boxes = draw_boxes(robot, count, size, np.random.default_rng(size_seeds))
+        layouts, usable = draw_layouts(
+            FreeSpace(Scene(robot, obstacles=boxes, ground=ground)),
+            (config.train_layouts, config.eval_layouts),
+            layout_seeds,
+            lambda space: space.free(q),
+        )
+        boxes = place_boxes(boxes, layouts[0])
     return ReachGoalSet(
-        q=q, poses=poses, obstacles=blocks, tried=tried, accepted=len(q), **identity
+        q=q,
+        poses=poses,
+        obstacles=boxes,
+        layouts=layouts,
+        usable=usable,
+        tried=tried,
+        accepted=len(q),
+        **identity,
     )
 
 
@@ -97,7 +121,8 @@ def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
 
     Returns:
         Faults, a line each: a configuration out of limits, in collision, in another component of
-        C-space, or whose tool is not at the goal; a set of another robot or other obstacles.
+        C-space, or whose tool is not at the goal; a set of another robot or other obstacles; see
+        also ``layout_faults``.
 
     Raises:
         FormatError: If MJCF cannot express the robot.
@@ -108,20 +133,26 @@ def certify_goals(goals: ReachGoalSet, robot: Robot, scene: Scene) -> list[str]:
             f"configurations {goals.q.shape} and poses {goals.poses.shape} are not goals of robot "
             f"{robot.name!r} with {robot.dof} joints"
         ]
-    faults = []
-    if scene.obstacles != goals.obstacles:
-        faults.append("the obstacles of the scene are not those of the goal set")
-    faults += [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
-    usable = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
-    free = FreeSpace(replace(scene, robot=robot)).free(goals.q[usable])
-    faults += [f"goal {i}: its configuration is in collision" for i in usable[~free].tolist()]
+    faults = [f"goal {i}: {why}" for i, why in outside_limits(robot, goals.q)]
+    rows = np.flatnonzero(np.isfinite(goals.q).all(axis=1))
+
+    def free_goals(space: FreeSpace) -> NDArray[np.bool_]:
+        """Return where a goal is free; those outside of all limits are faults already."""
+        free = np.ones(len(goals.q), dtype=np.bool_)
+        free[rows] = space.free(goals.q[rows])
+        return free
+
+    faults += layout_faults(goals, robot, scene, free_goals)
+    free = free_goals(FreeSpace(replace(scene, robot=robot, obstacles=())))
+    blocked = np.flatnonzero(~free).tolist()
+    faults += [f"goal {i}: its configuration is in collision" for i in blocked]
     planes = cspace_components(robot)
-    for i in usable[free].tolist():
+    for i in rows[free[rows]].tolist():
         for k in np.flatnonzero(in_other_component(planes, goals.q[i])).tolist():
             a, b = planes[k].pairs[0]
             faults.append(f"goal {i}: {a!r} and {b!r} touch on every path to most others")
-    tools = _pose_rows(MujocoKinematics(robot).frame_pose(goals.q[usable]))
-    for i, tool in zip(usable.tolist(), tools, strict=True):
+    tools = _pose_rows(MujocoKinematics(robot).frame_pose(goals.q[rows]))
+    for i, tool in zip(rows.tolist(), tools, strict=True):
         pose = goals.poses[i]
         distance = float(np.linalg.norm(pose[:3] - tool[:3]))
         # A quaternion and its negative are the same rotation.

@@ -26,13 +26,13 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
     name = "reach"
     config_type = ReachConfig
     goal_set_type = ReachGoalSet
-    goal_format = 4
-    cache_folder = "goals-4"
+    goal_format = 5
+    cache_folder = "goals-5"
     fields = (GOAL,)
     discrete_actions = True
     goal_files_readme = """\
-- reach: `q` (n, dof) are configurations free of collisions, and `poses` (n, 7) of the tool at them
-  are the goals; `q` are the starts of episodes, too
+- reach: `q` (n, dof) are configurations free of collisions without obstacles, and `poses` (n, 7) of
+  the tool at them are the goals; `q` are the starts of episodes, too
 """
 
     def check(self, robot: Robot, config: ReachConfig) -> None:

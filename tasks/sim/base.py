@@ -90,13 +90,21 @@ class Simulation(Protocol):
     def block_velocity(self) -> torch.Tensor:
         """Linear and angular velocities of the blocks in the world, (n, 6); zeros without one."""
 
-    def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
+    def reset(
+        self,
+        envs: torch.Tensor,
+        q: torch.Tensor,
+        block_pose: torch.Tensor,
+        obstacle_poses: torch.Tensor | None = None,
+    ) -> None:
         """Put some environments at rest; clear everything that earlier steps left behind.
 
         Args:
             envs: Indices of environments, shape (k,), int64.
             q: Positions of their independent joints, which become the targets, shape (k, J).
             block_pose: Poses of their blocks, shape (k, 7); ignored without a block.
+            obstacle_poses: Poses of their obstacles in the world, shape (k, O, 7), padded to the
+                largest number of obstacles; None leaves them where they are.
         """
 
     def step(self, targets: torch.Tensor) -> None:

@@ -27,6 +27,9 @@ from morphgen.tasks.sim.bullet_workers import (
 )
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 
+BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]
+"""Arguments of ``BulletBatch.reset``."""
+
 _BASE_LOAD = 5
 """Cost of stepping an environment without joints, in joints."""
 
@@ -101,7 +104,13 @@ class BulletSimulation:
             self.close()
             raise
 
-    def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
+    def reset(
+        self,
+        envs: torch.Tensor,
+        q: torch.Tensor,
+        block_pose: torch.Tensor,
+        obstacle_poses: torch.Tensor | None = None,
+    ) -> None:
         """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
@@ -110,14 +119,18 @@ class BulletSimulation:
         """
         self._require_open()
         indices, positions, poses = self._checked_state(envs, q, block_pose)
+        obstacles = self._checked_obstacles(envs, obstacle_poses)
+
+        def state(rows: NDArray[np.bool_]) -> BulletState:
+            moved = None if obstacles is None else obstacles[rows]
+            return indices[rows], positions[rows], poses[rows], moved
+
         messages = []
         for worker in self._workers:
             rows = np.isin(indices, worker.envs)
             if rows.any():
-                message = pickle.dumps((indices[rows], positions[rows], poses[rows]))
-                messages.append((worker, message))
-        rows = np.isin(indices, self._envs)
-        local_state = indices[rows], positions[rows], poses[rows]
+                messages.append((worker, pickle.dumps(state(rows))))
+        local_state = state(np.isin(indices, self._envs))
         self._run(messages, lambda batch: batch.reset(*local_state))
 
     def step(self, targets: torch.Tensor) -> None:
@@ -201,6 +214,21 @@ class BulletSimulation:
                 f"block {poses[k].tolist()}"
             )
         return indices, positions, poses
+
+    def _checked_obstacles(
+        self, envs: torch.Tensor, obstacle_poses: torch.Tensor | None
+    ) -> Float32 | None:
+        """Return valid poses of obstacles for ``reset`` as an array."""
+        if obstacle_poses is None:
+            return None
+        most = max(len(scene.obstacles) for scene in self.scenes)
+        poses: Float32 = obstacle_poses.numpy()
+        if poses.shape != (len(envs), most, 7) or not np.isfinite(poses).all():
+            raise ValueError(
+                f"reset of {len(envs)} environments with obstacles of shape {poses.shape}; they "
+                f"need finite numbers of shape ({len(envs)}, {most}, 7)"
+            )
+        return poses
 
     def _label(self, env: int) -> str:
         return f"environment {env} ({self.scenes[env].robot.name!r})"

@@ -80,6 +80,7 @@ class BulletBatch:
         self._index = {env: i for i, env in enumerate(self._envs)}
         self._steps = np.zeros(len(scenes), np.int64)
         self._diverged: dict[int, str] = {}
+        self._obstacle_poses: list[list[list[float]] | None] = [None] * len(scenes)
         self._loaded: list[BulletScene] = []
         try:
             self._loaded.extend(map(self._load, range(len(scenes))))
@@ -130,15 +131,26 @@ class BulletBatch:
         self._positions, self._velocities = np.zeros(len(offset)), np.zeros(len(offset))
         self._measured = np.zeros(len(offset))
 
-    def reset(self, envs: NDArray[np.int64], q: Float32, block_pose: Float32) -> None:
+    def reset(
+        self,
+        envs: NDArray[np.int64],
+        q: Float32,
+        block_pose: Float32,
+        obstacle_poses: Float32 | None,
+    ) -> None:
         """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
             SimulationError: If an environment that had diverged cannot be loaded again.
         """
         buffers = self._buffers
-        for env, positions, pose in zip(envs.tolist(), q, block_pose, strict=True):
+        for row, (env, positions, pose) in enumerate(
+            zip(envs.tolist(), q, block_pose, strict=True)
+        ):
             i = self._index[env]
+            if obstacle_poses is not None:
+                count = len(self._scenes[i].obstacles)
+                self._obstacle_poses[i] = obstacle_poses[row, :count].tolist()
             scene = self._scenes[i]
             positions = positions[: scene.robot.dof]
             if self._diverged.pop(env, None) is not None:
@@ -147,7 +159,7 @@ class BulletBatch:
             loaded, span = self._loaded[i], self._spans[i]
             self._positions[span] = movable_positions(scene.robot, positions)
             self._velocities[span], self._measured[span] = 0, 0
-            loaded.reset(self._positions[span].tolist(), pose.tolist())
+            loaded.reset(self._positions[span].tolist(), pose.tolist(), self._obstacle_poses[i])
             buffers.q[env, : scene.robot.dof] = positions
             buffers.qd[env] = 0
             if scene.block is not None:

@@ -182,8 +182,10 @@ class BulletScene:
             self._add(ground, FRICTION, _STATIC)
             for link in self._level:
                 pybullet.setCollisionFilterPair(self.robot, ground, link, -1, 0, **self._client)
-        for obstacle in self._scene.obstacles:
+        self._obstacles = [
             self._add(self._box(obstacle), obstacle.friction, _STATIC)
+            for obstacle in self._scene.obstacles
+        ]
         block = self._scene.block
         self.block = -1
         self._weight: tuple[float, float, float] | None = None
@@ -226,12 +228,18 @@ class BulletScene:
         }[group]
         self._groups.append((body, link, group, mask))
 
-    def reset(self, positions: Sequence[float], block_pose: Sequence[float]) -> None:
+    def reset(
+        self,
+        positions: Sequence[float],
+        block_pose: Sequence[float],
+        obstacle_poses: Sequence[Sequence[float]] | None = None,
+    ) -> None:
         """Put robot and block at rest, and clear the contact history.
 
         Args:
             positions: Positions of all movable joints [rad or m].
             block_pose: Pose of the block, (x, y, z, qw, qx, qy, qz); ignored without a block.
+            obstacle_poses: Poses of the obstacles; None leaves them where they are.
         """
         for joint, position in zip(self.driven, positions, strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
@@ -242,6 +250,12 @@ class BulletScene:
             )
             pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
             self._block_position = (x, y, z)
+        if obstacle_poses is not None:
+            for body, pose in zip(self._obstacles, obstacle_poses, strict=True):
+                x, y, z, qw, qx, qy, qz = pose
+                pybullet.resetBasePositionAndOrientation(
+                    body, (x, y, z), (qx, qy, qz, qw), **self._client
+                )
         for entry in self._groups:
             pybullet.setCollisionFilterGroupMask(*entry, **self._client)
 

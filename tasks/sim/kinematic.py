@@ -92,8 +92,14 @@ class KinematicSimulation:
         self.block_velocity = torch.zeros(n, 6, device=self.device)
         self._closed = False
 
-    def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
-        """Put some environments at rest; see ``Simulation.reset``.
+    def reset(
+        self,
+        envs: torch.Tensor,
+        q: torch.Tensor,
+        block_pose: torch.Tensor,
+        obstacle_poses: torch.Tensor | None = None,
+    ) -> None:
+        """Put some environments at rest; see ``Simulation.reset``. There are no obstacles.
 
         Raises:
             ValueError: If a shape is wrong, an environment does not exist, or a position is not

@@ -58,6 +58,8 @@ class World:
     """Indices in ``qvel`` of the independent joints."""
     block: int | None
     """Body id of the block, if there is one."""
+    obstacles: Indices
+    """Indices in ``mocap_pos`` of the obstacles, which are mocap bodies."""
 
     @property
     def block_moves(self) -> bool:
@@ -79,7 +81,7 @@ class World:
 
 
 def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
-    """Compile scenes; those that differ only in the initial pose of the block share a model.
+    """Compile scenes; those that differ only in poses of block and obstacles share a model.
 
     Contacts have elliptic cones, solved with Newton's method; damping is integrated implicitly, as
     in every MJCF of morphgen. MuJoCo's default contact, critically damped in 20 ms, lasts four
@@ -111,7 +113,8 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     compiled = []
     for env, scene in enumerate(scenes):
         block = replace(scene.block, pose=IDENTITY) if scene.block is not None else None
-        key = (id(scene.robot), scene.T_world_root, block, scene.obstacles, scene.ground)
+        obstacles = tuple(replace(obstacle, pose=IDENTITY) for obstacle in scene.obstacles)
+        key = (id(scene.robot), scene.T_world_root, block, obstacles, scene.ground)
         if key not in models:
             if id(scene.robot) not in specs:
                 specs[id(scene.robot)] = _robot_spec(scene.robot, contacts)
@@ -192,9 +195,11 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
         plane.pos = [0.0, 0.0, scene.ground]
         plane.contype, plane.conaffinity = _BY_GROUND | _BY_BLOCK, 0
+    obstacles = []
     for obstacle in scene.obstacles:
-        geom = _add_box(spec.worldbody, obstacle, _OBSTACLE_PRIORITY)
-        geom.pos, geom.quat = obstacle.pose.position, obstacle.pose.quaternion
+        obstacles.append(spec.worldbody.add_body(mocap=True))
+        obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
+        geom = _add_box(obstacles[-1], obstacle, _OBSTACLE_PRIORITY)
         geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
     body = _add_block(spec, scene.block) if scene.block is not None else None
     model = spec.compile()
@@ -207,6 +212,7 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         q_at=_addresses(joints[k].qposadr for k in robot.independent_joints),
         qd_at=_addresses(joints[k].dofadr for k in robot.independent_joints),
         block=body.id if body is not None else None,
+        obstacles=model.body_mocapid[[obstacle.id for obstacle in obstacles]].astype(np.int64),
     )
 
 

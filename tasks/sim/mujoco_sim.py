@@ -80,6 +80,8 @@ class MujocoSimulation:
             self._put(
                 i, *(np.array(values, np.float32).tolist() for values in (world.robot.home, pose))
             )
+            poses = [(*o.pose.position, *o.pose.quaternion) for o in self.scenes[i].obstacles]
+            self._put_obstacles(i, poses)
         self._state.read()
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
@@ -90,7 +92,13 @@ class MujocoSimulation:
         self._require_open()
         return self._state.block_velocity
 
-    def reset(self, envs: torch.Tensor, q: torch.Tensor, block_pose: torch.Tensor) -> None:
+    def reset(
+        self,
+        envs: torch.Tensor,
+        q: torch.Tensor,
+        block_pose: torch.Tensor,
+        obstacle_poses: torch.Tensor | None = None,
+    ) -> None:
         """Put some environments at rest and clear their history; see ``Simulation.reset``.
 
         Raises:
@@ -104,11 +112,20 @@ class MujocoSimulation:
                 f"reset of {k} environments to q of shape {tuple(q.shape)} and blocks of shape "
                 f"{tuple(block_pose.shape)}; they need ({k}, {joints}) and ({k}, 7)"
             )
+        most = max(len(world.obstacles) for world in self._worlds)
+        if obstacle_poses is not None and obstacle_poses.shape != (k, most, 7):
+            raise ValueError(
+                f"reset of {k} environments with obstacles of shape {tuple(obstacle_poses.shape)}; "
+                f"they need ({k}, {most}, 7)"
+            )
         if k and not (0 <= int(envs.min()) <= int(envs.max()) < n):
             raise ValueError(f"reset of environments {envs.tolist()}; there are {n}")
         rows = zip(envs.tolist(), q.tolist(), block_pose.tolist(), strict=True)
-        for env, positions, pose in rows:
+        for row, (env, positions, pose) in enumerate(rows):
             self._put(env, positions[: self._worlds[env].robot.dof], pose)
+            if obstacle_poses is not None:
+                count = len(self._worlds[env].obstacles)
+                self._put_obstacles(env, obstacle_poses[row, :count].tolist())
         self._state.read()
 
     def step(self, targets: torch.Tensor) -> None:
@@ -153,7 +170,10 @@ class MujocoSimulation:
         world, data = self._worlds[env], self._data[env]
         if not np.isfinite(q).all() or (world.block is not None and not np.isfinite(pose).all()):
             raise ValueError(f"{self._label(env)}: reset to q {list(q)}, block {list(pose)}")
+        obstacles = (values[world.obstacles] for values in (data.mocap_pos, data.mocap_quat))
+        positions, quaternions = obstacles
         mujoco.mj_resetData(world.model, data)
+        data.mocap_pos[world.obstacles], data.mocap_quat[world.obstacles] = positions, quaternions
         data.qpos[world.movable_q_at] = movable_positions(world.robot, q)
         mujoco.mj_kinematics(world.model, data)
         mujoco.mj_comPos(world.model, data)
@@ -163,6 +183,14 @@ class MujocoSimulation:
             position[:], quaternion[:] = pose[:3], pose[3:]
             if mujoco.mju_normalize4(quaternion) < 0.5:
                 raise ValueError(f"{self._label(env)}: {list(pose)} is not a pose of a block")
+
+    def _put_obstacles(self, env: int, poses: Sequence[Sequence[float]]) -> None:
+        """Put the obstacles of an environment at poses."""
+        rows = np.array(poses).reshape(-1, 7)
+        at, data = self._worlds[env].obstacles, self._data[env]
+        if rows.shape != (len(at), 7) or not np.isfinite(rows).all():
+            raise ValueError(f"{self._label(env)}: reset to obstacles {rows.tolist()}")
+        data.mocap_pos[at], data.mocap_quat[at] = rows[:, :3], rows[:, 3:]
 
     def _advance(self) -> dict[int, str]:
         """Step all environments; return the ones that MuJoCo could not step, with its reasons."""

@@ -57,7 +57,7 @@ def test_table_has_one_row_per_goal_set(run, path, cache):
     ]
     assert [row.split()[5] for row in rows] == ["0", "0", "3"]
     assert last == "3 of 3 goal sets are complete, seed 0"
-    assert len(list((cache / "goals-4").iterdir())) == 3
+    assert len(list((cache / "goals-5").iterdir())) == 3
 
 
 def test_certify_option_adds_certificates(run, path):

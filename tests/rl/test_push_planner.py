@@ -24,9 +24,16 @@ PUSH, REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
 
 
 @pytest.mark.slow
+def planner_of(setting):
+    tables = build_robot_tables([setting.robot])
+    return PushPlanner(setting, setting.scene, tables, 0, np.random.default_rng(0))
+
+
 def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     setting = draw_spec(robot(PANDA), PUSH, obstacles=True, seed=0, cache=tmp_path)
-    planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
+    planner = PushPlanner(
+        setting, setting.scene, build_robot_tables([setting.robot]), 0, np.random.default_rng(0)
+    )
     space, tool = FreeSpace(setting.scene), ToolKinematics(build_robot_tables([setting.robot]), 0)
     for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
         plan = planner.plan(q, block)
@@ -46,7 +53,9 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
 def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
     """A patched overhang penalises configurations near the end of the first plan."""
     setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)
-    planner = PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
+    planner = PushPlanner(
+        setting, setting.scene, build_robot_tables([setting.robot]), 0, np.random.default_rng(0)
+    )
     q, block = setting.goals.q[0], setting.goals.blocks[0]
     first = planner.plan(q, block).path[-1]
 
@@ -66,7 +75,9 @@ def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
 def test_the_planner_rejects_other_tasks(tmp_path):
     setting = draw_spec(robot(PLANE), REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
-        PushPlanner(setting, build_robot_tables([setting.robot]), 0, np.random.default_rng(0))
+        PushPlanner(
+            setting, setting.scene, build_robot_tables([setting.robot]), 0, np.random.default_rng(0)
+        )
 
 
 @pytest.mark.slow
@@ -76,7 +87,7 @@ def test_obstructed_arms_push_below_the_middle(tmp_path):
     member = next(each for each in members if each.name == "yumi")
     setting = member_spec(replace(member, obstacles=False), default_library(()), cache=tmp_path)
     robot_tables = build_robot_tables([setting.robot])
-    planner = PushPlanner(setting, robot_tables, 0, np.random.default_rng(0))
+    planner = PushPlanner(setting, setting.scene, robot_tables, 0, np.random.default_rng(0))
     space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
     over = []
     for i in (3, 4, 29, 31, 36, 39):

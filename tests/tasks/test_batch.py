@@ -330,7 +330,7 @@ def test_point_cloud_lies_on_the_obstacles(build_batch):
     seen = batch.reset()
     for env in range(3):
         off = torch.stack(
-            [_outside(seen["points"][env], block) for block in batch.specs[env].scene.obstacles]
+            [_outside(seen["points"][env], block) for block in batch.layouts.obstacles(env)]
         )
         assert off.abs().amin(dim=0).max() < 6 * NOISE
     again = batch.reset()["points"]

@@ -158,12 +158,23 @@ def test_goals_out_of_reach_are_reported(sets):
 
 
 def test_goals_in_collision_are_reported(sets):
-    box = sets.sets[LAST].goals.obstacles[0]
-    at = tuple(sets.sets[LAST].goals.poses[0, :3].tolist())
-    inside = (replace(box, pose=replace(box.pose, position=at)),)
-    findings = audit_goals(some(), changed(sets, LAST, {"obstacles": inside}), LIBRARY)
+    goals = sets.sets[LAST].goals
+    layouts = goals.layouts.copy()
+    usable = int(np.flatnonzero(goals.usable[1])[0])
+    layouts[1, 0, :3] = goals.poses[usable, :3]
+    findings = audit_goals(some(), changed(sets, LAST, {"layouts": layouts}), LIBRARY)
     assert [finding.code for finding in findings] == ["goals-changed", "goals-unproven"]
-    assert findings[1].why.startswith("goal 0: its configuration is in collision")
+    assert re.match(rf"layout 1: (goal {usable} is blocked|the robot at home)", findings[1].why)
+
+
+def test_obstacles_that_are_not_in_the_first_layout_are_reported(sets):
+    box, *others = sets.sets[LAST].goals.obstacles
+    moved_box = replace(box, pose=replace(box.pose, position=(0.0, 0.0, 3.0)))
+    findings = audit_goals(
+        some(), changed(sets, LAST, {"obstacles": (moved_box, *others)}), LIBRARY
+    )
+    assert [finding.code for finding in findings] == ["goals-changed", "goals-unproven"]
+    assert findings[1].why.startswith("the obstacles are not at the poses of the first layout")
 
 
 @pytest.mark.parametrize(
@@ -194,12 +205,12 @@ def test_block_in_an_obstacle_is_reported(cache):
     which = split([member(TRAIN[0], obstacles=True)], [member(TRAIN[2])])
     sets = draw_sets(which, cache)
     goals = sets.sets[REACH].goals
-    box = goals.obstacles[0]
-    at = tuple(goals.blocks[1, :3].tolist())
-    inside = (replace(box, pose=replace(box.pose, position=at)), *goals.obstacles[1:])
-    findings = audit_goals(which, changed(sets, REACH, {"obstacles": inside}), LIBRARY)
+    layouts = goals.layouts.copy()
+    usable = int(np.flatnonzero(goals.usable[1])[0])
+    layouts[1, 0, :3] = goals.blocks[usable, :3]
+    findings = audit_goals(which, changed(sets, REACH, {"layouts": layouts}), LIBRARY)
     (unproven,) = [finding.why for finding in findings if finding.code == "goals-unproven"]
-    assert re.match(r"start \d: the block is in an obstacle or the base", unproven)
+    assert re.match(rf"layout 1: (goal {usable} is blocked|the robot at home)", unproven)
 
 
 def test_missing_and_surplus_sets_are_reported(sets):

@@ -21,13 +21,20 @@ from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Link
 from morphgen.tasks import free_space, goal_sets, obstacles
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.obstacles import KEPT, draw_obstacles
+from morphgen.tasks.obstacles import (
+    KEPT,
+    draw_boxes,
+    draw_layouts,
+    fewest_goals,
+    layouts_of,
+    place_boxes,
+)
 from morphgen.tasks.reach import goals as module
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.goals import certify_goals
 from morphgen.tasks.sim.base import Scene
 
-CONFIG = ReachConfig(num_goals=12)
+CONFIG = ReachConfig(num_goals=12, train_layouts=3, eval_layouts=2)
 LIFTED = -0.4
 WORDS = (
     "arm=ur5 ee=plane",
@@ -52,8 +59,11 @@ def sample_goals(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=
     return draw_goals(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
 
 
-def scene_of(body, goal_set, ground=LIFTED):
-    return Scene(body, obstacles=goal_set.obstacles, ground=ground)
+def scene_of(body, goal_set, ground=LIFTED, layout=0):
+    boxes = goal_set.obstacles
+    if boxes:
+        boxes = place_boxes(boxes, goal_set.layouts[layout])
+    return Scene(body, obstacles=boxes, ground=ground)
 
 
 def files(folder):
@@ -69,6 +79,8 @@ def test_every_goal_is_proven_by_its_goal_configuration(words, boxes, cache):
     assert goal_set.poses.shape == (12, 7)
     assert (goal_set.poses[:, 3] >= 0).all()
     assert len(goal_set.obstacles) == (3 if boxes else 0)
+    assert goal_set.layouts.shape == ((5, 3, 7) if boxes else (0, 0, 7))
+    assert goal_set.usable.shape == ((5, 12) if boxes else (0, 12))
     assert certify_goals(goal_set, body, scene_of(body, goal_set, 0.0)) == []
     assert 12 == goal_set.accepted <= goal_set.tried
     assert len(np.unique(goal_set.q, axis=0)) == 12
@@ -84,15 +96,20 @@ def test_goals_are_above_the_ground_at_any_height(body, cache):
 
 @pytest.mark.parametrize("words", WORDS)
 def test_goals_are_never_inside_an_obstacle(words, cache):
-    """Neither the links at the goal configuration nor the tool point are inside an obstacle."""
+    """Neither the links at a usable configuration nor the tool point are inside an obstacle."""
     body = robot(words)
     config = replace(CONFIG, num_goals=60, obstacles=5, obstacle_size=(0.1, 0.15))
     goal_set = sample_goals(body, cache, obstacles=True, config=config, ground=0.0)
-    assert not FreeSpace(scene_of(body, goal_set, 0.0)).obstacle_hits(goal_set.q).any()
-    for box in goal_set.obstacles:
-        T = box.pose.inverse().matrix
-        inside = np.abs(goal_set.poses[:, :3] @ T[:3, :3].T + T[:3, 3]) <= np.array(box.size) / 2
-        assert not inside.all(axis=1).any()
+    for layout, usable in enumerate(goal_set.usable):
+        scene = scene_of(body, goal_set, 0.0, layout)
+        hits = FreeSpace(scene).obstacle_hits(goal_set.q).any(axis=1)
+        assert usable.tolist() == (~hits).tolist()
+        assert usable[:20].sum() >= fewest_goals(60) == 5
+        for box in scene.obstacles:
+            T = box.pose.inverse().matrix
+            local = goal_set.poses[usable, :3] @ T[:3, :3].T + T[:3, 3]
+            assert not (np.abs(local) <= np.array(box.size) / 2).all(axis=1).any()
+    assert not goal_set.usable.all()
 
 
 @pytest.mark.parametrize("ground", [0.0, -0.4])
@@ -102,31 +119,70 @@ def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground
     goal_set = sample_goals(
         body, cache, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6)
     )
-    space = FreeSpace(scene_of(body, goal_set, ground))
-    assert not space.obstacle_hits([body.home]).any()
     reach, centre = workspace(body).reach, shoulder(body)
-    for box in goal_set.obstacles:
-        assert all(0.06 * reach <= edge <= 0.15 * reach for edge in box.size)
-        assert box.pose.position[2] >= ground + box.size[2] / 2 - 1e-12
-        assert np.linalg.norm(np.subtract(centre, box.pose.position)) <= reach
     q, _ = FreeSpace(Scene(body, ground=ground)).sample(300, np.random.default_rng(9))
-    assert space.free(q).mean() > KEPT - 0.15
+    for layout in range(len(goal_set.layouts)):
+        scene = scene_of(body, goal_set, ground, layout)
+        space = FreeSpace(scene)
+        assert not space.obstacle_hits([body.home]).any()
+        for box in scene.obstacles:
+            assert all(0.06 * reach <= edge <= 0.15 * reach for edge in box.size)
+            assert box.pose.position[2] >= ground + box.size[2] / 2 - 1e-6
+            assert np.linalg.norm(np.subtract(centre, box.pose.position)) <= reach
+        assert space.free(q).mean() > KEPT - 0.15
+
+
+def layouts_in(body, count=8, size=(0.5, 0.7), usable=lambda space: np.ones(1, bool)):
+    boxes = draw_boxes(body, count, size, np.random.default_rng(0))
+    space = FreeSpace(Scene(body, obstacles=boxes, ground=LIFTED))
+    return draw_layouts(space, (1, 1), np.random.SeedSequence(0), usable)
 
 
 def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
+    boxes = draw_boxes(body, 8, (0.5, 0.7), np.random.default_rng(0))
+
     def left(share):
         monkeypatch.setattr(obstacles, "KEPT", share)
-        boxes = draw_obstacles(body, 8, (0.5, 0.7), np.random.default_rng(0), ground=LIFTED)
+        layouts, _ = layouts_in(body)
         q, _ = FreeSpace(Scene(body, ground=LIFTED)).sample(200, np.random.default_rng(1))
-        return FreeSpace(Scene(body, obstacles=boxes, ground=LIFTED)).free(q).mean()
+        placed = place_boxes(boxes, layouts[0])
+        return FreeSpace(Scene(body, obstacles=placed, ground=LIFTED)).free(q).mean()
 
     assert left(0.0) < 0.6
     assert left(0.7) > 0.6
 
 
+def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, cache):
+    config = replace(CONFIG, num_goals=30)
+    more = replace(config, num_goals=60, train_layouts=5, eval_layouts=4)
+    small, large = (sample_goals(body, cache, obstacles=True, config=one) for one in (config, more))
+    assert small.obstacles == large.obstacles
+    for side in ("train", "eval"):
+        few, many = layouts_of(config, side), layouts_of(more, side)
+        np.testing.assert_array_equal(
+            small.layouts[few], large.layouts[many][: len(few)], err_msg=side
+        )
+        np.testing.assert_array_equal(small.usable[few], large.usable[many][: len(few), :30])
+    assert len(np.unique(large.layouts[:, 0], axis=0)) == 9
+    assert (large.layouts == large.layouts.astype(np.float32)).all()
+
+
+def test_unknown_layouts_are_rejected():
+    with pytest.raises(TaskError, match="unknown layouts 'test'; valid: train, eval"):
+        layouts_of(CONFIG, "test")
+
+
+def test_a_layout_without_goals_is_an_error(body):
+    def usable(space):
+        return np.arange(40) >= 16  # 4 of the first 20, of which 5 are needed
+
+    with pytest.raises(BenchmarkError, match=r"of its first 20 goals only 4 or fewer"):
+        layouts_in(body, 1, (0.05, 0.1), usable=usable)
+
+
 def test_missing_room_for_obstacles_is_an_error(body, cache):
     config = replace(CONFIG, obstacles=2, obstacle_size=(3.0, 4.0))
-    with pytest.raises(BenchmarkError, match=r"'arm': of 32 boxes .* only 0 .* fewer or smaller"):
+    with pytest.raises(BenchmarkError, match=r"'arm': each of 16 .* home, .* fewer or smaller"):
         sample_goals(body, cache, obstacles=True, config=config)
     assert not cache.exists()
 
@@ -141,7 +197,7 @@ def test_obstacle_count_is_required(body, cache):
 @pytest.mark.parametrize("size", [(0.0, 0.1), (0.2, 0.1), (0.1, np.inf)])
 def test_invalid_obstacle_sizes_are_rejected(body, size):
     with pytest.raises(BenchmarkError, match="1 obstacles of size"):
-        draw_obstacles(body, 1, size, np.random.default_rng(0))
+        draw_boxes(body, 1, size, np.random.default_rng(0))
 
 
 def test_cache_key_depends_on_the_seed(body, cache):
@@ -159,6 +215,7 @@ def changes(body):
         "ground": {"ground": -0.2},
         "body": {"body": replace(body, home=(0.0, *body.home[1:]))},
         "pairs": {"body": replace(body, ignore_pairs=(*body.ignore_pairs, ("base", "slider")))},
+        "layouts": {"obstacles": True, "config": replace(CONFIG, eval_layouts=3)},
         "number of obstacles": {"obstacles": True, "config": replace(CONFIG, obstacles=2)},
         "size of obstacles": {
             "obstacles": True,
@@ -205,7 +262,8 @@ def test_goal_sets_are_byte_identical_across_processes(body, tmp_path):
         "from morphgen.tasks.reach.config import ReachConfig; "
         "from helpers.goal_sets import draw_goals; "
         "body = replace(arm(), ignore_pairs=survey_collisions(arm()).ignore_pairs); "
-        "draw_goals(body, ReachConfig(num_goals=12), obstacles=True, seed=0, ground=-0.4, "
+        "config = ReachConfig(num_goals=12, train_layouts=3, eval_layouts=2); "
+        "draw_goals(body, config, obstacles=True, seed=0, ground=-0.4, "
         "cache=Path(sys.argv[1]))"
     )
     tests = Path(__file__).parents[1]
@@ -310,7 +368,7 @@ def test_unwritable_cache_is_a_warning(body, tmp_path):
 def test_user_cache_is_the_default(body, tmp_path, monkeypatch):
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / name)
     goal_set = sample_goals(body, None)
-    assert (tmp_path / "morphgen" / "goals-4" / f"{goal_set.key}.npz").is_file()
+    assert (tmp_path / "morphgen" / "goals-5" / f"{goal_set.key}.npz").is_file()
 
 
 def test_certificate_names_every_fault(body, cache):

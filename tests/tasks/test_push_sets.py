@@ -11,16 +11,17 @@ from morphgen.benchmark.workspace import workspace
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose, joint_limits
+from morphgen.tasks import obstacles
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push import feasibility
+from morphgen.tasks.obstacles import place_boxes
 from morphgen.tasks.push import starts as module
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.feasibility import CLOSE
+from morphgen.tasks.push.feasibility import CLOSE, path_is_clear
 from morphgen.tasks.push.region import effective_reach, push_region
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.sim.base import Block, Scene
 
-CONFIG = PushConfig(num_goals=5)
+CONFIG = PushConfig(num_goals=5, train_layouts=3, eval_layouts=2)
 ARMS = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm=arm3 ee=claw")
 FREE = ("prims", "cubes", "chain beads=3")
 SWEEPS = ("stick", "nlink")
@@ -38,11 +39,11 @@ def sample_starts(words, cache, *, config=CONFIG, obstacles=False, seed=0, groun
     )
 
 
-def space_of(words, push_set):
-    scene = Scene(
-        robot(words), block=push_set.block, obstacles=push_set.obstacles, ground=push_set.ground
+def space_of(words, push_set, layout=None):
+    boxes = () if layout is None else place_boxes(push_set.obstacles, push_set.layouts[layout])
+    return FreeSpace(
+        Scene(robot(words), block=push_set.block, obstacles=boxes, ground=push_set.ground)
     )
-    return FreeSpace(scene)
 
 
 @pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
@@ -52,6 +53,14 @@ def test_every_block_can_be_pushed_across_the_line(words, boxes, cache):
     body, space = robot(words), space_of(words, push_set)
     edge, x, y = push_set.block.size[0], *push_set.blocks[:, :2].T
     assert len(push_set.obstacles) == (3 if boxes else 0)
+    assert push_set.usable.shape == ((5, 5) if boxes else (0, 5))
+    for layout, usable in enumerate(push_set.usable):
+        among = space_of(words, push_set, layout)
+        assert usable.sum() >= 2
+        assert path_is_clear(among, push_set.line, push_set.blocks[usable]).all()
+        for q in (push_set.q, push_set.behind):
+            assert among.free(q[usable], push_set.blocks[usable]).all()
+        assert among.free(push_set.across[usable]).all()
     assert 5 == push_set.accepted == len(push_set.q) <= push_set.tried
     assert push_set.blocks[:, 2] == pytest.approx(edge / 2)
     assert np.linalg.norm(push_set.blocks[:, 3:], axis=1) == pytest.approx(1.0)
@@ -200,11 +209,15 @@ def test_robot_that_cannot_push_is_rejected_with_the_reason(cache):
 
 
 def test_obstacles_that_block_every_push_are_an_error(cache, monkeypatch):
-    def wall(*_, **__):
+    def wall(*_):
         return (Block((9.0, 0.1, 0.1)),)
 
-    monkeypatch.setattr(feasibility, "draw_obstacles", wall)
-    with pytest.raises(TaskError, match="each of 8 layouts of 3 obstacles stands in more than 50%"):
+    def across_the_way(*_):
+        return np.array([[0.0, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0]])
+
+    monkeypatch.setattr(module, "draw_boxes", wall)
+    monkeypatch.setattr(obstacles, "_draw_poses", across_the_way)
+    with pytest.raises(BenchmarkError, match="of its first 20 goals only 0 or fewer: take"):
         sample_starts("prims", cache, obstacles=True)
 
 

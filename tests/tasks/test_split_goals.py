@@ -246,7 +246,7 @@ def test_index_describes_the_sets(home, cache):
     member_sets = sample_sets(mixed(), cache)
     write_goals(home, member_sets, RECIPE)
     index = json.loads((home / "goals" / "index.json").read_text())
-    assert (index["format"], index["seed"], index["reach"]["goals"]) == (1, 0, 12)
+    assert (index["format"], index["seed"], index["reach"]["goals"]) == (2, 0, 12)
     for record, one in zip(index["sets"], member_sets, strict=True):
         assert (record["robot"], record["side"], record["body"]) == (
             one.robot,
@@ -316,8 +316,8 @@ def test_build_without_goals_error_says_how_to_add_them(home):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"format": 1', '"format": 2', "format 2; this version reads 1"),
-        ('"format": 1,', "", "not an index of goal sets: KeyError"),
+        ('"format": 2', '"format": 1', "format 1; this version reads 2: build the goal sets again"),
+        ('"format": 2,', "", "not an index of goal sets: KeyError"),
         ('"goals": 12,', '"golas": 12,', "not an index of goal sets: TypeError"),
         ('"sets": [', '"sets": [3,', "not an index of goal sets: TypeError"),
         ("{", "{{", "invalid JSON"),
