@@ -1,12 +1,12 @@
 """Success of the baselines on every robot of every scenario, in both simulators.
 
     python benchmarks/reference_controllers.py [--task reach] [--only ur5] [--envs 8] [--episodes 2]
-        [--sims pybullet,mujoco] [--obstacles] [--jobs 2] [--json rows.json]
+        [--sims pybullet,mujoco] [--obstacles] [--goal pose] [--jobs 2] [--json rows.json]
 
 Runs each distinct pair of robot and task of the shipped splits, with collision shapes of fitted
-primitives and the goals and starts of seed 0. A row gives the success rate of inverse kinematics
-(reach) or the scripted push, the success rate of random actions, and the largest motion of the tool
-in an episode without actions. Obstacles exist only with ``--obstacles``.
+primitives and the goals and starts of seed 0. A row gives the success rate of each baseline (reach:
+``ik``, ``jacobian`` and ``random``; push: ``scripted`` and ``random``), and the largest motion of
+the tool in an episode without actions. Obstacles exist only with ``--obstacles``.
 
 The last rows are means. If a simulator is not installed, its columns are missing and the script
 prints that.
@@ -35,11 +35,13 @@ from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, baselines_for
-from morphgen.rl.baselines.simple import Random, Zero
+from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.rollouts import run_episodes
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.env_specs import member_spec
+from morphgen.tasks.env_specs import GoalConfig, member_spec
 from morphgen.tasks.make import batch_from_specs
+from morphgen.tasks.reach import GOAL_KINDS
+from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS, installed_simulators
 
 Row = dict[str, float | str]
@@ -53,6 +55,7 @@ class Measuring:
     envs: int
     episodes: int
     obstacles: bool
+    goal: str
 
     @cached_property
     def library(self) -> Library:
@@ -62,15 +65,16 @@ class Measuring:
     def __call__(self, member: Member) -> Row:
         """Measure one robot at one task."""
         torch.set_num_threads(1)
-        spec = member_spec(replace(member, obstacles=self.obstacles), self.library)
+        config = GoalConfig(tasks=(ReachConfig(goal=self.goal),))
+        spec = member_spec(replace(member, obstacles=self.obstacles), self.library, config)
         row: Row = {"robot": member.name, "task": member.task}
         for sim in self.sims:
             with closing(batch_from_specs([spec], self.envs, sim=sim)) as batch:
-                acting = BASELINES[baselines_for(member.task)[0]].make(0)
-                good = run_episodes(batch, acting, self.episodes)
-                chance = run_episodes(batch, Random(0), self.episodes)
-                row[f"{sim} reference"] = mean(episode.success for episode in good)
-                row[f"{sim} random"] = mean(episode.success for episode in chance)
+                for name in baselines_for(member.task):
+                    if name == "zero":
+                        continue
+                    episodes = run_episodes(batch, BASELINES[name].make(0), self.episodes)
+                    row[f"{sim} {name}"] = mean(episode.success for episode in episodes)
                 row[f"{sim} drift mm"] = _drift(batch)
         return row
 
@@ -84,6 +88,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=2, help="of each environment")
     parser.add_argument("--sims", default="pybullet,mujoco")
     parser.add_argument("--obstacles", action="store_true")
+    parser.add_argument("--goal", choices=GOAL_KINDS, default=GOAL_KINDS[0], help="of reach")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
@@ -94,7 +99,7 @@ def main() -> int:
         for member in _members()
         if args.task in (None, member.task) and re.search(args.only, member.name)
     ]
-    work = Measuring(sims, args.envs, args.episodes, args.obstacles)
+    work = Measuring(sims, args.envs, args.episodes, args.obstacles, args.goal)
     rows: list[Row] = []
     for row in tqdm(
         parallel_map(work, members, args.jobs, chunk=1), total=len(members), unit="robot"
