@@ -185,19 +185,26 @@ def run_without_extras(folder, *words):
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
 
 
+CORE_COMMANDS = (
+    ("compose", "arm=ur5", "--geometry", "primitive"),
+    ("sample", "chain", "-n", "1"),
+    ("check", "arm3-stick"),
+    ("tokens", "ur5-plane"),
+    ("similarity", "prims", "stick"),
+    ("conform", "prims"),
+    ("split", "show", "interpolation/panda/reach"),
+)
+
+
 @pytest.mark.parametrize(
     "words",
     [
-        ("compose", "ur5-plane"),
-        ("compose", "arm=ur5", "--geometry", "primitive"),
-        ("sample", "chain", "-n", "1"),
-        ("check", "arm3-stick"),
-        ("tokens", "ur5-plane"),
-        ("similarity", "prims", "stick"),
-        ("conform", "prims"),
-        ("split", "show", "interpolation/panda/reach"),
+        pytest.param(("compose", "ur5-plane"), id="compose"),
+        *(
+            pytest.param(words, id=" ".join(words), marks=pytest.mark.slow)
+            for words in CORE_COMMANDS
+        ),
     ],
-    ids=" ".join,
 )
 def test_core_works_without_optional_extras(words, tmp_path):
     done = run_without_extras(tmp_path, *words)

@@ -33,6 +33,7 @@ def follow(monkeypatch, tmp_path):
     spec.loader.exec_module(module)
 
 
+@pytest.mark.slow
 def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys):
     assert len(CUSTOM_TASK.read_text(encoding="utf-8").splitlines()) < 150
     few = ("--steps", "512", "--envs", "4", "--set", "minibatches=4", "--no-tensorboard")

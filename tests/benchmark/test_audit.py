@@ -266,6 +266,7 @@ def test_accepting_an_absent_finding_is_a_warning():
     assert report.passed()
 
 
+@pytest.mark.slow
 def test_progress_is_reported_and_the_number_of_processes_does_not_matter():
     words = [f"base=planar ee=cube ee.size={50 + i}mm" for i in range(9)]
     example_split = combined(

@@ -98,6 +98,7 @@ def test_robots_of_a_matrix_are_labelled_up_to_a_limit():
     assert heatmap_png(["a" * 20] * many, [panel(many)]) == heatmap_png(["b"] * many, [panel(many)])
 
 
+@pytest.mark.slow
 def test_robots_of_a_map_are_labelled_up_to_a_limit():
     some = [f"robot{i}" for i in range(MAX_NAMED)]
     others = [f"other{i}" for i in range(MAX_NAMED)]
@@ -112,6 +113,7 @@ def test_names_are_not_parsed_as_formulas():
     assert map_png(odd, [map_panel(4)])
 
 
+@pytest.mark.slow
 def test_panels_are_drawn_side_by_side():
     one = pixels(heatmap_png(names(5), [panel(5)]))
     three = pixels(heatmap_png(names(5), [panel(5), panel(5, "cosine", True), panel(5)]))

@@ -305,6 +305,7 @@ def test_duplicate_categories_are_errors(train, test, message):
 FROM = ["arm={ur5,lwr,xarm7} ee={plane,stick,cylinder}"]
 
 
+@pytest.mark.slow
 def test_composition_holds_out_combinations_whose_parts_are_trained():
     for seed in range(3):
         (split,) = composition(order(6, test=2, seed=seed, tasks=("push",)), FROM, LIBRARY)

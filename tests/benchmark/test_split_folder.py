@@ -272,6 +272,7 @@ def test_a_robot_of_another_version_is_rebuilt(tmp_path, whole, example_split):
     assert tree(whole) == before
 
 
+@pytest.mark.slow
 def test_a_killed_build_resumes_to_the_same_bytes(tmp_path):
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(30)]
     example_split = split(cubes, ["base=planar ee=plane"])

@@ -109,6 +109,7 @@ def test_decoded_robots_have_the_same_tokens(body):
             assert (field_of(token_array, name)[:, 3] >= 0).all()
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(bodies())
 def test_decoded_robots_have_the_same_link_poses_at_zero(body):

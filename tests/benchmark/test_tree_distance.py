@@ -102,6 +102,7 @@ def test_the_distance_is_symmetric_and_zero_on_the_diagonal(a, b):
     assert 0.0 <= normalised_distance(a, b) <= 1.0
 
 
+@pytest.mark.slow
 @given(trees(), trees(), trees())
 @settings(max_examples=300, deadline=None)
 def test_the_triangle_inequality(a, b, c):

@@ -95,6 +95,7 @@ def test_a_rod_in_the_opening_of_a_ring_is_apart_from_it(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_distances_of_dense_meshes_do_not_depend_on_the_coarse_test(tmp_path, monkeypatch):
     ball = mesh(tmp_path, "ball.stl", trimesh.creation.icosphere(5, radius=0.1))
     turned = Pose.from_xyz_rpy((0.0, 0.12, 0.16), (0.3, 0.2, 0.1))

@@ -41,6 +41,7 @@ def test_compose_again_replaces_the_bundle(run, tmp_path):
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["g"]
 
 
+@pytest.mark.slow
 def test_compose_prints_the_card_as_json_and_nothing_else():
     process = start("compose", "base=gantry", "ee=plane", "--out", "robots", "--json")
     out, err = process.communicate()
@@ -182,6 +183,7 @@ def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
     assert "lacks joints elbow" in out
 
 
+@pytest.mark.slow
 def test_conform_prints_json_and_nothing_else(tmp_path):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
     process = start("conform", folder, "--samples", "3", "--json")

@@ -118,6 +118,7 @@ def test_mesh_fit_prints_a_table_and_the_primitive(run, box, tmp_path):
     assert tree(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_mesh_fit_as_json_is_in_metres(run, box):
     code, out, err = run("fit", box, "--json", "--seed", "3")
     assert (code, err) == (0, "")
@@ -227,6 +228,7 @@ def test_fitted_part_has_no_collision_meshes(run, tmp_path):
     assert not [f for f in report["findings"] if f["severity"] == "error"]
 
 
+@pytest.mark.slow
 def test_a_bundle_is_fitted_link_by_link(run, meshed, tmp_path):
     code, out, err = run("fit", meshed, "--out", "made", "--no-picture", "--configurations", "50")
     assert (code, err) == (0, "")
@@ -279,6 +281,7 @@ def urdf_of(folder, *files):
     return "robot.urdf"
 
 
+@pytest.mark.slow
 def test_repeated_fit_writes_the_same_bytes(run, box, tmp_path):
     urdf = urdf_of(tmp_path, box)
     words = ("--no-picture", "--configurations", "1")
@@ -287,6 +290,7 @@ def test_repeated_fit_writes_the_same_bytes(run, box, tmp_path):
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
+@pytest.mark.slow
 def test_existing_bundle_is_replaced(run, tmp_path):
     words = ("--out", "made", "--no-picture", "--configurations", "1")
     assert run("fit", "plane", *words)[0] == 0
@@ -301,6 +305,7 @@ def test_picture_is_written_by_default(run, tmp_path):
     assert (tmp_path / "made" / "preview.png").is_file()
 
 
+@pytest.mark.slow
 def test_a_urdf_is_fitted(run, robot_urdf):
     code, out, err = run("fit", robot_urdf(arm()), "--json")
     assert (code, err) == (0, "")

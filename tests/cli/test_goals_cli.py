@@ -142,6 +142,7 @@ def test_split_folder_is_accepted_as_split(run, tmp_path):
     assert run("goals", folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")
 
 
+@pytest.mark.slow
 def test_interrupt_prints_one_line_and_keeps_completed_sets(tmp_path):
     many = [member(f"base=gantry ee=plane ee.size={60 + i}mm", f"robot-{i}") for i in range(40)]
     (tmp_path / "many.yaml").write_text(split_text(split(many, some().test)))

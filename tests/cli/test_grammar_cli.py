@@ -83,6 +83,7 @@ def test_sample_reports_duplicate_robots(run):
     assert out.splitlines()[1] == "  one-000001 has the same body as one-000000"
 
 
+@pytest.mark.slow
 def test_sample_prints_its_report_as_json_and_nothing_else():
     process = start("sample", "cubes", "-n", "2", "--light", "--json", "--where", "mass < 9")
     out, err = process.communicate()

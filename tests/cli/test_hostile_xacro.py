@@ -280,6 +280,7 @@ def test_expansion_is_stopped_at_the_time_limit(refused, hostile, monkeypatch, l
     assert f"{path}: its expansion takes more than {what}\n" in refused("show", path)
 
 
+@pytest.mark.slow
 def test_expansion_is_stopped_at_the_memory_limit(refused, hostile, monkeypatch):
     monkeypatch.setattr(xacro_process, "MEMORY_LIMIT", 150 << 20)
     path = hostile("<a/>" * 500_000)

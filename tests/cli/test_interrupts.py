@@ -37,6 +37,7 @@ def test_ctrl_c_while_workers_start_prints_one_line(tmp_path, name, later):
     check(tmp_path, name, later)
 
 
+@pytest.mark.slow
 def test_ctrl_c_as_the_first_worker_starts_prints_one_line(tmp_path):
     check(tmp_path, "sample", 0.0)
 

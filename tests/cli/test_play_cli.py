@@ -71,6 +71,7 @@ def test_episodes_differ_and_are_reproducible(run):
     assert first[2:] != second[2:]
 
 
+@pytest.mark.slow
 def test_zero_policy_does_not_move(run):
     code, out, _ = run("play", "push", "prims", "--policy", "zero", "--sim", "mujoco")
     assert code == 0

@@ -275,6 +275,7 @@ def test_interrupted_replacement_keeps_the_old_bundle(run, tmp_path, monkeypatch
     assert tree(tmp_path / "out") == before
 
 
+@pytest.mark.slow
 def test_interrupted_process_leaves_no_partial_bundle_or_temporary_folder(tmp_path):
     out = tmp_path / "out"
     process = start("compose", "arm=kinova_gen3", "ee=robotiq_2f85", "--out", out)

@@ -12,6 +12,7 @@ def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sim", ["pybullet", "mujoco", "kinematic"])
 def test_speed_prints_rates_and_shares(sim, capsys):
     words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]

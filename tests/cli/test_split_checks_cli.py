@@ -249,6 +249,7 @@ def build_with_goals(run, path, out="data", *more):
     return printed.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
 def test_build_with_goals_passes_verify_and_audit(run, write, tmp_path):
     path = write(reaching())

@@ -73,6 +73,7 @@ def test_single_robot_is_trained_resumed_evaluated_and_played(run, tmp_path):
     assert out.startswith("episode 1: ")
 
 
+@pytest.mark.slow
 def test_max_links_defaults_to_the_size_of_the_robot(run, tmp_path):
     words = ("train", "chain", "beads=7", "task=reach", "--agent", "me-mlp", *SMALL)
     words += ("--steps", "32")
@@ -92,6 +93,7 @@ def test_max_links_defaults_to_the_size_of_the_robot(run, tmp_path):
         assert out.startswith("episode 1: ")
 
 
+@pytest.mark.slow
 def test_policy_with_tool_position_is_evaluated_and_played(run):
     words = (*RUN, "--steps", "32", "--no-tensorboard", "--out", "run")
     assert run(*words, "--tool-position")[0] == 0
@@ -130,6 +132,7 @@ def test_the_goal_of_the_training_is_that_of_all_commands_on_its_policy(run, tmp
     assert [c for c in read_config(tmp_path / "tuned").tasks if c.task == "reach"] == [reach]
 
 
+@pytest.mark.slow
 def test_play_uses_the_given_checkpoint(run):
     outs = []
     for seed in (0, 1):
@@ -270,6 +273,7 @@ def test_interrupted_training_can_be_resumed(run, tmp_path, cache):
     assert sorted(tree(tmp_path / "cut")) == [CHECKPOINT, "config.json", METRICS]
 
 
+@pytest.mark.slow
 def test_resumed_run_equals_an_uninterrupted_run(run, tmp_path):
     words = (*RUN, "--steps", "96", "--no-tensorboard")
     for out in ("whole", "cut"):

@@ -22,6 +22,7 @@ def address(process):
     raise AssertionError(process.stderr.read())
 
 
+@pytest.mark.slow
 def test_bundle_is_served_until_interrupted(tmp_path):
     write_bundle(arm(), tmp_path / "arm", picture=False)
     viewing = start("view", tmp_path / "arm", "--port", "8931")
@@ -56,6 +57,7 @@ def test_uploads_are_deleted_on_every_signal(tmp_path, monkeypatch, end):
     assert list(tmp_path.glob("morphgen-uploads-*")) == []
 
 
+@pytest.mark.slow
 def test_allowed_origins_are_served(tmp_path):
     site = "https://hub.example.com"
     viewing = start("view", "--port", "8934", "--allow-origin", site)

@@ -39,6 +39,7 @@ def overlap(shapes, *found):
     return quality(solid_of(shapes), found, volume_points=2**15).iou
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_fit_overlaps_at_least_as_well_as_any_primitive_of_the_link(seed):
     shapes = drawn(seed)
@@ -63,6 +64,7 @@ def test_the_sides_of_the_fit_are_flush_with_the_link():
     assert fit == Shape(Box((0.02, 0.05, 0.04)), Pose((0.0, 0.0, 0.02)))
 
 
+@pytest.mark.slow
 def test_two_collinear_rods_are_fitted_by_one_rod():
     turned = Pose.from_xyz_rpy((0.1, 0.0, 0.0), (0.0, math.pi / 2, 0.0))
     rod = Shape(Cylinder(0.02, 0.2), turned)
@@ -74,6 +76,7 @@ def test_two_collinear_rods_are_fitted_by_one_rod():
     assert np.abs(fit.T_link_shape.matrix[:3, 2]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_mirrored_fingers_have_mirrored_primitives():
     def finger(side):
         blocks = [((0.022, 0.015, 0.02), (0.0, 0.0185, 0.011), 0.0)]

@@ -190,6 +190,7 @@ def test_surfaces_are_sampled_uniformly(geometry):
     assert measures.coverage == 1
 
 
+@pytest.mark.slow
 def test_measures_are_invariant_under_rigid_motion():
     pieces = [Shape(Box((0.3, 0.1, 0.1))), Shape(Cylinder(0.06, 0.3), at(0.1, 0, 0.1))]
     stand_ins = [Shape(Capsule(0.06, 0.2), at(0.1, 0, 0.08)), Shape(Box((0.3, 0.12, 0.08)))]

@@ -88,6 +88,7 @@ def test_a_flat_link_gets_no_primitive_and_a_finding(tmp_path, wedge):
     assert primitive_robot.links[0].collisions == ()
 
 
+@pytest.mark.slow
 def test_existing_primitives_are_unchanged():
     shapes = (Shape(Box((0.1, 0.2, 0.3)), Pose((0.0, 0.1, 0.0))), Shape(Sphere(0.1)))
     kept = fit_shapes(shapes, FitOptions(max_primitives=2))
@@ -212,6 +213,7 @@ def test_a_robot_agrees_perfectly_with_itself():
     assert same.neither
 
 
+@pytest.mark.slow
 def test_every_real_part_has_stored_fits():
     assert [m.name for m in parts_with_meshes(LIBRARY, missing=True)] == []
 

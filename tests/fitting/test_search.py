@@ -50,6 +50,7 @@ def assert_well_formed(shape):
     assert shape.rgba is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", PRIMITIVES, ids=lambda geometry: type(geometry).__name__)
 def test_a_rotated_primitive_is_recovered(geometry):
     shape, score, solid = fitted(geometry)
@@ -62,6 +63,7 @@ def test_a_rotated_primitive_is_recovered(geometry):
     assert score == pytest.approx(quality(solid, [shape]).iou, abs=0.015)
 
 
+@pytest.mark.slow
 def test_the_axis_of_a_cylinder_is_recovered():
     shape, _, _ = fitted(Cylinder(0.06, 0.3), seed=1)
     found, true = (pose.matrix[:3, 2] for pose in (shape.T_link_shape, TILTED))
@@ -93,6 +95,7 @@ def test_a_thin_plate_is_recovered(seed):
     assert iou > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_strut_is_recovered_in_any_orientation(seed):
     shape, _, solid = fitted(Cylinder(0.02, 0.5), TILTED, seed)
@@ -145,6 +148,7 @@ def test_the_same_seed_gives_the_same_shapes_with_any_number_of_threads(threads)
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_another_seed_gives_nearly_the_same_shape():
     first, second = (fitted(Box((0.1, 0.2, 0.4)), seed=seed)[0] for seed in (0, 1))
     assert first != second
@@ -289,6 +293,7 @@ def test_a_fully_covered_solid_gives_no_further_guess():
     assert by_growth(one.candidate, some, np.ones(len(some), bool), np.ones(len(some)), 0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_thin_tilted_solids_are_sampled_and_fitted(seed):
     rod = Shape(Cylinder(0.005, 0.3), TILTED)

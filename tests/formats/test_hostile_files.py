@@ -247,6 +247,7 @@ def test_a_card_that_is_a_pipe_is_not_opened(tmp_path, capsys):
     assert "holds no robot" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["many attributes", "shapes without end", "entity bomb"])
 def test_hostile_urdfs_use_bounded_memory_and_time(name, tmp_path):
     path = tmp_path / "x.urdf"

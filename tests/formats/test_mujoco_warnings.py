@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import logging, sys
 import morphgen.formats.mjcf
@@ -17,6 +19,7 @@ mujoco.mj_step(model, data)
 """
 
 
+@pytest.mark.slow
 def test_a_warning_is_logged_and_writes_no_file(tmp_path):
     result = subprocess.run(
         [sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=tmp_path

@@ -85,6 +85,7 @@ def test_rounded_robots_round_trip_through_a_file(tmp_path, robot):
         assert shapes[0] == shapes[1]
 
 
+@pytest.mark.slow
 def test_the_order_of_links_is_preserved(tmp_path):
     robot = morphgen.compose("arm=yumi left.ee=plane right.ee=yumi_gripper")
     back = read_bundle(write_bundle(robot, tmp_path / "r", picture=False))

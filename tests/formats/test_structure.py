@@ -213,6 +213,7 @@ def mutations() -> list[str]:
     return texts
 
 
+@pytest.mark.slow
 def test_documents_without_errors_are_parsed_without_a_crash(read):
     texts = mutations()
     passed = [t for t in texts if not any(f.severity == "error" for f in findings(t))]

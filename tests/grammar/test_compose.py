@@ -301,6 +301,7 @@ def test_provenance_names_licence_and_citation_of_every_part():
     assert "notes" not in parts[0]
 
 
+@pytest.mark.slow
 def test_a_finding_accepted_by_a_part_has_severity_info_and_a_reason():
     robot = joined("arm=panda")
     by_itself = [f for f in check(replace(robot, provenance={})) if f.severity == "warning"]

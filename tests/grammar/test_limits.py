@@ -54,6 +54,7 @@ def test_exceeding_a_limit_is_an_error_that_names_the_limit(lines, message):
     assert len(str(refused.value)) < 300
 
 
+@pytest.mark.slow
 def test_grammars_within_the_limits_are_read():
     x = "+".join(["1"] * MAX_NESTING)
     robot_grammar = grammar(f"let x = {x}", "robot -> " + "|".join(["@weight(x) cubes"] * 1000))

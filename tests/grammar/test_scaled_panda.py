@@ -23,6 +23,7 @@ def variation(*factors):
     ).fragment
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.tuples(*[FACTOR] * 7))
 def test_neighbouring_links_stay_in_contact_for_all_scale_factors(factors):

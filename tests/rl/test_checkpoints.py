@@ -10,6 +10,7 @@ from morphgen.errors import TaskError
 from morphgen.rl.learner_state import load_networks, resume, state_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
 @pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
 def test_a_resumed_run_equals_an_uninterrupted_one(agent, discrete):
@@ -39,6 +40,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(agent, discrete):
     assert went_on.batch.state_dict() == again.batch.state_dict()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part", ["optimiser", "generators", "batch", "target_critic", "update", "actor_lr_scale"]
 )
@@ -69,6 +71,7 @@ def test_later_updates_do_not_change_a_saved_state():
     assert steps == [each["step"] for each in before["optimiser"]["state"].values()]
 
 
+@pytest.mark.slow
 def test_saving_the_state_does_not_change_the_learner():
     looked_at, alone = learner(), learner()
     for each in (looked_at, alone):
@@ -78,6 +81,7 @@ def test_saving_the_state_does_not_change_the_learner():
     assert equal(weights(looked_at), weights(alone))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_run():
     runs = [learner(seed=seed) for seed in (1, 1, 2)]
     for each in runs:
@@ -109,6 +113,7 @@ def test_a_constant_missing_in_an_old_checkpoint_has_its_default():
     assert equal(weights(made), weights(again))
 
 
+@pytest.mark.slow
 def test_load_networks_loads_only_the_networks():
     pre = learner()
     pre.iterate()

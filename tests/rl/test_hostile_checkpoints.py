@@ -185,6 +185,7 @@ def test_the_hash_is_stored_and_the_content_read_back(run, tmp_path):
     assert again["sha256"] == stored["sha256"]
 
 
+@pytest.mark.slow
 def test_flipped_bits_are_detected_or_harmless(run, tmp_path):
     whole = (run / CHECKPOINT).read_bytes()
     drawn, noticed = random.Random(0), 0

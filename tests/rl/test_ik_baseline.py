@@ -60,6 +60,7 @@ def test_poses_are_reached(made, words):
     assert sum(episode.success for episode in episodes) >= 7
 
 
+@pytest.mark.slow
 def test_a_push_episode_scores_its_success_and_counts_its_steps(made):
     batch = made("prims", 3, "push")
     episodes = run_episodes(batch, ScriptedPush(0), 1)

@@ -167,6 +167,7 @@ def test_returns_by_hand(slow, logarithmic):
     torch.testing.assert_close(advantages, returns - values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("logarithmic", [True, False], ids=["symlog", "plain"])
 def test_the_critic_learns_the_returns_or_their_symlog(logarithmic):
     options = {"epochs": 80, "minibatches": 1, "learning_rate": 3e-3, "max_grad_norm": 10.0}
@@ -286,6 +287,7 @@ def test_robot_weights_are_one_or_random_with_mean_one():
     assert odds.var().item() == pytest.approx(2, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_robot_of_weight_zero_does_not_change_the_networks():
     def steps(weight, change=lambda learner: None):
         trainer = learner(epochs=1, minibatches=1, ent_coef=0.01)
@@ -309,6 +311,7 @@ def test_a_robot_of_weight_zero_does_not_change_the_networks():
     assert not equal(steps([1.0, 1.0]), steps([1.0, 1.0], twisted))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves", [True, False])
 def test_the_curriculum_follows_the_updates(moves):
     batch = OnALine(8)

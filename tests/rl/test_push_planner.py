@@ -50,6 +50,7 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     assert planner.plan(q, block, steps_left=across - 1) is None
 
 
+@pytest.mark.slow
 def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
     """A patched overhang penalises configurations near the end of the first plan."""
     setting = draw_spec(robot(PANDA), PUSH, obstacles=False, seed=0, cache=tmp_path)

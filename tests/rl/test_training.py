@@ -163,6 +163,7 @@ def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     ] * 2
 
 
+@pytest.mark.slow
 def test_a_stopped_se_run_resumes_at_the_same_robot(tmp_path):
     config = small_config(small_source(), agent="se", total_timesteps=128)
     train(tmp_path / "whole", config, execution=QUIET)

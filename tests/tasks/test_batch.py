@@ -60,6 +60,7 @@ def run(batch, controller, steps):
     return [batch.step(controller.act(batch)) for _ in range(steps)]
 
 
+@pytest.mark.slow
 def test_observations_have_the_declared_shapes(build_batch):
     channels = ObservationConfig(velocity=True, previous_action=True, tool=True, points=50)
     batch = build_batch(obstacles=True, observe=channels)
@@ -123,6 +124,7 @@ def test_start_is_never_the_goal_configuration(build_batch):
         assert (there - batch.field("goal")[:, :3]).abs().max() < 1e-4
 
 
+@pytest.mark.slow
 def test_zero_actions_move_no_joint(build_batch):
     batch = build_batch()
     batch.reset()
@@ -133,6 +135,7 @@ def test_zero_actions_move_no_joint(build_batch):
     assert (after - before).norm(dim=1).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 def test_ik_reaches_the_goal_and_random_actions_do_not(build_batch, kind):
     steps = run(

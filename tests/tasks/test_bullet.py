@@ -77,6 +77,7 @@ def test_touching_starts_are_in_contact(simulate):
     assert frozenset((loaded.robot, loaded.block)) in bodies
 
 
+@pytest.mark.slow
 def test_environment_is_bit_identical_alone_and_in_a_batch(simulate):
     scenes = [scene for _ in range(17) for scene in mixed_scenes()][:50]
     many = simulate(*scenes)

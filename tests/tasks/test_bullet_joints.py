@@ -123,6 +123,7 @@ def test_joints_return_to_their_limits(simulate, pushes):
     assert float(simulation.q[0, 0]) == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_strong_contacts_do_not_exceed_joint_speed_limits(simulate):
     """The arm presses against itself and the ground with full effort."""
     body = robot("arm=ur5 ee=plane")

@@ -244,6 +244,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
     process, running = script(tmp_path, "raise RuntimeError('on purpose')")
     _, errors = process.communicate(timeout=20)
@@ -253,6 +254,7 @@ def test_exception_in_the_parent_ends_the_workers(tmp_path, scratch):
     assert leftovers(scratch, process.pid) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [FOREVER, FOREVER.replace("simulation.step(q)", "pass")])
 def test_ctrl_c_ends_the_workers(tmp_path, scratch, ending):
     """A terminal sends Ctrl-C to all foreground processes."""
@@ -268,6 +270,7 @@ def test_ctrl_c_ends_the_workers(tmp_path, scratch, ending):
     assert leftovers(scratch, process.pid) == []
 
 
+@pytest.mark.slow
 def test_workers_end_when_the_parent_is_killed(tmp_path, scratch):
     process, running = script(tmp_path, FOREVER)
     process.kill()

@@ -66,6 +66,7 @@ def test_valid_sets_have_no_findings(sets):
     assert audit_codes(some(), sets) == []
 
 
+@pytest.mark.slow
 def test_built_in_split_has_no_findings(cache):
     which = read_split("extrapolation/primitives/reach")
     assert audit_codes(which, draw_sets(which, cache)) == []

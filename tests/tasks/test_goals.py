@@ -253,6 +253,7 @@ def test_stored_set_equals_the_sampled_set(body, cache, monkeypatch):
     assert (stored.poses == fresh.poses).all()
 
 
+@pytest.mark.slow
 def test_goal_sets_are_byte_identical_across_processes(body, tmp_path):
     sample_goals(body, tmp_path / "here", obstacles=True)
     code = (

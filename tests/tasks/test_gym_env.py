@@ -111,6 +111,7 @@ def test_ids_are_registered_after_importing_gymnasium_and_tasks(imports):
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_ids_with_a_module_prefix_work_in_any_import_order():
     code = (
         "import morphgen.tasks, gymnasium\n"
@@ -322,6 +323,7 @@ def test_invalid_options_are_rejected(task, options, error, message, cache):
         TaskEnv(task, **given)
 
 
+@pytest.mark.slow
 def test_mujoco_is_the_default_where_pybullet_is_missing(cache):
     code = (
         "import sys; from pathlib import Path; sys.modules['pybullet'] = None\n"

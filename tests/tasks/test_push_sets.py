@@ -143,6 +143,7 @@ def test_block_positions_and_orientations_are_random(cache):
     assert np.histogram(yaw, 3, (-np.pi, np.pi))[0] == pytest.approx(20, abs=12)
 
 
+@pytest.mark.slow
 def test_smaller_sets_are_prefixes_of_larger_ones(cache):
     few = sample_starts("arm=ur5 ee=plane", cache)
     more = sample_starts("arm=ur5 ee=plane", cache, config=replace(CONFIG, num_goals=40))
@@ -171,6 +172,7 @@ def test_same_seed_gives_the_same_bytes(tmp_path):
     assert files[0][0].read_bytes() == files[1][0].read_bytes()
 
 
+@pytest.mark.slow
 def test_cache_key_depends_on_exactly_the_relevant_inputs(cache):
     base = {"config": CONFIG}
     changes = [

@@ -113,6 +113,7 @@ def test_episode_after_divergence_is_unchanged(build_batch):
     assert torch.equal(batch.targets[0], whole.targets[0])
 
 
+@pytest.mark.slow
 def test_episodes_report_divergence(build_batch):
     class Breaks(Random):
         acted = 0
@@ -131,6 +132,7 @@ def test_episodes_report_divergence(build_batch):
     assert len(others) == 2 * ENVS - 2
 
 
+@pytest.mark.slow
 def test_diverged_episode_is_never_a_success(build_batch):
     """Even with the tool at the goal or the block across the line."""
     batch = build_batch()

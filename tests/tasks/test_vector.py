@@ -76,6 +76,7 @@ def test_empty_observation_entries_are_omitted(cache):
         assert not {"obstacles", "obstacle_mask"} & set(envs.single_observation_space)
 
 
+@pytest.mark.slow
 def test_steps_equal_those_of_the_batch(batch_from_specs):
     batch, envs = batch_from_specs(seed=3), TaskVector(batch_from_specs(seed=99))
     expected, (seen, _) = batch.reset(), envs.reset(seed=3)

@@ -11,6 +11,7 @@ KEYS = st.from_regex(r"[a-z][a-z_ ]{0,8}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
 
 
+@pytest.mark.slow
 @given(
     st.sampled_from(tuple(PAGES)),
     st.lists(TEXTS, min_size=1, max_size=4),

@@ -107,6 +107,7 @@ def test_playback_is_paused_stepped_and_scrubbed(player, display):
     display.wait_for(lambda: display.steps[-2:] == [0, "stopped"])
 
 
+@pytest.mark.slow
 def test_slow_steps_are_shown_as_they_arrive(player, display):
     source = Counting(steps=8, pause=0.1)
     player.set_speed(4.0)

@@ -59,6 +59,7 @@ def episode(files, cache):
     return rollout.episode
 
 
+@pytest.mark.slow
 def test_episode_equals_that_of_morphgen_play(episode):
     env = TaskEnv("reach", "planar-cube", sim="mujoco")
     results = []
