@@ -30,8 +30,8 @@ DRAWN_OPTIONS = (
     option(
         "--robots",
         metavar="GRAMMAR:N,...",
-        help="train on N robots drawn from each grammar, such as arm3:300,chain:300; the test "
-        "robots of the splits of morphgen are never drawn",
+        help="train on N robots drawn from each grammar, such as arm3:300,chain:300, by as many "
+        "processes as --workers; the test robots of the splits of morphgen are never drawn",
     ),
     number("--robot-seed", "with --robots: seed of the robots (default: 0)", least=0),
     repeated(
