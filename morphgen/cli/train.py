@@ -263,15 +263,11 @@ def _drawn_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace
         TaskError: If a number is out of its range or has no effect.
         MorphgenError: If a robot cannot be drawn.
     """
-    from morphgen.benchmark.split_file import read_split
-    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.rl.training_batches import default_slice_updates, num_slices
     from morphgen.tasks.env_specs import GoalConfig
 
     tasks = _task_configs(source, args)
-    source, most_links = draw_robots(source, GoalConfig(tasks=tasks), args)
-    held_out_links = (read_split(name).max_links for name in source.held_out)
-    max_links = args.max_links or max(MAX_LINKS, most_links, *held_out_links)
+    source, max_links = draw_robots(source, GoalConfig(tasks=tasks), args)
     args = argparse.Namespace(**{**vars(args), "max_links": max_links})
     config = run_config(source, spec, args)
     if args.slice_updates is not None and num_slices(config) == 1:

@@ -150,8 +150,12 @@ def draw_robots(
     """Draw the robots of a source and print how many were skipped.
 
     Returns:
-        The source with the hash of its robots, and the number of links of the largest one.
+        The source with the hash of its robots, and the number of links that observations are
+        padded to: as many as ``--max-links``, or the benchmark's, or those that the robots or the
+        splits of ``--held-out`` need.
     """
+    from morphgen.benchmark.split_file import read_split
+    from morphgen.benchmark.token_layout import MAX_LINKS
     from morphgen.rl.drawn_robots import draw
 
     with bar(args, "drawing robots and their goals") as update:
@@ -159,7 +163,9 @@ def draw_robots(
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         print(f"morphgen: robots that were skipped: {reasons}", file=sys.stderr)
-    return replace(source, drawn_hash=robots.hash), robots.most_links
+    held_out = (read_split(name).max_links for name in source.held_out)
+    max_links = args.max_links or max(MAX_LINKS, robots.most_links, *held_out)
+    return replace(source, drawn_hash=robots.hash), max_links
 
 
 def require_robots_for_options(args: argparse.Namespace) -> None:
