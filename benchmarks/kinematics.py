@@ -30,6 +30,7 @@ import morphgen
 from morphgen.formats.mujoco_kinematics import MujocoKinematics
 from morphgen.formats.urdf_text import urdf_text
 from morphgen.model import kinematics, kinematics_torch
+from morphgen.model.frame_positions import frame_positions
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
@@ -78,7 +79,7 @@ def _numpy(robot: Robot, q: Array) -> Rows:
     return {
         (LINKS, "NumPy"): lambda: kinematics.forward_kinematics(robot, q),
         (JACOBIAN, "NumPy"): lambda: kinematics.frame_jacobian(robot, q),
-        (POSITION, "NumPy"): lambda: kinematics.frame_positions(robot, columns),
+        (POSITION, "NumPy"): lambda: frame_positions(robot, columns),
     }
 
 

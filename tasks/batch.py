@@ -214,7 +214,7 @@ class TaskBatch:
         """
         self._act(actions)
         diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        diverged[self.simulate()] = True
+        diverged[self._simulate()] = True
         self.episode_step += 1
         result = self._evaluate(diverged)
         timed_out = self.episode_step >= self.max_episode_steps
@@ -243,7 +243,7 @@ class TaskBatch:
             angle=result.angle,
         )
 
-    def simulate(self) -> list[int]:
+    def _simulate(self) -> list[int]:
         """Step the simulation towards the targets; undo the step of environments that diverged.
 
         Returns:

@@ -23,7 +23,6 @@ from morphgen.model.kinematics_torch import (
 )
 from morphgen.model.rotation_torch import matrix_from_quaternion, rotvec_from_matrix, skew
 from morphgen.tasks.robot_tables import RobotTables
-from morphgen.tasks.task import ToolTargets
 
 KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls")
 """Names of the channels, in the order in which networks concatenate them."""
@@ -50,6 +49,23 @@ ROTATION_LENGTH = 0.3
 """Length by which rotation errors are multiplied to compare with position errors [m/rad]."""
 DAMPING = 0.03
 """Damping of the least squares of ``dls``, in units of the Jacobian's singular values [m/rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ToolTargets:
+    """Points and orientations that tasks want the tool at, in the root frame: n environments.
+
+    They are for observation channels such as ``jacobian``; evaluation does not depend on them.
+    """
+
+    points: torch.Tensor
+    """Target points, in the order in which the tool should visit them, shape (n, P, 3) [m]."""
+    exists: torch.Tensor
+    """Points that an environment's task has, shape (n, P), bool."""
+    rotations: torch.Tensor | None = None
+    """Orientations for the tool at the first point, shape (n, 3, 3); None if no task wants one."""
+    has_rotation: torch.Tensor | None = None
+    """Environments whose task wants an orientation, shape (n,), bool; None if none does."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,12 @@
-"""Row-wise tensor functions, a row per environment, whose bits depend on no other row."""
+"""Row-wise tensor functions, a row per environment, whose bits depend on no other row.
+
+``row_norms``, ``choose`` and ``positive_part`` also accept NumPy values of one row without its
+axis, so that formulas of tasks serve batches in torch and single environments in NumPy.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,7 +27,24 @@ def row_sums(values: torch.Tensor) -> torch.Tensor:
 
 def row_norms(vectors: torch.Tensor) -> torch.Tensor:
     """Return the Euclidean norms of rows (n, 3), shape (n,); see ``row_sums``."""
-    return vectors.double().square().sum(dim=1).sqrt().float()
+    if isinstance(vectors, torch.Tensor):
+        return vectors.double().square().sum(dim=1).sqrt().float()
+    exact = vectors.astype(np.float64)
+    return np.float32(math.sqrt(exact.dot(exact)))
+
+
+def choose(condition: torch.Tensor, value: float, otherwise: torch.Tensor) -> torch.Tensor:
+    """Return a value in the rows where a condition holds, and other values elsewhere, (n,)."""
+    if isinstance(condition, torch.Tensor):
+        return torch.where(condition, value, otherwise)
+    return np.float32(value) if condition else otherwise
+
+
+def positive_part(values: torch.Tensor) -> torch.Tensor:
+    """Return values (n,), or 0 where they are negative."""
+    if isinstance(values, torch.Tensor):
+        return torch.clamp(values, min=0)
+    return np.maximum(values, np.float32(0))
 
 
 def limit_violation(q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:

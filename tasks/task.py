@@ -9,7 +9,7 @@ batch's environments at this task and evaluate every step of them as tensors.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
@@ -199,20 +199,14 @@ class StepResult:
 
 
 @dataclass(frozen=True, eq=False)
-class ToolTargets:
-    """Points and orientations that tasks want the tool at, in the root frame: n environments.
+class NumpyRow:
+    """The formulas of one environment of a task in NumPy."""
 
-    They are for observation channels such as ``jacobian``; evaluation does not depend on them.
-    """
-
-    points: torch.Tensor
-    """Target points, in the order in which the tool should visit them, shape (n, P, 3) [m]."""
-    exists: torch.Tensor
-    """Points that an environment's task has, shape (n, P), bool."""
-    rotations: torch.Tensor | None = None
-    """Orientations for the tool at the first point, shape (n, 3, 3); None if no task wants one."""
-    has_rotation: torch.Tensor | None = None
-    """Environments whose task wants an orientation, shape (n,), bool; None if none does."""
+    evaluate: Callable[[TaskState], StepResult]
+    """``TaskEnvs.evaluate`` of a state whose values are NumPy numbers or vectors, float32 or bool:
+    those of ``TaskState`` without the axis of rows. The result has NumPy numbers, too."""
+    observe: Callable[[NDArray[np.float32]], dict[str, NDArray[np.float32]]]
+    """``TaskEnvs.observe`` of the pose of the block, shape (7,), in arrays that the caller owns."""
 
 
 class TaskEnvs(ABC):
@@ -263,6 +257,16 @@ class TaskEnvs(ABC):
 
     def target_rotations(self) -> torch.Tensor | None:
         """Return orientations for the tool, shape (k, 3, 3); None if the task wants none."""
+        return None
+
+    def numpy_row(self, row: int) -> NumpyRow | None:
+        """Return the formulas of an environment in NumPy, with which ``TaskEnv`` steps it.
+
+        They must return what ``evaluate`` and ``observe`` do: formulas of operators and functions
+        of ``morphgen.tasks.rows`` serve both. The environment's state must be in views of the
+        tensors that ``begin``, ``advance`` and ``load_state_dict`` change. With None, the default,
+        ``TaskEnv`` steps the batch in torch.
+        """
         return None
 
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
+from morphgen.tasks.kinematic_channels import ToolTargets
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.task import (
     STANDARD_FIELDS,
@@ -19,7 +20,6 @@ from morphgen.tasks.task import (
     Task,
     TaskEnvs,
     TaskState,
-    ToolTargets,
 )
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.model.kinematics import frame_positions, random_configurations
+from morphgen.model.frame_positions import frame_positions
+from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer.scene_robot import RobotView, robot_extent

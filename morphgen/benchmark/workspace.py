@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morphgen.errors import BenchmarkError, nearest
+from morphgen.model.frame_positions import frame_positions
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     forward_kinematics,
-    frame_positions,
     joint_axes,
     joint_limits,
     reach,

@@ -11,10 +11,8 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.model import rotation
-from morphgen.model.geometry import Pose
 from morphgen.model.robot import TOOL, Robot
-from morphgen.model.rotation import Quat, Vec3
+from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
 
@@ -234,60 +232,6 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
     return jacobians
 
 
-def frame_positions(robot: Robot, q: Array, frame: str = TOOL) -> Array:
-    """Return positions of a named frame in the root frame, many times as fast as ``frame_pose``.
-
-    Instead of multiplying poses, points are transformed from the frame to the root, joint by joint.
-    The axis of each joint is aligned with z first, so that a rotation changes x and y only.
-
-    Args:
-        robot: The robot.
-        q: Independent joint positions, a row per joint, shape (dof, n).
-        frame: Name of the frame.
-
-    Returns:
-        Positions, shape (3, n) [m].
-
-    Raises:
-        RobotError: If the frame is unknown.
-    """
-    gains, offsets = robot.mimic_map
-    row = {k: i for i, k in enumerate(robot.movable_joints)}
-    points = np.zeros((3, q.shape[1]))
-    target = robot.frame(frame)
-    T_joint_point = target.T_link_frame
-    for k in reversed(robot.joint_chain(target.link)):
-        joint = robot.joints[k]
-        if joint.is_movable:
-            gain, position = gains[row[k]], offsets[row[k]]
-            for column in gain.nonzero()[0]:
-                position = position + gain[column] * q[column]
-            T_joint_axis = Pose(quaternion=_rotation_from_z(joint.unit_axis))
-            points = _transform(T_joint_axis.inverse() @ T_joint_point, points)
-            if joint.kind == "prismatic":
-                points[2] += position
-            else:
-                c, s, (x, y) = np.cos(position), np.sin(position), points[:2]
-                points[0], points[1] = c * x - s * y, s * x + c * y
-            T_joint_point = T_joint_axis
-        T_joint_point = joint.T_parent_joint @ T_joint_point
-    return _transform(T_joint_point, points)
-
-
-def _transform(T: Pose, points: Array) -> Array:
-    # einsum, because starting the threads of a matrix product costs more than it saves
-    return np.asarray(np.einsum("ij,jn->in", T.matrix[:3, :3], points) + T.matrix[:3, 3:])
-
-
-def _rotation_from_z(axis: Vec3) -> Quat:
-    """Return a rotation that maps the z axis to a unit axis."""
-    x, y, z = axis
-    if z < -0.5:  # near -z the formula below is singular: first turn by pi about x
-        return rotation.multiply((0.0, 1.0, 0.0, 0.0), _rotation_from_z((x, -y, -z)))
-    # The quaternion (1 + z . axis, z x axis) rotates z to the axis by the shortest way.
-    return rotation.normalize((1 + z, -y, x, 0.0))
-
-
 def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) -> float:
     """Return the largest distance between a frame and the root's origin [m].
 
@@ -326,8 +270,8 @@ def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) 
 def _distance(robot: Robot, q: Array, frame: str) -> Array:
     """Return distances of a frame from the root's origin at q (..., dof), shape (...) [m].
 
-    ``frame_positions`` would be faster, but differs in the last bits, and these are stored in push
-    sets.
+    ``morphgen.model.frame_positions`` would be faster, but differs in the last bits, and these are
+    stored in push sets.
     """
     positions = movable_positions(robot, q)
     target = robot.frame(frame)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet
-from morphgen.tasks.rows import goal_choices, padded_rows, row_norms
-from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.rows import goal_choices, padded_rows, positive_part, row_norms
+from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
 
 GAP = 0.05
 """Distance from a face of the block to the point before contact [m], tuned on arm3 and ee-arm."""
@@ -63,18 +64,8 @@ class PushEnvs(TaskEnvs):
         return self._q[spec, start], self._blocks[spec, start]
 
     def evaluate(self, state: TaskState) -> StepResult:
-        """Compare the block with the line."""
-        y = state.block_pose[:, 1]
-        to_go = torch.clamp(self.line - y, min=0)
-        success = (y > self.line) & ~state.diverged
-        approach = row_norms(state.tool - state.block_pose[:, :3])
-        return StepResult(
-            success=success,
-            terminated=success.clone(),
-            distance=to_go,
-            score=success.float(),
-            terms=push_terms(self._config, to_go, approach, state.limit_violation, success),
-        )
+        """Compare the block with the line; see ``evaluate_push``."""
+        return evaluate_push(self._config, self.line, state)
 
     def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the block and the line."""
@@ -88,6 +79,21 @@ class PushEnvs(TaskEnvs):
         beyond[:, 1] = self.line + GAP
         return torch.stack([behind, centre, beyond], dim=1)
 
+    def numpy_row(self, row: int) -> NumpyRow:
+        """Return the formulas of an environment in NumPy."""
+        line: NDArray[np.float32] = self.line[row : row + 1].numpy()
+        token: NDArray[np.float32] = box_tokens(torch.zeros(7), self._size[row]).numpy()
+
+        def evaluate(state: TaskState) -> StepResult:
+            return evaluate_push(self._config, cast(torch.Tensor, line[0]), state)
+
+        def observe(block_pose: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+            block = token.copy()
+            block[:7] = block_pose
+            return {"object": block, "line": line.copy()}
+
+        return NumpyRow(evaluate, observe)
+
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the line."""
         x, ground = self._line_centres[int(self._env_spec_index[row])]
@@ -96,7 +102,7 @@ class PushEnvs(TaskEnvs):
 
     def advance(self, progress: float) -> None:
         """Move the line according to the curriculum; see ``curriculum_line``."""
-        self.line = curriculum_line(self._config, self._final_line, progress)
+        self.line.copy_(curriculum_line(self._config, self._final_line, progress))
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the position of the line."""
@@ -104,7 +110,28 @@ class PushEnvs(TaskEnvs):
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Restore the position of the line."""
-        self.line = state["line"].to(self.line, copy=True)
+        self.line.copy_(state["line"])
+
+
+def evaluate_push(config: PushConfig, line: torch.Tensor, state: TaskState) -> StepResult:
+    """Compare blocks with their lines.
+
+    Args:
+        config: Weights.
+        line: y that each block must cross, shape (k,) [m].
+        state: State after the step.
+    """
+    y = state.block_pose[..., 1]
+    to_go = positive_part(line - y)
+    success = (y > line) & ~state.diverged
+    approach = row_norms(state.tool - state.block_pose[..., :3])
+    return StepResult(
+        success=success,
+        terminated=success & ~state.diverged,
+        distance=to_go,
+        score=1.0 * success,
+        terms=push_terms(config, to_go, approach, state.limit_violation, success),
+    )
 
 
 def push_terms(
@@ -127,7 +154,7 @@ def push_terms(
         "joint_limits": -config.joint_limit_weight * limit_violation,
         "distance": -config.distance_weight * to_go,
         "approach": -config.approach_weight * approach,
-        "success": config.success_weight * success.float(),
+        "success": config.success_weight * success,
     }
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.model.frame_positions import frame_positions
 from morphgen.model.inverse_kinematics import solve_position_ik
-from morphgen.model.kinematics import frame_positions, random_configurations
+from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.region import Region, yawed

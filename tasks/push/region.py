@@ -9,9 +9,9 @@ import numpy as np
 
 from morphgen.benchmark.workspace import tool_reach
 from morphgen.errors import TaskError
+from morphgen.model.frame_positions import frame_positions
 from morphgen.model.kinematics import (
     forward_kinematics,
-    frame_positions,
     joint_axes,
     random_configurations,
 )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import cast
 
 import numpy as np
 import torch
@@ -11,8 +13,8 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.model.rotation_torch import angle_between, matrix_from_quaternion
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.rows import goal_choices, padded_rows, row_norms
-from morphgen.tasks.task import EnvSpec, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.rows import choose, goal_choices, padded_rows, row_norms
+from morphgen.tasks.task import EnvSpec, NumpyRow, StepResult, TaskEnvs, TaskState
 
 
 class ReachEnvs(TaskEnvs):
@@ -63,20 +65,8 @@ class ReachEnvs(TaskEnvs):
         return self._q[spec, start], torch.zeros(len(rows), 7, device=spec.device)
 
     def evaluate(self, state: TaskState) -> StepResult:
-        """Compare the tool with its goal."""
-        distance = row_norms(state.tool - self.goal[:, :3])
-        angle = self._angle(state)
-        terms = reach_terms(
-            self._config, distance, state.limit_violation, state.acceleration, angle
-        )
-        return StepResult(
-            success=is_near(self._config, distance, angle) & ~state.diverged,
-            terminated=torch.zeros_like(state.diverged),
-            distance=distance,
-            score=anybody_score(self._config, distance, angle),
-            terms=terms,
-            angle=angle,
-        )
+        """Compare the tool with its goal; see ``evaluate_reach``."""
+        return evaluate_reach(self._config, self.goal, state, self._angle(state))
 
     def _angle(self, state: TaskState) -> torch.Tensor | None:
         """Return the angles between tools and goals, shape (k,); None for goals of positions."""
@@ -97,9 +87,39 @@ class ReachEnvs(TaskEnvs):
         """Return the position of the goal."""
         return self.goal[:, None, :3]
 
+    def numpy_row(self, row: int) -> NumpyRow | None:
+        """Return the formulas of an environment in NumPy; None for goals that are poses."""
+        if self.needs_tool_rotation:
+            return None
+        goal: NDArray[np.float32] = self.goal[row].numpy()
+        evaluate = partial(evaluate_reach, self._config, cast(torch.Tensor, goal))
+        return NumpyRow(evaluate, lambda block_pose: {"goal": goal.copy()})
+
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the goal."""
         return {"goal": np.array(self.goal[row].cpu().numpy())}
+
+
+def evaluate_reach(
+    config: ReachConfig, goal: torch.Tensor, state: TaskState, angle: torch.Tensor | None = None
+) -> StepResult:
+    """Compare tools with their goals.
+
+    Args:
+        config: Weights, and the tolerances of success.
+        goal: Goal poses of the tools, shape (k, 7).
+        state: State after the step.
+        angle: Angle between tool and goal, shape (k,) [rad]; None for goals of positions.
+    """
+    distance = row_norms(state.tool - goal[..., :3])
+    return StepResult(
+        success=is_near(config, distance, angle) & ~state.diverged,
+        terminated=state.diverged & False,  # an episode lasts until its time limit
+        distance=distance,
+        score=anybody_score(config, distance, angle),
+        terms=reach_terms(config, distance, state.limit_violation, state.acceleration, angle),
+        angle=angle,
+    )
 
 
 def is_near(
@@ -136,7 +156,7 @@ def reach_terms(
         "joint_limits": -config.joint_limit_weight * limit_violation,
         "joint_acceleration": -config.joint_acceleration_weight * acceleration,
         "distance": -config.distance_weight * distance,
-        "near": config.near_weight * is_near(config, distance, angle).float(),
+        "near": config.near_weight * is_near(config, distance, angle),
     }
     if angle is not None:
         terms["rotation"] = -config.rotation_weight * config.metres_per_radian * angle
@@ -150,6 +170,5 @@ def anybody_score(
 
     For the arguments see ``is_near``.
     """
-    far = -config.score_square * distance.square()
-    bonus = torch.full_like(far, config.score_near)
-    return torch.where(is_near(config, distance, angle), bonus, far)
+    far = -config.score_square * (distance * distance)
+    return choose(is_near(config, distance, angle), config.score_near, far)

@@ -26,6 +26,7 @@ from morphgen.tasks.sim.bullet_workers import (
     start,
 )
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
+from morphgen.tasks.sim.short_arrays import TensorView, all_finite
 
 BulletState = tuple[NDArray[np.int64], Float32, Float32, Float32 | None]
 """Arguments of ``BulletBatch.reset``."""
@@ -79,6 +80,7 @@ class BulletSimulation:
         self._is_joint = np.arange(num_joints) < dofs[:, None]
         self._has_block = np.array([scene.block is not None for scene in scenes], bool)
         folder = tempfile.TemporaryDirectory(prefix="morphgen-")
+        self._view = TensorView()
         self._workers: list[Worker] = []
         self._local_batches: list[BulletBatch] = []
         self._free = weakref.finalize(self, _free, self._workers, self._local_batches, folder)
@@ -183,13 +185,14 @@ class BulletSimulation:
 
     def _checked_targets(self, targets: torch.Tensor) -> Float32:
         """Return valid targets of ``step`` as a contiguous array; padding may be anything."""
-        array = np.ascontiguousarray(targets.numpy(), np.float32)
+        array = np.ascontiguousarray(self._view(targets), np.float32)
         if array.shape != self._is_joint.shape:
             raise ValueError(f"targets have shape {array.shape}, not {self._is_joint.shape}")
-        invalid = self._is_joint & ~np.isfinite(array)
-        if invalid.any():
-            env = int(invalid.any(axis=1).argmax())
-            raise ValueError(f"{self._label(env)}: targets {array[env].tolist()}")
+        if not all_finite(array):
+            invalid = self._is_joint & ~np.isfinite(array)
+            if invalid.any():
+                env = int(invalid.any(axis=1).argmax())
+                raise ValueError(f"{self._label(env)}: targets {array[env].tolist()}")
         return array
 
     def _checked_state(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from morphgen.errors import DivergedError
 from morphgen.model.dynamics import BANDWIDTH
@@ -15,7 +15,8 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene
-from morphgen.tasks.sim.motor_law import MotorForces, clamp
+from morphgen.tasks.sim.motor_law import MotorForces
+from morphgen.tasks.sim.short_arrays import clamp, is_within
 
 MAX_VELOCITY = 1e4
 """Speed of joints and blocks [rad/s or m/s] and distance of blocks [m] that count as diverged."""
@@ -189,10 +190,10 @@ class BulletBatch:
         )
         forces: list[float] = (limits / SUBSTEPS).tolist()
         states: list[tuple[float, float]] = []
+        self._steps += 1
         for loaded, span in zip(self._loaded, self._spans, strict=True):
             loaded.step(velocities[span], forces[span])
             states += loaded.joint_states()
-        self._steps += 1
         buffers = self._buffers
         self._positions = np.array([state[0] for state in states])
         before, self._measured = self._measured, np.array([state[1] for state in states])
@@ -200,15 +201,13 @@ class BulletBatch:
         self._velocities = last + (self._measured - expected)
         q, qd = self._positions[self._independent], self._measured[self._independent]
         buffers.q.reshape(-1)[self._sink], buffers.qd.reshape(-1)[self._sink] = q, qd
-        blocks = np.array([self._loaded[i].block_state() for i in self._blocks]).reshape(-1, 13)
+        is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
         if self._blocks:
+            blocks = np.array([self._loaded[i].block_state() for i in self._blocks])
             buffers.block_pose[self._block_rows] = blocks[:, _FROM_BULLET]
             buffers.block_velocity[self._block_rows] = blocks[:, 7:]
-        if not (
-            _is_sane(q, MAX_POSITION)
-            and _is_sane(qd, MAX_VELOCITY)
-            and _is_sane(blocks, MAX_VELOCITY)
-        ):
+            is_sane = is_sane and is_within(blocks, MAX_VELOCITY)
+        if not is_sane:
             self._find_diverged()
             self._require_no_divergence()
 
@@ -234,8 +233,8 @@ class BulletBatch:
         for i, env in enumerate(self._envs):
             q, qd, pose = buffers.q[env], buffers.qd[env], buffers.block_pose[env]
             velocity, name = buffers.block_velocity[env], self._scenes[i].robot.name
-            joints = _is_sane(q, MAX_POSITION) and _is_sane(qd, MAX_VELOCITY)
-            if not (joints and _is_sane(pose, MAX_VELOCITY) and _is_sane(velocity, MAX_VELOCITY)):
+            joints = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
+            if not (joints and is_within(pose, MAX_VELOCITY) and is_within(velocity, MAX_VELOCITY)):
                 self._diverged[env] = (
                     f"environment {env} ({name!r}) diverged in step {self._steps[i]} after its "
                     f"reset: q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
@@ -249,8 +248,3 @@ class BulletBatch:
         """Free every scene; a second call does nothing."""
         for loaded in self._loaded:
             loaded.close()
-
-
-def _is_sane(values: ArrayLike, largest: float) -> bool:
-    """Return whether all values are within bounds; NaN compares as false."""
-    return bool(np.abs(values).max(initial=0.0) <= largest)

@@ -9,9 +9,10 @@ import numpy as np
 
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.sim.motor_law import CONTROL_STEP, GAIN, LAG, clamp, speed_limit
+from morphgen.tasks.sim.motor_law import CONTROL_STEP, GAIN, LAG, speed_limit
 from morphgen.tasks.sim.mujoco_model import PASSIVE, World
 from morphgen.tasks.sim.mujoco_state import GatheredArrays
+from morphgen.tasks.sim.short_arrays import clamp
 from morphgen.typing import Array
 
 BY_ERROR = CONTROL_STEP[1, 0] / CONTROL_PERIOD

@@ -16,6 +16,7 @@ from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulat
 from morphgen.tasks.sim.mujoco_control import PositionControl
 from morphgen.tasks.sim.mujoco_model import worlds
 from morphgen.tasks.sim.mujoco_state import MujocoState
+from morphgen.tasks.sim.short_arrays import TensorView, all_finite
 from morphgen.typing import Array
 
 Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
@@ -83,6 +84,7 @@ class MujocoSimulation:
             poses = [(*o.pose.position, *o.pose.quaternion) for o in self.scenes[i].obstacles]
             self._put_obstacles(i, poses)
         self._state.read()
+        self._view = TensorView()
         self._helpers = threads - 1
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
 
@@ -138,11 +140,11 @@ class MujocoSimulation:
             SimulationError: If the simulation is closed.
         """
         self._require_open()
-        if targets.shape != self._targets.shape:
-            shapes = f"{tuple(targets.shape)}, not {self._targets.shape}"
-            raise ValueError(f"targets have shape {shapes}")
-        np.copyto(self._targets, targets.numpy(), where=self._has_target)
-        if not np.isfinite(self._targets).all():
+        rows = self._view(targets)
+        if rows.shape != self._targets.shape:
+            raise ValueError(f"targets have shape {rows.shape}, not {self._targets.shape}")
+        np.copyto(self._targets, rows, where=self._has_target)
+        if not all_finite(self._targets):
             env = int(np.flatnonzero(~np.isfinite(self._targets).all(axis=1))[0])
             raise ValueError(f"{self._label(env)}: a target is not finite")
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
@@ -195,9 +197,10 @@ class MujocoSimulation:
     def _advance(self) -> dict[int, str]:
         """Step all environments; return the ones that MuJoCo could not step, with its reasons."""
         work, refused = iter(self._work), dict[int, str]()
-        helpers = []
-        if self._pool is not None:
-            helpers = [self._pool.submit(_drain, work, refused) for _ in range(self._helpers)]
+        if self._pool is None:
+            _drain(work, refused)
+            return refused
+        helpers = [self._pool.submit(_drain, work, refused) for _ in range(self._helpers)]
         try:
             _drain(work, refused)
         finally:

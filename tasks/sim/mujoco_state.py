@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from morphgen.tasks.sim.mujoco_model import World
+from morphgen.tasks.sim.short_arrays import is_within
 from morphgen.typing import Array
 
 MAX_SPEED = 1e4
@@ -58,7 +59,7 @@ class MujocoState:
         poses = [view for i in blocks for view in worlds[i].block_pose_in(data[i])]
         self._positions = GatheredArrays([*(env_data.qpos for env_data in data), *poses])
         self._velocities = GatheredArrays([env_data.qvel for env_data in data])
-        self._warnings = [env_data.warning.number for env_data in data]
+        self._warnings = GatheredArrays([env_data.warning.number for env_data in data])
         self._q_at = np.full((n, joints), -1)
         self._qd_at = np.full((n, joints), -1)
         self._pose_at = np.full((n, 7), -1)
@@ -119,10 +120,11 @@ class MujocoState:
         Their contacts do not fit into MuJoCo's memory, or they have a velocity that is not finite
         or beyond ``MAX_SPEED``.
         """
-        warnings = np.array(self._warnings)
-        speeds = np.abs(self._velocities.flat)
-        if speeds.max() <= MAX_SPEED and not warnings.any():
+        self._warnings.read()
+        if is_within(self._velocities.flat, MAX_SPEED) and is_within(self._warnings.flat, 0):
             return {}
+        warnings = self._warnings.flat[:-1].reshape(len(self._q), -1)
+        speeds = np.abs(self._velocities.flat)
         begin = self._velocities.begin
         slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(begin.tolist())]
         full = np.asarray(warnings[:, _FULL].any(axis=1))
@@ -134,8 +136,4 @@ class MujocoState:
 
     def release(self) -> None:
         """Release the environments' data."""
-        self._positions, self._velocities, self._warnings = (
-            GatheredArrays(()),
-            GatheredArrays(()),
-            [],
-        )
+        self._positions = self._velocities = self._warnings = GatheredArrays(())

@@ -10,8 +10,9 @@ import morphgen
 from helpers.robots import arm
 from morphgen.benchmark.workspace import density_overlap, shoulder, workspace
 from morphgen.errors import BenchmarkError
+from morphgen.model.frame_positions import FramePosition, frame_positions
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, frame_positions, random_configurations, reach
+from morphgen.model.kinematics import frame_pose, random_configurations, reach
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
 from morphgen.model.tree import scale_links
 
@@ -53,6 +54,8 @@ def test_the_density_agrees_with_forward_kinematics(robot):
     q = random_configurations(robot, 100, np.random.default_rng(0))
     expected = frame_pose(robot, q)[:, :3, 3]
     np.testing.assert_allclose(frame_positions(robot, q.T).T, expected, atol=1e-12)
+    position = FramePosition(robot)
+    np.testing.assert_allclose([position(row) for row in q.tolist()], expected, atol=1e-12)
 
 
 def test_the_density_is_normalized_and_reproducible():

@@ -1,0 +1,258 @@
+"""Single environments in NumPy: everything equals the batch's, or the batch steps in torch."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from morphgen.tasks import make_batch
+from morphgen.tasks.actions import BINS
+from morphgen.tasks.gym_env import TaskEnv
+from morphgen.tasks.numpy_step import numpy_stepper
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.push.config import PushConfig
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.reach.envs import ReachEnvs
+
+ROUNDING = 1e-5
+"""Largest difference of numbers of order one; codes of joint positions have angles up to 200 rad,
+which are exact to 1e-5."""
+STEPS = 40
+ROBOTS = {"reach": "arm=panda ee=panda_hand", "push": "prims"}
+CONFIGS = {
+    "reach": ReachConfig(max_episode_steps=STEPS, num_goals=5, near=0.5),
+    "push": PushConfig(max_episode_steps=STEPS, num_goals=5, line=-0.1),
+}
+CHANNELS = ObservationConfig(
+    *(True,) * 3, points=7, lag=True, joint=True, poses=True, jacobian=True, dls=True, tree=True
+)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("goals")
+
+
+@pytest.fixture
+def make(cache):
+    """Create an environment and a batch of the same one, and close them after the test."""
+    opened = []
+
+    def pair(task, robot=None, config=None, **options):
+        robot, config = robot or ROBOTS[task], config or CONFIGS[task]
+        options = {"sim": "mujoco", "cache": cache} | options
+        env = TaskEnv(task, robot, config=config, **options)
+        opened.append(env)
+        batch = make_batch(task, [robot], 1, configs=(config,), **options)
+        opened.append(batch)
+        return env, batch
+
+    yield pair
+    for each in opened:
+        each.close()
+
+
+def assert_observation_equals(seen, env, expected):
+    assert seen.keys() == env.observation_space.spaces.keys()
+    assert env.observation_space.contains(seen)
+    for name, values in seen.items():
+        batch_values = expected[name][0].numpy()
+        if name == "previous_action":
+            batch_values = batch_values[list(env.action_links)]
+        assert values.shape == env.observation_space[name].shape
+        links = len(env.env_spec.robot.links)
+        if name in ("tokens", "velocity", "lag", "joint", "poses", "jacobian", "dls"):
+            assert not batch_values[links:].any()
+            batch_values = batch_values[:links]
+        np.testing.assert_allclose(values, batch_values, rtol=1e-5, atol=ROUNDING, err_msg=name)
+
+
+def assert_step_equals(result, env, step):
+    seen, reward, terminated, truncated, info = result
+    assert_observation_equals(seen, env, step.final_observation)
+    assert reward == pytest.approx(float(step.reward[0]), rel=1e-5, abs=1e-5)
+    assert (terminated, truncated) == (bool(step.terminated[0]), bool(step.truncated[0]))
+    for name in ("success", "diverged"):
+        assert info[name] is bool(getattr(step, name)[0])
+    for name in ("distance", "score"):
+        assert info[name] == pytest.approx(float(getattr(step, name)[0]), rel=1e-5, abs=1e-5)
+    assert info["terms"].keys() == step.terms.keys()
+    for name, term in info["terms"].items():
+        assert term == pytest.approx(float(step.terms[name][0]), rel=1e-5, abs=1e-5), name
+    assert ("angle" in info) == (step.angle is not None)
+
+
+def run_both(env, batch, episodes, seed=3):
+    """Run episodes of the environment and of the batch; return which terminated and succeeded."""
+    rng = np.random.default_rng(seed)
+    seen, _ = env.reset(seed=seed)
+    assert_observation_equals(seen, env, batch.reset(seed))
+    ends, successes = [], 0
+    while len(ends) < episodes:
+        if env.batch.action_kind == "discrete":
+            action = rng.integers(len(BINS), size=env.action_space.shape)
+        else:
+            action = rng.uniform(-1.2, 1.2, env.action_space.shape).astype(np.float32)
+        actions = torch.zeros(batch.action_mask.shape, dtype=torch.from_numpy(action).dtype)
+        actions[0, list(env.action_links)] = torch.from_numpy(action)
+        result, step = env.step(action), batch.step(actions)
+        assert_step_equals(result, env, step)
+        successes += result[4]["success"]
+        if result[2] or result[3]:
+            ends.append(result[2])
+            seen, _ = env.reset()
+            assert_observation_equals(seen, env, step.observation)
+        for name in ("targets", "previous_action", "previous_qd", "episode_step"):
+            assert torch.equal(getattr(env.batch, name), getattr(batch, name)), name
+        assert torch.equal(env.batch.q, batch.q)
+    return ends, successes
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+@pytest.mark.parametrize(
+    ("sim", "obstacles"),
+    [
+        ("pybullet", False),
+        ("pybullet", True),
+        ("mujoco", False),
+        ("mujoco", True),
+        ("kinematic", False),
+    ],
+)
+def test_reach_equals_the_batch(make, sim, kind, obstacles):
+    if sim == "pybullet":
+        pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+    env, batch = make("reach", sim=sim, kind=kind, obstacles=obstacles)
+    assert env._stepper is not None
+    ends, successes = run_both(env, batch, 4)
+    assert ends == [False] * 4
+    assert 0 < successes < 4 * STEPS
+
+
+@pytest.mark.parametrize("sim", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+@pytest.mark.parametrize("obstacles", [False, True])
+def test_push_equals_the_batch(make, sim, kind, obstacles):
+    if sim == "pybullet":
+        pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
+    env, batch = make("push", sim=sim, kind=kind, obstacles=obstacles)
+    assert env._stepper is not None
+    run_both(env, batch, 4)
+
+
+def test_push_over_the_line_terminates_as_in_the_batch(make):
+    env, batch = make("push")
+    env.reset(seed=1)
+    batch.reset(1)
+    action = np.zeros(env.action_space.shape, np.float32)
+    for line, succeeds in ((1.0, False), (-2.0, True)):
+        for each in (env.batch, batch):
+            each.groups["push"].line.fill_(line)
+        result = env.step(action)
+        assert_step_equals(result, env, batch.step(torch.zeros(batch.action_mask.shape)))
+        assert result[2] is result[4]["success"] is succeeds
+
+
+def test_curriculum_moves_the_line_within_an_episode(make):
+    env, _ = make("push")
+    action = np.zeros(env.action_space.shape, np.float32)
+    env.reset(seed=1)
+    lines = []
+    for progress in (0.0, 0.2, 1.0):
+        env.batch.advance(progress)
+        lines.append(float(env.step(action)[0]["line"][0]))
+    assert lines[0] > lines[1] > lines[2] == pytest.approx(CONFIGS["push"].line)
+
+
+@pytest.mark.parametrize("task", ["reach", "push"])
+@pytest.mark.parametrize("in_numpy", [True, False])
+def test_all_channels_equal_those_of_the_batch(make, task, in_numpy):
+    env, batch = make(task, observe=CHANNELS, obstacles=True)
+    if not in_numpy:
+        env._stepper = None
+    run_both(env, batch, 2)
+
+
+def test_points_replace_the_state(make):
+    env, batch = make("push", observe=ObservationConfig(points=5, state=False), obstacles=True)
+    run_both(env, batch, 2)
+    assert not env.reset()[0]["object"].any()
+
+
+@pytest.mark.parametrize("robot", ["arm=jaco2 ee=stick", "planar-cube"])
+def test_joints_without_limits_and_slides_equal_the_batch(make, robot):
+    env, batch = make("reach", robot)
+    assert env._stepper is not None
+    run_both(env, batch, 2)
+
+
+def test_goals_that_are_poses_step_in_torch(make):
+    config = ReachConfig(max_episode_steps=STEPS, num_goals=5, goal="pose")
+    env, batch = make("reach", config=config)
+    assert env._stepper is None
+    run_both(env, batch, 2)
+
+
+def test_divergence_is_undone_as_in_the_batch(make):
+    env, batch = make("push")
+    env.reset(seed=0)
+    batch.reset(0)
+    action = np.full(env.action_space.shape, 0.3, np.float32)
+    actions = torch.zeros(batch.action_mask.shape)
+    actions[0, list(env.action_links)] = 0.3
+    assert_step_equals(env.step(action), env, batch.step(actions))
+    before = env.batch.q
+    for each in (env.batch, batch):
+        each.simulation._data[0].qvel[0] = math.nan
+    result, step = env.step(action), batch.step(actions)
+    assert_step_equals(result, env, step)
+    assert result[4]["diverged"]
+    assert result[3]
+    assert torch.equal(env.batch.q, before)
+    assert_observation_equals(env.reset()[0], env, step.observation)
+
+
+def test_simulators_may_replace_their_tensors(make):
+    env, batch = make("reach")
+
+    class Replacing:
+        def __init__(self, simulation):
+            self.simulation = simulation
+
+        def __getattr__(self, name):
+            value = getattr(self.simulation, name)
+            return value.clone() if isinstance(value, torch.Tensor) else value
+
+    env.batch.simulation = Replacing(env.batch.simulation)
+    run_both(env, batch, 1)
+
+
+def test_classes_that_change_only_the_formulas_in_torch_step_in_torch(make):
+    class Changed(ReachEnvs):
+        def evaluate(self, state):
+            return super().evaluate(state)
+
+    class Complete(Changed):
+        def numpy_row(self, row):
+            return super().numpy_row(row)
+
+    env, _ = make("reach")
+    for cls, in_numpy in ((Changed, False), (Complete, True), (ReachEnvs, True)):
+        env.batch.groups["reach"].__class__ = cls
+        assert (numpy_stepper(env.batch, env._without_padding) is not None) is in_numpy
+
+
+def test_observations_are_the_callers(make):
+    env, _ = make("push", obstacles=True)
+    seen, _ = env.reset(seed=0)
+    first = {name: values.copy() for name, values in seen.items()}
+    action = np.ones(env.action_space.shape, np.float32)
+    second = env.step(action)[0]
+    kept = {name: values.copy() for name, values in second.items()}
+    for values in seen.values():
+        values[:] = math.nan
+    third = env.step(action)[0]
+    assert all(np.array_equal(second[name], kept[name]) for name in kept)
+    assert all(np.isfinite(values).all() for values in third.values())
+    assert all(np.array_equal(env.reset(seed=0)[0][name], first[name]) for name in first)
