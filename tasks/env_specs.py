@@ -151,8 +151,9 @@ def env_spec(
     obstacles: bool = False,
     cache: Path | None = None,
     shipped: GoalSet | None = None,
+    anew: bool = False,
 ) -> EnvSpec:
-    """Return the specification of a robot at a task, whose goal set is sampled if not cached.
+    """Return the specification of a robot at a task, whose goal set is sampled if not stored.
 
     Args:
         robot: The robot, with a tool.
@@ -161,6 +162,7 @@ def env_spec(
         obstacles: Whether there are obstacles.
         cache: Folder of stored goal sets; by default one in the user's cache.
         shipped: Goal set that came with a split.
+        anew: Whether to sample the goal set even if it is packaged or cached.
 
     Raises:
         TaskError: If the task is unknown, or ``shipped`` is of another robot, task or config.
@@ -179,6 +181,7 @@ def env_spec(
         ground=ground,
         cache=cache,
         shipped=shipped,
+        anew=anew,
     )
     return EnvSpec(robot, task, kind.scene(robot, goals, ground), goals, constants)
 

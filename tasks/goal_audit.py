@@ -13,7 +13,6 @@ with the start configuration if the robots are the same.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -159,14 +158,9 @@ class _MemberExaminer:
         try:
             robot = member_with_primitives(member, self.library)
             digest = robot_hash(robot, visuals=False)
-            with tempfile.TemporaryDirectory() as folder:
-                spec = env_spec(
-                    robot,
-                    member.task,
-                    self.goals.config,
-                    obstacles=member.obstacles,
-                    cache=Path(folder),
-                )
+            spec = env_spec(
+                robot, member.task, self.goals.config, obstacles=member.obstacles, anew=True
+            )
             key = spec.goals.key
             if result is None or result.goals is None:
                 return _Examination(key, digest)

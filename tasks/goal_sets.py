@@ -1,4 +1,4 @@
-"""Goal sets of robots: sampled once, kept in a cache, and stored as files of a split.
+"""Goal sets of robots: packaged, or sampled once and cached, and stored as files of a split.
 
 A file has an array for each field; the same set gives the same bytes.
 """
@@ -24,6 +24,7 @@ from morphgen.errors import BenchmarkError, TaskError
 from morphgen.formats.files import write_cache_file
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
+from morphgen.tasks.packaged_sets import packaged_set
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import GoalSet, Task, TaskConfig
@@ -41,11 +42,11 @@ def goal_set(
     ground: float = 0.0,
     cache: Path | None = None,
     shipped: GoalSet | None = None,
+    anew: bool = False,
 ) -> GoalSet:
-    """Return a robot's goal set: the shipped one, the cached one, or a new one.
+    """Return a robot's goal set: the shipped one, the packaged one, the cached one, or a new one.
 
-    A set depends on robot, ignored pairs of links, seed, ground, constants and obstacles, not on
-    the robot's name. A smaller set is the beginning of a larger one.
+    A set depends on what ``goal_set_key`` says. A smaller set is the beginning of a larger one.
 
     Args:
         robot: The robot, with a tool.
@@ -56,6 +57,7 @@ def goal_set(
         ground: Height of the ground in the root frame [m].
         cache: Folder of stored goal sets; by default one in the user's cache.
         shipped: Goal set that came with a split; it must be the one that would be sampled.
+        anew: Whether to sample the set even if it is packaged or cached; it is not stored then.
 
     Raises:
         BenchmarkError: If a number is invalid, or the robot cannot have such a set.
@@ -68,14 +70,7 @@ def goal_set(
             f"{config.num_goals} goals with seed {seed}: at least one goal, and no negative seed"
         )
     task.check(robot, config)
-    robot_digest = robot_hash(robot, visuals=False)
-    index = robot.link_index
-    ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)
-    layouts = config.train_layouts, config.eval_layouts
-    boxes = [config.obstacles, *map(float, config.obstacle_size), *layouts] if obstacles else None
-    constants = [*task.key_parts(config), boxes]
-    parts = [task.goal_format, robot_digest, ignored, *constants, seed, float(ground)]
-    key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    key = goal_set_key(robot, task, config, obstacles=obstacles, seed=seed, ground=ground)
     if shipped is not None:
         if shipped.key != key:
             raise TaskError(
@@ -85,16 +80,45 @@ def goal_set(
         return shipped
 
     def sample() -> GoalSet:
-        seeds = np.random.SeedSequence([seed, int(robot_digest, 16), int(obstacles)])
+        digest = int(robot_hash(robot, visuals=False), 16)
+        seeds = np.random.SeedSequence([seed, digest, int(obstacles)])
         identity = {"robot": robot.name, "key": key, "seed": seed}
         goals: GoalSet = task.sample(
             robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
         )
         return goals
 
-    folder = user_cache_path("morphgen") / task.cache_folder if cache is None else cache
+    if anew:
+        return sample()
     kind: type[GoalSet] = task.goal_set_type
+    if (content := packaged_set(key)) is not None:
+        return replace(set_from_npz(content, kind), robot=robot.name)
+    folder = user_cache_path("morphgen") / task.cache_folder if cache is None else cache
     return _cached(kind, folder / f"{key}.npz", robot.name, sample)
+
+
+def goal_set_key(
+    robot: Robot,
+    task: Task[Any, Any],
+    config: TaskConfig,
+    *,
+    obstacles: bool,
+    seed: int,
+    ground: float,
+) -> str:
+    """Return the hash of everything that a goal set depends on: 64 hexadecimal digits.
+
+    These are robot, ignored pairs of links, seed, ground, constants and obstacles, not the robot's
+    name. For the arguments see ``goal_set``.
+    """
+    index = robot.link_index
+    ignored = sorted(sorted((index[a], index[b])) for a, b in robot.ignore_pairs)
+    layouts = config.train_layouts, config.eval_layouts
+    boxes = [config.obstacles, *map(float, config.obstacle_size), *layouts] if obstacles else None
+    constants = [*task.key_parts(config), boxes]
+    digest = robot_hash(robot, visuals=False)
+    parts = [task.goal_format, digest, ignored, *constants, seed, float(ground)]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
 def set_npz(goals: GoalSet) -> bytes:
