@@ -207,25 +207,27 @@ class _Tokens:
     """Tokens of a robot's links; see ``morphgen.tasks.observation.LinkTokens``."""
 
     def __init__(self, tables: RobotTables) -> None:
-        links = slice(len(tables.robots[0].links))
-        gains = tables.position_gain[0, links].numpy()
-        self._joint = np.abs(gains).argmax(axis=1)  # each link follows one independent joint
-        self._gain = gains[np.arange(len(gains)), self._joint]
-        self._offset = tables.position_offset[0, links].numpy()
-        self._wraps = np.flatnonzero(tables.wraps[0, links].numpy())
-        self._is_movable = tables.movable_links[0, links, None].float().numpy()
-        self._frequencies = FREQUENCIES.astype(np.float32)
-        self._constant = tables.tokens[0, links].numpy()
-        start, middle = POSITION.start, POSITION.start + len(FREQUENCIES)
-        self._sines, self._cosines = slice(start, middle), slice(middle, start + POSITION.size)
+        num_links, num_codes = len(tables.robots[0].links), len(FREQUENCIES)
+        self._constant = tables.tokens[0, :num_links].numpy()
+        links = np.flatnonzero(tables.movable_links[0].numpy())
+        gains, offsets = tables.position_gain[0, links].numpy(), tables.position_offset[0, links]
+        joint = np.abs(gains).argmax(axis=1)  # each link follows one independent joint
+        # Arrays of a number for each link and frequency: NumPy is fastest without broadcasting.
+        rows = links, joint, gains[np.arange(len(links)), joint], offsets.numpy()
+        link, self._joint, self._gain, self._offset = (np.repeat(row, num_codes) for row in rows)
+        self._wraps = np.flatnonzero(tables.wraps[0].numpy()[link])
+        self._frequencies = np.tile(FREQUENCIES.astype(np.float32), len(links))
+        columns = POSITION.start + np.tile(np.arange(num_codes), len(links))
+        self._sines = link * self._constant.shape[1] + columns
+        self._cosines = self._sines + num_codes
 
     def __call__(self, q: Float32) -> Float32:
         """Return the tokens, shape (links, 48), at joint positions, shape (J,)."""
         x = self._gain * q[self._joint] + self._offset
         if len(self._wraps):
             x[self._wraps] -= 2 * np.ceil((x[self._wraps] - 1) / 2)
-        angles = x[:, None] * self._frequencies  # zero where the joint is fixed
+        angles = x * self._frequencies
         tokens = self._constant.copy()
-        np.sin(angles, out=tokens[:, self._sines])
-        np.multiply(np.cos(angles), self._is_movable, out=tokens[:, self._cosines])
+        flat = tokens.reshape(-1)
+        flat[self._sines], flat[self._cosines] = np.sin(angles), np.cos(angles)
         return tokens

@@ -6,7 +6,6 @@ MuJoCo tests the collision shapes; as in MuJoCo and PyBullet, a mesh counts as i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import TYPE_CHECKING
@@ -117,11 +116,13 @@ class SelfCollisionChecker:
         """
         import mujoco
 
+        from morphgen.formats.mujoco_warnings import MujocoWarnings
+
         model, data, qpos = self._model, self._data, self._data.qpos
         full = data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL]
         positions = movable_positions(self._robot, self._require_rows(q))
         free = np.ones(len(positions), dtype=np.bool_)
-        with capture_mujoco_warnings() as warnings:
+        with MujocoWarnings() as warnings:
             for i, row in enumerate(positions):
                 qpos[self._qpos] = row
                 mujoco.mj_kinematics(model, data)
@@ -167,10 +168,12 @@ class SelfCollisionChecker:
         """Find the contacts at movable joint positions, perturbed slightly where EPA fails."""
         import mujoco
 
+        from morphgen.formats.mujoco_warnings import MujocoWarnings
+
         for offset in _PERTURBATIONS:
             self._data.qpos[self._qpos] = positions + offset * self._perturbation
             mujoco.mj_kinematics(self._model, self._data)
-            with capture_mujoco_warnings() as warnings:
+            with MujocoWarnings() as warnings:
                 mujoco.mj_collision(self._model, self._data)
             if not any(_EPA_WARNING in warning for warning in warnings):
                 return
@@ -277,20 +280,6 @@ def adjacent_pairs(robot: Robot) -> tuple[Pair, ...]:
         if parent is not None:
             pairs.update(sorted_pair(a, b) for a, b in product(names, collidable[parent]))
     return tuple(sorted(pairs))
-
-
-@contextmanager
-def capture_mujoco_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings, of all threads, instead of writing them to ``MUJOCO_LOG.TXT``."""
-    import mujoco
-
-    warnings: list[str] = []
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(warnings.append)
-    try:
-        yield warnings
-    finally:
-        mujoco.set_mju_user_warning(previous)
 
 
 def _pairs(names: Iterable[str]) -> Iterator[Pair]:

@@ -16,7 +16,7 @@ from morphgen.model.robot import Robot
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene
 from morphgen.tasks.sim.bullet_scene import VELOCITY_GAIN, BulletScene
 from morphgen.tasks.sim.motor_law import MotorForces
-from morphgen.tasks.sim.short_arrays import clamp, is_within
+from morphgen.tasks.sim.short_arrays import clamp, consecutive, is_within
 
 MAX_VELOCITY = 1e4
 """Speed of joints and blocks [rad/s or m/s] and distance of blocks [m] that count as diverged."""
@@ -79,7 +79,8 @@ class BulletBatch:
         self._share, self._scenes = share, scenes
         self._buffers, self._envs = buffers, list(share.envs)
         self._index = {env: i for i, env in enumerate(self._envs)}
-        self._steps = np.zeros(len(scenes), np.int64)
+        self._num_steps = 0
+        self._num_steps_at_reset = [0] * len(scenes)
         self._diverged: dict[int, str] = {}
         self._obstacle_poses: list[list[list[float]] | None] = [None] * len(scenes)
         self._loaded: list[BulletScene] = []
@@ -105,6 +106,7 @@ class BulletBatch:
         and a sum; a matrix product may round differently in another batch.
         """
         width = self._buffers.q.shape[1]
+        self._flat_q, self._flat_qd = self._buffers.q.reshape(-1), self._buffers.qd.reshape(-1)
         source: list[int] = []
         gain: list[float] = []
         offset: list[float] = []
@@ -126,9 +128,11 @@ class BulletBatch:
                 start + robot.movable_joints.index(k) for k in robot.independent_joints
             )
             sink.extend(range(env * width, env * width + robot.dof))
-        self._source, self._sink = np.array(source, np.intp), np.array(sink, np.intp)
+        self._source = consecutive(np.array(source, np.intp))
+        self._sink = consecutive(np.array(sink, np.intp))
         self._gain, self._offset = np.array(gain), np.array(offset)
-        self._fastest, self._independent = np.array(fastest), np.array(independent, np.intp)
+        self._fastest = np.array(fastest)
+        self._independent = consecutive(np.array(independent, np.intp))
         self._positions, self._velocities = np.zeros(len(offset)), np.zeros(len(offset))
         self._measured = np.zeros(len(offset))
 
@@ -166,7 +170,7 @@ class BulletBatch:
             if scene.block is not None:
                 buffers.block_pose[env] = np.array(loaded.block_state()[:7])[_FROM_BULLET]
                 buffers.block_velocity[env] = 0
-            self._steps[i] = 0
+            self._num_steps_at_reset[i] = self._num_steps
 
     def step(self, targets: Float32) -> None:
         """Advance the environments by one control step; see ``Simulation.step``.
@@ -190,7 +194,7 @@ class BulletBatch:
         )
         forces: list[float] = (limits / SUBSTEPS).tolist()
         states: list[tuple[float, float]] = []
-        self._steps += 1
+        self._num_steps += 1
         for loaded, span in zip(self._loaded, self._spans, strict=True):
             loaded.step(velocities[span], forces[span])
             states += loaded.joint_states()
@@ -200,7 +204,7 @@ class BulletBatch:
         expected = before + (commanded - before) * _FINAL_RESPONSE
         self._velocities = last + (self._measured - expected)
         q, qd = self._positions[self._independent], self._measured[self._independent]
-        buffers.q.reshape(-1)[self._sink], buffers.qd.reshape(-1)[self._sink] = q, qd
+        self._flat_q[self._sink], self._flat_qd[self._sink] = q, qd
         is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
         if self._blocks:
             blocks = np.array([self._loaded[i].block_state() for i in self._blocks])
@@ -221,9 +225,10 @@ class BulletBatch:
         afterwards, and carry over to the next step.
         """
         q, v = self._positions, self._velocities
+        fastest, slowest = self._fastest, -self._fastest
         for _ in range(SUBSTEPS):
             v = v + TIMESTEP * BANDWIDTH * (BANDWIDTH * (desired - q) - 2 * v)
-            v = clamp(v, self._fastest)
+            v = np.minimum(np.maximum(v, slowest), fastest)
             q = q + TIMESTEP * v
         return q, v
 
@@ -235,8 +240,9 @@ class BulletBatch:
             velocity, name = buffers.block_velocity[env], self._scenes[i].robot.name
             joints = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
             if not (joints and is_within(pose, MAX_VELOCITY) and is_within(velocity, MAX_VELOCITY)):
+                steps = self._num_steps - self._num_steps_at_reset[i]
                 self._diverged[env] = (
-                    f"environment {env} ({name!r}) diverged in step {self._steps[i]} after its "
+                    f"environment {env} ({name!r}) diverged in step {steps} after its "
                     f"reset: q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
                 )
 

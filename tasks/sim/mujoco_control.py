@@ -50,11 +50,11 @@ class PositionControl:
             joints: Number of independent joints with padding, J.
         """
         self._shape = (len(worlds), joints)
-        self._bias = GatheredArrays([env_data.qfrc_bias for env_data in data])
-        self._weight = GatheredArrays([env_data.qfrc_gravcomp for env_data in data])
-        self._applied = np.zeros(len(self._bias.flat))
-        self._acceleration = np.zeros(len(self._bias.flat))
-        self._force = np.zeros(len(self._bias.flat))
+        bias = [env_data.qfrc_bias for env_data in data]
+        weight = [env_data.qfrc_gravcomp for env_data in data]
+        self._data_forces = GatheredArrays([*bias, np.zeros(1), *weight])  # one call reads both
+        self._bias, self._weight = np.split(self._data_forces.flat, 2)
+        self._applied, self._acceleration, self._force = np.zeros((3, len(self._bias)))
         self._products: list[tuple[mujoco.MjModel, mujoco.MjData, Array, Array]] = []
         self._compliance = np.zeros(self._shape)
         self._farthest = np.zeros(self._shape)
@@ -62,7 +62,7 @@ class PositionControl:
         self._damping.read()
         slots, leaders, gains = [], [], []
         for i, (world, env_data) in enumerate(zip(worlds, data, strict=True)):
-            begin, end = self._bias.begin[i : i + 2].tolist()
+            begin, end = self._data_forces.begin[i : i + 2].tolist()
             force, acceleration = self._force[begin:end], self._acceleration[begin:end]
             self._products.append((world.model, env_data, force, acceleration))
             self._compliance[i, : world.robot.dof] = 1 / world.model.actuator_gainprm[:, 0]
@@ -79,7 +79,7 @@ class PositionControl:
 
     def applied_to(self, env: int) -> Array:
         """Return the extra forces on an environment's degrees of freedom, shape (nv,); a view."""
-        begin, end = self._bias.begin[env : env + 2].tolist()
+        begin, end = self._data_forces.begin[env : env + 2].tolist()
         return self._applied[begin:end]
 
     def controls(self, targets: Array, q: Array, qd: Array, velocities: Array, out: Array) -> None:
@@ -97,9 +97,8 @@ class PositionControl:
         self._acceleration[self._slots] = self._gains * mean_acceleration.ravel()[self._leaders]
         for model, data, force, acceleration in self._products:
             mujoco.mj_mulM(model, data, force, acceleration)
-        self._bias.read()
-        self._weight.read()
-        force = self._force + self._bias.flat - self._weight.flat
+        self._data_forces.read()
+        force = self._force + self._bias - self._weight
         leader_forces = np.bincount(
             self._leaders, self._gains * force[self._slots], minlength=mean_acceleration.size
         )
@@ -110,4 +109,4 @@ class PositionControl:
     def release(self) -> None:
         """Release the environments' data."""
         self._products = []
-        self._bias, self._weight = GatheredArrays(()), GatheredArrays(())
+        self._data_forces = GatheredArrays(())

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import torch
 
-from morphgen.checks.self_collision import capture_mujoco_warnings
 from morphgen.errors import DivergedError, SimulationError
+from morphgen.formats.mujoco_warnings import MujocoWarnings
 from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts, Scene, Simulator
 from morphgen.tasks.sim.mujoco_control import PositionControl
@@ -148,7 +148,7 @@ class MujocoSimulation:
             env = int(np.flatnonzero(~np.isfinite(self._targets).all(axis=1))[0])
             raise ValueError(f"{self._label(env)}: a target is not finite")
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
-        with np.errstate(invalid="ignore", over="ignore"), capture_mujoco_warnings():
+        with np.errstate(invalid="ignore", over="ignore"), MujocoWarnings():
             self._control.controls(
                 self._targets, *self._state.joints(), self._state.velocities, out=self._controls
             )

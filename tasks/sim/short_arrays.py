@@ -33,6 +33,13 @@ def all_finite(values: NDArray[Any]) -> bool:
     return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
+def consecutive(indices: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+    """Return indices as a slice if they are consecutive: they select the same, in less time."""
+    first = int(indices[0]) if len(indices) else 0
+    is_slice = np.array_equal(indices, np.arange(first, first + len(indices)))
+    return slice(first, first + len(indices)) if is_slice else indices
+
+
 class TensorView:
     """View of a tensor as an array, which is kept while the same tensor is passed."""
 
