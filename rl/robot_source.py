@@ -14,6 +14,7 @@ from morphgen.benchmark.token_layout import require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
+from morphgen.processes import Progress, no_progress
 from morphgen.tasks.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec, GoalSet
@@ -179,12 +180,15 @@ def require_links(source: RobotSource, max_links: int) -> None:
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
-def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
+def specs_of(
+    source: RobotSource, config: GoalConfig, progress: Progress = no_progress
+) -> list[EnvSpec]:
     """Return the robots with their tasks and scenes; each is built once per process.
 
     Args:
         source: The robots.
         config: Constants of the tasks; the seed is the source's.
+        progress: Called with the number of robots whose goal set is ready, and their total.
 
     Raises:
         TaskError: If the robots are drawn from grammars.
@@ -195,8 +199,13 @@ def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
         raise _without_sides(source)
     config = replace(config, seed=source.goal_seed)
     if source.split:
-        own = replace(source, split="", member=None)
-        return [_of_member(member, own, config) for member in members(source)]
+        own, meant = replace(source, split="", member=None), members(source)
+        specs: list[EnvSpec] = []
+        for member in meant:
+            progress(len(specs), len(meant))
+            specs.append(_of_member(member, own, config))
+        progress(len(specs), len(meant))
+        return specs
     if source.task is None:
         raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
     robot = load_robot(source.name, library=map(Path, source.library))

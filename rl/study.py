@@ -15,6 +15,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from morphgen import processes
 from morphgen.benchmark.split import Side
 from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.data_files import read_json
@@ -173,6 +174,7 @@ def do_cell(
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None = None,
     progress: StartProgress = lambda name: no_progress,
+    prepare: processes.Progress = processes.no_progress,
 ) -> None:
     """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
@@ -191,6 +193,7 @@ def do_cell(
             resume=True,
             execution=execution,
             show=show,
+            prepare=prepare,
             hold=lambda folder: nullcontext(),  # the caller has locked the cell's folder
         )
         scores = {
@@ -209,6 +212,7 @@ def run_cells(
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None = None,
     progress: StartProgress = lambda name: no_progress,
+    prepare: processes.Progress = processes.no_progress,
 ) -> Iterator[Outcome]:
     """Train and evaluate cells one after another, and yield their outcomes.
 
@@ -219,7 +223,7 @@ def run_cells(
     skipped = 0
     while waiting:
         cell = waiting.popleft()
-        outcome = _do_locked(cell, execution, show, progress)
+        outcome = _do_locked(cell, execution, show, progress, prepare)
         if outcome is not None:
             skipped = 0
             yield outcome
@@ -273,12 +277,13 @@ def _do_locked(
     execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None,
     progress: StartProgress,
+    prepare: processes.Progress,
 ) -> Outcome | None:
     """Train and evaluate a cell and return its outcome; None if another process works on it."""
     try:
         cell.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(cell.folder / LOCK, timeout=0):
-            do_cell(cell, execution, show, progress)
+            do_cell(cell, execution, show, progress, prepare)
     except Timeout:
         return None
     except MorphgenError as error:

@@ -11,6 +11,7 @@ import numpy as np
 
 from morphgen.errors import TaskError
 from morphgen.formats.files import locked_folder
+from morphgen.processes import Progress, no_progress
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.drawn_robots import num_drawn, write_drawn
 from morphgen.rl.learner_state import load_networks, state_of, use_batch
@@ -106,6 +107,7 @@ def train(
     resume: bool = False,
     execution: ExecutionConfig | None = None,
     show: Callable[[Subrun], ShowMetrics] | None = None,
+    prepare: Progress = no_progress,
     hold: Callable[[Path], AbstractContextManager[None]] = locked_folder,
 ) -> list[Subrun]:
     """Train all parts of a run to their end; see ``subruns_of``.
@@ -120,6 +122,7 @@ def train(
         resume: Whether to continue a run that is already in the folder.
         execution: How the run is executed.
         show: Called at the start of every part; returns the callback for its updates.
+        prepare: Called with the number of robots whose goal set is ready, and their total.
         hold: Context manager that locks the folder against other runs.
 
     Returns:
@@ -142,7 +145,7 @@ def train(
                 continue
             if not holds:
                 require_links(config.source, config.max_links)
-            batches = TrainingBatches(part.config, workers=execution.workers)
+            batches = TrainingBatches(part.config, workers=execution.workers, progress=prepare)
             with _learner(part, batches) as learner:
                 if not holds:
                     folder.mkdir(parents=True, exist_ok=True)

@@ -16,6 +16,7 @@ import numpy as np
 from morphgen.benchmark.token_layout import require_max_links
 from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot
+from morphgen.processes import Progress, no_progress
 from morphgen.rl.drawn_robots import DrawnRobots, draw, num_drawn
 from morphgen.rl.robot_source import specs_of
 from morphgen.rl.runs import RunConfig
@@ -80,12 +81,15 @@ class TrainingBatches:
         most_links: Number of links of the largest robot.
     """
 
-    def __init__(self, config: RunConfig, *, workers: int = 1) -> None:
+    def __init__(
+        self, config: RunConfig, *, workers: int = 1, progress: Progress = no_progress
+    ) -> None:
         """Build the robots and their goal sets.
 
         Args:
             config: Config of the run.
             workers: Number of processes of PyBullet, or of threads of MuJoCo.
+            progress: Called with the number of robots whose goal set is ready, and their total.
 
         Raises:
             BenchmarkError: If a robot has more links than the config's ``max_links``.
@@ -96,8 +100,8 @@ class TrainingBatches:
         self._batch: TaskBatch | None = None
         self.drawn: DrawnRobots | None = None
         if config.source.grammars:
-            self.drawn = draw(config.source, goals)
-        self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals)
+            self.drawn = draw(config.source, goals, progress=progress)
+        self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals, progress)
         for spec in self._specs:
             links = len(spec.robot.links)
             require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)

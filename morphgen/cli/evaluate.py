@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from morphgen.tasks.registry import default_simulator
 
 if TYPE_CHECKING:
     from morphgen.benchmark.split import Side
+    from morphgen.rl.evaluation import EvalConfig
     from morphgen.rl.robot_source import RobotSource
     from morphgen.rl.scores import Score
     from morphgen.tasks.task import TaskConfig
@@ -101,6 +102,7 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
         args.workers,
         _with_goal(default_configs(), sources, args),
     )
+    _prepare(sources, config, display)
     return {
         name: [
             score
@@ -110,6 +112,21 @@ def _baseline_scores(args: argparse.Namespace, display: TrainingProgress) -> dic
             )
         ]
     }
+
+
+def _sources_of(source: RobotSource, sides: Sequence[Side]) -> list[RobotSource]:
+    from morphgen.rl.robot_source import other_side
+
+    return [other_side(source, side) for side in sides]
+
+
+def _prepare(sources: Sequence[RobotSource], config: EvalConfig, display: TrainingProgress) -> None:
+    """Make the goal sets of robots, and show how many are ready; evaluations find them made."""
+    from morphgen.rl.robot_source import specs_of
+    from morphgen.tasks.env_specs import GoalConfig
+
+    for source in sources:
+        specs_of(source, GoalConfig(tasks=config.tasks), display.goal_sets)
 
 
 def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[str, list[Score]]:
@@ -135,6 +152,8 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
     sources = _sources(args) if args.words else [run.source]
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=args.sim or config.sim, tasks=tasks)
+    sides = _sides(args, has_test=bool(run.source.split))
+    _prepare(sources if args.words else _sources_of(run.source, sides), config, display)
     results: dict[str, list[Score]] = {}
     if args.words and run.source.grammars:
         _warn_of_drawn(files[0].parent, sources)
@@ -147,7 +166,7 @@ def _policy_scores(args: argparse.Namespace, display: TrainingProgress) -> dict[
                     files, source, config, mode, device=args.device, progress=progress
                 )
             continue
-        for side in _sides(args, has_test=bool(run.source.split)):
+        for side in sides:
             progress = display.evaluation(f"{mode} on {side}")
             scores += evaluate_run(path, side, config, mode, device=args.device, progress=progress)
     return results

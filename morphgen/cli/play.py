@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from morphgen.cli import options as opt
 from morphgen.cli.command import command, flag, number, option, path_option, positive
-from morphgen.cli.progress import print_line, status
+from morphgen.cli.progress import bar, print_line, status
 from morphgen.rl.baselines import BASELINES
 from morphgen.tasks.registry import SIMULATORS, TASKS, default_simulator
 
@@ -94,7 +94,7 @@ def play(args: argparse.Namespace) -> None:
             f"{episode.seconds:.2f} s{', the simulation diverged' * episode.unstable}"
         )
 
-    with status(args, f"preparing {robot} and its goals"):
+    with bar(args, f"preparing {robot} and its goals") as progress:
         env = TaskEnv(
             args.task,
             robot,
@@ -105,6 +105,7 @@ def play(args: argparse.Namespace) -> None:
             observe=interface.channels,
             config=config,
             max_links=interface.max_links,
+            progress=progress,
             library=args.library,
             render_mode=None if args.out is None else "rgb_array",
         )
@@ -152,7 +153,7 @@ def speed(args: argparse.Namespace) -> None:
         from morphgen.tasks.speed import measure_speed
 
     robot, sim = " ".join(args.words), args.sim or default_simulator()
-    with status(args, f"preparing {robot} and its goals"):
+    with bar(args, f"preparing {robot} and its goals") as progress:
         batch = make_batch(
             args.task,
             [robot],
@@ -161,6 +162,7 @@ def speed(args: argparse.Namespace) -> None:
             workers=args.workers,
             obstacles=args.obstacles,
             max_links=None,
+            progress=progress,
             library=args.library,
         )
     with closing(batch), status(args, "measuring"):

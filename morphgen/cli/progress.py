@@ -23,6 +23,8 @@ LINE_INTERVAL = 60.0
 """Time between two lines about an evaluation where there is no terminal [s]."""
 REDRAW_INTERVAL = 1.0
 """Time after which a bar appears, and between its updates if nothing else happens [s]."""
+GOAL_LINE_INTERVAL = 5.0
+"""Time between two lines about goal sets that are made, where there is no terminal [s]."""
 TRAINING_LINES = 20
 """Number of lines about a training where there is no terminal."""
 
@@ -150,6 +152,23 @@ class TrainingProgress:
     def __init__(self) -> None:
         self._shown = ExitStack()
         self._shown.enter_context(status(argparse.Namespace(), "preparing"))
+        self._goal_bar: Bar | None = None
+        self._last_line = time.monotonic()
+
+    def goal_sets(self, done: int, total: int) -> None:
+        """Show how many of the robots have their goal set."""
+        if not sys.stderr.isatty():
+            if done < total and time.monotonic() - self._last_line > GOAL_LINE_INTERVAL:
+                self._last_line = time.monotonic()
+                print(f"goal sets: {done} of {total} robots", file=sys.stderr, flush=True)
+            return
+        if self._goal_bar is None:
+            self.close()
+            self._goal_bar = self._shown.enter_context(bar(argparse.Namespace(), "goal sets"))
+        self._goal_bar(done, total)
+        if done == total:
+            self.close()
+            self._shown.enter_context(status(argparse.Namespace(), "preparing"))
 
     def __call__(self, subrun: Subrun) -> ShowMetrics:
         """Begin with a subrun; return the function that shows its metrics."""
@@ -183,6 +202,7 @@ class TrainingProgress:
     def close(self) -> None:
         """Finish the bar that is shown."""
         self._shown.close()
+        self._goal_bar = None
 
 
 def _draw_update(shown: tqdm[NoReturn], report: UpdateMetrics) -> None:

@@ -207,7 +207,14 @@ def _train(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
 
     with training_progress() as show:
         execution = execution_config(args)
-        subruns = train(folder, config, resume=args.resume, execution=execution, show=show)
+        subruns = train(
+            folder,
+            config,
+            resume=args.resume,
+            execution=execution,
+            show=show,
+            prepare=show.goal_sets,
+        )
     for subrun in subruns:
         print(subrun.folder / CHECKPOINT)
 

@@ -66,3 +66,17 @@ def test_terminal_progress_bar_is_removed_at_the_end(capsys, monkeypatch):
     assert "train" in err
     assert "test" in err
     assert err.rsplit("\r", 1)[-1].strip() == ""
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_goal_sets_are_counted_until_all_are_ready(terminal, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setattr(progress, "GOAL_LINE_INTERVAL", -1.0)
+    monkeypatch.setattr(progress, "REDRAW_INTERVAL", 0.01)
+    with closing(TrainingProgress()) as display:
+        display.goal_sets(3, 10)
+        bar = display._goal_bar
+        display.goal_sets(10, 10)
+        assert display._goal_bar is None
+    lines = [line for line in capsys.readouterr().err.splitlines() if "goal sets: 3 of 10" in line]
+    assert (bar is None, len(lines)) == ((False, 0) if terminal else (True, 1))

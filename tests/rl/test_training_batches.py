@@ -11,12 +11,13 @@ from helpers.learners import learner
 from helpers.line_batch import OnALine
 from helpers.runs import QUIET, equal, small_config, weights
 from helpers.splits import member, split
-from morphgen.benchmark.split_file import write_split
+from morphgen.benchmark.split_file import read_split, write_split
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.rl.config import PolicyConfig
 from morphgen.rl.drawn_robots import FILE, draw, drawn_source
 from morphgen.rl.learner_state import use_batch
 from morphgen.rl.recorders import read_metrics
+from morphgen.rl.robot_source import specs_of, split_source
 from morphgen.rl.runs import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.training import train
 from morphgen.rl.training_batches import (
@@ -232,3 +233,18 @@ def test_a_batch_that_does_not_fit_is_refused():
     larger.observe = lambda: {**observe(), "links": observe()["links"] | True}
     with pytest.raises(TaskError, match="a robot has 4 links; the learner has room for 3"):
         use_batch(agent, larger)
+
+
+def test_goal_sets_are_reported_robot_by_robot():
+    reports = []
+
+    def report(done, total):
+        reports.append((done, total))
+
+    source = split_source(read_split("extrapolation/primitives/reach"), side="test")
+    specs = specs_of(source, GoalConfig(), report)
+    assert reports == [(0, 2), (1, 2), (2, 2)]
+    reports.clear()
+    TrainingBatches(replace(small_config(), source=source), progress=report)
+    assert reports == [(0, 2), (1, 2), (2, 2)]
+    assert [spec.robot.name for spec in specs] == ["chain-000000", "chain-000001"]

@@ -13,6 +13,7 @@ from morphgen.model.geometry import Pose
 from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.scripted_push import ScriptedPush
 from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.gym_env import TaskEnv
 from morphgen.tasks.make import batch_from_specs
 from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.push.config import PushConfig
@@ -220,3 +221,29 @@ def test_a_set_of_one_goal_may_have_obstacles(specs, tmp_path):
     config = replace(PUSH, num_goals=1)
     spec = draw_spec(specs["push"].robot, config, obstacles=True, cache=tmp_path)
     assert spec.goals.usable.all()
+
+
+@pytest.mark.parametrize("side", ["train", "eval"])
+def test_a_gymnasium_environment_observes_the_obstacles_of_its_episode(side, tmp_path):
+    reports = []
+    env = TaskEnv(
+        "reach",
+        robot("arm3"),
+        obstacles=True,
+        layouts=side,
+        config=replace(REACH, max_episode_steps=2),
+        sim="mujoco",
+        cache=tmp_path,
+        progress=lambda done, total: reports.append((done, total)),
+    )
+    assert reports == [(0, 1), (1, 1)]
+    drawn = set()
+    for episode in range(12):
+        observation, _ = env.reset(seed=0 if episode == 0 else None)
+        for _ in range(2):
+            poses = env.batch.layouts.poses[0].numpy().copy()
+            assert (observation["obstacles"][:, :7] == poses).all()
+            drawn.add(env.batch.layouts.current[0])
+            observation, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
+    env.close()
+    assert drawn == ({0, 1, 2, 3} if side == "train" else {4, 5})
